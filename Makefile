@@ -1,0 +1,60 @@
+# Placewise: `make` alone lists the targets.
+PYTHON ?= python3
+# Another build of PyTorch, for example: make setup TORCH_INDEX=https://download.pytorch.org/whl/cpu
+TORCH_INDEX ?=
+HOST ?= 127.0.0.1
+PORT ?= 8000
+PLACEWISE_HOME ?= ./var
+
+VENV := .venv
+BIN := $(VENV)/bin
+UV_VERSION := 0.13.8
+INSTALLED := $(VENV)/.installed
+
+.DEFAULT_GOAL := help
+.PHONY: help setup run test lint types bench demo clean
+
+help: ## list the targets
+	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | awk -F':.*## ' '{printf "  make %-8s %s\n", $$1, $$2}'
+
+setup: $(INSTALLED) ## make .venv and install everything into it (TORCH_INDEX= picks another torch build)
+
+$(INSTALLED): pyproject.toml requirements.lock
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Placewise needs Python 3.11 or newer; this is %d.%d. Try: make setup PYTHON=python3.12" % sys.version_info[:2])'
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check uv==$(UV_VERSION)
+ifeq ($(TORCH_INDEX),)
+	VIRTUAL_ENV=$(VENV) $(BIN)/uv pip install --requirement requirements.lock
+else
+	# The lock pins the CUDA build and its libraries: leave those out and take torch from the other index.
+	VIRTUAL_ENV=$(VENV) $(BIN)/uv pip install --index-url $(TORCH_INDEX) \
+		$$(grep -oE '^(torch|torchvision)==[0-9.]+' requirements.lock)
+	grep -vE '^(torch|torchvision|triton|nvidia-[a-z0-9-]+|cuda-[a-z0-9-]+)(\[|==)' requirements.lock > $(VENV)/other.lock
+	VIRTUAL_ENV=$(VENV) $(BIN)/uv pip install --no-deps --requirement $(VENV)/other.lock
+endif
+	VIRTUAL_ENV=$(VENV) $(BIN)/uv pip install --no-deps --editable .
+	@touch $(INSTALLED)
+
+run: $(INSTALLED) ## serve the embedded Placewise on http://HOST:PORT, data under PLACEWISE_HOME
+	HOST=$(HOST) PORT=$(PORT) PLACEWISE_HOME=$(PLACEWISE_HOME) $(BIN)/placewise serve
+
+test: $(INSTALLED) ## every test (PLACEWISE_TEST_DATA=FOLDER adds those on real photos)
+	$(BIN)/python -m pytest tests
+
+lint: $(INSTALLED) ## ruff, formatting and the import contracts
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/lint-imports
+
+types: $(INSTALLED) ## mypy, strict
+	$(BIN)/mypy
+
+bench: $(INSTALLED) ## time the main job: upload, describe, search
+	$(BIN)/placewise bench spine
+
+demo: $(INSTALLED) ## index photographs that packages bring, fit, ask, print what was found
+	$(BIN)/python -m benchmarks.demo
+
+clean: ## remove the environment and what tools left behind (your data under PLACEWISE_HOME stays)
+	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis
+	find . -name __pycache__ -type d -not -path './.git/*' -prune -exec rm -rf {} +

@@ -1,0 +1,112 @@
+"""`placewise bench`: timings of the main job, on this machine."""
+
+from __future__ import annotations
+
+import io
+import statistics
+import tempfile
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+from PIL import Image
+from rich.table import Table
+
+from services.cli.connect import connect
+from services.cli.output import JsonOption, answers, explained, print_json, progress_bar
+from shared.client import Client, Json
+
+app = typer.Typer(help="Timings on this machine.", no_args_is_help=True)
+
+
+@app.callback()
+def _bench() -> None:
+    """A group, so that each benchmark has its own name."""
+
+
+@app.command("spine")
+def spine(
+    photos: Annotated[int, typer.Option(min=2)] = 200,
+    queries: Annotated[int, typer.Option(min=1)] = 50,
+    as_json: JsonOption = False,
+) -> None:
+    """Upload, describe, search by stored photo and by new photo, on an empty embedded server.
+
+    The photos are random textures of 320 x 240 pixels: timings need no places.
+    """
+    import os
+
+    with explained(as_json), tempfile.TemporaryDirectory() as home:
+        os.environ["PLACEWISE_HOME"] = home
+        made = _make_photos(Path(home, "photos"), photos)
+        with connect(None, None) as client, progress_bar() as progress:
+            figures = _measure(client, made, queries, progress)
+    if as_json:
+        print_json(figures)
+        return
+    table = Table("what", "median", "p95", "rate")
+    for name, value in figures["timings"].items():
+        table.add_row(
+            name,
+            f"{value['median_ms']:.1f} ms",
+            f"{value['p95_ms']:.1f} ms",
+            f"{value['per_second']:.1f} /s",
+        )
+    answers.print(table)
+    answers.print(f"{photos} photos, searchable {figures['searchable_after_seconds']:.1f} s in all")
+
+
+def _measure(client: Client, photos: list[Path], queries: int, progress) -> Json:  # type: ignore[no-untyped-def]
+    bar = progress.add_task("photos", total=len(photos) + 2 * queries)
+
+    def timed(call) -> tuple[float, Json]:  # type: ignore[no-untyped-def]
+        started = time.perf_counter()
+        answer = call()
+        progress.advance(bar)
+        return time.perf_counter() - started, answer
+
+    begun = time.perf_counter()
+    with ThreadPoolExecutor(4) as pool:
+        uploads = list(pool.map(lambda photo: timed(lambda: client.upload(photo)), photos))
+    uploaded = time.perf_counter() - begun
+    for _, answer in uploads:
+        client.wait_for(answer["job_id"])
+    searchable = time.perf_counter() - begun
+    stored = [
+        timed(lambda a=answer: client.similar_to(a["file_id"])) for _, answer in uploads[:queries]
+    ]
+    new = [timed(lambda p=photo: client.similar_to_file(p)) for photo in photos[:queries]]
+    return {
+        "photos": len(photos),
+        "searchable_after_seconds": searchable,
+        "timings": {
+            "upload, 4 at once": _figures([s for s, _ in uploads], uploaded),
+            "query by stored photo": _figures([s for s, _ in stored]),
+            "query by new photo": _figures([s for s, _ in new]),
+        },
+    }
+
+
+def _figures(seconds: list[float], wall_seconds: float | None = None) -> Json:
+    ordered = sorted(seconds)
+    return {
+        "median_ms": statistics.median(ordered) * 1000,
+        "p95_ms": ordered[min(len(ordered) - 1, int(0.95 * len(ordered)))] * 1000,
+        "per_second": len(ordered) / (wall_seconds or sum(ordered)),
+    }
+
+
+def _make_photos(folder: Path, count: int) -> list[Path]:
+    folder.mkdir()
+    rng = np.random.default_rng(0)
+    made = []
+    for number in range(count):
+        coarse = Image.fromarray(rng.integers(0, 256, (15, 20, 3), dtype=np.uint8))
+        buffer = io.BytesIO()
+        coarse.resize((320, 240), Image.Resampling.BICUBIC).save(buffer, "JPEG", quality=90)
+        made.append(folder / f"{number:05d}.jpg")
+        made[-1].write_bytes(buffer.getvalue())
+    return made

@@ -1,0 +1,42 @@
+"""Which server a command talks to: the one named, the one on the folder, or one of its own."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from collections.abc import Iterator
+
+from services.standalone import address_of_running, standalone
+from shared.client import Client
+from shared.errors import Unavailable
+from shared.settings import Settings
+
+START_SECONDS = 30.0
+
+
+@contextlib.contextmanager
+def connect(server: str | None, map_name: str | None) -> Iterator[Client]:
+    """A client of `server`, else of the server on PLACEWISE_HOME, else of one started for it."""
+    settings = Settings()
+    url = server or address_of_running(settings.placewise_home)
+    if url is not None:
+        with Client(url, map_name) as client:
+            yield client
+        return
+    own = settings.model_copy(update={"host": "127.0.0.1", "port": 0})
+    with standalone(own) as running:
+        # Not the main thread: uvicorn would take over the command's signals there.
+        serving = threading.Thread(target=running.serve, name="http")
+        serving.start()
+        try:
+            deadline = time.monotonic() + START_SECONDS
+            while not running.server.started:
+                if time.monotonic() > deadline or not serving.is_alive():
+                    raise Unavailable("server_unreachable", "The embedded server did not start.")
+                time.sleep(0.01)
+            with Client(running.url, map_name) as client:
+                yield client
+        finally:
+            running.server.should_exit = True
+            serving.join()

@@ -1,0 +1,114 @@
+"""`placewise doctor`: part by part, what works and what to do about what does not."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+
+import typer
+
+from services.cli.output import JsonOption, answers, print_json
+from services.standalone import address_of_running
+from shared.catalog.session import Catalog
+from shared.client import Client
+from shared.errors import PlacewiseError
+from shared.objects import FolderStore
+from shared.settings import Settings
+
+LOW_DISK_BYTES = 1_000_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    part: str
+    ok: bool
+    detail: str
+
+
+def doctor(as_json: JsonOption = False) -> None:
+    """Check this installation; exit code 1 when something needs attention."""
+    settings = Settings()
+    checks: list[tuple[str, Callable[[Settings], str]]] = [
+        ("python", _python),
+        ("folder", _folder),
+        ("server", _server),
+        ("device", _device),
+        ("extractor", _extractor),
+    ]
+    findings = [_look(part, check, settings) for part, check in checks]
+    if as_json:
+        print_json([asdict(finding) for finding in findings])
+    else:
+        for finding in findings:
+            mark = "[green]ok[/green]  " if finding.ok else "[red]look[/red]"
+            answers.print(f"{mark} {finding.part}: {finding.detail}", soft_wrap=True)
+    if not all(finding.ok for finding in findings):
+        raise typer.Exit(1)
+
+
+def _look(part: str, check: Callable[[Settings], str], settings: Settings) -> Finding:
+    try:
+        return Finding(part, True, check(settings))
+    except PlacewiseError as error:
+        return Finding(part, False, error.detail)
+    except OSError as error:
+        return Finding(part, False, f"{error.filename or ''}: {error.strerror}. Check permissions.")
+
+
+def _python(_settings: Settings) -> str:
+    return f"Python {sys.version.split()[0]}"
+
+
+def _folder(settings: Settings) -> str:
+    home = settings.placewise_home
+    home.mkdir(parents=True, exist_ok=True)
+    probe = home / ".doctor"
+    probe.write_bytes(b"ok")
+    probe.unlink()
+    free = shutil.disk_usage(home).free
+    if free < LOW_DISK_BYTES:
+        raise OSError(28, f"only {free / 1e9:.1f} GB are free", str(home))
+    return f"{home} is writable, {free / 1e9:.0f} GB free"
+
+
+def _server(settings: Settings) -> str:
+    url = address_of_running(settings.placewise_home)
+    if url is not None:
+        with Client(url) as client:
+            stats = client.stats()
+        return (
+            f"running on {url}: {stats['searchable_images']} of {stats['total_images']} photos "
+            f"searchable, vocabulary {stats['vocabulary']}"
+        )
+    # Nothing holds the folder: open it as the server would.
+    FolderStore(settings.placewise_home / "objects").check()
+    catalog = Catalog(settings.catalog_url())
+    try:
+        catalog.migrate()
+    finally:
+        catalog.close()
+    return "not running; its folder and catalog can be opened (start it: make run)"
+
+
+def _device(settings: Settings) -> str:
+    import torch
+
+    from shared.vision.extractors import choose_device
+
+    device = choose_device(settings.device)
+    if device.type == "cuda":
+        return f"CUDA: {torch.cuda.get_device_name(device)}, PyTorch {torch.__version__}"
+    return f"CPU, PyTorch {torch.__version__} (CUDA available: {torch.cuda.is_available()})"
+
+
+def _extractor(settings: Settings) -> str:
+    from shared.vision.extractors import Extractor, choose_device, get_recipe
+
+    recipe = get_recipe(settings.extractor, allow_test_extractors=settings.allow_test_extractors)
+    extractor = Extractor(recipe, choose_device(settings.device))
+    shipped = extractor.shipped_vocabulary()
+    return f"{recipe.name}: weights {extractor.backbone.fingerprint[:12]} load, " + (
+        f"{shipped[0].clusters} shipped centres" if shipped else "no shipped vocabulary"
+    )

@@ -1,0 +1,32 @@
+"""The command's tree."""
+
+from __future__ import annotations
+
+import logging
+
+import typer
+
+from services.cli import ask, bench, configuration, doctor, index, serve, vocabulary
+
+app = typer.Typer(
+    name="placewise",
+    help="Photo in, place out: visual place recognition on your own photos.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    add_completion=False,
+)
+app.command("serve")(serve.serve)
+app.command("index")(index.index)
+app.command("query")(ask.query)
+app.add_typer(vocabulary.app, name="vocabulary")
+app.add_typer(bench.app, name="bench")
+app.command("config")(configuration.config)
+app.command("doctor")(doctor.doctor)
+
+
+def run() -> None:
+    """Parse the command line and do it."""
+    logging.basicConfig(
+        level=logging.WARNING, format="%(asctime)s %(levelname)s %(name)s: %(message)s"
+    )
+    app()

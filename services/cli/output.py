@@ -1,0 +1,63 @@
+"""What a command prints: tables and progress for people, JSON for programs, errors for both."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from collections.abc import Iterator
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+)
+
+from shared.errors import PlacewiseError
+
+# Progress and messages go to stderr: stdout is the answer, and can be piped.
+messages = Console(stderr=True, highlight=False)
+answers = Console(highlight=False)
+
+JsonOption = Annotated[bool, typer.Option("--json", help="Print the answer as JSON.")]
+MapOption = Annotated[str | None, typer.Option("--map", help="The map that is meant.")]
+ServerOption = Annotated[
+    str | None,
+    typer.Option(
+        "--server",
+        envvar="PLACEWISE_SERVER",
+        help="Address of a running Placewise; left out: the one on PLACEWISE_HOME.",
+    ),
+]
+
+
+def print_json(value: Any) -> None:
+    typer.echo(json.dumps(value, indent=2, ensure_ascii=False))
+
+
+@contextlib.contextmanager
+def explained(as_json: bool) -> Iterator[None]:
+    """Turn an error that can be explained into one line and exit code 1."""
+    try:
+        yield
+    except PlacewiseError as error:
+        if as_json:
+            print_json(error.as_problem())
+        else:
+            messages.print(f"[red]{error.code}[/red]: {error.detail}", soft_wrap=True)
+        raise typer.Exit(1) from error
+
+
+def progress_bar() -> Progress:
+    """A bar on stderr; silent where stderr is no terminal."""
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        console=messages,
+    )

@@ -1,0 +1,106 @@
+"""Where the photos of a folder were taken: from a CSV, or from `@UTM@` file names.
+
+EXIF is read by the server, and fills what is not said here.
+
+The `@` convention of visual place recognition data sets: `@ UTM_east @ UTM_north @ zone_number @
+zone_letter @ latitude @ longitude @ pano_id @ tile @ heading @ pitch @ roll @ height @ timestamp @
+note @ .jpg`; only the first two are always there.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+from dataclasses import dataclass
+from pathlib import Path
+
+import utm
+
+from shared.errors import InvalidRequest
+
+SUFFIXES = {".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff"}
+CSV_FILE_COLUMNS = ("filename", "file", "path")
+CSV_COLUMNS = ("latitude", "longitude", "heading", "captured_at", "place", "tags")
+
+
+@dataclass(frozen=True, slots=True)
+class FoundPhoto:
+    path: Path
+    fields: dict[str, str]
+    """What is said of it, in the upload form's names."""
+
+
+def find_photos(folder: Path, table: Path | None, utm_zone: str | None) -> list[FoundPhoto]:
+    """Every photo below the folder, in the order of the paths, with what is said of it.
+
+    Raises InvalidRequest for a table that names a photo that is not there, and for coordinates
+    that can't be read.
+    """
+    paths = sorted(
+        path
+        for path in folder.rglob("*")
+        if path.is_file() and path.suffix.lower() in SUFFIXES and not path.name.startswith(".")
+    )
+    if not paths:
+        raise InvalidRequest(
+            "no_photos",
+            f"There is no photo ({', '.join(sorted(SUFFIXES))}) below {folder}.",
+        )
+    said = _read_table(folder, table, set(paths)) if table else {}
+    return [
+        FoundPhoto(path, said.get(path) or fields_of_name(path.name, utm_zone)) for path in paths
+    ]
+
+
+def fields_of_name(name: str, utm_zone: str | None) -> dict[str, str]:
+    """What an `@UTM@` file name says; {} for any other name."""
+    parts = name.split("@")
+    if len(parts) < 4 or parts[0]:
+        return {}
+    parts += [""] * (16 - len(parts))
+    east, north, number, letter, latitude, longitude = parts[1:7]
+    if not (latitude and longitude):
+        zone = f"{number}{letter}" if number and letter else utm_zone
+        if zone is None:
+            raise InvalidRequest(
+                "no_utm_zone",
+                f"{name} says UTM east and north but no zone. Give it: --utm-zone 32T.",
+            )
+        try:
+            found = utm.to_latlon(float(east), float(north), int(zone[:-1]), zone[-1].upper())
+        except (ValueError, utm.OutOfRangeError) as error:
+            raise InvalidRequest(
+                "bad_coordinates",
+                f"{name}: its UTM coordinates can't be read ({error}).",
+            ) from error
+        latitude, longitude = f"{float(found[0]):.7f}", f"{float(found[1]):.7f}"
+    fields = {"latitude": latitude, "longitude": longitude}
+    with contextlib.suppress(ValueError):  # the heading is optional in the convention
+        fields["heading"] = f"{float(parts[9]) % 360:g}"
+    return fields
+
+
+def _read_table(folder: Path, table: Path, paths: set[Path]) -> dict[Path, dict[str, str]]:
+    try:
+        with table.open(newline="", encoding="utf-8-sig") as file:
+            reader = csv.DictReader(file)
+            columns = reader.fieldnames or []
+            name_column = next((c for c in CSV_FILE_COLUMNS if c in columns), None)
+            if name_column is None:
+                raise InvalidRequest(
+                    "bad_table",
+                    f"{table} has no column {' or '.join(CSV_FILE_COLUMNS)}; "
+                    f"beside it may stand {', '.join(CSV_COLUMNS)}.",
+                )
+            said = {}
+            for number, row in enumerate(reader, start=2):
+                path = folder / row[name_column]
+                if path not in paths:
+                    raise InvalidRequest(
+                        "bad_table",
+                        f"{table}, line {number}: there is no photo {path}.",
+                    )
+                said[path] = {c: row[c] for c in CSV_COLUMNS if row.get(c)}
+            return said
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise InvalidRequest("bad_table", f"Can't read {table}: {error}") from error

@@ -1,0 +1,147 @@
+"""`placewise vocabulary fit|import|list`."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.progress import Progress
+from rich.table import Table
+
+from services.cli.connect import connect
+from services.cli.output import (
+    JsonOption,
+    MapOption,
+    ServerOption,
+    answers,
+    explained,
+    print_json,
+    progress_bar,
+)
+from shared.client import Client, Json
+from shared.errors import PlacewiseError, Unprocessable
+
+app = typer.Typer(help="VLAD's cluster centres: fit them on the map's own photos, import, list.")
+
+POLL_SECONDS = 1.0  # so that the bar moves
+
+
+@app.command("fit")
+def fit(
+    clusters: Annotated[
+        int | None, typer.Option(min=1, help="Cluster centres; default 64.")
+    ] = None,
+    sample: Annotated[int | None, typer.Option(min=1, help="Photos to learn from.")] = None,
+    seed: Annotated[int | None, typer.Option(min=0)] = None,
+    map_name: MapOption = None,
+    server: ServerOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Learn a vocabulary from the map's photos, describe all of them anew, switch."""
+    wanted = {"clusters": clusters, "sample": sample, "seed": seed}
+    given = {name: value for name, value in wanted.items() if value is not None}
+    with explained(as_json):
+        with connect(server, map_name) as client, progress_bar() as progress:
+            job = fit_and_wait(client, given, progress)
+        _print_change(job, as_json)
+
+
+@app.command("import")
+def import_(
+    file: Annotated[
+        Path,
+        typer.Argument(exists=True, dir_okay=False, help=".npy, or AnyLoc's c_centers.pt"),
+    ],
+    map_name: MapOption = None,
+    server: ServerOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Bring a vocabulary, describe all photos with it, switch."""
+    from shared.vision.vocabulary import (
+        encode_centres,
+        read_centres,
+    )  # torch takes seconds
+
+    with explained(as_json):
+        data = encode_centres(read_centres(file))
+        with (
+            tempfile.TemporaryDirectory() as folder,
+            connect(server, map_name) as client,
+            progress_bar() as progress,
+        ):
+            plain = Path(folder, f"{file.stem}.npy")
+            plain.write_bytes(data)
+            started = client.import_vocabulary(plain)
+            job = wait_for_change(client, started["job_id"], progress)
+        _print_change(job, as_json)
+
+
+@app.command("list")
+def list_(
+    map_name: MapOption = None, server: ServerOption = None, as_json: JsonOption = False
+) -> None:
+    """The map's vocabularies, newest first; the one that answers is marked."""
+    with explained(as_json):
+        with connect(server, map_name) as client:
+            found = client.vocabularies()
+            active = {g["vocabulary_id"] for g in client.generations() if g["state"] == "active"}
+        if as_json:
+            print_json([{**v, "active": v["vocabulary_id"] in active} for v in found])
+            return
+        table = Table("", "vocabulary", "origin", "clusters", "dimension", "photos", "made")
+        for v in found:
+            table.add_row(
+                "*" if v["vocabulary_id"] in active else "",
+                v["vocabulary_id"],
+                v["origin"],
+                str(v["clusters"]),
+                str(v["dimension"]),
+                str(v["provenance"].get("photos", "")),
+                v["created_at"],
+            )
+        answers.print(table)
+
+
+def fit_and_wait(client: Client, wanted: dict[str, int], progress: Progress) -> Json:
+    """Fit on the map's photos and wait until the new generation answers."""
+    return wait_for_change(client, client.fit_vocabulary(**wanted)["job_id"], progress)
+
+
+def wait_for_change(client: Client, job_id: str, progress: Progress) -> Json:
+    """The model change once it has succeeded; its stored reason as an error when it has not."""
+    bar = progress.add_task("changing the model", total=None)
+
+    def show(job: Json) -> None:
+        done = job["progress"]
+        progress.update(
+            bar,
+            description=f"vocabulary: {job['stage'] or job['state']}",
+            completed=done["done"],
+            total=done["total"],
+        )
+
+    job = client.wait_for(job_id, show, poll_seconds=POLL_SECONDS)
+    if job["state"] != "succeeded":
+        error = job["error"] or {}
+        raise _refusal(error, job["state"])
+    return job
+
+
+def _refusal(error: Json, state: str) -> PlacewiseError:
+    return Unprocessable(
+        error.get("code", "model_change_ended"),
+        error.get("detail", f"The model change is {state}."),
+    )
+
+
+def _print_change(job: Json, as_json: bool) -> None:
+    if as_json:
+        print_json(job)
+        return
+    result = job["result"]
+    answers.print(
+        f"Generation {result['generation_id']} answers: {result['photos']} photos, "
+        f"{result['clusters']} clusters, {result['failed']} failed."
+    )

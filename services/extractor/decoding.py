@@ -1,0 +1,110 @@
+"""Decoding in child processes with a memory limit and a time limit.
+
+A photo that makes the decoder crash, hang or swallow memory ends its child, not the worker, and
+not the photos beside it.
+"""
+
+from __future__ import annotations
+
+import logging
+import multiprocessing
+import resource
+from collections.abc import Sequence
+from concurrent.futures import TimeoutError as TimedOut
+from concurrent.futures import wait
+
+from pebble import ProcessExpired, ProcessFuture, ProcessPool
+
+from shared.errors import PlacewiseError, Unavailable, Unprocessable
+from shared.settings import Settings
+from shared.vision.decode import Decoded, decode
+from shared.vision.preprocessing import Preprocessing
+
+log = logging.getLogger(__name__)
+
+LOOK_SECONDS = 1.0  # how often a waiting batch looks whether the pool still lives
+
+# A child may be killed for reasons of the machine (memory); a photo gets a second one.
+TRIES = 2
+
+
+class DecoderPool:
+    """Decodes batches of photos in parallel; results come in the order of the photos."""
+
+    def __init__(self, settings: Settings) -> None:
+        self._settings = settings
+        self._pool = self._new_pool()
+
+    def decode(
+        self, photos: Sequence[bytes], preprocessing: Preprocessing
+    ) -> list[Decoded | PlacewiseError]:
+        """Each photo decoded, or the reason why it can't be."""
+        if not self._pool.active:
+            log.error("the decoder pool broke; starting a new one")
+            self.close()
+            self._pool = self._new_pool()
+        pending = [self._schedule(data, preprocessing) for data in photos]
+        return [
+            self._result(future, data, preprocessing)
+            for future, data in zip(pending, photos, strict=True)
+        ]
+
+    def close(self) -> None:
+        """End the children now."""
+        self._pool.stop()  # type: ignore[no-untyped-call]
+        self._pool.join()
+
+    def _new_pool(self) -> ProcessPool:
+        return ProcessPool(
+            max_workers=self._settings.decode_processes,
+            # Fork would copy a process that holds torch's threads and locks.
+            context=multiprocessing.get_context("spawn"),
+            initializer=_limit_memory,
+            initargs=[self._settings.decode_memory_bytes],
+        )
+
+    def _schedule(self, data: bytes, preprocessing: Preprocessing) -> ProcessFuture[Decoded]:
+        return self._pool.schedule(
+            decode,
+            args=[data, preprocessing, self._settings.max_image_pixels],
+            timeout=self._settings.decode_timeout_seconds,
+        )
+
+    def _result(
+        self, future: ProcessFuture[Decoded], data: bytes, preprocessing: Preprocessing
+    ) -> Decoded | PlacewiseError:
+        for attempt in range(1, TRIES + 1):
+            try:
+                return self._await(future)
+            except PlacewiseError as error:
+                if isinstance(error, Unavailable):
+                    raise
+                return error
+            except TimedOut:
+                return Unprocessable(
+                    "undecodable_photo",
+                    "The photo could not be decoded within "
+                    f"{self._settings.decode_timeout_seconds:g} s.",
+                )
+            except (ProcessExpired, MemoryError) as error:
+                if attempt == TRIES:
+                    return Unprocessable(
+                        "undecodable_photo",
+                        f"The decoder crashed on this photo {TRIES} times "
+                        f"({type(error).__name__}).",
+                    )
+                future = self._schedule(data, preprocessing)
+        raise AssertionError("the last try returns")
+
+    def _await(self, future: ProcessFuture[Decoded]) -> Decoded:
+        """The future's result; Unavailable when the pool broke, and no result will ever come."""
+        while True:
+            done, _ = wait([future], timeout=LOOK_SECONDS)
+            if done:
+                return future.result()
+            if not self._pool.active:
+                raise Unavailable("decoders_broke", "The decoder processes broke; trying again.")
+
+
+def _limit_memory(limit_bytes: int) -> None:
+    resource.setrlimit(resource.RLIMIT_AS, (limit_bytes, limit_bytes))

@@ -1,0 +1,121 @@
+"""What the worker keeps in memory: a few loaded extractors and vocabularies."""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from uuid import UUID
+
+from sqlalchemy.orm import Session
+
+from shared.catalog.generations import Generation
+from shared.catalog.models import Model, ensure_model
+from shared.catalog.vocabularies import Vocabulary
+from shared.errors import Unavailable
+from shared.objects import ObjectStore
+from shared.settings import Settings
+from shared.vision.extractors import (
+    Extractor,
+    choose_device,
+    get_recipe,
+    spec_fingerprint,
+)
+from shared.vision.vocabulary import Centres, decode_centres
+
+MOST_EXTRACTORS = 2  # a large backbone takes gigabytes of GPU memory
+MOST_VOCABULARIES = 16
+SPEC_DIFFERS = "spec_differs"
+
+
+class LoadedModels:
+    """Small LRU caches, shared by the thread that prepares and the one that describes."""
+
+    def __init__(self, store: ObjectStore, settings: Settings) -> None:
+        self._store = store
+        self._settings = settings
+        self._lock = threading.RLock()
+        self._device = choose_device(settings.device)
+        self._extractors: OrderedDict[str, Extractor] = OrderedDict()
+        self._centres: OrderedDict[UUID, Centres] = OrderedDict()
+
+    def extractor(self, name: str) -> Extractor:
+        """The extractor called `name`, its weights loaded."""
+        allow_test_extractors = self._settings.allow_test_extractors
+        with self._lock:
+            found = self._extractors.get(name)
+            if found is None:
+                recipe = get_recipe(name, allow_test_extractors=allow_test_extractors)
+                found = self._extractors[name] = Extractor(recipe, self._device)
+            self._extractors.move_to_end(name)
+            while len(self._extractors) > MOST_EXTRACTORS:
+                self._extractors.popitem(last=False)
+            return found
+
+    def centres(self, vocabulary: Vocabulary) -> Centres:
+        """The vocabulary's centres, checked against the catalog's hash."""
+        with self._lock:
+            found = self._centres.get(vocabulary.id)
+            if found is None:
+                found = decode_centres(self._store.get(vocabulary.object_key))
+                if found.sha256 != vocabulary.sha256:
+                    raise Unavailable(
+                        "vocabulary_corrupt",
+                        f"The vocabulary {vocabulary.id} is not what was stored (its hash "
+                        "differs). Restore it from a backup, or fit a new one.",
+                    )
+                self._centres[vocabulary.id] = found
+            self._centres.move_to_end(vocabulary.id)
+            while len(self._centres) > MOST_VOCABULARIES:
+                self._centres.popitem(last=False)
+            return found
+
+
+def register(session: Session, extractor: Extractor) -> Model:
+    """The catalog's row of the extractor's weights."""
+    backbone = extractor.backbone
+    return ensure_model(
+        session, backbone.name, backbone.fingerprint, backbone.licence, backbone.card
+    )
+
+
+def spec_columns(
+    model: Model,
+    extractor: Extractor,
+    centres: Centres | None,
+    vocabulary_id: UUID | None,
+) -> dict[str, object]:
+    """The columns of a generation that say how its descriptors are made."""
+    spec = extractor.spec(centres)
+    return {
+        "extractor": extractor.recipe.name,
+        "spec": spec,
+        "spec_fingerprint": spec_fingerprint(spec),
+        "dimension": extractor.dimension(centres),
+        "model_id": model.id,
+        "vocabulary_id": vocabulary_id,
+    }
+
+
+def check_spec(
+    generation: Generation,
+    extractor: Extractor,
+    centres: Centres | None,
+    *,
+    decoder_matters: bool = True,
+) -> None:
+    """Unavailable (`spec_differs`) when this worker does not reproduce the generation's spec."""
+    spec = extractor.spec(centres)
+    differing = sorted(
+        key
+        for key in spec.keys() | generation.spec.keys()
+        if spec.get(key) != generation.spec.get(key) and (decoder_matters or key != "decoder")
+    )
+    if not differing:
+        return
+    raise Unavailable(
+        SPEC_DIFFERS,
+        f"This worker would describe photos otherwise than generation {generation.id} was: "
+        + "; ".join(f"{k} is {spec.get(k)!r}, was {generation.spec.get(k)!r}" for k in differing)
+        + ". Start a model change (POST /api/v1/generations), or run the old packages.",
+        generation_id=str(generation.id),
+    )

@@ -1,0 +1,101 @@
+"""The CPU half of a batch: which generation it goes to, its bytes, its pixels."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+from uuid import UUID
+
+import numpy as np
+from numpy.typing import NDArray
+from sqlalchemy import select
+
+from services.extractor.decoding import DecoderPool
+from services.extractor.target import Target
+from shared.catalog.photos import Photo
+from shared.catalog.session import Catalog
+from shared.errors import NotFound, PlacewiseError
+from shared.jobs import Job, JobKind
+from shared.objects import ObjectStore
+from shared.objects.keys import query_key
+from shared.vision.decode import Decoded
+
+
+@dataclass(slots=True)
+class Batch:
+    """Claimed jobs of one kind, map and generation, on their way to a chunk.
+
+    `ready` and the rows of `pixels` belong together; `failed` are jobs whose photo is at fault;
+    `gone` are jobs whose photo was deleted meanwhile.
+    """
+
+    jobs: list[Job]
+    target: Target
+    ready: list[Job] = field(default_factory=list)
+    decoded: list[Decoded] = field(default_factory=list)
+    failed: list[tuple[Job, PlacewiseError]] = field(default_factory=list)
+    gone: list[Job] = field(default_factory=list)
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def token(self) -> UUID:
+        token = self.jobs[0].lease_token
+        assert token is not None, "a claimed job carries a token"
+        return token
+
+    @property
+    def kind(self) -> JobKind:
+        return JobKind(self.jobs[0].kind)
+
+    def pixels(self) -> NDArray[np.uint8]:
+        """(ready, height, width, 3)"""
+        return np.stack([decoded.pixels for decoded in self.decoded])
+
+
+def prepare(
+    catalog: Catalog,
+    store: ObjectStore,
+    decoders: DecoderPool,
+    jobs: list[Job],
+    target: Target,
+) -> Batch:
+    """Read and decode the photos of the claimed jobs."""
+    batch = Batch(jobs=jobs, target=target)
+    started = time.perf_counter()
+    keys = _object_keys(catalog, jobs)
+    present: list[tuple[Job, bytes]] = []
+    for job in jobs:
+        key = keys.get(job.id)
+        try:
+            if key is None:
+                batch.gone.append(job)
+            else:
+                present.append((job, store.get(key)))
+        except NotFound as error:
+            # Deleted between the two reads, or lost: publishing tells which, under the map's lock.
+            batch.failed.append((job, error))
+    batch.seconds["read"] = time.perf_counter() - started
+
+    started = time.perf_counter()
+    outcomes = decoders.decode([data for _, data in present], target.extractor.preprocessing)
+    for (job, _), outcome in zip(present, outcomes, strict=True):
+        if isinstance(outcome, PlacewiseError):
+            batch.failed.append((job, outcome))
+        else:
+            batch.ready.append(job)
+            batch.decoded.append(outcome)
+    batch.seconds["decode"] = time.perf_counter() - started
+    return batch
+
+
+def _object_keys(catalog: Catalog, jobs: list[Job]) -> dict[UUID, str]:
+    """The key of each job's photo; deleted photos are left out."""
+    if jobs[0].kind == JobKind.DESCRIBE:
+        return {job.id: query_key(job.id) for job in jobs}
+    with catalog.read() as session:
+        found = session.execute(
+            select(Job.id, Photo.object_key)
+            .join(Photo, Photo.id == Job.photo_id)
+            .where(Job.id.in_([job.id for job in jobs]), Photo.deleted_at.is_(None))
+        )
+        return {row.id: row.object_key for row in found}

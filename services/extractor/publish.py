@@ -1,0 +1,163 @@
+"""The last step of a batch: a chunk in the object store, then one transaction that makes it true.
+
+A crash between the two leaves an orphan that the steward collects. A job whose lease was taken
+over, or that was cancelled, is passed over: its row stays in the chunk as a dead row.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from uuid import UUID
+
+import numpy as np
+from sqlalchemy import insert, select
+from sqlalchemy.orm import Session
+
+from services.extractor.prepare import Batch
+from shared.catalog.chunks import Chunk, Descriptor, take_slot
+from shared.catalog.generations import GenerationState, lock_generation
+from shared.catalog.maps import bump_version, lock_map
+from shared.catalog.photos import live_photos
+from shared.catalog.session import Catalog
+from shared.chunks import Rows, encode_rows, write_chunk
+from shared.ids import new_id
+from shared.jobs import Job, JobKind
+from shared.jobs.finish import cancel, fail, release, succeed
+from shared.jobs.leases import held
+from shared.objects import ObjectStore
+from shared.objects.keys import query_vector_key, thumbnail_key
+
+
+@dataclass(slots=True)
+class Published:
+    succeeded: int = 0
+    failed: int = 0
+
+
+def publish(
+    catalog: Catalog, store: ObjectStore, batch: Batch, rows: Rows, slot_rows: int
+) -> Published:
+    """Commit what the batch has come to; `rows` belong to `batch.ready`."""
+    started = time.perf_counter()
+    if len(rows) and not np.isfinite(rows).all():
+        raise ValueError("a descriptor is not finite: the backbone or its weights are broken")
+    if batch.kind == JobKind.DESCRIBE:
+        outcome = _publish_queries(catalog, store, batch, rows)
+    else:
+        outcome = _publish_photos(catalog, store, batch, rows, slot_rows)
+    batch.seconds["publish"] = time.perf_counter() - started
+    return outcome
+
+
+def _publish_photos(
+    catalog: Catalog, store: ObjectStore, batch: Batch, rows: Rows, slot_rows: int
+) -> Published:
+    generation_id = batch.target.generation.id
+    chunk_id = new_id()
+    written = None
+    if len(rows):
+        if batch.kind == JobKind.INDEX:
+            for job, decoded in zip(batch.ready, batch.decoded, strict=True):
+                store.put(thumbnail_key(_photo_id(job)), decoded.thumbnail)
+        written = write_chunk(
+            store,
+            generation_id=generation_id,
+            chunk_id=chunk_id,
+            rows=rows,
+            photo_ids=[_photo_id(job) for job in batch.ready],
+            spec=batch.target.generation.spec,
+        )
+    outcome = Published()
+    with catalog.write() as session:
+        lock_map(session, batch.jobs[0].map_id)
+        generation = lock_generation(session, generation_id)
+        mine = {job.id: job for job in held(session, batch.token, batch.jobs)}
+        if generation.state not in _wanted_states(batch.kind):
+            # A model change was switched in (or given up) while the batch was computed.
+            for job in mine.values():
+                cancel(job) if batch.kind == JobKind.REINDEX else release(job)
+            return outcome
+        live = live_photos(session, [_photo_id(job) for job in mine.values()])
+        done = _described(session, generation_id, list(live))
+        for job in mine.values():
+            if job.photo_id not in live:
+                cancel(job)
+        for stale, error in batch.failed:
+            own = mine.get(stale.id)
+            if own is not None and own.photo_id in live:
+                fail(own, error.as_problem())
+                outcome.failed += 1
+        fresh = []
+        for row, stale in enumerate(batch.ready):
+            own = mine.get(stale.id)
+            if own is None or own.photo_id not in live:
+                continue  # a dead row
+            if own.photo_id not in done:
+                fresh.append({"photo_id": own.photo_id, "row": row})
+            succeed(own, {"file_id": str(own.photo_id), "generation_id": str(generation_id)})
+            outcome.succeeded += 1
+        if fresh and written is not None:
+            session.add(
+                Chunk(
+                    id=chunk_id,
+                    generation_id=generation_id,
+                    slot=take_slot(generation, written.rows, slot_rows),
+                    object_key=written.object_key,
+                    rows=written.rows,
+                    size_bytes=written.size_bytes,
+                    sha256=written.sha256,
+                )
+            )
+            session.flush()
+            session.execute(
+                insert(Descriptor),
+                [{"generation_id": generation_id, "chunk_id": chunk_id, **new} for new in fresh],
+            )
+            bump_version(session, generation.map_id)
+    return outcome
+
+
+def _publish_queries(catalog: Catalog, store: ObjectStore, batch: Batch, rows: Rows) -> Published:
+    for job, row in zip(batch.ready, rows, strict=True):
+        store.put(query_vector_key(job.id), encode_rows(row[np.newaxis]))
+    outcome = Published()
+    with catalog.write() as session:
+        mine = {job.id: job for job in held(session, batch.token, batch.jobs)}
+        for stale, error in batch.failed:
+            if stale.id in mine:
+                fail(mine[stale.id], error.as_problem())
+                outcome.failed += 1
+        for stale in batch.ready:
+            if stale.id in mine:
+                reference = {
+                    "generation_id": str(batch.target.generation.id),
+                    "object_key": query_vector_key(stale.id),
+                    "row": 0,
+                }
+                succeed(mine[stale.id], reference)
+                outcome.succeeded += 1
+    return outcome
+
+
+def _wanted_states(kind: JobKind) -> tuple[GenerationState, ...]:
+    if kind == JobKind.INDEX:
+        return (GenerationState.ACTIVE,)
+    return (GenerationState.BUILDING, GenerationState.ACTIVE)
+
+
+def _described(session: Session, generation_id: UUID, photo_ids: list[UUID]) -> set[UUID]:
+    """Photos that have their row already: described by a batch that lost its lease too late."""
+    return set(
+        session.scalars(
+            select(Descriptor.photo_id).where(
+                Descriptor.generation_id == generation_id,
+                Descriptor.photo_id.in_(photo_ids),
+            )
+        )
+    )
+
+
+def _photo_id(job: Job) -> UUID:
+    assert job.photo_id is not None, "index and reindex jobs name a photo"
+    return job.photo_id

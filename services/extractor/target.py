@@ -1,0 +1,110 @@
+"""Which generation a batch is described into, with the extractor and centres that it takes."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from uuid import UUID
+
+from services.extractor.loaded import LoadedModels, check_spec, register, spec_columns
+from shared.catalog.base import db_now
+from shared.catalog.generations import Generation, GenerationState, active_generation
+from shared.catalog.maps import Map, bump_version, lock_map
+from shared.catalog.session import Catalog
+from shared.catalog.vocabularies import Vocabulary, VocabularyOrigin
+from shared.ids import new_id
+from shared.jobs import Job, JobKind
+from shared.jobs.model_changes import release_vocabulary_waiters
+from shared.objects import ObjectStore
+from shared.objects.keys import new_vocabulary_key
+from shared.vision.extractors import Extractor
+from shared.vision.vocabulary import Centres, encode_centres
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Target:
+    generation: Generation
+    extractor: Extractor
+    centres: Centres | None
+
+
+def find_target(
+    catalog: Catalog, store: ObjectStore, models: LoadedModels, job: Job
+) -> Target | None:
+    """Where the batch of `job` goes; None while the map has no vocabulary.
+
+    A reindex job names its generation; the others go to the map's active one, which is made here
+    on first use when the extractor brings a vocabulary or needs none.
+    """
+    with catalog.read() as session:
+        if job.kind == JobKind.REINDEX:
+            generation = session.get(Generation, job.generation_id)
+        else:
+            generation = active_generation(session, job.map_id)
+        vocabulary = None
+        if generation is not None and generation.vocabulary_id is not None:
+            vocabulary = session.get(Vocabulary, generation.vocabulary_id)
+        map_extractor = session.get_one(Map, job.map_id).extractor
+    if generation is None:
+        first = _make_first_generation(catalog, store, models.extractor(map_extractor), job.map_id)
+        if first is None:
+            return None
+        generation, vocabulary = first
+    extractor = models.extractor(generation.extractor)
+    centres = models.centres(vocabulary) if vocabulary else None
+    # A query's row is compared once and thrown away: another decoder release is close enough.
+    check_spec(generation, extractor, centres, decoder_matters=job.kind != JobKind.DESCRIBE)
+    return Target(generation, extractor, centres)
+
+
+def _make_first_generation(
+    catalog: Catalog, store: ObjectStore, extractor: Extractor, map_id: UUID
+) -> tuple[Generation, Vocabulary | None] | None:
+    """The map's first generation, with the shipped vocabulary if one is needed."""
+    shipped = extractor.shipped_vocabulary()
+    if extractor.recipe.needs_vocabulary and shipped is None:
+        return None
+    key = new_vocabulary_key()
+    if shipped is not None:
+        store.put(key, encode_centres(shipped[0]))
+    with catalog.write() as session:
+        lock_map(session, map_id)
+        found = active_generation(session, map_id)
+        if found is not None:  # another worker was first
+            vocabulary = session.get(Vocabulary, found.vocabulary_id)
+            return found, vocabulary
+        vocabulary, centres = None, None
+        if shipped is not None:
+            centres, provenance = shipped
+            vocabulary = Vocabulary(
+                id=new_id(),
+                map_id=map_id,
+                origin=VocabularyOrigin.SHIPPED,
+                clusters=centres.clusters,
+                dimension=centres.dimension,
+                object_key=key,
+                sha256=centres.sha256,
+                provenance=provenance,
+            )
+            session.add(vocabulary)
+        generation = Generation(
+            id=new_id(),
+            map_id=map_id,
+            state=GenerationState.ACTIVE,
+            activated_at=db_now(),
+            **spec_columns(
+                register(session, extractor),
+                extractor,
+                centres,
+                vocabulary.id if vocabulary else None,
+            ),
+        )
+        session.flush()
+        session.add(generation)
+        session.flush()
+        release_vocabulary_waiters(session, map_id)
+        bump_version(session, map_id)
+    log.info("generation %s begins with %s", generation.id, extractor.recipe.name)
+    return generation, vocabulary

@@ -1,0 +1,257 @@
+"""The worker: drains the job table, one batch after the other, queries first.
+
+While a batch is on the GPU the next one is read and decoded. A query that arrives meanwhile goes
+before a bulk batch that is already decoded, so it waits for one batch at most.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import threading
+import time
+from collections import defaultdict
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
+from uuid import UUID
+
+import numpy as np
+from sqlalchemy.exc import SQLAlchemyError
+
+from services.extractor.decoding import DecoderPool
+from services.extractor.loaded import LoadedModels
+from services.extractor.model_change import ModelChanges
+from services.extractor.prepare import Batch, prepare
+from services.extractor.publish import Published, publish
+from services.extractor.target import find_target
+from shared.catalog.generations import active_generation
+from shared.catalog.maps import lock_map
+from shared.catalog.session import Catalog
+from shared.errors import Conflict, PlacewiseError, Unavailable
+from shared.jobs import Hints, Job, Priority, claim, hold_lease
+from shared.jobs.finish import fail, release
+from shared.jobs.leases import fallen, held
+from shared.jobs.model_changes import abandon_generation
+from shared.jobs.table import MODEL_CHANGES, JobKind, WaitingFor
+from shared.objects import ObjectStore
+from shared.settings import Settings
+
+log = logging.getLogger(__name__)
+
+IDLE_SECONDS = 1.0  # how long a lost hint can cost
+AWAY_SECONDS = 2.0  # pause of jobs when the store or the catalog is not there right now
+OPERATOR_SECONDS = 15.0  # pause of photos that need an operator first (weights missing, say)
+
+
+@dataclass(slots=True)
+class DrainResult:
+    """What one drain did: this is what the operator sees."""
+
+    maps: set[str] = field(default_factory=set)
+    claimed: int = 0
+    succeeded: int = 0
+    failed: int = 0
+    seconds: defaultdict[str, float] = field(default_factory=lambda: defaultdict(float))
+
+
+@dataclass(slots=True)
+class Work:
+    """Claimed jobs, the lease that keeps them, and their photos being decoded."""
+
+    jobs: list[Job]
+    lease: contextlib.ExitStack
+    batch: Future[Batch | None] | None
+    """None inside: the map has no vocabulary yet. None itself: a slice of a model change."""
+
+    @property
+    def token(self) -> UUID:
+        token = self.jobs[0].lease_token
+        assert token is not None, "a claimed job carries a token"
+        return token
+
+
+class ExtractorWorker:
+    """One per GPU (or per process on CPU). `run` until stopped, or `drain` once per hint."""
+
+    def __init__(
+        self,
+        catalog: Catalog,
+        store: ObjectStore,
+        hints: Hints,
+        settings: Settings,
+        name: str,
+    ) -> None:
+        self._catalog = catalog
+        self._store = store
+        self._hints = hints
+        self._settings = settings
+        self._name = name
+        self._models = LoadedModels(store, settings)
+        self._decoders = DecoderPool(settings)
+        self._changes = ModelChanges(catalog, store, self._models, self._decoders, settings)
+        self._ahead = ThreadPoolExecutor(max_workers=1, thread_name_prefix="prepare")
+
+    def run(self, stop: threading.Event) -> None:
+        """Drain whenever there is work, until `stop` is set."""
+        while not stop.is_set():
+            try:
+                result = self.drain(stop)
+            except SQLAlchemyError:
+                log.exception("the catalog can't be reached; trying again in %g s", AWAY_SECONDS)
+                stop.wait(AWAY_SECONDS)
+                continue
+            if result.claimed:
+                log.info(
+                    "drained: %d claimed, %d succeeded, %d failed (%s)",
+                    result.claimed,
+                    result.succeeded,
+                    result.failed,
+                    ", ".join(f"{stage} {took:.2f} s" for stage, took in result.seconds.items()),
+                )
+            else:
+                self._hints.wait(IDLE_SECONDS)
+
+    def close(self) -> None:
+        """End the decoders; what is claimed comes back when its lease expires."""
+        self._ahead.shutdown(wait=True, cancel_futures=True)
+        self._decoders.close()
+
+    def drain(self, stop: threading.Event) -> DrainResult:
+        """Work until nothing is claimable or `stop` is set."""
+        result = DrainResult()
+        ahead = self._take(result)
+        while ahead is not None:
+            if stop.is_set():
+                self._give_back(ahead)
+                break
+            work = ahead
+            if work.jobs[0].priority < Priority.QUERY:
+                query = self._take(result, least_priority=Priority.QUERY)
+                if query is not None:
+                    self._do(query, result)
+            # Taken before the forward pass: the next photos are decoded while it runs.
+            ahead = self._take(result)
+            self._do(work, result)
+            if ahead is None:
+                ahead = self._take(result)
+        return result
+
+    def _take(self, result: DrainResult, least_priority: int | None = None) -> Work | None:
+        settings = self._settings
+        with self._catalog.write() as session:
+            jobs = claim(
+                session,
+                worker=self._name,
+                limit=settings.batch_photos,
+                lease_seconds=settings.lease_seconds,
+                least_priority=least_priority,
+            )
+        if not jobs:
+            return None
+        result.claimed += len(jobs)
+        result.maps.add(str(jobs[0].map_id))
+        work = Work(jobs, contextlib.ExitStack(), None)
+        work.lease.enter_context(hold_lease(self._catalog, work.token, settings.lease_seconds))
+        if jobs[0].kind not in MODEL_CHANGES:
+            work.batch = self._ahead.submit(self._prepare, jobs)
+        return work
+
+    def _prepare(self, jobs: list[Job]) -> Batch | None:
+        target = find_target(self._catalog, self._store, self._models, jobs[0])
+        if target is None:
+            return None
+        return prepare(self._catalog, self._store, self._decoders, jobs, target)
+
+    def _do(self, work: Work, result: DrainResult) -> None:
+        with work.lease:
+            try:
+                if work.batch is None:
+                    started = time.perf_counter()
+                    self._changes.slice(work.jobs[0])
+                    result.seconds["model change"] += time.perf_counter() - started
+                else:
+                    batch = work.batch.result()
+                    if batch is None:
+                        self._wait_for_vocabulary(work)
+                    else:
+                        outcome = self._describe(batch)
+                        result.succeeded += outcome.succeeded
+                        result.failed += outcome.failed
+                        for stage, took in batch.seconds.items():
+                            result.seconds[stage] += took
+            except (Unavailable, OSError, SQLAlchemyError) as error:
+                self._pause(work, error)
+            except PlacewiseError as error:
+                result.failed += self._refuse(work, error)
+            except Exception as error:
+                log.exception("a batch of %d jobs crashed", len(work.jobs))
+                self._crashed(work, error)
+
+    def _describe(self, batch: Batch) -> Published:
+        target = batch.target
+        rows = np.empty((0, target.generation.dimension), np.float32)
+        if batch.ready:
+            started = time.perf_counter()
+            rows = target.extractor.describe(batch.pixels(), target.centres)
+            batch.seconds["describe"] = time.perf_counter() - started
+        return publish(self._catalog, self._store, batch, rows, self._settings.slot_rows)
+
+    def _wait_for_vocabulary(self, work: Work) -> None:
+        """Photos wait until the map has one; a query is told at once."""
+        with self._catalog.write() as session:
+            lock_map(session, work.jobs[0].map_id)
+            there = active_generation(session, work.jobs[0].map_id) is not None
+            for job in held(session, work.token, work.jobs):
+                if job.kind == JobKind.DESCRIBE and not there:
+                    fail(job, no_vocabulary().as_problem())
+                else:
+                    release(job, waiting_for=None if there else WaitingFor.VOCABULARY)
+
+    def _give_back(self, work: Work) -> None:
+        """Stopping: what was taken ahead goes to another worker, unharmed."""
+        with work.lease, self._catalog.write() as session:
+            for job in held(session, work.token, work.jobs):
+                release(job)
+
+    def _pause(self, work: Work, error: Exception) -> None:
+        """Something outside the jobs is away: try again soon, and count no attempt."""
+        log.warning("%d jobs pause for %g s: %s", len(work.jobs), AWAY_SECONDS, error)
+        with self._catalog.write() as session:
+            for job in held(session, work.token, work.jobs):
+                release(job, after_seconds=AWAY_SECONDS)
+                job.error = error.as_problem() if isinstance(error, PlacewiseError) else None
+
+    def _refuse(self, work: Work, error: PlacewiseError) -> int:
+        """The request can't be met. Stored photos wait for the operator, all else fails."""
+        log.error("%s", error.detail)
+        failed = 0
+        with self._catalog.write() as session:
+            for job in held(session, work.token, work.jobs):
+                if job.kind in (JobKind.INDEX, JobKind.REINDEX):
+                    release(job, after_seconds=OPERATOR_SECONDS)
+                    job.error = error.as_problem()
+                    continue
+                fail(job, error.as_problem())
+                failed += 1
+                if job.kind in MODEL_CHANGES:
+                    abandon_generation(session, job)
+        return failed
+
+    def _crashed(self, work: Work, error: Exception) -> None:
+        """As if the worker had died: what fell in a batch is tried alone, then counted."""
+        with self._catalog.write() as session:
+            for job in held(session, work.token, work.jobs):
+                fallen(
+                    session,
+                    job,
+                    self._settings.max_attempts,
+                    cause=type(error).__name__,
+                )
+
+
+def no_vocabulary() -> Conflict:
+    return Conflict(
+        "no_vocabulary",
+        "The map's extractor needs a vocabulary and the map has none yet. Fit one on its photos "
+        "(POST /api/v1/vocabularies) or import one (POST /api/v1/vocabularies/import).",
+    )

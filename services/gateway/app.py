@@ -1,0 +1,36 @@
+"""The application: every router, every problem handler, one gateway."""
+
+from __future__ import annotations
+
+from fastapi import FastAPI
+
+from services.gateway import (
+    figures,
+    health,
+    jobs,
+    model_changes,
+    photos,
+    similarity,
+    upload,
+)
+from services.gateway.context import API, Gateway
+from services.gateway.problems import PROBLEM_RESPONSES, install_problem_handlers
+
+DESCRIPTION = """Photo in, place out. Upload geotagged photos, poll their jobs, and ask which known
+place a photo shows. Every error is an RFC 9457 problem with a stable `code`."""
+
+
+def create_app(gateway: Gateway) -> FastAPI:
+    """The HTTP API on the given ports."""
+    app = FastAPI(
+        title="Placewise",
+        version=health.VERSION,
+        description=DESCRIPTION,
+        responses=PROBLEM_RESPONSES,
+    )
+    app.state.gateway = gateway
+    install_problem_handlers(app)
+    for module in (upload, jobs, similarity, photos, model_changes, figures, health):
+        app.include_router(module.router, prefix=API)
+    app.include_router(health.probes)
+    return app

@@ -1,0 +1,75 @@
+"""What every route can reach, and the parameters that every call understands."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+from typing import Annotated
+from uuid import UUID
+
+from fastapi import Depends, Query, Request
+from pydantic import BeforeValidator
+
+from shared.catalog.maps import DEFAULT_MAP
+from shared.catalog.session import Catalog
+from shared.errors import NotFound
+from shared.jobs import Hints
+from shared.objects import ObjectStore
+from shared.search_protocol import SearchPort
+from shared.settings import Settings
+
+API = "/api/v1"
+
+
+@dataclass(frozen=True, slots=True)
+class Gateway:
+    """The ports that the gateway speaks to."""
+
+    catalog: Catalog
+    store: ObjectStore
+    hints: Hints
+    search: SearchPort
+    settings: Settings
+    started: float = field(default_factory=time.monotonic)
+
+
+def get_gateway(request: Request) -> Gateway:
+    gateway: Gateway = request.app.state.gateway
+    return gateway
+
+
+def _known_shape(noun: str):  # type: ignore[no-untyped-def]
+    def parse(value: object) -> UUID:
+        try:
+            return UUID(str(value))
+        except ValueError:
+            # What is no id can't be the id of anything: 404, like any other unknown one.
+            raise NotFound(f"{noun}_not_found", f"There is no {noun} {value!r}.") from None
+
+    return BeforeValidator(parse)
+
+
+GatewayDep = Annotated[Gateway, Depends(get_gateway)]
+MapName = Annotated[
+    str,
+    Query(alias="map", description="The map that is meant.", min_length=1, max_length=100),
+]
+FileId = Annotated[UUID, _known_shape("photo")]
+JobId = Annotated[UUID, _known_shape("job")]
+TopK = Annotated[int, Query(ge=1, le=100, description="How many photos to answer.")]
+MinScore = Annotated[
+    float | None,
+    Query(ge=-1, le=1, description="Leave out photos less similar than this."),
+]
+
+__all__ = [
+    "API",
+    "DEFAULT_MAP",
+    "FileId",
+    "Gateway",
+    "GatewayDep",
+    "JobId",
+    "MapName",
+    "MinScore",
+    "TopK",
+]

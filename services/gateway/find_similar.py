@@ -1,0 +1,180 @@
+"""From a reference to a descriptor to an answer: ask the search tier, join with live photos.
+
+Results are joined by photo id, never by position: a photo that was deleted a moment ago falls out
+here, and the search is asked again for more until k live ones are found or there are no more.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import Any
+from uuid import UUID
+
+from sqlalchemy.orm import Session
+
+from services.gateway.context import Gateway
+from services.gateway.schemas import (
+    PhotoAnswer,
+    SimilarityAnswer,
+    SimilarPhoto,
+    job_url,
+)
+from shared.catalog.chunks import descriptor_of
+from shared.catalog.generations import Generation, active_generation
+from shared.catalog.maps import Map, get_map
+from shared.catalog.photos import Photo, get_photo, live_photos
+from shared.catalog.searches import Search
+from shared.catalog.vocabularies import Vocabulary
+from shared.errors import Conflict, Gone
+from shared.jobs import Job, JobState
+from shared.search_protocol import Hit, SearchRequest, SearchResponse
+
+
+@dataclass(frozen=True, slots=True)
+class Query:
+    """What is compared, with what, and what the answer says about it."""
+
+    map_id: UUID
+    min_version: int
+    generation: Generation
+    vocabulary: str
+    object_key: str
+    row: int
+    photo_id: UUID | None
+    filename: str
+
+
+def query_by_photo(gateway: Gateway, map_name: str, photo_id: UUID) -> Query:
+    """A stored photo as a query; 404 for an unknown one, 409 while it is not searchable."""
+    with gateway.catalog.read() as session:
+        map_ = get_map(session, map_name)
+        photo = get_photo(session, map_.id, photo_id)
+        generation = active_generation(session, map_.id)
+        found = descriptor_of(session, generation.id, photo.id) if generation else None
+        if generation is None or found is None:
+            raise _not_searchable(session, photo)
+        descriptor, chunk = found
+        return Query(
+            map_id=map_.id,
+            min_version=map_.version,
+            generation=generation,
+            vocabulary=_vocabulary_standing(session, generation),
+            object_key=chunk.object_key,
+            row=descriptor.row,
+            photo_id=photo.id,
+            filename=photo.filename,
+        )
+
+
+def query_by_job(gateway: Gateway, job: Job) -> Query:
+    """A described query photo; 410 when what it was described into has gone."""
+    result: dict[str, Any] = job.result or {}
+    with gateway.catalog.read() as session:
+        map_ = session.get_one(Map, job.map_id)
+        generation = session.get(Generation, UUID(result["generation_id"]))
+        if generation is None:
+            raise Gone(
+                "query_expired",
+                "The query's generation is gone. Ask with the photo again.",
+            )
+        return Query(
+            map_id=map_.id,
+            min_version=map_.version,
+            generation=generation,
+            vocabulary=_vocabulary_standing(session, generation),
+            object_key=result["object_key"],
+            row=result["row"],
+            photo_id=None,
+            filename=job.params["filename"],
+        )
+
+
+def find_similar(
+    gateway: Gateway, query: Query, top_k: int, min_score: float | None
+) -> SimilarityAnswer:
+    """The `top_k` most similar live photos, without the query itself; noted in the history."""
+    started = time.perf_counter()
+    hits, photos, response = _search_live(gateway, query, top_k, min_score)
+    took_ms = (time.perf_counter() - started) * 1000
+    answer = SimilarityAnswer(
+        query_file_id=query.photo_id,
+        query_filename=query.filename,
+        processing_time_ms=took_ms,
+        total_similar=len(hits),
+        similar_images=[
+            SimilarPhoto(
+                similarity_score=hit.score,
+                **PhotoAnswer.fields_of(photos[hit.photo_id]),
+            )
+            for hit in hits
+        ],
+        vocabulary=query.vocabulary,
+        generation_id=query.generation.id,
+        certificate=response.certificate,
+        rows_scanned=response.rows_scanned,
+        rows_reranked=response.rows_reranked,
+        snapshot_version=response.snapshot_version,
+        missing=list(response.missing),
+    )
+    with gateway.catalog.write() as session:
+        session.add(
+            Search(
+                map_id=query.map_id,
+                generation_id=query.generation.id,
+                query_photo_id=query.photo_id,
+                query_filename=query.filename,
+                top_k=top_k,
+                results=len(hits),
+                processing_ms=took_ms,
+            )
+        )
+    return answer
+
+
+def _search_live(
+    gateway: Gateway, query: Query, top_k: int, min_score: float | None
+) -> tuple[list[Hit], dict[UUID, Photo], SearchResponse]:
+    k = top_k
+    while True:
+        response = gateway.search.search(
+            SearchRequest(
+                map_id=query.map_id,
+                generation_id=query.generation.id,
+                object_key=query.object_key,
+                row=query.row,
+                min_version=query.min_version,
+                k=k,
+                min_score=min_score,
+                exclude=(query.photo_id,) if query.photo_id else (),
+            )
+        )
+        with gateway.catalog.read() as session:
+            photos = live_photos(session, [hit.photo_id for hit in response.hits])
+        hits = [hit for hit in response.hits if hit.photo_id in photos]
+        if len(hits) >= top_k or len(response.hits) < k:
+            return hits[:top_k], photos, response
+        k *= 2
+
+
+def _vocabulary_standing(session: Session, generation: Generation) -> str:
+    if generation.vocabulary_id is None:
+        return "none"
+    return session.get_one(Vocabulary, generation.vocabulary_id).standing
+
+
+def _not_searchable(session: Session, photo: Photo) -> Conflict:
+    """Why the photo can't be asked with, and what to wait for."""
+    job = session.get(Job, photo.job_id) if photo.job_id else None
+    extra: dict[str, Any] = {"file_id": str(photo.id)}
+    if job is None:
+        return Conflict("not_searchable", "The photo is not described yet.", **extra)
+    extra |= {"job_id": str(job.id), "status_url": job_url(job.id), "state": job.state}
+    if job.state == JobState.FAILED:
+        reason = (job.error or {}).get("detail", "no reason is stored")
+        detail = f"The photo could not be described: {reason}"
+    elif job.waiting_for:
+        detail = f"The photo is not searchable yet: its job waits for a {job.waiting_for}."
+    else:
+        detail = f"The photo is not searchable yet: its job is {job.state}. Poll {job_url(job.id)}."
+    return Conflict("not_searchable", detail, **extra)

@@ -1,0 +1,125 @@
+"""`/livez`, `/readyz`, `/api/v1/health`: does the process live, can it serve, how are its parts."""
+
+from __future__ import annotations
+
+import time
+from importlib.metadata import version
+
+from fastapi import APIRouter, Response
+from sqlalchemy import select
+from sqlalchemy.exc import SQLAlchemyError
+
+from services.gateway.context import Gateway, GatewayDep
+from services.gateway.schemas import Answer
+from shared.catalog.maps import Map
+from shared.errors import PlacewiseError
+
+probes = APIRouter(tags=["operations"])
+router = APIRouter(tags=["operations"])
+
+VERSION = version("placewise")
+
+
+class ServiceAnswer(Answer):
+    service: str
+    version: str
+    status: str
+    description: str
+    docs: str
+    redoc: str
+    health: str
+    api: str
+
+
+class ProbeAnswer(Answer):
+    status: str
+
+
+class PartAnswer(Answer):
+    status: str
+    detail: str | None = None
+
+
+class HealthAnswer(Answer):
+    status: str
+    version: str
+    uptime_seconds: float
+    parts: dict[str, PartAnswer]
+
+
+@probes.get("/", operation_id="service", response_model=ServiceAnswer)
+def service() -> ServiceAnswer:
+    """What this is and where to look."""
+    return ServiceAnswer(
+        service="Placewise",
+        version=VERSION,
+        status="running",
+        description="Photo in, place out: visual place recognition over HTTP.",
+        docs="/docs",
+        redoc="/redoc",
+        health="/api/v1/health",
+        api="/api/v1",
+    )
+
+
+@probes.get("/livez", operation_id="livez", response_model=ProbeAnswer)
+def livez() -> ProbeAnswer:
+    """The process answers; nothing else is looked at."""
+    return ProbeAnswer(status="alive")
+
+
+@probes.get("/readyz", operation_id="readyz", response_model=ProbeAnswer)
+def readyz(gateway: GatewayDep, response: Response) -> ProbeAnswer:
+    """503 while a part that every call needs is away."""
+    ready = all(part.status == "healthy" for part in _parts(gateway).values())
+    response.status_code = 200 if ready else 503
+    return ProbeAnswer(status="ready" if ready else "not ready")
+
+
+@router.get("/health", operation_id="health", response_model=HealthAnswer)
+def health(gateway: GatewayDep, response: Response) -> HealthAnswer:
+    """The state of each part; 503 when one is away."""
+    parts = _parts(gateway)
+    healthy = all(part.status == "healthy" for part in parts.values())
+    response.status_code = 200 if healthy else 503
+    return HealthAnswer(
+        status="healthy" if healthy else "unhealthy",
+        version=VERSION,
+        uptime_seconds=time.monotonic() - gateway.started,
+        parts=parts,
+    )
+
+
+def _parts(gateway: Gateway) -> dict[str, PartAnswer]:
+    return {
+        "catalog": _catalog(gateway),
+        "object_store": _object_store(gateway),
+        "search": _search(gateway),
+    }
+
+
+def _catalog(gateway: Gateway) -> PartAnswer:
+    try:
+        with gateway.catalog.read() as session:
+            session.scalar(select(Map.id).limit(1))
+    except SQLAlchemyError:
+        return PartAnswer(status="unhealthy", detail="the catalog can't be reached")
+    return PartAnswer(status="healthy")
+
+
+def _object_store(gateway: Gateway) -> PartAnswer:
+    try:
+        gateway.store.check()
+    except PlacewiseError as error:
+        return PartAnswer(status="unhealthy", detail=error.detail)
+    return PartAnswer(status="healthy")
+
+
+def _search(gateway: Gateway) -> PartAnswer:
+    try:
+        status = gateway.search.status()
+    except PlacewiseError as error:
+        return PartAnswer(status="unhealthy", detail=error.detail)
+    if status.missing:
+        return PartAnswer(status="unhealthy", detail=f"{len(status.missing)} chunks can't be read")
+    return PartAnswer(status="healthy", detail=f"{status.rows} rows in memory")

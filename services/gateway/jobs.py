@@ -1,0 +1,138 @@
+"""`/jobs`: what is being done, and how far it is."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import AsyncIterator
+from typing import Annotated, Any
+from uuid import UUID
+
+from fastapi import APIRouter, Query, Request
+from fastapi.responses import StreamingResponse
+from starlette.concurrency import run_in_threadpool
+
+from services.gateway.context import DEFAULT_MAP, Gateway, GatewayDep, JobId, MapName
+from services.gateway.schemas import JobAnswer, JobsAnswer
+from services.gateway.waiting import SLOWEST_LOOK_SECONDS, read_job, wait_for_job
+from shared.catalog.maps import get_map
+from shared.errors import invalid_field
+from shared.jobs import Job, JobKind, JobState
+from shared.jobs.finish import cancel, retry
+from shared.jobs.model_changes import cancel_model_change
+from shared.jobs.table import MODEL_CHANGES, UNFINISHED, get_job, list_jobs
+
+router = APIRouter(tags=["jobs"])
+
+HEARTBEAT_SECONDS = 15.0  # a comment line, so that proxies keep a silent stream open
+
+
+@router.get("/jobs", operation_id="list_jobs", response_model=JobsAnswer)
+def jobs(
+    gateway: GatewayDep,
+    state: Annotated[list[JobState] | None, Query()] = None,
+    kind: Annotated[list[JobKind] | None, Query()] = None,
+    limit: Annotated[int, Query(ge=1, le=1000)] = 50,
+    cursor: Annotated[str | None, Query()] = None,
+    map_name: MapName = DEFAULT_MAP,
+) -> JobsAnswer:
+    """Newest first. `reindex` jobs are listed only when asked for by `kind`."""
+    try:
+        before = UUID(cursor) if cursor else None
+    except ValueError:
+        raise invalid_field("cursor", "is not one that this call has given") from None
+    with gateway.catalog.read() as session:
+        map_id = get_map(session, map_name).id
+        found = list_jobs(session, map_id, state or [], kind or [], limit + 1, before)
+    page = found[:limit]
+    return JobsAnswer(
+        jobs=[JobAnswer.of(job) for job in page],
+        next_cursor=str(page[-1].id) if len(found) > limit else None,
+    )
+
+
+@router.get("/jobs/{job_id}", operation_id="get_job", response_model=JobAnswer)
+async def job(
+    gateway: GatewayDep,
+    job_id: JobId,
+    wait: Annotated[float, Query(ge=0, description="seconds to wait for the end")] = 0.0,
+    map_name: MapName = DEFAULT_MAP,
+) -> JobAnswer:
+    """One job; `?wait=20` answers when it ends, or after 20 seconds as it is then."""
+    found = await run_in_threadpool(_get, gateway, map_name, job_id)
+    if wait and found.state in UNFINISHED:
+        seconds = min(wait, gateway.settings.max_wait_seconds)
+        found = await wait_for_job(gateway, job_id, seconds) or found
+    return JobAnswer.of(found)
+
+
+@router.get(
+    "/jobs/{job_id}/events",
+    operation_id="job_events",
+    response_class=StreamingResponse,
+    responses={200: {"content": {"text/event-stream": {}}, "description": "`progress` events"}},
+)
+async def job_events(
+    request: Request,
+    gateway: GatewayDep,
+    job_id: JobId,
+    map_name: MapName = DEFAULT_MAP,
+) -> StreamingResponse:
+    """Server-sent events: a `progress` event with the job at every change, until it ends."""
+    await run_in_threadpool(_get, gateway, map_name, job_id)
+    return StreamingResponse(
+        _events(request, gateway, job_id),
+        media_type="text/event-stream",
+        headers={"Cache-Control": "no-store", "X-Accel-Buffering": "no"},
+    )
+
+
+@router.post("/jobs/{job_id}/cancel", operation_id="cancel_job", response_model=JobAnswer)
+def cancel_job(gateway: GatewayDep, job_id: JobId, map_name: MapName = DEFAULT_MAP) -> JobAnswer:
+    """End a job at once; what a worker computes for it meanwhile is thrown away."""
+    with gateway.catalog.write() as session:
+        found = get_job(session, get_map(session, map_name).id, job_id, lock=True)
+        if found.kind in MODEL_CHANGES:
+            cancel_model_change(session, found)
+        else:
+            cancel(found)
+        session.flush()
+        session.refresh(found)
+        return JobAnswer.of(found)
+
+
+@router.post("/jobs/{job_id}/retry", operation_id="retry_job", response_model=JobAnswer)
+def retry_job(gateway: GatewayDep, job_id: JobId, map_name: MapName = DEFAULT_MAP) -> JobAnswer:
+    """Queue a failed or cancelled job again."""
+    with gateway.catalog.write() as session:
+        found = get_job(session, get_map(session, map_name).id, job_id, lock=True)
+        retry(session, found)
+        session.flush()
+        session.refresh(found)
+        answer = JobAnswer.of(found)
+    gateway.hints.send()
+    return answer
+
+
+def _get(gateway: Gateway, map_name: str, job_id: UUID) -> Job:
+    with gateway.catalog.read() as session:
+        return get_job(session, get_map(session, map_name).id, job_id)
+
+
+async def _events(request: Request, gateway: Gateway, job_id: UUID) -> AsyncIterator[str]:
+    sent: dict[str, Any] | None = None
+    number, spoken = 0, time.monotonic()
+    while not await request.is_disconnected():
+        found = await run_in_threadpool(read_job, gateway, job_id)
+        if found is None:
+            return
+        answer = JobAnswer.of(found)
+        if (now := answer.model_dump()) != sent:
+            sent, number, spoken = now, number + 1, time.monotonic()
+            yield f"id: {number}\nevent: progress\ndata: {answer.model_dump_json()}\n\n"
+        if answer.state not in UNFINISHED:
+            return
+        if time.monotonic() - spoken > HEARTBEAT_SECONDS:
+            spoken = time.monotonic()
+            yield ": still here\n\n"
+        await asyncio.sleep(SLOWEST_LOOK_SECONDS)

@@ -1,0 +1,184 @@
+"""`/vocabularies` and `/generations`: what a map's descriptors are made with, and changing it."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+from uuid import UUID
+
+from fastapi import APIRouter, Request, Response
+from pydantic import BaseModel, ConfigDict, Field
+from starlette.concurrency import run_in_threadpool
+
+from services.gateway.context import DEFAULT_MAP, Gateway, GatewayDep, MapName
+from services.gateway.receive import receive_file
+from services.gateway.schemas import (
+    GenerationAnswer,
+    JobStarted,
+    VocabularyAnswer,
+    job_started,
+)
+from shared.catalog.chunks import count_searchable
+from shared.catalog.generations import list_generations
+from shared.catalog.maps import get_map
+from shared.catalog.photos import count_live
+from shared.catalog.vocabularies import get_vocabulary, list_vocabularies
+from shared.errors import Conflict, PlacewiseError
+from shared.jobs import Job, JobKind
+from shared.jobs.model_changes import start_model_change
+from shared.objects.keys import new_vocabulary_key
+
+router = APIRouter(tags=["model changes"])
+
+
+class FitRequest(BaseModel):
+    """How to learn the vocabulary; {} is a good choice."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    clusters: int = Field(
+        64, ge=1, le=4096, description="fewer are made when the photos bear fewer"
+    )
+    sample: int = Field(1000, ge=1, le=1_000_000, description="photos to learn from, at most")
+    seed: int = Field(0, ge=0, le=2**31 - 1)
+
+
+class SwitchRequest(BaseModel):
+    """The vocabulary that the new generation is made with; null for extractors without one."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    vocabulary_id: UUID | None = None
+
+
+@router.post(
+    "/vocabularies",
+    operation_id="fit_vocabulary",
+    status_code=202,
+    response_model=JobStarted,
+)
+def fit_vocabulary(
+    gateway: GatewayDep,
+    response: Response,
+    wanted: FitRequest | None = None,
+    map_name: MapName = DEFAULT_MAP,
+) -> JobStarted:
+    """Learn a vocabulary from the map's own photos and switch to it.
+
+    All photos are described again in the background while search goes on; the job has succeeded
+    when the new generation answers.
+    """
+    params = (wanted or FitRequest.model_validate({})).model_dump()
+    with gateway.catalog.write() as session:
+        map_id = get_map(session, map_name).id
+        if count_live(session, map_id) == 0:
+            raise Conflict("no_photos", "The map has no photos to learn from. Upload some first.")
+        job = start_model_change(session, map_id, JobKind.FIT, params)
+    return _started(gateway, response, job)
+
+
+@router.post(
+    "/vocabularies/import",
+    operation_id="import_vocabulary",
+    status_code=202,
+    response_model=JobStarted,
+    openapi_extra={
+        "requestBody": {
+            "required": True,
+            "content": {
+                "multipart/form-data": {
+                    "schema": {
+                        "type": "object",
+                        "required": ["file"],
+                        "properties": {"file": {"type": "string", "format": "binary"}},
+                    }
+                }
+            },
+        }
+    },
+)
+async def import_vocabulary(
+    request: Request,
+    response: Response,
+    gateway: GatewayDep,
+    map_name: MapName = DEFAULT_MAP,
+) -> JobStarted:
+    """Bring a vocabulary, a `.npy` file of (clusters, dimension) floats, and switch to it.
+
+    The extractor checks it; one that does not fit ends the job as `failed` with the reason.
+    """
+    received = await receive_file(
+        request,
+        gateway.store,
+        new_vocabulary_key(),
+        gateway.settings.max_vocabulary_bytes,
+    )
+    params = {"object_key": received.key, "filename": received.filename}
+    job = await run_in_threadpool(_queue_import, gateway, map_name, params)
+    return _started(gateway, response, job)
+
+
+@router.get(
+    "/vocabularies",
+    operation_id="list_vocabularies",
+    response_model=list[VocabularyAnswer],
+)
+def vocabularies(gateway: GatewayDep, map_name: MapName = DEFAULT_MAP) -> list[VocabularyAnswer]:
+    """The map's vocabularies, newest first, with their provenance."""
+    with gateway.catalog.read() as session:
+        found = list_vocabularies(session, get_map(session, map_name).id)
+    return [VocabularyAnswer.of(vocabulary) for vocabulary in found]
+
+
+@router.get(
+    "/generations",
+    operation_id="list_generations",
+    response_model=list[GenerationAnswer],
+)
+def generations(gateway: GatewayDep, map_name: MapName = DEFAULT_MAP) -> list[GenerationAnswer]:
+    """The map's generations, newest first."""
+    with gateway.catalog.read() as session:
+        return [
+            GenerationAnswer.of(generation, count_searchable(session, generation.id))
+            for generation in list_generations(session, get_map(session, map_name).id)
+        ]
+
+
+@router.post(
+    "/generations",
+    operation_id="start_generation",
+    status_code=202,
+    response_model=JobStarted,
+)
+def start_generation(
+    gateway: GatewayDep,
+    response: Response,
+    wanted: Annotated[SwitchRequest, Field()],
+    map_name: MapName = DEFAULT_MAP,
+) -> JobStarted:
+    """Describe all photos anew with a vocabulary that the map has, and switch to it."""
+    params: dict[str, Any] = {"vocabulary_id": None}
+    with gateway.catalog.write() as session:
+        map_id = get_map(session, map_name).id
+        if wanted.vocabulary_id is not None:
+            vocabulary = get_vocabulary(session, map_id, wanted.vocabulary_id)
+            params["vocabulary_id"] = str(vocabulary.id)
+        job = start_model_change(session, map_id, JobKind.SWITCH, params)
+    return _started(gateway, response, job)
+
+
+def _queue_import(gateway: Gateway, map_name: str, params: dict[str, Any]) -> Job:
+    try:
+        with gateway.catalog.write() as session:
+            map_id = get_map(session, map_name).id
+            return start_model_change(session, map_id, JobKind.IMPORT, params)
+    except PlacewiseError:
+        gateway.store.delete(params["object_key"])
+        raise
+
+
+def _started(gateway: Gateway, response: Response, job: Job) -> JobStarted:
+    gateway.hints.send()
+    answer = job_started(job)
+    response.headers["Location"] = answer.status_url
+    response.headers["Retry-After"] = "1"
+    return answer

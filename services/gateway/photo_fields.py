@@ -1,0 +1,128 @@
+"""What people say of a photo: read from form fields and JSON alike, each error naming its field."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Any
+
+from shared.errors import PlacewiseError, Unprocessable, invalid_field
+
+MAX_TAGS = 50
+MAX_TEXT = 500  # characters of a tag or a place
+
+
+@dataclass(frozen=True, slots=True)
+class PhotoFields:
+    """None means "not said"."""
+
+    latitude: float | None = None
+    longitude: float | None = None
+    heading: float | None = None
+    captured_at: datetime | None = None
+    place: str | None = None
+    tags: list[str] | None = None
+    metadata: dict[str, Any] | None = None
+
+
+FORM_FIELDS = tuple(PhotoFields.__slots__)
+
+
+def read_form_fields(form: dict[str, str]) -> PhotoFields:
+    """The form's text fields; an empty one counts as not said, an unknown one is refused."""
+    for name in form:
+        if name not in FORM_FIELDS:
+            raise invalid_field(name, f"is unknown; known are {', '.join(FORM_FIELDS)}")
+    said = {name: value.strip() for name, value in form.items() if value.strip()}
+    fields = PhotoFields(
+        latitude=_number(said, "latitude", -90, 90),
+        longitude=_number(said, "longitude", -180, 180),
+        heading=_heading(said),
+        captured_at=parse_time("captured_at", said["captured_at"])
+        if "captured_at" in said
+        else None,
+        place=_text("place", said["place"]) if "place" in said else None,
+        tags=parse_tags(said["tags"].split(",")) if "tags" in said else None,
+        metadata=_metadata(said["metadata"]) if "metadata" in said else None,
+    )
+    check_pair(fields.latitude, fields.longitude)
+    return fields
+
+
+def check_pair(latitude: float | None, longitude: float | None) -> None:
+    """Coordinates come in pairs."""
+    if (latitude is None) != (longitude is None):
+        missing = "latitude" if latitude is None else "longitude"
+        raise invalid_field(missing, "is missing: coordinates come in pairs")
+
+
+def parse_time(field: str, text: str) -> datetime:
+    """ISO 8601; a time without an offset is taken as UTC."""
+    try:
+        parsed = datetime.fromisoformat(text)
+    except ValueError:
+        raise invalid_field(
+            field, f"{text!r} is not an ISO 8601 time such as 2026-05-01T12:30:00+02:00"
+        ) from None
+    parsed = parsed if parsed.tzinfo else parsed.replace(tzinfo=UTC)
+    try:
+        return parsed.astimezone(UTC)
+    except OverflowError:
+        raise invalid_field(field, f"{text!r} is out of range") from None
+
+
+def parse_tags(tags: list[str]) -> list[str]:
+    """Trimmed, without doubles, in the order given."""
+    kept = list(dict.fromkeys(_text("tags", tag.strip()) for tag in tags if tag.strip()))
+    if len(kept) > MAX_TAGS:
+        raise invalid_field("tags", f"at most {MAX_TAGS} tags")
+    return kept
+
+
+def _number(said: dict[str, str], field: str, least: float, most: float) -> float | None:
+    if field not in said:
+        return None
+    try:
+        number = float(said[field])
+    except ValueError:
+        raise invalid_field(field, f"{said[field]!r} is not a number") from None
+    if not math.isfinite(number) or not least <= number <= most:
+        raise invalid_field(field, f"{said[field]} is not between {least:g} and {most:g}")
+    return number
+
+
+def _heading(said: dict[str, str]) -> float | None:
+    heading = _number(said, "heading", 0, 360)
+    return None if heading is None else heading % 360
+
+
+def _text(field: str, text: str) -> str:
+    if len(text) > MAX_TEXT:
+        raise invalid_field(field, f"is longer than {MAX_TEXT} characters")
+    if "\0" in text:
+        raise invalid_field(field, "holds a NUL character")
+    return text
+
+
+def _metadata(text: str) -> dict[str, Any]:
+    refusal: PlacewiseError = invalid_field("metadata", "is not a JSON object")
+    try:
+        value = json.loads(text, parse_constant=_no_constant)
+    except (ValueError, RecursionError):
+        raise refusal from None
+    if not isinstance(value, dict):
+        raise refusal
+    check_metadata(value)
+    return value
+
+
+def check_metadata(value: dict[str, Any]) -> None:
+    """What a JSON column can't hold: NUL characters."""
+    if "\\u0000" in json.dumps(value):
+        raise invalid_field("metadata", "holds a NUL character")
+
+
+def _no_constant(name: str) -> Any:
+    raise Unprocessable("invalid_field", f"metadata: {name} is not JSON")

@@ -1,0 +1,244 @@
+"""`/uploads/{file_id}` and `/search`: one photo, and photos by what is known of them."""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import time
+from collections.abc import Iterator
+from datetime import datetime
+from typing import Annotated, Any, BinaryIO
+from urllib.parse import quote
+from uuid import UUID
+
+from fastapi import APIRouter, Query, Request
+from fastapi.responses import Response, StreamingResponse
+from pydantic import BaseModel, ConfigDict, Field
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from services.gateway.context import DEFAULT_MAP, FileId, GatewayDep, MapName
+from services.gateway.photo_fields import (
+    check_metadata,
+    check_pair,
+    parse_tags,
+    parse_time,
+)
+from services.gateway.schemas import (
+    DeleteAnswer,
+    MetadataAnswer,
+    OnePhotoAnswer,
+    PhotoAnswer,
+)
+from shared.catalog.chunks import descriptor_of
+from shared.catalog.generations import active_generation
+from shared.catalog.maps import bump_version, get_map, lock_map
+from shared.catalog.photos import (
+    MetadataFilter,
+    Photo,
+    get_photo,
+    mark_deleted,
+    search_metadata,
+)
+from shared.errors import NotFound, invalid_field
+from shared.jobs import Job
+from shared.jobs.finish import cancel
+from shared.jobs.table import UNFINISHED
+from shared.objects.keys import thumbnail_key
+
+router = APIRouter(tags=["photos"])
+
+READ_BYTES = 256 * 1024
+PICTURE: dict[int | str, dict[str, Any]] = {
+    200: {"content": {"image/*": {}}, "description": "The picture."}
+}
+
+
+@router.get("/uploads/{file_id}", operation_id="get_photo", response_model=OnePhotoAnswer)
+def photo(gateway: GatewayDep, file_id: FileId, map_name: MapName = DEFAULT_MAP) -> OnePhotoAnswer:
+    """What is known of one photo."""
+    with gateway.catalog.read() as session:
+        return _one(session, get_photo(session, get_map(session, map_name).id, file_id))
+
+
+class PhotoPatch(BaseModel):
+    """What to change; what is left out stays, null clears."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    latitude: Annotated[float | None, Field(ge=-90, le=90, allow_inf_nan=False)] = None
+    longitude: Annotated[float | None, Field(ge=-180, le=180, allow_inf_nan=False)] = None
+    heading: Annotated[float | None, Field(ge=0, le=360, allow_inf_nan=False)] = None
+    captured_at: str | None = None
+    place: Annotated[str | None, Field(max_length=500, pattern=r"^[^\x00]*$")] = None
+    tags: list[Annotated[str, Field(pattern=r"^[^\x00]*$")]] | None = None
+    metadata: dict[str, Any] | None = None
+
+    def columns(self) -> dict[str, Any]:
+        """The photo's columns that are said, with their new values."""
+        said = self.model_dump(exclude_unset=True)
+        if said.get("captured_at") is not None:
+            said["captured_at"] = parse_time("captured_at", said["captured_at"])
+        if said.get("heading") is not None:
+            said["heading"] %= 360
+        if "tags" in said:
+            said["tags"] = parse_tags(said["tags"] or [])
+        if "metadata" in said:
+            said["attributes"] = said.pop("metadata") or {}
+            check_metadata(said["attributes"])
+        return said
+
+
+@router.patch("/uploads/{file_id}", operation_id="patch_photo", response_model=OnePhotoAnswer)
+def patch_photo(
+    gateway: GatewayDep,
+    file_id: FileId,
+    patch: PhotoPatch,
+    map_name: MapName = DEFAULT_MAP,
+) -> OnePhotoAnswer:
+    """Change where, when and what of a photo; its descriptor stays."""
+    columns = patch.columns()
+    with gateway.catalog.write() as session:
+        map_ = lock_map(session, get_map(session, map_name).id)
+        found = get_photo(session, map_.id, file_id)
+        for name, value in columns.items():
+            setattr(found, name, value)
+        check_pair(found.latitude, found.longitude)
+        found.changed_version = bump_version(session, map_.id)
+        session.flush()
+        return _one(session, found)
+
+
+@router.delete("/uploads/{file_id}", operation_id="delete_photo", response_model=DeleteAnswer)
+def delete_photo(
+    gateway: GatewayDep, file_id: FileId, map_name: MapName = DEFAULT_MAP
+) -> DeleteAnswer:
+    """Gone from every answer at once; the bytes follow within seconds."""
+    with gateway.catalog.write() as session:
+        map_ = lock_map(session, get_map(session, map_name).id)
+        found = get_photo(session, map_.id, file_id)
+        mark_deleted(session, found, bump_version(session, map_.id))
+        unfinished = select(Job).where(Job.photo_id == found.id, Job.state.in_(UNFINISHED))
+        for job in session.scalars(unfinished.with_for_update()):
+            cancel(job)
+    return DeleteAnswer(
+        success=True, message=f"{found.filename} is deleted.", deleted_file_id=file_id
+    )
+
+
+@router.get(
+    "/uploads/{file_id}/image",
+    operation_id="get_image",
+    response_class=Response,
+    responses=PICTURE,
+)
+def image(
+    request: Request,
+    gateway: GatewayDep,
+    file_id: FileId,
+    map_name: MapName = DEFAULT_MAP,
+) -> Response:
+    """The photo's bytes as they were uploaded."""
+    with gateway.catalog.read() as session:
+        found = get_photo(session, get_map(session, map_name).id, file_id)
+    etag = f'"{found.sha256}"'
+    if request.headers.get("if-none-match") == etag:
+        return Response(status_code=304, headers={"ETag": etag})
+    return StreamingResponse(
+        _pieces(gateway.store.open(found.object_key)),
+        media_type=found.media_type,
+        headers={
+            "Content-Length": str(found.size_bytes),
+            "Content-Disposition": f"inline; filename*=UTF-8''{quote(found.filename)}",
+            "ETag": etag,
+            "X-Content-Type-Options": "nosniff",
+        },
+    )
+
+
+@router.get(
+    "/uploads/{file_id}/thumbnail",
+    operation_id="get_thumbnail",
+    response_class=Response,
+    responses=PICTURE,
+)
+def thumbnail(gateway: GatewayDep, file_id: FileId, map_name: MapName = DEFAULT_MAP) -> Response:
+    """A small JPEG without any metadata; it is there once the photo has been described."""
+    with gateway.catalog.read() as session:
+        found = get_photo(session, get_map(session, map_name).id, file_id)
+    try:
+        data = gateway.store.get(thumbnail_key(found.id))
+    except NotFound:
+        raise NotFound(
+            "thumbnail_not_found",
+            "The photo has no thumbnail yet: it is not described.",
+        ) from None
+    return Response(data, media_type="image/jpeg", headers={"X-Content-Type-Options": "nosniff"})
+
+
+@router.get("/search", operation_id="search_metadata", response_model=MetadataAnswer)
+def search(
+    gateway: GatewayDep,
+    filename: Annotated[str | None, Query(description="part of the name, case ignored")] = None,
+    upload_after: Annotated[str | None, Query(description="ISO 8601; no offset means UTC")] = None,
+    upload_before: Annotated[str | None, Query(description="ISO 8601; no offset means UTC")] = None,
+    min_file_size: Annotated[int | None, Query(ge=0, le=2**62)] = None,
+    max_file_size: Annotated[int | None, Query(ge=0, le=2**62)] = None,
+    tags: Annotated[str | None, Query(description="separated by commas: all are wanted")] = None,
+    limit: Annotated[int, Query(ge=1, le=1000)] = 100,
+    cursor: Annotated[str | None, Query(description="`next_cursor` of the page before")] = None,
+    map_name: MapName = DEFAULT_MAP,
+) -> MetadataAnswer:
+    """Photos by name, time, size and tags, newest first, a page at a time."""
+    started = time.perf_counter()
+    if filename is not None and "\0" in filename:
+        raise invalid_field("filename", "holds a NUL character")
+    wanted = MetadataFilter(
+        filename=filename,
+        upload_after=parse_time("upload_after", upload_after) if upload_after else None,
+        upload_before=parse_time("upload_before", upload_before) if upload_before else None,
+        min_file_size=min_file_size,
+        max_file_size=max_file_size,
+        tags=tuple(parse_tags(tags.split(","))) if tags else (),
+    )
+    after = _read_cursor(cursor) if cursor else None
+    with gateway.catalog.read() as session:
+        map_id = get_map(session, map_name).id
+        found, total = search_metadata(session, map_id, wanted, limit + 1, after)
+    page = found[:limit]
+    return MetadataAnswer(
+        total_found=total,
+        images=[PhotoAnswer(**PhotoAnswer.fields_of(item)) for item in page],
+        next_cursor=_cursor(page[-1]) if len(found) > limit else None,
+        query_time_ms=(time.perf_counter() - started) * 1000,
+    )
+
+
+def _one(session: Session, found: Photo) -> OnePhotoAnswer:
+    generation = active_generation(session, found.map_id)
+    searchable = generation is not None and descriptor_of(session, generation.id, found.id)
+    return OnePhotoAnswer(
+        **PhotoAnswer.fields_of(found),
+        job_id=found.job_id,
+        media_type=found.media_type,
+        sha256=found.sha256,
+        searchable=bool(searchable),
+    )
+
+
+def _pieces(file: BinaryIO) -> Iterator[bytes]:
+    with file:
+        while piece := file.read(READ_BYTES):
+            yield piece
+
+
+def _cursor(last: Photo) -> str:
+    return base64.urlsafe_b64encode(f"{last.uploaded_at.isoformat()} {last.id}".encode()).decode()
+
+
+def _read_cursor(cursor: str) -> tuple[datetime, UUID]:
+    try:
+        uploaded_at, photo_id = base64.urlsafe_b64decode(cursor.encode()).decode().split(" ")
+        return parse_time("cursor", uploaded_at), UUID(photo_id)
+    except (ValueError, binascii.Error):
+        raise invalid_field("cursor", "is not one that this call has given") from None

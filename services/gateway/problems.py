@@ -1,0 +1,127 @@
+"""Every error leaves as an RFC 9457 problem with a stable `code`, never with a trace."""
+
+from __future__ import annotations
+
+import logging
+from typing import Any
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse
+from pydantic import BaseModel, ConfigDict
+from sqlalchemy.exc import DBAPIError
+from starlette.exceptions import HTTPException
+
+from shared.errors import InvalidRequest, PlacewiseError, Unavailable, Unprocessable
+
+log = logging.getLogger(__name__)
+
+RETRY_AFTER_SECONDS = "2"
+
+
+class Problem(BaseModel):
+    """RFC 9457; `code` is stable, `detail` is for people. More members may follow."""
+
+    model_config = ConfigDict(extra="allow")
+
+    type: str
+    title: str
+    status: int
+    detail: str
+    code: str
+
+
+# What the description of every call promises beside its success.
+PROBLEM_RESPONSES: dict[int | str, dict[str, Any]] = {
+    "4XX": {
+        "description": "The request can't be met; `code` says why.",
+        "content": {"application/problem+json": {"schema": Problem.model_json_schema()}},
+    },
+    "5XX": {
+        "description": "Not the caller's fault; with `Retry-After` it may work later.",
+        "content": {"application/problem+json": {"schema": Problem.model_json_schema()}},
+    },
+}
+
+
+def install_problem_handlers(app: FastAPI) -> None:
+    """Turn whatever is raised in a route into a problem document."""
+    app.add_exception_handler(PlacewiseError, _on_placewise_error)
+    app.add_exception_handler(RequestValidationError, _on_validation_error)
+    app.add_exception_handler(HTTPException, _on_http_exception)
+    app.add_exception_handler(DBAPIError, _on_database_error)
+    app.add_exception_handler(Exception, _on_any_error)
+
+
+def problem_response(error: PlacewiseError, request: Request) -> JSONResponse:
+    headers = {}
+    if error.status == 503:
+        headers["Retry-After"] = RETRY_AFTER_SECONDS
+    if error.status == 413:
+        headers["Connection"] = "close"  # the rest of the body stays unread
+    return JSONResponse(
+        {**error.as_problem(), "instance": request.url.path},
+        status_code=error.status,
+        headers=headers,
+        media_type="application/problem+json",
+    )
+
+
+async def _on_placewise_error(request: Request, error: Exception) -> JSONResponse:
+    assert isinstance(error, PlacewiseError)
+    if error.status >= 500:
+        log.error("%s %s: %s", request.method, request.url.path, error.detail)
+    return problem_response(error, request)
+
+
+async def _on_validation_error(request: Request, error: Exception) -> JSONResponse:
+    assert isinstance(error, RequestValidationError)
+    faults = error.errors()
+    if any(fault["type"] == "json_invalid" for fault in faults):
+        problem: PlacewiseError = InvalidRequest("malformed_body", "The body is not valid JSON.")
+    else:
+        errors = [
+            {
+                "field": ".".join(str(part) for part in fault["loc"][1:]),
+                "detail": fault["msg"],
+            }
+            for fault in faults
+        ]
+        named = "; ".join(f"{e['field'] or 'body'}: {e['detail']}" for e in errors)
+        problem = Unprocessable("invalid_field", named, errors=errors)
+    return problem_response(problem, request)
+
+
+async def _on_http_exception(request: Request, error: Exception) -> JSONResponse:
+    """Unknown paths and methods, as Starlette raises them."""
+    assert isinstance(error, HTTPException)
+    code = {404: "path_not_found", 405: "method_not_allowed"}.get(error.status_code, "http_error")
+    return JSONResponse(
+        {
+            "type": f"urn:placewise:problem:{code}",
+            "title": str(error.detail),
+            "status": error.status_code,
+            "detail": f"{request.method} {request.url.path}: {error.detail}. See /docs.",
+            "code": code,
+            "instance": request.url.path,
+        },
+        status_code=error.status_code,
+        headers=error.headers,
+        media_type="application/problem+json",
+    )
+
+
+async def _on_database_error(request: Request, error: Exception) -> JSONResponse:
+    log.error("the catalog failed", exc_info=error)
+    return problem_response(
+        Unavailable("catalog_unavailable", "The catalog can't be reached right now. Try again."),
+        request,
+    )
+
+
+async def _on_any_error(request: Request, error: Exception) -> JSONResponse:
+    log.error("%s %s failed", request.method, request.url.path, exc_info=error)
+    return problem_response(
+        PlacewiseError("internal_error", "Something went wrong here; the server's log says what."),
+        request,
+    )

@@ -1,0 +1,245 @@
+"""What the API answers. Times are UTC with an offset; ids are UUIDv7; sizes are bytes."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Any
+from uuid import UUID
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from services.gateway.context import API
+from shared.catalog.generations import Generation, GenerationState
+from shared.catalog.photos import Photo
+from shared.catalog.vocabularies import Vocabulary, VocabularyOrigin
+from shared.jobs import Job, JobKind, JobState
+
+
+class Answer(BaseModel):
+    model_config = ConfigDict(frozen=True)
+
+
+class PhotoAnswer(Answer):
+    """A stored photo."""
+
+    image_id: UUID
+    image_path: str = Field(description="path of the photo's bytes on this server")
+    original_filename: str
+    upload_time: datetime
+    file_size: int
+    width: int
+    height: int
+    metadata: dict[str, Any]
+    tags: list[str]
+    latitude: float | None
+    longitude: float | None
+    heading: float | None
+    captured_at: datetime | None
+    place: str | None
+    image_url: str
+    thumbnail_url: str
+
+    @classmethod
+    def fields_of(cls, photo: Photo) -> dict[str, Any]:
+        here = f"{API}/uploads/{photo.id}"
+        return {
+            "image_id": photo.id,
+            "image_path": f"{here}/image",
+            "original_filename": photo.filename,
+            "upload_time": photo.uploaded_at,
+            "file_size": photo.size_bytes,
+            "width": photo.width,
+            "height": photo.height,
+            "metadata": photo.attributes,
+            "tags": photo.tags,
+            "latitude": photo.latitude,
+            "longitude": photo.longitude,
+            "heading": photo.heading,
+            "captured_at": photo.captured_at,
+            "place": photo.place,
+            "image_url": f"{here}/image",
+            "thumbnail_url": f"{here}/thumbnail",
+        }
+
+
+class OnePhotoAnswer(PhotoAnswer):
+    """A stored photo with the state of its job."""
+
+    job_id: UUID | None
+    media_type: str
+    sha256: str
+    searchable: bool = Field(description="whether the active generation has its descriptor")
+
+
+class SimilarPhoto(PhotoAnswer):
+    similarity_score: float = Field(description="cosine similarity in [-1, 1]")
+
+
+class SimilarityAnswer(Answer):
+    """The most similar photos, best first, never the query itself."""
+
+    query_file_id: UUID | None = Field(description="null when the query photo is not stored")
+    query_filename: str
+    processing_time_ms: float
+    total_similar: int
+    similar_images: list[SimilarPhoto]
+    vocabulary: str = Field(
+        description="`own`: learnt on this map's photos; `foreign`: on photos of elsewhere; "
+        "`none`: the extractor uses none"
+    )
+    generation_id: UUID
+    certificate: str = Field(description="`exhaustive`: every row was compared exactly")
+    rows_scanned: int
+    rows_reranked: int
+    snapshot_version: int
+    missing: list[str] = Field(description="parts of the map that could not be searched")
+
+
+class MetadataAnswer(Answer):
+    total_found: int = Field(description="all that match, not only this page")
+    images: list[PhotoAnswer]
+    next_cursor: str | None
+    query_time_ms: float
+
+
+class Progress(Answer):
+    done: int
+    total: int
+    failed: int
+
+
+class JobAnswer(Answer):
+    job_id: UUID
+    kind: JobKind
+    state: JobState
+    stage: str | None = Field(description="of a model change: sample, cluster, describe")
+    waiting_for: str | None = Field(description="what has to be there before the job can go on")
+    progress: Progress
+    attempts: int
+    file_id: UUID | None
+    result: dict[str, Any] | None
+    error: dict[str, Any] | None = Field(description="an RFC 9457 problem")
+    created_at: datetime
+    started_at: datetime | None
+    finished_at: datetime | None
+    status_url: str
+    result_url: str | None
+
+    @classmethod
+    def of(cls, job: Job) -> JobAnswer:
+        query = job.kind == JobKind.DESCRIBE
+        return cls(
+            job_id=job.id,
+            kind=JobKind(job.kind),
+            state=JobState(job.state),
+            stage=job.stage,
+            waiting_for=job.waiting_for,
+            progress=Progress(
+                done=job.progress_done,
+                total=job.progress_total,
+                failed=job.progress_failed,
+            ),
+            attempts=job.attempts,
+            file_id=job.photo_id,
+            result=None if query else job.result,
+            error=job.error,
+            created_at=job.created_at,
+            started_at=job.started_at,
+            finished_at=job.finished_at,
+            status_url=job_url(job.id),
+            result_url=f"{job_url(job.id)}/result" if query else None,
+        )
+
+
+class JobsAnswer(Answer):
+    jobs: list[JobAnswer]
+    next_cursor: str | None
+
+
+class JobStarted(Answer):
+    """202: the work is queued; poll `status_url`."""
+
+    job_id: UUID
+    status: JobState
+    status_url: str
+    result_url: str | None = None
+
+
+class UploadAnswer(Answer):
+    file_id: UUID
+    job_id: UUID | None
+    filename: str
+    file_size: int
+    upload_time: datetime
+    status: JobState
+    status_url: str
+    message: str
+
+
+class DeleteAnswer(Answer):
+    success: bool
+    message: str
+    deleted_file_id: UUID
+
+
+class VocabularyAnswer(Answer):
+    vocabulary_id: UUID
+    origin: VocabularyOrigin
+    clusters: int
+    dimension: int
+    sha256: str
+    provenance: dict[str, Any]
+    created_at: datetime
+
+    @classmethod
+    def of(cls, vocabulary: Vocabulary) -> VocabularyAnswer:
+        return cls(
+            vocabulary_id=vocabulary.id,
+            origin=VocabularyOrigin(vocabulary.origin),
+            clusters=vocabulary.clusters,
+            dimension=vocabulary.dimension,
+            sha256=vocabulary.sha256,
+            provenance=vocabulary.provenance,
+            created_at=vocabulary.created_at,
+        )
+
+
+class GenerationAnswer(Answer):
+    generation_id: UUID
+    state: GenerationState
+    extractor: str
+    dimension: int
+    vocabulary_id: UUID | None
+    photos: int = Field(description="live photos that have a descriptor in it")
+    spec: dict[str, Any]
+    created_at: datetime
+    activated_at: datetime | None
+    ended_at: datetime | None
+
+    @classmethod
+    def of(cls, generation: Generation, photos: int) -> GenerationAnswer:
+        return cls(
+            generation_id=generation.id,
+            state=GenerationState(generation.state),
+            extractor=generation.extractor,
+            dimension=generation.dimension,
+            vocabulary_id=generation.vocabulary_id,
+            photos=photos,
+            spec=generation.spec,
+            created_at=generation.created_at,
+            activated_at=generation.activated_at,
+            ended_at=generation.ended_at,
+        )
+
+
+def job_url(job_id: UUID) -> str:
+    return f"{API}/jobs/{job_id}"
+
+
+def job_started(job: Job) -> JobStarted:
+    return JobStarted(
+        job_id=job.id,
+        status=JobState(job.state),
+        status_url=job_url(job.id),
+        result_url=f"{job_url(job.id)}/result" if job.kind == JobKind.DESCRIBE else None,
+    )

@@ -1,0 +1,139 @@
+"""`POST /upload`: one photo in."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from fastapi import APIRouter, Request, Response
+from starlette.concurrency import run_in_threadpool
+
+from services.gateway.context import DEFAULT_MAP, Gateway, GatewayDep, MapName
+from services.gateway.photo_fields import PhotoFields, read_form_fields
+from services.gateway.photo_header import read_photo_header
+from services.gateway.receive import Received, check_photo_begin, receive_file
+from services.gateway.schemas import UploadAnswer, job_url
+from services.gateway.store_photo import Stored, store_photo
+from services.gateway.waiting import preferred_wait, wait_for_job
+from shared.errors import PlacewiseError
+from shared.jobs import JobState
+from shared.objects.keys import new_original_key
+
+router = APIRouter(tags=["photos"])
+
+_TEXT = {"type": "string"}
+FORM_DESCRIPTION: dict[str, Any] = {
+    "requestBody": {
+        "required": True,
+        "content": {
+            "multipart/form-data": {
+                "schema": {
+                    "type": "object",
+                    "required": ["file"],
+                    "properties": {
+                        "file": {
+                            "type": "string",
+                            "format": "binary",
+                            "description": "JPEG, PNG, WebP, BMP or TIFF",
+                        },
+                        "latitude": {"type": "number", "minimum": -90, "maximum": 90},
+                        "longitude": {
+                            "type": "number",
+                            "minimum": -180,
+                            "maximum": 180,
+                        },
+                        "heading": {"type": "number", "minimum": 0, "maximum": 360},
+                        "captured_at": {"type": "string", "format": "date-time"},
+                        "place": {
+                            **_TEXT,
+                            "description": "a label, where coordinates say little",
+                        },
+                        "tags": {**_TEXT, "description": "separated by commas"},
+                        "metadata": {**_TEXT, "description": "a JSON object"},
+                    },
+                }
+            }
+        },
+    }
+}
+
+
+@router.post(
+    "/upload",
+    operation_id="upload",
+    status_code=202,
+    response_model=UploadAnswer,
+    responses={
+        200: {"model": UploadAnswer, "description": "The map has these bytes already."},
+        201: {
+            "model": UploadAnswer,
+            "description": "Searchable (with `Prefer: wait=N`).",
+        },
+    },
+    openapi_extra=FORM_DESCRIPTION,
+)
+async def upload(
+    request: Request,
+    response: Response,
+    gateway: GatewayDep,
+    map_name: MapName = DEFAULT_MAP,
+) -> UploadAnswer:
+    """Store a photo and queue its description. EXIF fills what the form leaves out.
+
+    202 with the job to poll; with `Prefer: wait=N`, 201 once the photo is searchable. The same
+    bytes again give the existing photo (200), or queue it again after a failed job (202).
+    """
+    received = await receive_file(
+        request,
+        gateway.store,
+        new_original_key(),
+        gateway.settings.max_file_size,
+        check_photo_begin,
+    )
+    stored, status = await run_in_threadpool(_store, gateway, map_name, received)
+    job = stored.job
+    if stored.queued and job is not None:
+        response.status_code = 202
+        wait = preferred_wait(request, gateway.settings.max_wait_seconds)
+        if wait:
+            response.headers["Preference-Applied"] = f"wait={wait:g}"
+            job = await wait_for_job(gateway, job.id, wait)
+            if job is not None and job.state == JobState.SUCCEEDED:
+                response.status_code = 201
+    else:
+        response.status_code = 200
+    status_url = job_url(job.id) if job else f"/api/v1/uploads/{stored.photo.id}"
+    response.headers["Location"] = status_url
+    if response.status_code == 202:
+        response.headers["Retry-After"] = "1"
+    return UploadAnswer(
+        file_id=stored.photo.id,
+        job_id=job.id if job else None,
+        filename=stored.photo.filename,
+        file_size=stored.photo.size_bytes,
+        upload_time=stored.photo.uploaded_at,
+        status=JobState(job.state) if job else JobState.SUCCEEDED,
+        status_url=status_url,
+        message=status,
+    )
+
+
+def _store(gateway: Gateway, map_name: str, received: Received) -> tuple[Stored, str]:
+    """Check what came and acknowledge it; whatever is not kept leaves no bytes behind."""
+    try:
+        media_type = check_photo_begin(received.begin)
+        fields: PhotoFields = read_form_fields(received.fields)
+        with gateway.store.open(received.key) as file:
+            header = read_photo_header(file, gateway.settings.max_image_pixels)
+        stored = store_photo(gateway, map_name, received, media_type, header, fields)
+    except PlacewiseError:
+        # Only what is certainly refused: after a lost connection the row may be committed.
+        gateway.store.delete(received.key)
+        raise
+    kept = stored.photo.object_key == received.key
+    if not kept:
+        gateway.store.delete(received.key)
+    if kept:
+        return stored, "Stored; it is described in the background."
+    if stored.queued:
+        return stored, "The map has this photo; its failed job is queued again."
+    return stored, "The map has this photo already."

@@ -1,0 +1,200 @@
+"""Everything in one process, no servers: gateway, extractor, search and steward on SQLite and a
+local folder. These are the very classes that the separate services run; only the ports differ:
+
+| port | here | between machines |
+|---|---|---|
+| hints | an event | a Celery message |
+| object store | a folder | S3 |
+| search protocol | a call | HTTP |
+| catalog | SQLite | PostgreSQL |
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import logging
+import os
+import socket
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import uvicorn
+from filelock import FileLock, Timeout
+
+from services.extractor.worker import ExtractorWorker
+from services.gateway.app import create_app
+from services.gateway.context import Gateway
+from services.search.worker import SearchWorker
+from services.steward.loop import Steward
+from services.steward.queue import free_leases
+from shared.catalog.maps import ensure_default_map
+from shared.catalog.session import Catalog
+from shared.errors import Misconfigured
+from shared.jobs import InProcessHints
+from shared.objects import FolderStore
+from shared.settings import Settings
+
+log = logging.getLogger(__name__)
+
+GRACEFUL_SECONDS = 10  # for requests under way when the server is asked to stop
+
+
+def lock_file(home: Path) -> Path:
+    """Held by whoever serves the folder."""
+    return home / "server.lock"
+
+
+def address_file(home: Path) -> Path:
+    """Says where the server that holds the lock listens."""
+    return home / "server.json"
+
+
+def address_of_running(home: Path) -> str | None:
+    """The address of the server that serves the folder now, or None."""
+    if not lock_file(home).exists():
+        return None
+    with contextlib.suppress(Timeout), FileLock(lock_file(home), timeout=0):
+        return None
+    with contextlib.suppress(FileNotFoundError, ValueError, KeyError):
+        url: str = json.loads(address_file(home).read_text())["url"]
+        return url
+    return None
+
+
+@dataclass(slots=True)
+class Standalone:
+    """A running embedded Placewise."""
+
+    url: str
+    server: uvicorn.Server
+    listener: socket.socket
+    failed: threading.Event
+    """Set when one of the parts has died: the process should end and say so."""
+
+    def serve(self) -> None:
+        """Answer HTTP until the process is asked to stop."""
+        self.server.run(sockets=[self.listener])
+        if self.failed.is_set():
+            raise Misconfigured("part_died", "A part of Placewise died; the log above says why.")
+
+
+@contextlib.contextmanager
+def standalone(settings: Settings) -> Iterator[Standalone]:
+    """Lock the folder, recover what a killed process left, and start every part.
+
+    Raises Misconfigured: `home_in_use` for a folder that another server has, `address_in_use`.
+    """
+    home = settings.placewise_home
+    try:
+        home.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise Misconfigured(
+            "home_unwritable",
+            f"Can't make the folder {home}: {error.strerror}. Choose another PLACEWISE_HOME.",
+        ) from error
+    with _folder_lock(home), _listener(settings) as listener:
+        host, port = listener.getsockname()[:2]
+        url = f"http://{f'[{host}]' if ':' in host else host}:{port}"
+        address_file(home).write_text(json.dumps({"url": url, "pid": os.getpid()}))
+        catalog = Catalog(settings.catalog_url())
+        store = FolderStore(home / "objects")
+        hints = InProcessHints()
+        catalog.migrate()
+        with catalog.write() as session:
+            ensure_default_map(session, settings.extractor)
+        # The lock says that no other worker lives: what was leased belongs to a killed process.
+        free_leases(catalog, settings.max_attempts, everyone=True)
+
+        search = SearchWorker(catalog, store, settings)
+        extractor = ExtractorWorker(catalog, store, hints, settings, name=f"embedded-{os.getpid()}")
+        steward = Steward(catalog, store, hints, settings)
+        gateway = Gateway(catalog, store, hints, search, settings)
+        server = uvicorn.Server(
+            uvicorn.Config(
+                create_app(gateway),
+                log_config=None,
+                access_log=False,
+                timeout_graceful_shutdown=GRACEFUL_SECONDS,
+            )
+        )
+        running = Standalone(url, server, listener, threading.Event())
+        stop = threading.Event()
+        parts = [
+            _start(name, part, stop, running)
+            for name, part in (
+                ("search", search.run),
+                ("extractor", extractor.run),
+                ("steward", steward.run),
+            )
+        ]
+        try:
+            yield running
+        finally:
+            stop.set()
+            hints.send()
+            for part in parts:
+                part.join()
+            extractor.close()
+            catalog.close()
+            address_file(home).unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def _folder_lock(home: Path) -> Iterator[None]:
+    lock = FileLock(lock_file(home), timeout=0)
+    try:
+        lock.acquire()
+    except Timeout:
+        where = address_of_running(home) or "another process"
+        raise Misconfigured(
+            "home_in_use",
+            f"The folder {home} is served already, by {where}. Use that server, stop it, or give "
+            "this one another PLACEWISE_HOME.",
+        ) from None
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+@contextlib.contextmanager
+def _listener(settings: Settings) -> Iterator[socket.socket]:
+    """The listening socket; port 0 takes a free one."""
+    try:
+        family = socket.getaddrinfo(settings.host, settings.port, type=socket.SOCK_STREAM)[0][0]
+        listener = socket.create_server(
+            (settings.host, settings.port),
+            family=family,
+            backlog=2048,
+            reuse_port=False,
+        )
+    except OSError as error:
+        raise Misconfigured(
+            "address_in_use",
+            f"Can't listen on {settings.host}:{settings.port}: {error.strerror or error}. "
+            "Choose another one, for example: make run PORT=8001.",
+        ) from error
+    with listener:
+        yield listener
+
+
+def _start(
+    name: str,
+    run: Callable[[threading.Event], None],
+    stop: threading.Event,
+    running: Standalone,
+) -> threading.Thread:
+    def guarded() -> None:
+        try:
+            run(stop)
+        except BaseException:
+            log.exception("the %s died", name)
+            running.failed.set()
+            running.server.should_exit = True
+
+    part = threading.Thread(target=guarded, name=name)
+    part.start()
+    return part

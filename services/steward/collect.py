@@ -1,0 +1,219 @@
+"""Removing what nothing refers to any more. Objects go before the rows that remember them.
+
+An object is deleted first and its row after it: a crash in between repeats the deletion, which
+harms nothing, while the other order would leave bytes that no one knows of.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterable
+from datetime import timedelta
+from uuid import UUID
+
+from sqlalchemy import delete, select, update
+from sqlalchemy.orm import Session
+
+from shared.catalog.base import db_now, db_now_plus
+from shared.catalog.chunks import Chunk, Descriptor
+from shared.catalog.generations import Generation, GenerationState
+from shared.catalog.maps import bump_version, lock_map
+from shared.catalog.photos import Photo
+from shared.catalog.session import Catalog
+from shared.catalog.vocabularies import Vocabulary
+from shared.chunks import delete_chunk
+from shared.jobs.table import MODEL_CHANGES, UNFINISHED, Job, JobKind
+from shared.objects import ObjectStore
+from shared.objects.keys import (
+    ORIGINALS,
+    QUERIES,
+    THUMBNAILS,
+    VOCABULARIES,
+    WORK,
+    query_key,
+    query_vector_key,
+    thumbnail_key,
+)
+from shared.settings import Settings
+
+log = logging.getLogger(__name__)
+
+AT_ONCE = 500  # rows looked at in one transaction
+
+
+def collect_superseded_chunks(catalog: Catalog, store: ObjectStore, grace_seconds: float) -> None:
+    """Chunks that were merged into others; the grace lets running queries finish with them."""
+    with catalog.read() as session:
+        chunks = session.scalars(
+            select(Chunk).where(Chunk.superseded_at < db_now_plus(-grace_seconds)).limit(AT_ONCE)
+        ).all()
+    for chunk in chunks:
+        delete_chunk(store, chunk.object_key)
+    if chunks:
+        with catalog.write() as session:
+            session.execute(delete(Chunk).where(Chunk.id.in_([chunk.id for chunk in chunks])))
+
+
+def collect_ended_generations(catalog: Catalog, store: ObjectStore, grace_seconds: float) -> None:
+    """Generations that no longer answer: their rows and chunks. The generation's own row stays
+    as history until its map goes."""
+    with catalog.read() as session:
+        ended = session.scalars(
+            select(Chunk)
+            .join(Generation, Generation.id == Chunk.generation_id)
+            .where(
+                Generation.state.in_((GenerationState.RETIRED, GenerationState.ABANDONED)),
+                Generation.ended_at < db_now_plus(-grace_seconds),
+            )
+            .limit(AT_ONCE)
+        ).all()
+    for chunk in ended:
+        delete_chunk(store, chunk.object_key)
+    if ended:
+        chunk_ids = [chunk.id for chunk in ended]
+        with catalog.write() as session:
+            session.execute(delete(Descriptor).where(Descriptor.chunk_id.in_(chunk_ids)))
+            session.execute(delete(Chunk).where(Chunk.id.in_(chunk_ids)))
+
+
+def collect_deleted_photos(catalog: Catalog, store: ObjectStore, grace_seconds: float) -> None:
+    """The bytes of deleted photos at once; their rows after the grace, when every search worker
+    has seen the deletion and merging has dropped their descriptors."""
+    with catalog.read() as session:
+        photos = session.scalars(
+            select(Photo)
+            .where(Photo.deleted_at.is_not(None), Photo.object_key != "")
+            .limit(AT_ONCE)
+        ).all()
+    for photo in photos:
+        store.delete(photo.object_key)
+        store.delete(thumbnail_key(photo.id))
+    photo_ids = [photo.id for photo in photos]
+    with catalog.write() as session:
+        if photo_ids:
+            session.execute(update(Photo).where(Photo.id.in_(photo_ids)).values(object_key=""))
+        _forget_photos(session, grace_seconds)
+
+
+def _forget_photos(session: Session, grace_seconds: float) -> None:
+    gone = session.execute(
+        select(Photo.id, Photo.map_id)
+        .where(Photo.deleted_at < db_now_plus(-grace_seconds), Photo.object_key == "")
+        .limit(AT_ONCE)
+    ).all()
+    photo_ids = [photo_id for photo_id, _ in gone]
+    if not photo_ids:
+        return
+    for map_id in sorted({map_id for _, map_id in gone}):
+        lock_map(session, map_id)
+        bump_version(session, map_id)  # workers that are far behind load their chunks again
+    session.execute(delete(Descriptor).where(Descriptor.photo_id.in_(photo_ids)))
+    session.execute(delete(Job).where(Job.photo_id.in_(photo_ids)))
+    session.execute(delete(Photo).where(Photo.id.in_(photo_ids)))
+
+
+def collect_queries(catalog: Catalog, store: ObjectStore, ttl_seconds: float) -> None:
+    """Query photos that are not stored, with their descriptors and jobs, after QUERY_TTL."""
+    with catalog.read() as session:
+        job_ids = session.scalars(
+            select(Job.id)
+            .where(Job.kind == JobKind.DESCRIBE, Job.created_at < db_now_plus(-ttl_seconds))
+            .limit(AT_ONCE)
+        ).all()
+    for job_id in job_ids:
+        store.delete(query_key(job_id))
+        store.delete(query_vector_key(job_id))
+    if job_ids:
+        with catalog.write() as session:
+            session.execute(delete(Job).where(Job.id.in_(job_ids)))
+
+
+def collect_work(catalog: Catalog, store: ObjectStore) -> None:
+    """What model changes kept between their slices, once they have ended or need it no more."""
+    keys = [info.key for info in store.list(WORK)]
+    if not keys:
+        return
+    with catalog.read() as session:
+        needed = set(
+            session.scalars(
+                select(Job.id).where(
+                    Job.kind.in_(MODEL_CHANGES),
+                    Job.state.in_(UNFINISHED),
+                    Job.generation_id.is_(None),
+                )
+            )
+        )
+    for key in keys:
+        if UUID(key.split("/")[1]) not in needed:
+            store.delete(key)
+
+
+def collect_orphans(catalog: Catalog, store: ObjectStore, age_seconds: float) -> int:
+    """Objects older than `age_seconds` that no row knows: crashes between object and commit."""
+    with catalog.read() as session:
+        now = session.execute(select(db_now())).scalar_one()
+    before = now - timedelta(seconds=age_seconds)
+    removed = 0
+    for prefix, referenced in REFERENCED.items():
+        old = [info.key for info in store.list(prefix) if info.modified_at < before]
+        for begin in range(0, len(old), AT_ONCE):
+            keys = old[begin : begin + AT_ONCE]
+            with catalog.read() as session:
+                known = set(referenced(session, keys))
+            for key in keys:
+                if key not in known:
+                    store.delete(key)
+                    removed += 1
+    if removed:
+        log.info("%d orphaned objects removed", removed)
+    return removed
+
+
+def collect(catalog: Catalog, store: ObjectStore, settings: Settings) -> None:
+    """Everything above but the orphans, which need a walk over the whole store."""
+    collect_superseded_chunks(catalog, store, settings.superseded_grace_seconds)
+    collect_ended_generations(catalog, store, settings.retired_grace_seconds)
+    collect_deleted_photos(catalog, store, settings.retired_grace_seconds)
+    collect_queries(catalog, store, settings.query_ttl_seconds)
+    collect_work(catalog, store)
+
+
+def _known_originals(session: Session, keys: list[str]) -> Iterable[str]:
+    return session.scalars(select(Photo.object_key).where(Photo.object_key.in_(keys)))
+
+
+def _known_thumbnails(session: Session, keys: list[str]) -> Iterable[str]:
+    by_photo = {UUID(key.removeprefix(THUMBNAILS).removesuffix(".jpg")): key for key in keys}
+    live = session.scalars(
+        select(Photo.id).where(Photo.id.in_(by_photo), Photo.deleted_at.is_(None))
+    )
+    return [by_photo[photo_id] for photo_id in live]
+
+
+def _known_chunks(session: Session, keys: list[str]) -> Iterable[str]:
+    arrays = {key.removesuffix(".json").removesuffix(".npy") + ".npy" for key in keys}
+    known = session.scalars(select(Chunk.object_key).where(Chunk.object_key.in_(arrays)))
+    return [name for key in known for name in (key, key.removesuffix(".npy") + ".json")]
+
+
+def _known_vocabularies(session: Session, keys: list[str]) -> Iterable[str]:
+    stored = session.scalars(select(Vocabulary.object_key).where(Vocabulary.object_key.in_(keys)))
+    waiting = session.scalars(
+        select(Job.params).where(Job.kind == JobKind.IMPORT, Job.state.in_(UNFINISHED))
+    )
+    return [*stored, *(params["object_key"] for params in waiting)]
+
+
+def _known_queries(session: Session, keys: list[str]) -> Iterable[str]:
+    by_job = {key: UUID(key.removeprefix(QUERIES).removesuffix(".npy")) for key in keys}
+    known = set(session.scalars(select(Job.id).where(Job.id.in_(by_job.values()))))
+    return [key for key, job_id in by_job.items() if job_id in known]
+
+
+REFERENCED: dict[str, Callable[[Session, list[str]], Iterable[str]]] = {
+    ORIGINALS: _known_originals,
+    THUMBNAILS: _known_thumbnails,
+    "chunks/": _known_chunks,
+    VOCABULARIES: _known_vocabularies,
+    QUERIES: _known_queries,
+}

@@ -1,0 +1,154 @@
+"""Merging small chunks into one, inside their slot; rows of deleted photos are dropped."""
+
+from __future__ import annotations
+
+import logging
+from uuid import UUID
+
+import numpy as np
+from sqlalchemy import delete, func, select, update
+from sqlalchemy.orm import Session
+
+from shared.catalog.base import db_now
+from shared.catalog.chunks import Chunk, Descriptor, live_rows
+from shared.catalog.generations import Generation, GenerationState, lock_generation
+from shared.catalog.maps import bump_version, lock_map
+from shared.catalog.photos import Photo
+from shared.catalog.session import Catalog
+from shared.chunks import read_chunk, write_chunk
+from shared.errors import NotFound, Unavailable
+from shared.ids import new_id
+from shared.objects import ObjectStore
+
+log = logging.getLogger(__name__)
+
+DEAD_SHARE = 0.2  # of a chunk's rows: more, and rewriting it is worth the reading
+
+
+def compact(catalog: Catalog, store: ObjectStore, compact_chunks: int) -> int:
+    """Merge every slot that is worth it; returns how many were merged."""
+    merged = 0
+    for generation_id, slot in _worth_merging(catalog, compact_chunks):
+        try:
+            merged += merge_slot(catalog, store, generation_id, slot)
+        except (Unavailable, NotFound) as error:
+            log.error(
+                "slot %d of generation %s stays as it is: %s",
+                slot,
+                generation_id,
+                error,
+            )
+    return merged
+
+
+def merge_slot(catalog: Catalog, store: ObjectStore, generation_id: UUID, slot: int) -> bool:
+    """Write the slot's live rows into one new chunk; False when something changed meanwhile."""
+    with catalog.read() as session:
+        generation = session.get_one(Generation, generation_id)
+        old = _chunks(session, generation_id, slot)
+        kept = {chunk.id: live_rows(session, chunk.id) for chunk in old}
+    rows = [read_chunk(store, chunk.object_key, chunk.sha256) for chunk in old]
+    photo_ids = [photo_id for chunk in old for _, photo_id in kept[chunk.id]]
+    written, chunk_id = None, new_id()
+    if photo_ids:
+        matrix = np.concatenate(
+            [part[[row for row, _ in kept[c.id]]] for c, part in zip(old, rows, strict=True)]
+        )
+        written = write_chunk(
+            store,
+            generation_id=generation_id,
+            chunk_id=chunk_id,
+            rows=matrix,
+            photo_ids=photo_ids,
+            spec=generation.spec,
+        )
+    with catalog.write() as session:
+        lock_map(session, generation.map_id)
+        generation = lock_generation(session, generation_id)
+        now = {chunk.id for chunk in _chunks(session, generation_id, slot)}
+        if now != {chunk.id for chunk in old}:
+            return False  # another steward, or a new chunk in the slot: the new file is an orphan
+        old_ids = [chunk.id for chunk in old]
+        # Rows of photos deleted meanwhile are copied but lead nowhere: dead rows of the new chunk.
+        present = set(
+            session.scalars(select(Descriptor.photo_id).where(Descriptor.chunk_id.in_(old_ids)))
+        )
+        session.execute(delete(Descriptor).where(Descriptor.chunk_id.in_(old_ids)))
+        if written is not None:
+            session.add(
+                Chunk(
+                    id=chunk_id,
+                    generation_id=generation_id,
+                    slot=slot,
+                    object_key=written.object_key,
+                    rows=written.rows,
+                    size_bytes=written.size_bytes,
+                    sha256=written.sha256,
+                    sealed=slot < generation.open_slot,
+                )
+            )
+            session.flush()
+            session.add_all(
+                Descriptor(
+                    generation_id=generation_id,
+                    photo_id=photo_id,
+                    chunk_id=chunk_id,
+                    row=row,
+                )
+                for row, photo_id in enumerate(photo_ids)
+                if photo_id in present
+            )
+        session.execute(update(Chunk).where(Chunk.id.in_(old_ids)).values(superseded_at=db_now()))
+        bump_version(session, generation.map_id)
+    log.info("slot %d of %s: %d chunks are one", slot, generation_id, len(old))
+    return True
+
+
+def _chunks(session: Session, generation_id: UUID, slot: int) -> list[Chunk]:
+    return list(
+        session.scalars(
+            select(Chunk)
+            .where(
+                Chunk.generation_id == generation_id,
+                Chunk.slot == slot,
+                Chunk.superseded_at.is_(None),
+            )
+            .order_by(Chunk.id)
+        )
+    )
+
+
+def _worth_merging(catalog: Catalog, compact_chunks: int) -> list[tuple[UUID, int]]:
+    """Slots that are full but in pieces, open slots in many pieces, and slots with dead rows."""
+    live = (
+        select(func.count())
+        .select_from(Descriptor)
+        .join(Photo, Photo.id == Descriptor.photo_id)
+        .where(Descriptor.chunk_id == Chunk.id, Photo.deleted_at.is_(None))
+        .correlate(Chunk)
+        .scalar_subquery()
+    )
+    with catalog.read() as session:
+        slots = session.execute(
+            select(
+                Chunk.generation_id,
+                Chunk.slot,
+                Generation.open_slot,
+                func.count(),
+                func.sum(Chunk.rows),
+                func.sum(live),
+            )
+            .join(Generation, Generation.id == Chunk.generation_id)
+            .where(
+                Chunk.superseded_at.is_(None),
+                Generation.state.in_((GenerationState.ACTIVE, GenerationState.BUILDING)),
+            )
+            .group_by(Chunk.generation_id, Chunk.slot, Generation.open_slot)
+        ).all()
+    return [
+        (generation_id, slot)
+        for generation_id, slot, open_slot, chunks, rows, alive in slots
+        if (slot < open_slot and chunks > 1)
+        or chunks >= compact_chunks
+        or rows - alive > DEAD_SHARE * rows
+    ]

@@ -1,0 +1,78 @@
+"""The steward's one loop: which duty, how often."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from services.steward.collect import collect, collect_orphans
+from services.steward.compact import compact
+from services.steward.model_changes import advance_model_changes, fit_maps_that_wait
+from services.steward.queue import free_leases, resend_hints
+from shared.catalog.session import Catalog
+from shared.jobs import Hints
+from shared.objects import ObjectStore
+from shared.settings import Settings
+
+log = logging.getLogger(__name__)
+
+TICK_SECONDS = 0.25
+
+
+@dataclass(slots=True)
+class Duty:
+    name: str
+    every_seconds: float
+    do: Callable[[], object]
+    due: float = field(default=0.0)
+
+
+class Steward:
+    """Does each duty when it is due. A duty that fails is logged and tried again next time."""
+
+    def __init__(
+        self, catalog: Catalog, store: ObjectStore, hints: Hints, settings: Settings
+    ) -> None:
+        self.duties = [
+            Duty("free leases", 1.0, lambda: free_leases(catalog, settings.max_attempts)),
+            Duty("resend hints", 2.0, lambda: resend_hints(catalog, hints)),
+            Duty(
+                "advance model changes",
+                0.5,
+                lambda: advance_model_changes(catalog, hints),
+            ),
+            Duty(
+                "fit maps that wait",
+                2.0,
+                lambda: fit_maps_that_wait(catalog, hints, settings.auto_fit_photos),
+            ),
+            Duty("compact", 5.0, lambda: compact(catalog, store, settings.compact_chunks)),
+            Duty("collect", 10.0, lambda: collect(catalog, store, settings)),
+            Duty(
+                "collect orphans",
+                3600.0,
+                lambda: collect_orphans(catalog, store, settings.orphan_age_seconds),
+            ),
+        ]
+
+    def run(self, stop: threading.Event) -> None:
+        """Do what is due until `stop` is set."""
+        while not stop.is_set():
+            for duty in self.duties:
+                if time.monotonic() >= duty.due and not stop.is_set():
+                    self._do(duty)
+            stop.wait(TICK_SECONDS)
+
+    def _do(self, duty: Duty) -> None:
+        try:
+            duty.do()
+        except Exception:  # one duty's trouble must not end the others
+            log.exception(
+                "the steward could not %s; next try in %g s",
+                duty.name,
+                duty.every_seconds,
+            )
+        duty.due = time.monotonic() + duty.every_seconds

@@ -1,0 +1,30 @@
+"""The queue's duties: leases of dead workers come back, lost hints are sent again."""
+
+from __future__ import annotations
+
+import logging
+
+from sqlalchemy import exists, select
+
+from shared.catalog.session import Catalog
+from shared.jobs import Hints, free_expired_leases
+from shared.jobs.table import Job, claimable
+
+log = logging.getLogger(__name__)
+
+
+def free_leases(catalog: Catalog, max_attempts: int, *, everyone: bool = False) -> int:
+    """Give back what dead workers held; see `free_expired_leases`."""
+    with catalog.write() as session:
+        freed = free_expired_leases(session, max_attempts, everyone=everyone)
+    if freed:
+        log.warning("%d jobs were held by workers that died: given back", freed)
+    return freed
+
+
+def resend_hints(catalog: Catalog, hints: Hints) -> None:
+    """Wake a worker when there is work: the hint that was sent with it may be lost."""
+    with catalog.read() as session:
+        waiting = session.scalar(select(exists(select(Job.id).where(claimable()))))
+    if waiting:
+        hints.send()

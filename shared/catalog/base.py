@@ -1,0 +1,121 @@
+"""What every table of the catalog shares: the declarative base, UTC times, the database's clock.
+
+Leases and ages are decided by the database's clock alone, so that a worker whose clock is wrong
+can neither steal a lease nor keep one: `db_now()` and `db_now_plus(seconds)` are SQL, not Python.
+"""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from typing import Any
+
+from sqlalchemy import JSON, DateTime, Dialect, MetaData
+from sqlalchemy.dialects.postgresql import JSONB
+from sqlalchemy.ext.compiler import compiles
+from sqlalchemy.orm import DeclarativeBase
+from sqlalchemy.sql.elements import ColumnElement
+from sqlalchemy.sql.functions import FunctionElement
+from sqlalchemy.types import Boolean, TypeDecorator
+
+
+class UtcDateTime(TypeDecorator[datetime]):
+    """An aware UTC datetime in Python; `timestamptz` in PostgreSQL, sortable text in SQLite."""
+
+    impl = DateTime(timezone=True)
+    cache_ok = True
+
+    def process_bind_param(self, value: datetime | None, dialect: Dialect) -> datetime | None:
+        if value is None:
+            return None
+        if value.tzinfo is None:
+            raise ValueError(f"a time without an offset can't be stored: {value!r}")
+        value = value.astimezone(UTC)
+        return value.replace(tzinfo=None) if dialect.name == "sqlite" else value
+
+    def process_result_value(self, value: datetime | None, dialect: Dialect) -> datetime | None:
+        if value is None:
+            return None
+        return value.replace(tzinfo=UTC) if value.tzinfo is None else value.astimezone(UTC)
+
+
+JsonValue = JSON(none_as_null=True).with_variant(JSONB(none_as_null=True), "postgresql")
+
+
+class Base(DeclarativeBase):
+    """The tables' common ancestor. Constraint names are fixed so that migrations can name them."""
+
+    metadata = MetaData(
+        naming_convention={
+            "ix": "ix_%(table_name)s_%(column_0_N_name)s",
+            "uq": "uq_%(table_name)s_%(column_0_N_name)s",
+            "ck": "ck_%(table_name)s_%(constraint_name)s",
+            "fk": "fk_%(table_name)s_%(column_0_N_name)s",
+            "pk": "pk_%(table_name)s",
+        }
+    )
+
+
+class db_now(FunctionElement[datetime]):
+    """The database's clock, now (not the transaction's start)."""
+
+    type = UtcDateTime()
+    inherit_cache = True
+
+
+class db_now_plus(FunctionElement[datetime]):
+    """The database's clock plus a number of seconds (which may be negative)."""
+
+    type = UtcDateTime()
+    inherit_cache = True
+
+
+class json_array_has(FunctionElement[bool]):
+    """True where a JSON array column holds a string: `json_array_has(Photo.tags, "night")`."""
+
+    type = Boolean()
+    inherit_cache = True
+
+
+@compiles(db_now, "postgresql")
+def _now_postgresql(element: db_now, compiler: Any, **kw: Any) -> str:
+    return "clock_timestamp()"
+
+
+@compiles(db_now, "sqlite")
+def _now_sqlite(element: db_now, compiler: Any, **kw: Any) -> str:
+    # SQLite gives milliseconds; SQLAlchemy stores microseconds: pad, so that text sorts as time.
+    return "(strftime('%Y-%m-%d %H:%M:%f', 'now') || '000')"
+
+
+@compiles(db_now_plus, "postgresql")
+def _now_plus_postgresql(element: db_now_plus, compiler: Any, **kw: Any) -> str:
+    seconds = compiler.process(element.clauses, **kw)
+    return f"(clock_timestamp() + make_interval(secs => CAST({seconds} AS double precision)))"
+
+
+@compiles(db_now_plus, "sqlite")
+def _now_plus_sqlite(element: db_now_plus, compiler: Any, **kw: Any) -> str:
+    seconds = compiler.process(element.clauses, **kw)
+    return f"(strftime('%Y-%m-%d %H:%M:%f', 'now', ({seconds}) || ' seconds') || '000')"
+
+
+@compiles(json_array_has, "postgresql")
+def _json_array_has_postgresql(element: json_array_has, compiler: Any, **kw: Any) -> str:
+    array, value = element.clauses
+    array_sql, value_sql = compiler.process(array, **kw), compiler.process(value, **kw)
+    return f"({array_sql} @> jsonb_build_array(CAST({value_sql} AS text)))"
+
+
+@compiles(json_array_has, "sqlite")
+def _json_array_has_sqlite(element: json_array_has, compiler: Any, **kw: Any) -> str:
+    array, value = element.clauses
+    array_sql, value_sql = compiler.process(array, **kw), compiler.process(value, **kw)
+    return f"EXISTS (SELECT 1 FROM json_each({array_sql}) WHERE json_each.value = {value_sql})"  # noqa: S608  (compiled SQL, no text of users)
+
+
+def rowcount(result: Any) -> int:
+    """How many rows an UPDATE or DELETE touched."""
+    return int(result.rowcount)
+
+
+Condition = ColumnElement[bool]

@@ -1,0 +1,139 @@
+"""Chunks and descriptor rows: which photo's descriptor is which row of which file.
+
+A chunk object is never rewritten. Merging writes a new one in the same slot and supersedes the
+old; a row that no descriptor points at is dead and is dropped at the next merging.
+"""
+
+from __future__ import annotations
+
+from datetime import datetime
+from uuid import UUID
+
+from sqlalchemy import (
+    BigInteger,
+    Boolean,
+    ForeignKey,
+    Index,
+    Integer,
+    String,
+    Text,
+    Uuid,
+    func,
+    select,
+)
+from sqlalchemy.orm import Mapped, Session, mapped_column
+
+from shared.catalog.base import Base, UtcDateTime, db_now
+from shared.catalog.generations import Generation
+from shared.catalog.photos import Photo
+from shared.ids import new_id
+
+
+class Chunk(Base):
+    """One immutable `.npy` file of `rows` descriptors, float32, with its hash."""
+
+    __tablename__ = "chunks"
+
+    id: Mapped[UUID] = mapped_column(Uuid, primary_key=True, default=new_id)
+    generation_id: Mapped[UUID] = mapped_column(Uuid, ForeignKey("generations.id"))
+    slot: Mapped[int] = mapped_column(Integer)
+    object_key: Mapped[str] = mapped_column(Text, unique=True)
+    rows: Mapped[int] = mapped_column(Integer)
+    size_bytes: Mapped[int] = mapped_column(BigInteger)
+    sha256: Mapped[str] = mapped_column(String(64))
+    sealed: Mapped[bool] = mapped_column(Boolean, default=False)
+    created_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())
+    superseded_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
+
+    __table_args__ = (
+        Index(
+            "ix_chunks_live",
+            "generation_id",
+            "slot",
+            postgresql_where=superseded_at.is_(None),
+            sqlite_where=superseded_at.is_(None),
+        ),
+        Index(
+            "ix_chunks_superseded",
+            "superseded_at",
+            postgresql_where=superseded_at.is_not(None),
+            sqlite_where=superseded_at.is_not(None),
+        ),
+    )
+
+
+class Descriptor(Base):
+    """Where the one descriptor of a photo in a generation lies: chunk and row (from 0)."""
+
+    __tablename__ = "descriptors"
+
+    generation_id: Mapped[UUID] = mapped_column(
+        Uuid, ForeignKey("generations.id"), primary_key=True
+    )
+    photo_id: Mapped[UUID] = mapped_column(Uuid, ForeignKey("photos.id"), primary_key=True)
+    chunk_id: Mapped[UUID] = mapped_column(Uuid, ForeignKey("chunks.id"))
+    row: Mapped[int] = mapped_column(Integer)
+
+    __table_args__ = (
+        Index("uq_descriptors_chunk_row", "chunk_id", "row", unique=True),
+        Index("ix_descriptors_photo", "photo_id"),
+    )
+
+
+def descriptor_of(
+    session: Session, generation_id: UUID, photo_id: UUID
+) -> tuple[Descriptor, Chunk] | None:
+    """The photo's descriptor in the generation and the chunk that holds it."""
+    found = session.execute(
+        select(Descriptor, Chunk)
+        .join(Chunk, Chunk.id == Descriptor.chunk_id)
+        .where(Descriptor.generation_id == generation_id, Descriptor.photo_id == photo_id)
+    ).one_or_none()
+    return None if found is None else (found[0], found[1])
+
+
+def live_chunks(session: Session, generation_id: UUID) -> list[Chunk]:
+    """The chunks that make up the generation now, in slot order."""
+    return list(
+        session.scalars(
+            select(Chunk)
+            .where(Chunk.generation_id == generation_id, Chunk.superseded_at.is_(None))
+            .order_by(Chunk.slot, Chunk.id)
+        )
+    )
+
+
+def live_rows(session: Session, chunk_id: UUID) -> list[tuple[int, UUID]]:
+    """(row, photo) of the chunk's rows that belong to live photos, by row."""
+    found = session.execute(
+        select(Descriptor.row, Descriptor.photo_id)
+        .join(Photo, Photo.id == Descriptor.photo_id)
+        .where(Descriptor.chunk_id == chunk_id, Photo.deleted_at.is_(None))
+        .order_by(Descriptor.row)
+    )
+    return [(row, photo_id) for row, photo_id in found]
+
+
+def count_searchable(session: Session, generation_id: UUID) -> int:
+    """How many live photos have a descriptor in the generation."""
+    return (
+        session.scalar(
+            select(func.count())
+            .select_from(Descriptor)
+            .join(Photo, Photo.id == Descriptor.photo_id)
+            .where(Descriptor.generation_id == generation_id, Photo.deleted_at.is_(None))
+        )
+        or 0
+    )
+
+
+def take_slot(generation: Generation, rows: int, slot_rows: int) -> int:
+    """The slot that a new chunk of `rows` goes into, holding at most `slot_rows` in the end.
+
+    The caller holds the generation's lock.
+    """
+    if generation.open_slot_rows and generation.open_slot_rows + rows > slot_rows:
+        generation.open_slot += 1
+        generation.open_slot_rows = 0
+    generation.open_slot_rows += rows
+    return generation.open_slot

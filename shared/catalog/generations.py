@@ -1,0 +1,106 @@
+"""Generations: one complete set of descriptors of a map, made by one extractor spec.
+
+BUILDING --complete and switched--> ACTIVE --another is switched in--> RETIRED --grace--> (removed)
+   \\--its job is cancelled or fails--> ABANDONED --grace--> (removed)
+"""
+
+from __future__ import annotations
+
+from datetime import datetime
+from enum import StrEnum
+from typing import Any
+from uuid import UUID
+
+from sqlalchemy import ForeignKey, Index, Integer, String, Uuid, select
+from sqlalchemy.orm import Mapped, Session, mapped_column
+
+from shared.catalog.base import Base, JsonValue, UtcDateTime, db_now
+from shared.ids import new_id
+
+
+class GenerationState(StrEnum):
+    BUILDING = "building"  # photos are being described into it; not searched yet
+    ACTIVE = "active"  # the one that answers
+    RETIRED = "retired"  # answered until another was switched in; removed after a grace period
+    ABANDONED = "abandoned"  # never became complete; removed after a grace period
+
+
+class Generation(Base):
+    """`spec` is everything that decides a descriptor's value; rows of two specs never mix.
+
+    New chunks go into `open_slot`, which holds `open_slot_rows` rows so far.
+    """
+
+    __tablename__ = "generations"
+
+    id: Mapped[UUID] = mapped_column(Uuid, primary_key=True, default=new_id)
+    map_id: Mapped[UUID] = mapped_column(Uuid, ForeignKey("maps.id"), index=True)
+    state: Mapped[GenerationState] = mapped_column(String(20))
+    extractor: Mapped[str] = mapped_column(String(200))
+    spec: Mapped[dict[str, Any]] = mapped_column(JsonValue)
+    spec_fingerprint: Mapped[str] = mapped_column(String(64))
+    dimension: Mapped[int] = mapped_column(Integer)
+    model_id: Mapped[UUID] = mapped_column(Uuid, ForeignKey("models.id"), index=True)
+    vocabulary_id: Mapped[UUID | None] = mapped_column(
+        Uuid, ForeignKey("vocabularies.id"), index=True
+    )
+    open_slot: Mapped[int] = mapped_column(Integer, default=0)
+    open_slot_rows: Mapped[int] = mapped_column(Integer, default=0)
+    created_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())
+    activated_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
+    ended_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
+
+    __table_args__ = (
+        # One model change at a time: two would describe every photo three times over.
+        Index(
+            "uq_generations_one_building",
+            "map_id",
+            unique=True,
+            postgresql_where=state == GenerationState.BUILDING,
+            sqlite_where=state == GenerationState.BUILDING,
+        ),
+        Index(
+            "uq_generations_one_active",
+            "map_id",
+            unique=True,
+            postgresql_where=state == GenerationState.ACTIVE,
+            sqlite_where=state == GenerationState.ACTIVE,
+        ),
+    )
+
+
+def active_generation(session: Session, map_id: UUID) -> Generation | None:
+    """The generation that answers, if the map has one."""
+    return session.scalar(
+        select(Generation).where(
+            Generation.map_id == map_id, Generation.state == GenerationState.ACTIVE
+        )
+    )
+
+
+def building_generation(session: Session, map_id: UUID) -> Generation | None:
+    """The generation being made, if there is one."""
+    return session.scalar(
+        select(Generation).where(
+            Generation.map_id == map_id, Generation.state == GenerationState.BUILDING
+        )
+    )
+
+
+def lock_generation(session: Session, generation_id: UUID) -> Generation:
+    """The generation's row as it is now, locked until the transaction ends."""
+    return session.scalars(
+        select(Generation)
+        .where(Generation.id == generation_id)
+        .with_for_update()
+        .execution_options(populate_existing=True)
+    ).one()
+
+
+def list_generations(session: Session, map_id: UUID) -> list[Generation]:
+    """The map's generations, newest first."""
+    return list(
+        session.scalars(
+            select(Generation).where(Generation.map_id == map_id).order_by(Generation.id.desc())
+        )
+    )

@@ -1,0 +1,47 @@
+"""Models: the backbones that have described photos here, with their weights' fingerprint."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Any
+from uuid import UUID
+
+from sqlalchemy import String, Text, UniqueConstraint, Uuid, select
+from sqlalchemy.exc import IntegrityError
+from sqlalchemy.orm import Mapped, Session, mapped_column
+
+from shared.catalog.base import Base, JsonValue, UtcDateTime, db_now
+from shared.ids import new_id
+
+
+class Model(Base):
+    """One set of weights. `card` says where they come from and under which licence."""
+
+    __tablename__ = "models"
+
+    id: Mapped[UUID] = mapped_column(Uuid, primary_key=True, default=new_id)
+    name: Mapped[str] = mapped_column(String(200))
+    fingerprint: Mapped[str] = mapped_column(String(64))
+    licence: Mapped[str] = mapped_column(Text)
+    card: Mapped[dict[str, Any]] = mapped_column(JsonValue, default=dict)
+    first_used_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())
+
+    __table_args__ = (UniqueConstraint("name", "fingerprint"),)
+
+
+def ensure_model(
+    session: Session, name: str, fingerprint: str, licence: str, card: dict[str, Any]
+) -> Model:
+    """The row of these weights, made on first use."""
+    known = select(Model).where(Model.name == name, Model.fingerprint == fingerprint)
+    found = session.scalar(known)
+    if found is not None:
+        return found
+    try:
+        with session.begin_nested():
+            made = Model(name=name, fingerprint=fingerprint, licence=licence, card=card)
+            session.add(made)
+            session.flush()
+    except IntegrityError:  # another worker loaded the same weights
+        return session.scalars(known).one()
+    return made

@@ -1,0 +1,212 @@
+"""Photos: what was uploaded into a map, where it was taken, and where its bytes lie."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Any
+from uuid import UUID
+
+from sqlalchemy import (
+    BigInteger,
+    CheckConstraint,
+    Float,
+    ForeignKey,
+    Index,
+    Integer,
+    String,
+    Text,
+    Uuid,
+    func,
+    literal,
+    select,
+    tuple_,
+    update,
+)
+from sqlalchemy.orm import Mapped, Session, mapped_column
+
+from shared.catalog.base import (
+    Base,
+    Condition,
+    JsonValue,
+    UtcDateTime,
+    db_now,
+    json_array_has,
+)
+from shared.errors import NotFound
+from shared.ids import new_id
+
+
+class Photo(Base):
+    """One live or deleted photo. `sha256` is unique among a map's live photos.
+
+    `job_id` is the job that describes the photo; whether it is searchable is told by its row in
+    `descriptors`. `changed_version` is the map's version at the last change that search must see.
+    """
+
+    __tablename__ = "photos"
+
+    id: Mapped[UUID] = mapped_column(Uuid, primary_key=True, default=new_id)
+    map_id: Mapped[UUID] = mapped_column(Uuid, ForeignKey("maps.id"))
+    job_id: Mapped[UUID | None] = mapped_column(Uuid)
+    sha256: Mapped[str] = mapped_column(String(64))
+    object_key: Mapped[str] = mapped_column(Text)
+    filename: Mapped[str] = mapped_column(Text)
+    media_type: Mapped[str] = mapped_column(String(50))
+    size_bytes: Mapped[int] = mapped_column(BigInteger)
+    width: Mapped[int] = mapped_column(Integer)
+    height: Mapped[int] = mapped_column(Integer)
+    latitude: Mapped[float | None] = mapped_column(Float)
+    longitude: Mapped[float | None] = mapped_column(Float)
+    heading: Mapped[float | None] = mapped_column(Float)
+    captured_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
+    place: Mapped[str | None] = mapped_column(Text)
+    tags: Mapped[list[str]] = mapped_column(JsonValue, default=list)
+    attributes: Mapped[dict[str, Any]] = mapped_column("metadata", JsonValue, default=dict)
+    uploaded_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())
+    deleted_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
+    changed_version: Mapped[int] = mapped_column(BigInteger, default=0)
+
+    __table_args__ = (
+        CheckConstraint(
+            "(latitude IS NULL) = (longitude IS NULL)", name="coordinates_come_in_pairs"
+        ),
+        Index(
+            "uq_photos_live_sha256",
+            "map_id",
+            "sha256",
+            unique=True,
+            postgresql_where=deleted_at.is_(None),
+            sqlite_where=deleted_at.is_(None),
+        ),
+        Index("ix_photos_map_uploaded", "map_id", "uploaded_at", "id"),
+        Index("ix_photos_map_changed", "map_id", "changed_version"),
+        Index(
+            "ix_photos_deleted",
+            "deleted_at",
+            postgresql_where=deleted_at.is_not(None),
+            sqlite_where=deleted_at.is_not(None),
+        ),
+    )
+
+
+def get_photo(session: Session, map_id: UUID, photo_id: UUID) -> Photo:
+    """A live photo of the map; 404 when there is none."""
+    photo = session.scalar(
+        select(Photo).where(
+            Photo.id == photo_id, Photo.map_id == map_id, Photo.deleted_at.is_(None)
+        )
+    )
+    if photo is None:
+        raise NotFound(
+            "photo_not_found",
+            f"There is no photo {photo_id} in this map.",
+            file_id=str(photo_id),
+        )
+    return photo
+
+
+def find_live_by_sha256(session: Session, map_id: UUID, sha256: str) -> Photo | None:
+    """The live photo with these bytes, if the map has it."""
+    return session.scalar(
+        select(Photo).where(
+            Photo.map_id == map_id, Photo.sha256 == sha256, Photo.deleted_at.is_(None)
+        )
+    )
+
+
+def live_photos(session: Session, photo_ids: Iterable[UUID]) -> dict[UUID, Photo]:
+    """Those of the photos that are live, by id."""
+    found = session.scalars(
+        select(Photo).where(Photo.id.in_(list(photo_ids)), Photo.deleted_at.is_(None))
+    )
+    return {photo.id: photo for photo in found}
+
+
+def deleted_since(session: Session, map_id: UUID, version: int) -> list[UUID]:
+    """Photos of the map that were deleted after `version`."""
+    return list(
+        session.scalars(
+            select(Photo.id).where(
+                Photo.map_id == map_id,
+                Photo.changed_version > version,
+                Photo.deleted_at.is_not(None),
+            )
+        )
+    )
+
+
+def count_live(session: Session, map_id: UUID) -> int:
+    """How many live photos the map has."""
+    return (
+        session.scalar(
+            select(func.count())
+            .select_from(Photo)
+            .where(Photo.map_id == map_id, Photo.deleted_at.is_(None))
+        )
+        or 0
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class MetadataFilter:
+    """Conditions of a metadata search; None means "any". Bounds are inclusive."""
+
+    filename: str | None = None
+    """Part of the file name, case ignored; `%` and `_` are ordinary characters."""
+    upload_after: datetime | None = None
+    upload_before: datetime | None = None
+    min_file_size: int | None = None
+    max_file_size: int | None = None
+    tags: tuple[str, ...] = ()
+    """A photo must carry all of them."""
+
+    def conditions(self) -> list[Condition]:
+        found: list[Condition] = []
+        if self.filename is not None:
+            found.append(Photo.filename.icontains(self.filename, autoescape=True))
+        if self.upload_after is not None:
+            found.append(Photo.uploaded_at >= self.upload_after)
+        if self.upload_before is not None:
+            found.append(Photo.uploaded_at <= self.upload_before)
+        if self.min_file_size is not None:
+            found.append(Photo.size_bytes >= self.min_file_size)
+        if self.max_file_size is not None:
+            found.append(Photo.size_bytes <= self.max_file_size)
+        found.extend(json_array_has(Photo.tags, tag) for tag in self.tags)
+        return found
+
+
+def search_metadata(
+    session: Session,
+    map_id: UUID,
+    wanted: MetadataFilter,
+    limit: int,
+    after: tuple[datetime, UUID] | None,
+) -> tuple[list[Photo], int]:
+    """Newest first: up to `limit` live photos after the cursor, and how many match in all."""
+    conditions = [
+        Photo.map_id == map_id,
+        Photo.deleted_at.is_(None),
+        *wanted.conditions(),
+    ]
+    total = session.scalar(select(func.count()).select_from(Photo).where(*conditions)) or 0
+    page = select(Photo).where(*conditions)
+    if after is not None:
+        page = page.where(tuple_(Photo.uploaded_at, Photo.id) < tuple_(*_bound(after)))
+    page = page.order_by(Photo.uploaded_at.desc(), Photo.id.desc()).limit(limit)
+    return list(session.scalars(page)), total
+
+
+def _bound(after: tuple[datetime, UUID]) -> tuple[Any, Any]:
+    return literal(after[0], UtcDateTime()), literal(after[1], Uuid())
+
+
+def mark_deleted(session: Session, photo: Photo, version: int) -> None:
+    """The photo is gone from every answer from this commit on; its bytes go later."""
+    session.execute(
+        update(Photo)
+        .where(Photo.id == photo.id)
+        .values(deleted_at=db_now(), changed_version=version)
+    )

@@ -1,0 +1,30 @@
+"""Searches: what was asked, for the history and the figures."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from uuid import UUID
+
+from sqlalchemy import Float, ForeignKey, Index, Integer, Text, Uuid
+from sqlalchemy.orm import Mapped, mapped_column
+
+from shared.catalog.base import Base, UtcDateTime, db_now
+from shared.ids import new_id
+
+
+class Search(Base):
+    """One answered similarity search."""
+
+    __tablename__ = "searches"
+
+    id: Mapped[UUID] = mapped_column(Uuid, primary_key=True, default=new_id)
+    map_id: Mapped[UUID] = mapped_column(Uuid, ForeignKey("maps.id"))
+    generation_id: Mapped[UUID] = mapped_column(Uuid)
+    query_photo_id: Mapped[UUID | None] = mapped_column(Uuid)
+    query_filename: Mapped[str] = mapped_column(Text)
+    top_k: Mapped[int] = mapped_column(Integer)
+    results: Mapped[int] = mapped_column(Integer)
+    processing_ms: Mapped[float] = mapped_column(Float)
+    searched_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())
+
+    __table_args__ = (Index("ix_searches_map_time", "map_id", "searched_at"),)

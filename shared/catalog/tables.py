@@ -1,0 +1,22 @@
+"""Every table, imported: what Alembic compares the database with."""
+
+from shared.catalog.chunks import Chunk, Descriptor
+from shared.catalog.generations import Generation
+from shared.catalog.maps import Map
+from shared.catalog.models import Model
+from shared.catalog.photos import Photo
+from shared.catalog.searches import Search
+from shared.catalog.vocabularies import Vocabulary
+from shared.jobs.table import Job
+
+__all__ = [
+    "Chunk",
+    "Descriptor",
+    "Generation",
+    "Job",
+    "Map",
+    "Model",
+    "Photo",
+    "Search",
+    "Vocabulary",
+]

@@ -1,0 +1,65 @@
+"""Vocabularies: VLAD's cluster centres, where they were learnt, and where they lie."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from enum import StrEnum
+from typing import Any
+from uuid import UUID
+
+from sqlalchemy import ForeignKey, Integer, String, Text, Uuid, select
+from sqlalchemy.orm import Mapped, Session, mapped_column
+
+from shared.catalog.base import Base, JsonValue, UtcDateTime, db_now
+from shared.errors import NotFound
+from shared.ids import new_id
+
+
+class VocabularyOrigin(StrEnum):
+    SHIPPED = "shipped"  # came with the extractor: learnt on photographs of elsewhere
+    FITTED = "fitted"  # learnt on the map's own photos
+    IMPORTED = "imported"  # brought by the user
+
+
+class Vocabulary(Base):
+    """(clusters, dimension) float32 centres under `object_key`, as a `.npy` file."""
+
+    __tablename__ = "vocabularies"
+
+    id: Mapped[UUID] = mapped_column(Uuid, primary_key=True, default=new_id)
+    map_id: Mapped[UUID] = mapped_column(Uuid, ForeignKey("maps.id"), index=True)
+    origin: Mapped[VocabularyOrigin] = mapped_column(String(20))
+    clusters: Mapped[int] = mapped_column(Integer)
+    dimension: Mapped[int] = mapped_column(Integer)
+    object_key: Mapped[str] = mapped_column(Text)
+    sha256: Mapped[str] = mapped_column(String(64))
+    provenance: Mapped[dict[str, Any]] = mapped_column(JsonValue, default=dict)
+    created_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())
+
+    @property
+    def standing(self) -> str:
+        """What an answer says of it: `own` when learnt on this map's photos, else `foreign`."""
+        return "own" if self.origin == VocabularyOrigin.FITTED else "foreign"
+
+
+def get_vocabulary(session: Session, map_id: UUID, vocabulary_id: UUID) -> Vocabulary:
+    """A vocabulary of the map; 404 when there is none."""
+    found = session.scalar(
+        select(Vocabulary).where(Vocabulary.id == vocabulary_id, Vocabulary.map_id == map_id)
+    )
+    if found is None:
+        raise NotFound(
+            "vocabulary_not_found",
+            f"There is no vocabulary {vocabulary_id} in this map.",
+            vocabulary_id=str(vocabulary_id),
+        )
+    return found
+
+
+def list_vocabularies(session: Session, map_id: UUID) -> list[Vocabulary]:
+    """The map's vocabularies, newest first."""
+    return list(
+        session.scalars(
+            select(Vocabulary).where(Vocabulary.map_id == map_id).order_by(Vocabulary.id.desc())
+        )
+    )

@@ -1,0 +1,118 @@
+"""The chunk format: descriptor rows as an immutable `.npy` file with a `.json` beside it.
+
+`<chunk>.npy` is a C-contiguous (rows, dimension) array, float32, each row L2-normalised.
+`<chunk>.json` says what the rows are (spec, photo ids in row order, hash), so that a lost catalog
+can be rebuilt from the object store.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+from dataclasses import dataclass
+from typing import Any
+from uuid import UUID
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared.errors import Unavailable
+from shared.objects import ObjectStore
+
+Rows = NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True)
+class WrittenChunk:
+    """What the catalog has to know of a chunk that lies in the object store."""
+
+    object_key: str
+    rows: int
+    size_bytes: int
+    sha256: str
+
+
+def chunk_key(generation_id: UUID, chunk_id: UUID) -> str:
+    return f"chunks/{generation_id}/{chunk_id}.npy"
+
+
+def manifest_key(object_key: str) -> str:
+    """The key of the `.json` beside a chunk."""
+    return object_key.removesuffix(".npy") + ".json"
+
+
+def encode_rows(rows: Rows) -> bytes:
+    """(n, dimension) float32 rows as the bytes of a `.npy` file."""
+    if rows.dtype != np.float32 or rows.ndim != 2:
+        raise ValueError(f"a chunk is 2-D float32, not {rows.ndim}-D {rows.dtype}")
+    buffer = io.BytesIO()
+    np.save(buffer, np.ascontiguousarray(rows), allow_pickle=False)
+    return buffer.getvalue()
+
+
+def decode_rows(data: bytes) -> Rows:
+    """The rows of a `.npy` file, read-only, sharing memory with `data`."""
+    buffer = io.BytesIO(data)
+    major, _ = np.lib.format.read_magic(buffer)
+    read_header = {
+        1: np.lib.format.read_array_header_1_0,
+        2: np.lib.format.read_array_header_2_0,
+    }[major]
+    shape, fortran_order, dtype = read_header(buffer)
+    if dtype != np.float32 or fortran_order or len(shape) != 2:
+        raise ValueError(f"not a chunk: {dtype}, shape {shape}, fortran_order={fortran_order}")
+    rows = np.frombuffer(data, dtype=np.float32, offset=buffer.tell())
+    return rows.reshape(shape)
+
+
+def write_chunk(
+    store: ObjectStore,
+    *,
+    generation_id: UUID,
+    chunk_id: UUID,
+    rows: Rows,
+    photo_ids: list[UUID],
+    spec: dict[str, Any],
+) -> WrittenChunk:
+    """Put the chunk and its manifest into the store; the catalog does not know of them yet.
+
+    The manifest goes first: a chunk object never lies there without its description.
+    """
+    if len(photo_ids) != len(rows):
+        raise ValueError(f"{len(rows)} rows for {len(photo_ids)} photos")
+    data = encode_rows(rows)
+    sha256 = hashlib.sha256(data).hexdigest()
+    key = chunk_key(generation_id, chunk_id)
+    manifest = {
+        "format": 1,
+        "chunk_id": str(chunk_id),
+        "generation_id": str(generation_id),
+        "spec": spec,
+        "rows": len(rows),
+        "dimension": rows.shape[1],
+        "sha256": sha256,
+        "photo_ids": [str(photo_id) for photo_id in photo_ids],
+    }
+    store.put(manifest_key(key), json.dumps(manifest).encode())
+    store.put(key, data)
+    return WrittenChunk(object_key=key, rows=len(rows), size_bytes=len(data), sha256=sha256)
+
+
+def read_chunk(store: ObjectStore, object_key: str, sha256: str) -> Rows:
+    """The chunk's rows, checked against the catalog's hash; Unavailable when they differ."""
+    data = store.get(object_key)
+    if hashlib.sha256(data).hexdigest() != sha256:
+        raise Unavailable(
+            "chunk_corrupt",
+            f"The chunk {object_key} is not what was written (its hash differs). "
+            "Restore the object from a backup, or describe its photos again.",
+            object_key=object_key,
+        )
+    return decode_rows(data)
+
+
+def delete_chunk(store: ObjectStore, object_key: str) -> None:
+    """Remove the chunk and its manifest."""
+    store.delete(object_key)
+    store.delete(manifest_key(object_key))

@@ -1,0 +1,210 @@
+"""A client of the HTTP API.
+
+    with Client("http://127.0.0.1:8000") as places:
+        uploaded = places.upload(Path("street.jpg"), latitude=45.07, longitude=7.69)
+        places.wait_for(uploaded["job_id"])
+        answer = places.similar_to_file(Path("where.jpg"), top_k=5)
+
+Answers are the API's JSON. Whatever it refuses is raised as the error that the server raised, with
+its status and `code`; a server that can't be reached is Unavailable (`server_unreachable`).
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+from uuid import UUID
+
+import httpx2
+
+from shared.errors import (
+    Conflict,
+    Gone,
+    InvalidRequest,
+    NotFound,
+    PlacewiseError,
+    TooLarge,
+    Unavailable,
+    Unprocessable,
+    UnsupportedMedia,
+)
+
+API = "/api/v1"
+FINISHED = ("succeeded", "failed", "cancelled")
+POLL_SECONDS = 20.0  # one long poll
+TIMEOUT_SECONDS = 90.0  # of one call: longer than the longest wait that a server grants
+
+_BY_STATUS: dict[int, type[PlacewiseError]] = {
+    kind.status: kind
+    for kind in (
+        InvalidRequest,
+        NotFound,
+        Conflict,
+        Gone,
+        TooLarge,
+        UnsupportedMedia,
+        Unprocessable,
+        Unavailable,
+    )
+}
+
+Json = dict[str, Any]
+
+
+class Client:
+    """One server and one map. Thread-safe; close it, or use it as a context manager."""
+
+    def __init__(self, url: str, map_name: str | None = None) -> None:
+        self.url = url.rstrip("/")
+        self._http = httpx2.Client(
+            base_url=self.url,
+            timeout=TIMEOUT_SECONDS,
+            params={"map": map_name} if map_name else None,
+        )
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        self._http.close()
+
+    def upload(self, photo: Path, **fields: Any) -> Json:
+        """Store a photo; `fields` are the form's (`latitude`, `longitude`, `place`, ...)."""
+        said = {name: str(value) for name, value in fields.items() if value is not None}
+        return self._send_file("/upload", photo, data=said)
+
+    def similar_to_file(
+        self,
+        photo: Path,
+        top_k: int = 10,
+        min_score: float | None = None,
+        wait_seconds: int = 60,
+    ) -> Json:
+        """The photos most similar to one that is not stored."""
+        params = _given(top_k=top_k, min_score=min_score)
+        answer = self._send_file(
+            "/similarity",
+            photo,
+            params=params,
+            headers={"Prefer": f"wait={wait_seconds}"},
+        )
+        if "result_url" not in answer:
+            return answer
+        self.wait_for(answer["job_id"])
+        return self._call("GET", answer["result_url"].removeprefix(API))
+
+    def similar_to(
+        self, file_id: UUID | str, top_k: int = 10, min_score: float | None = None
+    ) -> Json:
+        """The photos most similar to a stored one."""
+        params = _given(top_k=top_k, min_score=min_score)
+        return self._call("POST", f"/similarity/{file_id}", params=params)
+
+    def job(self, job_id: UUID | str, wait_seconds: float = 0) -> Json:
+        return self._call("GET", f"/jobs/{job_id}", params={"wait": wait_seconds})
+
+    def wait_for(
+        self,
+        job_id: UUID | str,
+        on_progress: Callable[[Json], object] = lambda job: None,
+        poll_seconds: float = POLL_SECONDS,
+    ) -> Json:
+        """The job once it has ended; `on_progress` sees it after every poll."""
+        while True:
+            job = self.job(job_id, wait_seconds=poll_seconds)
+            on_progress(job)
+            if job["state"] in FINISHED:
+                return job
+
+    def photo(self, file_id: UUID | str) -> Json:
+        return self._call("GET", f"/uploads/{file_id}")
+
+    def patch_photo(self, file_id: UUID | str, **fields: Any) -> Json:
+        return self._call("PATCH", f"/uploads/{file_id}", json=fields)
+
+    def delete_photo(self, file_id: UUID | str) -> Json:
+        return self._call("DELETE", f"/uploads/{file_id}")
+
+    def search(self, **filters: Any) -> Json:
+        """Photos by what is known of them; see `GET /search`."""
+        return self._call("GET", "/search", params=_given(**filters))
+
+    def fit_vocabulary(self, **wanted: int) -> Json:
+        """Start fitting; `clusters`, `sample` and `seed` may be given."""
+        return self._call("POST", "/vocabularies", json=wanted)
+
+    def import_vocabulary(self, file: Path) -> Json:
+        """Start switching to the vocabulary in a `.npy` file."""
+        return self._send_file("/vocabularies/import", file)
+
+    def vocabularies(self) -> list[Json]:
+        found: Any = self._call("GET", "/vocabularies")
+        return list(found)
+
+    def generations(self) -> list[Json]:
+        found: Any = self._call("GET", "/generations")
+        return list(found)
+
+    def stats(self) -> Json:
+        return self._call("GET", "/database/stats")
+
+    def _send_file(self, path: str, file: Path, **options: Any) -> Json:
+        try:
+            with file.open("rb") as opened:
+                return self._call("POST", path, files={"file": (file.name, opened)}, **options)
+        except OSError as error:
+            raise InvalidRequest(
+                "unreadable_file", f"Can't read {file}: {error.strerror}"
+            ) from error
+
+    def _call(self, method: str, path: str, **options: Any) -> Json:
+        try:
+            answer = self._http.request(method, f"{API}{path}", **options)
+        except httpx2.TransportError as error:
+            raise Unavailable(
+                "server_unreachable",
+                f"No Placewise answers at {self.url} ({type(error).__name__}). Is it running?",
+            ) from error
+        if answer.is_success:
+            body: Json = answer.json()
+            return body
+        raise _refusal(answer)
+
+
+def retry_while_away(call: Callable[[], Json], seconds: float) -> Json:
+    """`call`, tried again while the server is away or busy, for up to `seconds`."""
+    deadline = time.monotonic() + seconds
+    while True:
+        try:
+            return call()
+        except Unavailable:
+            if time.monotonic() > deadline:
+                raise
+            time.sleep(0.5)
+
+
+def _given(**params: Any) -> Json:
+    return {name: value for name, value in params.items() if value is not None}
+
+
+def _refusal(answer: httpx2.Response) -> PlacewiseError:
+    """The server's problem document as the error that it was."""
+    try:
+        problem: Json = answer.json()
+        code, detail = problem.pop("code"), problem.pop("detail")
+    except (ValueError, KeyError, TypeError):
+        return PlacewiseError("bad_answer", f"HTTP {answer.status_code}: {answer.text[:200]}")
+    for member in ("type", "title", "status", "instance"):
+        problem.pop(member, None)
+    return _BY_STATUS.get(answer.status_code, PlacewiseError)(code, detail, **problem)

@@ -1,0 +1,113 @@
+"""Every error that a caller can meet, with its HTTP status and its stable code.
+
+PlacewiseError
+├── InvalidRequest 400          no_file, empty_file, malformed_body
+├── NotFound 404                photo_not_found, job_not_found, map_not_found, ...
+├── Conflict 409                not_searchable, coordinates_differ, model_change_running, ...
+├── Gone 410                    query_expired
+├── TooLarge 413                file_too_large
+├── UnsupportedMedia 415        unsupported_photo, unsupported_body
+├── Unprocessable 422           invalid_field, undecodable_photo, too_many_pixels, ...
+├── Unavailable 503             search_behind, chunk_unreadable, ... (may be tried again)
+└── Misconfigured 500           weights_missing, home_in_use, ... (an operator must act)
+
+`shared.errors` knows nothing of HTTP libraries: the gateway turns these into RFC 9457 problems,
+the extractor stores them in `jobs.error`, the command line prints `detail`.
+"""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+
+class PlacewiseError(Exception):
+    """Something that can be explained to whoever asked.
+
+    `detail` says what is wrong with which thing and what to do next. `extra` holds members that a
+    program can read (they become extension members of the problem document).
+    """
+
+    status: ClassVar[int] = 500
+    title: ClassVar[str] = "Placewise could not do this"
+
+    def __init__(self, code: str, detail: str, **extra: Any) -> None:
+        super().__init__(detail)
+        self.code = code
+        self.detail = detail
+        self.extra = extra
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Keyword arguments don't survive the default pickling, and errors cross processes.
+        return _rebuild, (type(self), self.code, self.detail, self.extra)
+
+    def as_problem(self) -> dict[str, Any]:
+        """The RFC 9457 members, without `instance`."""
+        return {
+            "type": f"urn:placewise:problem:{self.code}",
+            "title": self.title,
+            "status": self.status,
+            "detail": self.detail,
+            "code": self.code,
+            **self.extra,
+        }
+
+
+def _rebuild(
+    kind: type[PlacewiseError], code: str, detail: str, extra: dict[str, Any]
+) -> PlacewiseError:
+    return kind(code, detail, **extra)
+
+
+class InvalidRequest(PlacewiseError):
+    status = 400
+    title = "The request can't be read"
+
+
+class NotFound(PlacewiseError):
+    status = 404
+    title = "Not found"
+
+
+class Conflict(PlacewiseError):
+    status = 409
+    title = "Not possible in the present state"
+
+
+class Gone(PlacewiseError):
+    status = 410
+    title = "No longer kept"
+
+
+class TooLarge(PlacewiseError):
+    status = 413
+    title = "Too large"
+
+
+class UnsupportedMedia(PlacewiseError):
+    status = 415
+    title = "Not a supported format"
+
+
+class Unprocessable(PlacewiseError):
+    status = 422
+    title = "The content can't be used"
+
+
+class Unavailable(PlacewiseError):
+    """The same call may work a little later: the gateway adds `Retry-After`."""
+
+    status = 503
+    title = "Not available right now"
+
+
+class Misconfigured(PlacewiseError):
+    title = "The installation needs attention"
+
+
+def invalid_field(field: str, detail: str) -> Unprocessable:
+    """The 422 for one value that is out of range or can't be read; it names the field."""
+    return Unprocessable(
+        "invalid_field",
+        f"{field}: {detail}",
+        errors=[{"field": field, "detail": detail}],
+    )

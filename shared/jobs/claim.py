@@ -1,0 +1,68 @@
+"""Taking work: a batch of jobs that one forward pass can serve."""
+
+from __future__ import annotations
+
+from sqlalchemy import func, select, update
+from sqlalchemy.orm import Session
+
+from shared.catalog.base import db_now, db_now_plus
+from shared.ids import new_id
+from shared.jobs.table import MODEL_CHANGES, Job, JobState, claimable
+
+
+def claim(
+    session: Session,
+    *,
+    worker: str,
+    limit: int,
+    lease_seconds: float,
+    least_priority: int | None = None,
+) -> list[Job]:
+    """Up to `limit` claimable jobs of one kind, map and generation, leased under one fresh token.
+
+    The first by (priority, age) decides which; jobs that other workers hold are passed over
+    (`FOR UPDATE SKIP LOCKED`; SQLite has one writer). A job marked `alone` and a model change come
+    as a batch of one. With `least_priority`, jobs below it are left alone.
+    """
+    order = (Job.priority.desc(), Job.id)
+    wanted = [claimable()]
+    if least_priority is not None:
+        wanted.append(Job.priority >= least_priority)
+    head = session.scalar(
+        select(Job).where(*wanted).order_by(*order).limit(1).with_for_update(skip_locked=True)
+    )
+    if head is None:
+        return []
+    batch = [head]
+    if not head.alone and head.kind not in MODEL_CHANGES and limit > 1:
+        batch += session.scalars(
+            select(Job)
+            .where(
+                *wanted,
+                Job.id != head.id,
+                Job.alone.is_(False),
+                Job.kind == head.kind,
+                Job.map_id == head.map_id,
+                Job.generation_id.is_not_distinct_from(head.generation_id),
+            )
+            .order_by(*order)
+            .limit(limit - 1)
+            .with_for_update(skip_locked=True)
+        )
+    session.execute(
+        update(Job)
+        .where(Job.id.in_([job.id for job in batch]))
+        .values(
+            state=JobState.RUNNING,
+            worker=worker,
+            claimed_together=len(batch),
+            lease_token=new_id(),
+            lease_until=db_now_plus(lease_seconds),
+            run_after=None,
+            started_at=func.coalesce(Job.started_at, db_now()),
+        )
+        .execution_options(synchronize_session=False)
+    )
+    for job in batch:
+        session.refresh(job)
+    return batch

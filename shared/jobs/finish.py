@@ -1,0 +1,123 @@
+"""Ending a job, or giving it back. Callers hold the job's row and have checked its token."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from sqlalchemy import update
+from sqlalchemy.orm import Session
+
+from shared.catalog.base import Condition, db_now, db_now_plus
+from shared.catalog.photos import Photo
+from shared.errors import Conflict
+from shared.jobs.table import (
+    MODEL_CHANGES,
+    UNFINISHED,
+    Job,
+    JobKind,
+    JobState,
+    WaitingFor,
+)
+
+
+def _drop_lease(job: Job) -> None:
+    job.lease_token = None
+    job.lease_until = None
+
+
+def succeed(job: Job, result: dict[str, Any] | None = None) -> None:
+    """The job has done what it promised."""
+    job.state = JobState.SUCCEEDED
+    job.result = result
+    job.error = None
+    job.waiting_for = None
+    job.progress_done = job.progress_total - job.progress_failed
+    job.finished_at = db_now()
+    _drop_lease(job)
+
+
+def fail(job: Job, problem: dict[str, Any]) -> None:
+    """The job ends with a stored reason: an RFC 9457 problem."""
+    job.state = JobState.FAILED
+    job.error = problem
+    job.waiting_for = None
+    if job.progress_total == 1:
+        job.progress_failed = 1
+    job.finished_at = db_now()
+    _drop_lease(job)
+
+
+def release(job: Job, *, after_seconds: float = 0.0, waiting_for: WaitingFor | None = None) -> None:
+    """Give the job back without counting an attempt: to go on later, or once something is there.
+
+    A model change stays `running` between its slices; everything else is `queued` again.
+    """
+    job.state = JobState.RUNNING if job.kind in MODEL_CHANGES else JobState.QUEUED
+    job.waiting_for = waiting_for
+    job.run_after = db_now_plus(after_seconds) if after_seconds else None
+    _drop_lease(job)
+
+
+def release_waiting(session: Session, condition: Condition) -> None:
+    """What the jobs waited for is there: they may be claimed."""
+    session.execute(
+        update(Job)
+        .where(Job.waiting_for.is_not(None), condition)
+        .values(waiting_for=None)
+        .execution_options(synchronize_session=False)
+    )
+
+
+def cancel(job: Job) -> None:
+    """End the job at once; a worker that has it computes in vain, its token is gone."""
+    if job.state not in UNFINISHED:
+        raise Conflict(
+            "job_finished",
+            f"The job {job.id} is {job.state} and can't be cancelled.",
+            job_id=str(job.id),
+            state=job.state,
+        )
+    job.state = JobState.CANCELLED
+    job.waiting_for = None
+    job.finished_at = db_now()
+    _drop_lease(job)
+
+
+def retry(session: Session, job: Job) -> None:
+    """Queue a failed or cancelled job again, with all its attempts."""
+    if job.state not in (JobState.FAILED, JobState.CANCELLED):
+        raise Conflict(
+            "job_not_retryable",
+            f"The job {job.id} is {job.state}; only failed and cancelled jobs can be retried.",
+            job_id=str(job.id),
+            state=job.state,
+        )
+    if job.kind in MODEL_CHANGES or job.kind == JobKind.REINDEX:
+        raise Conflict(
+            "job_not_retryable",
+            "A model change is started anew, not retried: POST /api/v1/vocabularies or "
+            "/api/v1/generations.",
+            job_id=str(job.id),
+        )
+    if job.photo_id is not None:
+        photo = session.get_one(Photo, job.photo_id)
+        if photo.deleted_at is not None:
+            raise Conflict("photo_deleted", "The job's photo was deleted.", job_id=str(job.id))
+        photo.job_id = job.id
+    requeue(job)
+
+
+def requeue(job: Job) -> None:
+    """Back to the start, as if it were new."""
+    job.state = JobState.QUEUED
+    job.attempts = 0
+    job.alone = False
+    job.error = None
+    job.result = None
+    job.waiting_for = None
+    job.run_after = None
+    job.progress_done = 0
+    job.progress_failed = 0
+    job.started_at = None
+    job.finished_at = None
+    _drop_lease(job)

@@ -1,0 +1,116 @@
+"""Leases: how long a worker is believed to be alive, by the database's clock alone."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import threading
+from collections.abc import Iterator, Sequence
+from typing import Any
+from uuid import UUID
+
+from sqlalchemy import select, update
+from sqlalchemy.exc import SQLAlchemyError
+from sqlalchemy.orm import Session
+
+from shared.catalog.base import db_now, db_now_plus, rowcount
+from shared.catalog.session import Catalog
+from shared.jobs.finish import fail, release
+from shared.jobs.model_changes import abandon_generation
+from shared.jobs.table import MODEL_CHANGES, Job
+
+log = logging.getLogger(__name__)
+
+
+def extend_lease(session: Session, token: UUID, lease_seconds: float) -> bool:
+    """Keep what was claimed under `token`; False when all of it has been taken over or ended."""
+    touched = session.execute(
+        update(Job)
+        .where(Job.lease_token == token)
+        .values(lease_until=db_now_plus(lease_seconds))
+        .execution_options(synchronize_session=False)
+    )
+    return rowcount(touched) > 0
+
+
+@contextlib.contextmanager
+def hold_lease(catalog: Catalog, token: UUID, lease_seconds: float) -> Iterator[None]:
+    """Extends the lease from a thread while the block runs, three times per lease."""
+    done = threading.Event()
+
+    def keep() -> None:
+        while not done.wait(lease_seconds / 3):
+            try:
+                with catalog.write() as session:
+                    if not extend_lease(session, token, lease_seconds):
+                        return
+            except SQLAlchemyError:
+                # The catalog is away: the lease may run out, and then the token fences the commit.
+                log.warning("the lease %s could not be extended", token, exc_info=True)
+
+    keeper = threading.Thread(target=keep, name=f"lease-{token}", daemon=True)
+    keeper.start()
+    try:
+        yield
+    finally:
+        done.set()
+        keeper.join()
+
+
+def held(session: Session, token: UUID, jobs: Sequence[Job]) -> list[Job]:
+    """Those of the jobs that still carry the token, locked: only these may be finished."""
+    return list(
+        session.scalars(
+            select(Job)
+            .where(Job.id.in_([job.id for job in jobs]), Job.lease_token == token)
+            .order_by(Job.id)
+            .with_for_update()
+            .execution_options(populate_existing=True)
+        )
+    )
+
+
+def free_expired_leases(session: Session, max_attempts: int, *, everyone: bool = False) -> int:
+    """Give back what dead workers held; returns how many jobs that were.
+
+    A job that fell with others is marked `alone`: it may be innocent. One that fell alone has
+    used an attempt, and after `max_attempts` it is failed. `everyone` frees all leases, for a
+    process that knows that no other worker lives.
+    """
+    expired = select(Job).where(Job.lease_token.is_not(None))
+    if not everyone:
+        expired = expired.where(Job.lease_until < db_now())
+    jobs = session.scalars(expired.order_by(Job.id).with_for_update(skip_locked=True)).all()
+    for job in jobs:
+        fallen(session, job, max_attempts, cause=None)
+    return len(jobs)
+
+
+def fallen(session: Session, job: Job, max_attempts: int, *, cause: str | None) -> None:
+    """The worker that had the job died, or crashed (`cause`): who is to blame is not known yet.
+
+    What fell in a batch is tried again alone, and no attempt is counted.
+    """
+    fell_alone = job.claimed_together == 1
+    job.attempts += fell_alone
+    if job.attempts >= max_attempts:
+        fail(job, _fallen_problem(job, cause))
+        if job.kind in MODEL_CHANGES:
+            abandon_generation(session, job)
+        return
+    job.alone = job.alone or not fell_alone
+    release(job)
+
+
+def _fallen_problem(job: Job, cause: str | None) -> dict[str, Any]:
+    what = f"crashed ({cause})" if cause else "died"
+    return {
+        "type": "urn:placewise:problem:worker_fell",
+        "title": "The worker fell",
+        "status": 500,
+        "code": "worker_fell",
+        "detail": (
+            f"The worker {job.worker} {what} {job.attempts} times while it had only this job. "
+            "If the photo is fine, look at the worker's log and memory, then retry the job."
+        ),
+    }

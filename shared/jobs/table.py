@@ -1,0 +1,178 @@
+"""The jobs table and its state machine.
+
+```
+            claim (lease + token)                finish, the token still its own
+  QUEUED ───────────────────────────> RUNNING ───────────────────────────────────> SUCCEEDED
+   ^  ^ │                              │ │ │ └──── the photo or the request is at fault ──> FAILED
+   │  │ │                              │ │ └── release: a slice is done, or what it needs is away
+   │  │ │ cancel                       │ │     (no attempt is counted) ──> QUEUED, or RUNNING
+   │  │ └─────────> CANCELLED <────────┘ │     without a lease for a sliced job
+   │  │                 │    cancel      │
+   │  └──── retry ──────┴──── FAILED     │ the lease expires: the worker died
+   │                                     v
+   └──── in a batch: marked `alone`, tried again one by one, no attempt counted
+         alone: attempts + 1; at `max_attempts` ──────────────────────────────────> FAILED
+```
+
+A job is claimable when it is unfinished, no one holds its lease, it waits for nothing
+(`waiting_for`) and its time has come (`run_after`). Every claim writes a fresh `lease_token`; a
+worker may only finish what still carries its token, so one that was taken over can compute but
+never commit. A batch's jobs share one token.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from datetime import datetime
+from enum import IntEnum, StrEnum
+from typing import Any
+from uuid import UUID
+
+from sqlalchemy import (
+    Boolean,
+    ForeignKey,
+    Index,
+    Integer,
+    String,
+    Uuid,
+    and_,
+    or_,
+    select,
+)
+from sqlalchemy.orm import Mapped, Session, mapped_column
+
+from shared.catalog.base import Base, Condition, JsonValue, UtcDateTime, db_now
+from shared.errors import NotFound
+from shared.ids import new_id
+
+
+class JobState(StrEnum):
+    QUEUED = "queued"  # waiting for a worker, or for what `waiting_for` names
+    RUNNING = "running"  # a worker holds its lease, or it rests between two slices
+    SUCCEEDED = "succeeded"  # done: what it promised can be seen
+    FAILED = "failed"  # ended with `error`; may be retried
+    CANCELLED = "cancelled"  # ended on request; may be retried
+
+
+UNFINISHED = (JobState.QUEUED, JobState.RUNNING)
+
+
+class JobKind(StrEnum):
+    INDEX = "index"  # describe a stored photo into the active generation
+    REINDEX = "reindex"  # describe a stored photo into one generation that is being built
+    DESCRIBE = "describe"  # describe a query photo that is not stored
+    FIT = "fit"  # learn a vocabulary from the map's photos and switch to it
+    IMPORT = "import_vocabulary"  # check a vocabulary file and switch to it
+    SWITCH = "switch"  # switch to a vocabulary that the map already has
+
+
+MODEL_CHANGES = (JobKind.FIT, JobKind.IMPORT, JobKind.SWITCH)
+
+
+class Priority(IntEnum):
+    """Higher goes first; within one priority, older goes first."""
+
+    QUERY = 100  # someone waits for the answer
+    UPLOAD = 50
+    MODEL_CHANGE = 20
+    REINDEX = 10
+
+
+class WaitingFor(StrEnum):
+    VOCABULARY = "vocabulary"  # the map's extractor needs one and the map has none yet
+    DESCRIPTORS = "descriptors"  # every photo has to be described into the new generation
+
+
+class Job(Base):
+    """One thing to do. See the module's docstring for `state`, `attempts` and the lease."""
+
+    __tablename__ = "jobs"
+
+    id: Mapped[UUID] = mapped_column(Uuid, primary_key=True, default=new_id)
+    map_id: Mapped[UUID] = mapped_column(Uuid, ForeignKey("maps.id"))
+    kind: Mapped[JobKind] = mapped_column(String(30))
+    state: Mapped[JobState] = mapped_column(String(20), default=JobState.QUEUED)
+    priority: Mapped[int] = mapped_column(Integer)
+    photo_id: Mapped[UUID | None] = mapped_column(Uuid, ForeignKey("photos.id"), index=True)
+    generation_id: Mapped[UUID | None] = mapped_column(
+        Uuid, ForeignKey("generations.id"), index=True
+    )
+    params: Mapped[dict[str, Any]] = mapped_column(JsonValue, default=dict)
+    stage: Mapped[str | None] = mapped_column(String(30))
+    waiting_for: Mapped[str | None] = mapped_column(String(30))
+    progress_done: Mapped[int] = mapped_column(Integer, default=0)
+    progress_total: Mapped[int] = mapped_column(Integer, default=1)
+    progress_failed: Mapped[int] = mapped_column(Integer, default=0)
+    result: Mapped[dict[str, Any] | None] = mapped_column(JsonValue)
+    error: Mapped[dict[str, Any] | None] = mapped_column(JsonValue)
+    attempts: Mapped[int] = mapped_column(Integer, default=0)
+    alone: Mapped[bool] = mapped_column(Boolean, default=False)
+    claimed_together: Mapped[int] = mapped_column(Integer, default=0)
+    worker: Mapped[str | None] = mapped_column(String(200))
+    lease_token: Mapped[UUID | None] = mapped_column(Uuid)
+    lease_until: Mapped[datetime | None] = mapped_column(UtcDateTime)
+    run_after: Mapped[datetime | None] = mapped_column(UtcDateTime)
+    created_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())
+    started_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
+    finished_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
+
+    __table_args__ = (
+        Index(
+            "ix_jobs_claimable",
+            priority.desc(),
+            "id",
+            postgresql_where=and_(state.in_(UNFINISHED), lease_token.is_(None)),
+            sqlite_where=and_(state.in_(UNFINISHED), lease_token.is_(None)),
+        ),
+        Index(
+            "ix_jobs_leased",
+            "lease_until",
+            postgresql_where=lease_token.is_not(None),
+            sqlite_where=lease_token.is_not(None),
+        ),
+        Index("ix_jobs_map_state", "map_id", "state", "id"),
+        Index("ix_jobs_finished_kind", "kind", "finished_at"),
+    )
+
+
+def claimable() -> Condition:
+    """True for jobs that a worker may take now."""
+    return and_(
+        Job.state.in_(UNFINISHED),
+        Job.lease_token.is_(None),
+        Job.waiting_for.is_(None),
+        or_(Job.run_after.is_(None), Job.run_after <= db_now()),
+    )
+
+
+def get_job(session: Session, map_id: UUID, job_id: UUID, *, lock: bool = False) -> Job:
+    """A job of the map; 404 when there is none."""
+    wanted = select(Job).where(Job.id == job_id, Job.map_id == map_id)
+    job = session.scalar(wanted.with_for_update() if lock else wanted)
+    if job is None:
+        raise NotFound(
+            "job_not_found",
+            f"There is no job {job_id} in this map.",
+            job_id=str(job_id),
+        )
+    return job
+
+
+def list_jobs(
+    session: Session,
+    map_id: UUID,
+    states: Sequence[JobState],
+    kinds: Sequence[JobKind],
+    limit: int,
+    before: UUID | None,
+) -> list[Job]:
+    """Newest first, up to `limit`, older than `before`; empty lists mean "any"."""
+    wanted = select(Job).where(Job.map_id == map_id)
+    if states:
+        wanted = wanted.where(Job.state.in_(states))
+    wanted = (
+        wanted.where(Job.kind.in_(kinds)) if kinds else wanted.where(Job.kind != JobKind.REINDEX)
+    )
+    if before is not None:
+        wanted = wanted.where(Job.id < before)
+    return list(session.scalars(wanted.order_by(Job.id.desc()).limit(limit)))

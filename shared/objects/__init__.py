@@ -1,0 +1,16 @@
+"""The object store: bytes under keys. A folder when embedded; S3 for many machines.
+
+| keys | what lies there |
+|---|---|
+| `originals/<uuid>` | an uploaded photo |
+| `thumbnails/<photo>` | its thumbnail, JPEG |
+| `chunks/<generation>/<chunk>.npy`, `.json` | descriptor rows, and what they are |
+| `vocabularies/<uuid>.npy` | VLAD centres |
+| `queries/<job>`, `queries/<job>.npy` | a query photo that is not stored, and its descriptor |
+| `work/<job>/...` | what a sliced job keeps between its slices |
+"""
+
+from shared.objects.folder import FolderStore
+from shared.objects.port import ObjectInfo, ObjectStore, ObjectWriter
+
+__all__ = ["FolderStore", "ObjectInfo", "ObjectStore", "ObjectWriter"]

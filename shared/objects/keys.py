@@ -1,0 +1,41 @@
+"""Where things lie in the object store; `shared.chunks` names its own keys."""
+
+from __future__ import annotations
+
+from uuid import UUID
+
+from shared.ids import new_id
+
+ORIGINALS = "originals/"
+QUERIES = "queries/"
+THUMBNAILS = "thumbnails/"
+VOCABULARIES = "vocabularies/"
+WORK = "work/"
+
+
+def new_original_key() -> str:
+    """A fresh key for an upload; user file names never become keys."""
+    return f"{ORIGINALS}{new_id()}"
+
+
+def thumbnail_key(photo_id: UUID) -> str:
+    return f"{THUMBNAILS}{photo_id}.jpg"
+
+
+def query_key(job_id: UUID) -> str:
+    """The bytes of a query photo that is not stored."""
+    return f"{QUERIES}{job_id}"
+
+
+def query_vector_key(job_id: UUID) -> str:
+    """Its descriptor: a chunk of one row."""
+    return f"{QUERIES}{job_id}.npy"
+
+
+def new_vocabulary_key() -> str:
+    return f"{VOCABULARIES}{new_id()}.npy"
+
+
+def work_key(job_id: UUID, name: str) -> str:
+    """What a sliced job keeps between its slices."""
+    return f"{WORK}{job_id}/{name}"

@@ -1,0 +1,55 @@
+"""What every object store can do. One contract test serves all of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from datetime import datetime
+from typing import BinaryIO, Protocol
+
+
+@dataclass(frozen=True, slots=True)
+class ObjectInfo:
+    key: str
+    size_bytes: int
+    modified_at: datetime
+    """When it was written, by the store's clock, UTC."""
+
+
+class ObjectWriter(Protocol):
+    """Writes one object piece by piece; nothing is visible before `commit`."""
+
+    def write(self, data: bytes) -> None: ...
+
+    def commit(self) -> None:
+        """Make the whole object visible and durable at once."""
+
+    def abort(self) -> None:
+        """Forget what was written; harmless after `commit`."""
+
+
+class ObjectStore(Protocol):
+    """Objects are whole or absent: a crash never leaves a part of one under its key.
+
+    `get` and `open` raise NotFound (`object_not_found`) for a missing key.
+    """
+
+    def writer(self, key: str) -> ObjectWriter: ...
+
+    def put(self, key: str, data: bytes) -> None: ...
+
+    def get(self, key: str) -> bytes: ...
+
+    def open(self, key: str) -> BinaryIO:
+        """A seekable reader that fetches only what is read."""
+
+    def head(self, key: str) -> ObjectInfo | None: ...
+
+    def delete(self, key: str) -> None:
+        """Remove the object; a missing one is not an error."""
+
+    def list(self, prefix: str) -> Iterator[ObjectInfo]:
+        """Every object whose key begins with `prefix`, in no particular order."""
+
+    def check(self) -> None:
+        """Raise Unavailable when objects can't be written now."""

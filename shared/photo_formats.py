@@ -1,0 +1,48 @@
+"""Which photos are accepted: recognised by their content, limited by their header."""
+
+from __future__ import annotations
+
+from typing import BinaryIO
+
+from PIL import Image
+
+from shared.errors import Unprocessable
+
+# MPO is what many phones write under the name JPEG: a JPEG with a second picture behind it.
+FORMATS = ("JPEG", "MPO", "PNG", "WEBP", "BMP", "TIFF")
+ACCEPTED = "JPEG, PNG, WebP, BMP or TIFF"
+SNIFFED_BYTES = 16  # enough to tell every accepted format
+
+# Our own limit is checked from the header before anything is decoded.
+Image.MAX_IMAGE_PIXELS = None
+
+
+def sniff_media_type(begin: bytes) -> str | None:
+    """The media type by the first SNIFFED_BYTES of a file; None for anything not accepted."""
+    if begin.startswith(b"\xff\xd8\xff"):
+        return "image/jpeg"
+    if begin.startswith(b"\x89PNG\r\n\x1a\n"):
+        return "image/png"
+    if begin[:4] == b"RIFF" and begin[8:12] == b"WEBP":
+        return "image/webp"
+    if begin.startswith((b"II*\x00", b"MM\x00*", b"II+\x00", b"MM\x00+")):
+        return "image/tiff"
+    # "BM" alone begins many texts: a bitmap has two reserved fields, which are zero.
+    if begin.startswith(b"BM") and begin[6:10] == b"\x00\x00\x00\x00":
+        return "image/bmp"
+    return None
+
+
+def open_photo(file: BinaryIO) -> Image.Image:
+    """The photo with its header read and its pixels not yet decoded."""
+    return Image.open(file, formats=FORMATS)
+
+
+def check_pixels(image: Image.Image, max_pixels: int) -> None:
+    """Unprocessable (`too_many_pixels`) when the header promises more than the limit."""
+    if image.width * image.height > max_pixels:
+        raise Unprocessable(
+            "too_many_pixels",
+            f"The photo has {image.width} x {image.height} pixels; "
+            f"the limit is {max_pixels} in all (MAX_IMAGE_PIXELS).",
+        )

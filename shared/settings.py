@@ -1,0 +1,79 @@
+"""One settings object for every service, read from the environment and `.env`.
+
+Durations end in `_seconds`, sizes in `_bytes` unless the predecessor's name is kept
+(`MAX_FILE_SIZE`, in bytes).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+from pydantic import Field, SecretStr, field_validator
+from pydantic_settings import BaseSettings, SettingsConfigDict
+
+
+class Settings(BaseSettings):
+    """What is in force. Each field is an environment variable of the same name in capitals."""
+
+    model_config = SettingsConfigDict(
+        env_file=".env", extra="ignore", frozen=True, validate_default=True
+    )
+
+    # Where it listens and where it keeps things.
+    host: str = "127.0.0.1"
+    port: int = Field(8000, ge=0, le=65535)
+    placewise_home: Path = Path("./var")
+    database_url: SecretStr | None = Field(
+        None,
+        description="SQLAlchemy URL of the catalog; unset: SQLite under PLACEWISE_HOME",
+    )
+
+    # What is accepted.
+    max_file_size: int = Field(10_485_760, gt=0, description="bytes of one photo")
+    max_image_pixels: int = Field(50_000_000, gt=0, description="width x height of one photo")
+    max_vocabulary_bytes: int = Field(64_000_000, gt=0)
+    max_wait_seconds: int = Field(60, ge=0, description="longest `Prefer: wait` and `?wait=`")
+
+    # How photos are described.
+    extractor: str = Field("efficientnet-lite0-vlad", description="extractor of new maps")
+    allow_test_extractors: bool = Field(
+        False, description="lets a map use the tiny extractors that exist for tests"
+    )
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    batch_photos: int = Field(16, ge=1, le=1024, description="most photos in one batch")
+    decode_processes: int = Field(2, ge=1, le=64)
+    decode_memory_bytes: int = Field(2_000_000_000, ge=500_000_000)
+    decode_timeout_seconds: float = Field(30.0, gt=0)
+    auto_fit_photos: int = Field(
+        200, ge=1, description="photos at which a map without a vocabulary fits its own"
+    )
+
+    # How jobs are kept alive.
+    lease_seconds: float = Field(60.0, gt=0)
+    max_attempts: int = Field(3, ge=1, description="lone crashes before a job is failed")
+    query_ttl_seconds: float = Field(3600.0, gt=0, description="life of an unstored query")
+
+    # How the store is kept healthy.
+    slot_rows: int = Field(1000, ge=2, description="rows of a sealed chunk")
+    compact_chunks: int = Field(
+        8, ge=2, description="chunks of an open slot that are worth merging"
+    )
+    superseded_grace_seconds: float = Field(600.0, ge=0)
+    retired_grace_seconds: float = Field(3600.0, ge=0)
+    orphan_age_seconds: float = Field(86_400.0, ge=0)
+
+    # How search follows the catalog.
+    search_follow_seconds: float = Field(1.0, gt=0)
+    search_wait_seconds: float = Field(5.0, gt=0, description="longest wait for `min_version`")
+
+    @field_validator("placewise_home")
+    @classmethod
+    def _absolute(cls, value: Path) -> Path:
+        return value.expanduser().resolve()
+
+    def catalog_url(self) -> str:
+        """The SQLAlchemy URL of the catalog."""
+        if self.database_url is not None:
+            return self.database_url.get_secret_value()
+        return f"sqlite:///{self.placewise_home / 'catalog.sqlite'}"

@@ -1,0 +1,42 @@
+"""What every backbone offers, whatever network is inside."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import torch
+
+
+class Backbone(Protocol):
+    """Turns a batch of photos into dense local features."""
+
+    name: str
+    fingerprint: str
+    """sha256 of the weights."""
+    licence: str
+    card: dict[str, Any]
+    """Where the weights come from."""
+    width: int
+    """Length of one local feature."""
+    layer: str
+    """The point of the network that the features are taken from."""
+    facet: str | None
+    """query, key, value or token of a transformer layer; None for other networks."""
+    device: torch.device
+    """Where `features` runs and where its answer lies."""
+
+    def features(self, pixels: torch.Tensor) -> torch.Tensor:
+        """(B, H, W, 3) uint8 RGB -> (B, patches, width) float32, each patch L2-normalised.
+
+        A patch whose feature is zero stays zero.
+        """
+
+
+def normalise_pixels(
+    pixels: torch.Tensor, mean: tuple[float, ...], std: tuple[float, ...]
+) -> torch.Tensor:
+    """(B, H, W, 3) uint8 -> (B, 3, H, W) float32, ((x / 255) - mean) / std by channel."""
+    scaled = pixels.permute(0, 3, 1, 2).to(torch.float32) / 255.0
+    shape = (1, 3, 1, 1)
+    centre = torch.tensor(mean, device=pixels.device).view(shape)
+    return (scaled - centre) / torch.tensor(std, device=pixels.device).view(shape)

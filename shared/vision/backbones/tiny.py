@@ -1,0 +1,42 @@
+"""A deterministic backbone without weights, for tests of everything around the model.
+
+Each patch's feature is a fixed random projection of its 4 x 4 pixels. It knows nothing of places
+beyond their pixels, so maps refuse it unless ALLOW_TEST_EXTRACTORS is set.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Any
+
+import numpy as np
+import torch
+from torch.nn.functional import normalize
+
+SEED = 20_240
+PATCH = 4  # pixels
+
+
+class TinyBackbone:
+    name = "test-tiny"
+    licence = "MIT"
+    width = 16
+    layer = "projection"
+    facet: str | None = None
+
+    def __init__(self, device: torch.device) -> None:
+        projection = (
+            np.random.default_rng(SEED)
+            .standard_normal((PATCH * PATCH * 3, self.width))
+            .astype(np.float32)
+        )
+        self.fingerprint = hashlib.sha256(projection.tobytes()).hexdigest()
+        self.card: dict[str, Any] = {"made": "a fixed random projection, no training"}
+        self._projection = torch.from_numpy(projection).to(device)
+        self.device = device
+
+    @torch.inference_mode()
+    def features(self, pixels: torch.Tensor) -> torch.Tensor:
+        images = pixels.to(self.device).permute(0, 3, 1, 2).to(torch.float32) / 127.5 - 1.0
+        patches = torch.nn.functional.unfold(images, PATCH, stride=PATCH).transpose(1, 2)
+        return normalize(patches @ self._projection, dim=-1)

@@ -1,0 +1,83 @@
+"""Decoding one photo: the only place where pixels are read from untrusted bytes.
+
+Runs in child processes with a memory limit (`services.extractor.decoding`), so that a poisonous
+photo harms nothing but its own job. Imports no torch.
+"""
+
+from __future__ import annotations
+
+import io
+import warnings
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageOps, UnidentifiedImageError
+from PIL import __version__ as pillow_version
+
+from shared.errors import Unprocessable
+from shared.photo_formats import check_pixels, open_photo
+from shared.vision.preprocessing import Preprocessing
+
+THUMBNAIL_PIXELS = 256  # the longer side
+DECODER = f"pillow-{pillow_version}"
+
+
+@dataclass(frozen=True, slots=True)
+class Decoded:
+    pixels: NDArray[np.uint8]
+    """(height, width, 3) RGB, upright, as the preprocessing left it."""
+    thumbnail: bytes
+    """JPEG without any metadata, its longer side at most THUMBNAIL_PIXELS."""
+
+
+def decode(data: bytes, preprocessing: Preprocessing, max_pixels: int) -> Decoded:
+    """The photo upright in RGB at the preprocessing's size, and its thumbnail.
+
+    Only the first frame is read. Raises Unprocessable (`undecodable_photo`, `too_many_pixels`)
+    with the decoder's own reason.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # a strange tag is no reason to refuse the pixels
+            with open_photo(io.BytesIO(data)) as image:
+                check_pixels(image, max_pixels)
+                image.load()
+                rgb = _to_rgb(ImageOps.exif_transpose(image))
+            pixels = np.asarray(preprocessing.apply(rgb), dtype=np.uint8)
+            return Decoded(pixels=pixels, thumbnail=_thumbnail(rgb))
+    except (
+        OSError,
+        SyntaxError,
+        ValueError,
+        EOFError,
+        UnidentifiedImageError,
+    ) as error:
+        raise Unprocessable(
+            "undecodable_photo",
+            f"The photo can't be decoded: {error or type(error).__name__}.",
+        ) from error
+    except MemoryError as error:
+        raise Unprocessable(
+            "undecodable_photo",
+            "The photo needs more memory to decode than one photo may have.",
+        ) from error
+
+
+def _to_rgb(image: Image.Image) -> Image.Image:
+    if image.mode.startswith("I;16"):
+        # Pillow would clip 16-bit samples at 255 and make the photo white.
+        samples = np.asarray(image, dtype=np.uint16)
+        return Image.fromarray((samples >> 8).astype(np.uint8)).convert("RGB")
+    if image.mode in ("I", "F"):
+        raise ValueError(f"samples of mode {image.mode!r} have no defined brightness range")
+    return image.convert("RGB")
+
+
+def _thumbnail(rgb: Image.Image) -> bytes:
+    small = rgb.copy()
+    small.thumbnail((THUMBNAIL_PIXELS, THUMBNAIL_PIXELS))
+    small.info.clear()  # what the camera wrote (where, when, whose) stays with the original
+    buffer = io.BytesIO()
+    small.save(buffer, "JPEG", quality=85)
+    return buffer.getvalue()

@@ -1,0 +1,172 @@
+"""Extractors by name: which backbone, preprocessing and aggregator make a descriptor."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch.nn.functional import normalize
+
+from shared.errors import Misconfigured
+from shared.vision.backbones import Backbone
+from shared.vision.backbones.efficientnet_lite0 import EfficientNetLite0
+from shared.vision.backbones.tiny import TinyBackbone
+from shared.vision.decode import DECODER
+from shared.vision.preprocessing import Preprocessing, get_preprocessing
+from shared.vision.vlad import vlad
+from shared.vision.vocabulary import Centres, decode_centres
+
+SHIPPED = Path(__file__).parent / "vocabularies"
+
+
+@dataclass(frozen=True, slots=True)
+class Recipe:
+    """How the extractor `name` is put together."""
+
+    name: str
+    backbone: Callable[[torch.device], Backbone]
+    preprocessing: str
+    aggregator: str
+    """`vlad` needs a vocabulary; `avg` is the mean of the local features."""
+    clusters: int = 64
+    shipped_vocabulary: str | None = None
+    """File below `vocabularies/`: learnt on photographs of elsewhere, so that a new map answers."""
+    for_tests: bool = False
+
+    @property
+    def needs_vocabulary(self) -> bool:
+        return self.aggregator == "vlad"
+
+
+RECIPES = {
+    recipe.name: recipe
+    for recipe in (
+        Recipe(
+            name="efficientnet-lite0-vlad",
+            backbone=EfficientNetLite0,
+            preprocessing="square224",
+            aggregator="vlad",
+            shipped_vocabulary="efficientnet-lite0.npy",
+        ),
+        Recipe(
+            name="test-tiny-avg",
+            backbone=TinyBackbone,
+            preprocessing="square32",
+            aggregator="avg",
+            for_tests=True,
+        ),
+        Recipe(
+            name="test-tiny-vlad",
+            backbone=TinyBackbone,
+            preprocessing="square32",
+            aggregator="vlad",
+            clusters=8,
+            for_tests=True,
+        ),
+    )
+}
+
+
+def get_recipe(name: str, *, allow_test_extractors: bool) -> Recipe:
+    """The recipe called `name`; Misconfigured when unknown, or for tests and not allowed."""
+    recipe = RECIPES.get(name)
+    if recipe is None:
+        known = ", ".join(sorted(r.name for r in RECIPES.values() if not r.for_tests))
+        raise Misconfigured(
+            "unknown_extractor",
+            f"There is no extractor {name!r}. Known: {known} (EXTRACTOR).",
+        )
+    if recipe.for_tests and not allow_test_extractors:
+        raise Misconfigured(
+            "test_extractor",
+            f"The extractor {name!r} exists for tests and knows nothing of places. "
+            "Tests set ALLOW_TEST_EXTRACTORS=true.",
+        )
+    return recipe
+
+
+def choose_device(device: str) -> torch.device:
+    """The device called `auto`, `cpu` or `cuda`; `auto` is CUDA where there is one."""
+    if device == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    if device == "cuda" and not torch.cuda.is_available():
+        raise Misconfigured(
+            "cuda_missing",
+            "DEVICE=cuda, but PyTorch finds no CUDA device. Check the driver with `nvidia-smi` "
+            "and the PyTorch build, or set DEVICE=auto.",
+        )
+    return torch.device(device)
+
+
+class Extractor:
+    """A recipe with its weights loaded: the backbone is shared by all its vocabularies."""
+
+    def __init__(self, recipe: Recipe, device: torch.device) -> None:
+        self.recipe = recipe
+        self.preprocessing: Preprocessing = get_preprocessing(recipe.preprocessing)
+        self.backbone = recipe.backbone(device)
+
+    def shipped_vocabulary(self) -> tuple[Centres, dict[str, Any]] | None:
+        """The vocabulary that comes with the extractor, with its provenance; None without one."""
+        if self.recipe.shipped_vocabulary is None:
+            return None
+        path = SHIPPED / self.recipe.shipped_vocabulary
+        centres = decode_centres(path.read_bytes(), width=self.backbone.width)
+        provenance = json.loads(path.with_suffix(".json").read_text())
+        if provenance["backbone_fingerprint"] != self.backbone.fingerprint:
+            raise Misconfigured(
+                "vocabulary_unfit",
+                f"The shipped vocabulary {path.name} was learnt with other weights "
+                f"({provenance['backbone_fingerprint'][:12]}) than those installed "
+                f"({self.backbone.fingerprint[:12]}). Install the pinned packages: `make setup`.",
+            )
+        return centres, provenance
+
+    def spec(self, centres: Centres | None) -> dict[str, Any]:
+        """Everything that decides a descriptor's value."""
+        return {
+            "extractor": self.recipe.name,
+            "backbone": self.backbone.name,
+            "backbone_fingerprint": self.backbone.fingerprint,
+            "layer": self.backbone.layer,
+            "facet": self.backbone.facet,
+            "preprocessing": self.preprocessing.as_spec(),
+            "aggregator": self.recipe.aggregator,
+            "vocabulary_sha256": centres.sha256 if centres else None,
+            "clusters": centres.clusters if centres else None,
+            "precision": "float32",
+            "decoder": DECODER,
+            "dimension": self.dimension(centres),
+        }
+
+    def dimension(self, centres: Centres | None) -> int:
+        """Length of a descriptor."""
+        return self.backbone.width * (centres.clusters if centres else 1)
+
+    def features(self, pixels: NDArray[np.uint8]) -> torch.Tensor:
+        """(B, H, W, 3) uint8 -> (B, patches, width) float32 local features on the device."""
+        return self.backbone.features(torch.from_numpy(np.ascontiguousarray(pixels)))
+
+    def describe(self, pixels: NDArray[np.uint8], centres: Centres | None) -> NDArray[np.float32]:
+        """(B, H, W, 3) uint8 RGB -> (B, dimension) float32 unit rows."""
+        features = self.features(pixels)
+        if self.recipe.needs_vocabulary:
+            if centres is None:
+                raise ValueError(f"{self.recipe.name} needs a vocabulary")
+            on_device = torch.from_numpy(centres.array).to(features.device)
+            rows = vlad(features, on_device)
+        else:
+            rows = normalize(features.mean(dim=1), dim=-1)
+        return rows.cpu().numpy().astype(np.float32, copy=False)
+
+
+def spec_fingerprint(spec: dict[str, Any]) -> str:
+    """sha256 of the spec's canonical JSON."""
+    return hashlib.sha256(json.dumps(spec, sort_keys=True).encode()).hexdigest()

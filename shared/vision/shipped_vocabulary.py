@@ -1,0 +1,129 @@
+"""Makes the general vocabulary that is shipped with EfficientNet-Lite0:
+
+    python -m shared.vision.shipped_vocabulary
+
+It is learnt on photographs that installed packages bring (scikit-learn, scikit-image), cut into
+overlapping views at several scales. It has never seen your places: that is why every answer made
+with it says `vocabulary: foreign`, and why fitting one on your own photos is the first thing to do.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import json
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+
+from shared.vision.extractors import RECIPES, SHIPPED, Extractor, choose_device
+from shared.vision.kmeans import MAX_ITERATIONS, TOLERANCE, iterate, seed_centres
+from shared.vision.vocabulary import check_centres, encode_centres
+
+# Photographs only: no drawings, scans, microscope or depth pictures, none of them generated.
+PHOTOGRAPHS = {
+    "sklearn": ("datasets/images", ("china.jpg", "flower.jpg")),
+    "skimage": (
+        "data",
+        (
+            "astronaut.png",
+            "brick.png",
+            "camera.png",
+            "chelsea.png",
+            "coffee.png",
+            "grass.png",
+            "gravel.png",
+            "motorcycle_left.png",
+            "motorcycle_right.png",
+            "rocket.jpg",
+        ),
+    ),
+}
+PACKAGES = {"sklearn": "scikit-learn", "skimage": "scikit-image"}
+SCALES = (1.0, 0.6, 0.35)  # of the photograph's shorter side
+STEPS = 4  # views along each side, at every scale below the whole
+SEED = 0
+
+
+def main() -> None:
+    """Fit the centres and write them beside their provenance."""
+    recipe = RECIPES["efficientnet-lite0-vlad"]
+    extractor = Extractor(recipe, choose_device("cpu"))
+    views = [view for path in photographs() for view in cut(Image.open(path).convert("RGB"))]
+    points = torch.cat(
+        [
+            extractor.features(
+                np.stack([np.asarray(extractor.preprocessing.apply(v)) for v in views[i : i + 16]])
+            ).flatten(0, 1)
+            for i in range(0, len(views), 16)
+        ]
+    )
+    centres = seed_centres(points, recipe.clusters, SEED)
+    iterations, movement = 0, float("inf")
+    while iterations < MAX_ITERATIONS and movement > TOLERANCE:
+        centres, movement = iterate(points, centres)
+        iterations += 1
+    checked = check_centres(centres.numpy(), width=extractor.backbone.width)
+    provenance = {
+        "backbone": extractor.backbone.name,
+        "backbone_fingerprint": extractor.backbone.fingerprint,
+        "layer": extractor.backbone.layer,
+        "facet": extractor.backbone.facet,
+        "preprocessing": extractor.preprocessing.as_spec(),
+        "clusters": checked.clusters,
+        "sha256": checked.sha256,
+        "seed": SEED,
+        "iterations": iterations,
+        "views": len(views),
+        "patches": len(points),
+        "made_by": "python -m shared.vision.shipped_vocabulary",
+        "photographs": {
+            PACKAGES[package]: {
+                "version": version(PACKAGES[package]),
+                "files": list(names),
+            }
+            for package, (_, names) in PHOTOGRAPHS.items()
+        },
+        "photographs_sha256": {
+            path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in photographs()
+        },
+    }
+    target = SHIPPED / str(recipe.shipped_vocabulary)
+    target.write_bytes(encode_centres(checked))
+    target.with_suffix(".json").write_text(json.dumps(provenance, indent=2) + "\n")
+    print(f"{checked.clusters} centres from {len(points)} patches of {len(views)} views: {target}")
+
+
+def photographs() -> list[Path]:
+    """The photographs' files inside the installed packages."""
+    found = []
+    for package, (folder, names) in PHOTOGRAPHS.items():
+        spec = importlib.util.find_spec(package)
+        if spec is None or spec.origin is None:
+            raise SystemExit(f"{PACKAGES[package]} is not installed: make setup")
+        root = Path(spec.origin).parent / folder
+        found += [root / name for name in names]
+    return found
+
+
+def cut(photograph: Image.Image) -> list[Image.Image]:
+    """Square views: the middle of the whole, and a grid of overlapping ones at smaller scales."""
+    width, height = photograph.size
+    views = []
+    for scale in SCALES:
+        side = int(min(width, height) * scale)
+        lefts = np.linspace(0, width - side, STEPS) if side < width else np.zeros(1)
+        tops = np.linspace(0, height - side, STEPS) if side < height else np.zeros(1)
+        views += [
+            photograph.crop((int(left), int(top), int(left) + side, int(top) + side))
+            for top in tops
+            for left in lefts
+        ]
+    return views
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,101 @@
+"""Vocabulary files: reading them, and refusing what would silently spoil every descriptor."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared.errors import Unprocessable
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Centres:
+    """(clusters, dimension) float32 cluster centres and the sha256 of their bytes."""
+
+    array: NDArray[np.float32]
+    sha256: str
+
+    @property
+    def clusters(self) -> int:
+        return int(self.array.shape[0])
+
+    @property
+    def dimension(self) -> int:
+        return int(self.array.shape[1])
+
+
+def check_centres(array: NDArray[np.float32], *, width: int | None = None) -> Centres:
+    """The array as centres; Unprocessable (`vocabulary_unfit`) says what is wrong with it.
+
+    `width` is the length of the local features that they are meant for.
+    """
+
+    def refuse(reason: str) -> Unprocessable:
+        return Unprocessable("vocabulary_unfit", f"This is not a usable vocabulary: {reason}.")
+
+    if array.ndim != 2 or 0 in array.shape:
+        raise refuse(f"its shape is {array.shape}, not (clusters, dimension)")
+    if array.dtype.kind != "f":
+        raise refuse(f"its numbers are {array.dtype}, not floating point")
+    array = np.ascontiguousarray(array, dtype=np.float32)
+    if width is not None and array.shape[1] != width:
+        raise refuse(
+            f"its centres have {array.shape[1]} dimensions, the extractor's local features {width}"
+        )
+    if not np.isfinite(array).all():
+        raise refuse("it holds NaN or infinite numbers")
+    zero = np.flatnonzero(np.linalg.norm(array, axis=1) < 1e-6)
+    if len(zero):
+        raise refuse(f"centre {int(zero[0])} is zero")
+    distinct = len(np.unique(array, axis=0))
+    if distinct != len(array):
+        raise refuse(f"only {distinct} of its {len(array)} centres are distinct")
+    return Centres(array, hashlib.sha256(array.tobytes()).hexdigest())
+
+
+def encode_centres(centres: Centres) -> bytes:
+    """The centres as the bytes of a `.npy` file."""
+    buffer = io.BytesIO()
+    np.save(buffer, centres.array, allow_pickle=False)
+    return buffer.getvalue()
+
+
+def decode_centres(data: bytes, *, width: int | None = None) -> Centres:
+    """The centres in the bytes of a `.npy` file, checked."""
+    try:
+        array = np.load(io.BytesIO(data), allow_pickle=False)
+    except (ValueError, EOFError, OSError) as error:
+        raise Unprocessable(
+            "vocabulary_unfit",
+            f"This is not a NumPy .npy file of cluster centres: {error}.",
+        ) from error
+    if not isinstance(array, np.ndarray):
+        raise Unprocessable("vocabulary_unfit", "This is an .npz archive; a .npy file is needed.")
+    return check_centres(array, width=width)
+
+
+def read_centres(path: Path) -> Centres:
+    """The centres in a `.npy` file or in AnyLoc's `c_centers.pt` (a bare tensor)."""
+    if path.suffix != ".pt":
+        return decode_centres(path.read_bytes())
+    import pickle
+
+    import torch
+
+    try:
+        tensor = torch.load(path, map_location="cpu", weights_only=True)
+    except (pickle.UnpicklingError, RuntimeError, EOFError) as error:
+        raise Unprocessable(
+            "vocabulary_unfit", f"{path.name} is not a file of tensors: {error}"
+        ) from error
+    if not isinstance(tensor, torch.Tensor):
+        raise Unprocessable(
+            "vocabulary_unfit",
+            f"{path.name} holds a {type(tensor).__name__}, not one tensor.",
+        )
+    return check_centres(tensor.numpy())
