@@ -12,17 +12,14 @@ local folder. These are the very classes that the separate services run; only th
 from __future__ import annotations
 
 import contextlib
-import json
 import logging
 import os
 import socket
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from pathlib import Path
 
 import uvicorn
-from filelock import FileLock, Timeout
 
 from services.extractor.worker import ExtractorWorker
 from services.gateway.app import create_app
@@ -33,6 +30,7 @@ from services.steward.queue import free_leases
 from shared.catalog.maps import ensure_default_map
 from shared.catalog.session import Catalog
 from shared.errors import Misconfigured
+from shared.home import announced, lock_home
 from shared.jobs import InProcessHints
 from shared.objects import FolderStore
 from shared.settings import Settings
@@ -40,28 +38,6 @@ from shared.settings import Settings
 log = logging.getLogger(__name__)
 
 GRACEFUL_SECONDS = 10  # for requests under way when the server is asked to stop
-
-
-def lock_file(home: Path) -> Path:
-    """Held by whoever serves the folder."""
-    return home / "server.lock"
-
-
-def address_file(home: Path) -> Path:
-    """Says where the server that holds the lock listens."""
-    return home / "server.json"
-
-
-def address_of_running(home: Path) -> str | None:
-    """The address of the server that serves the folder now, or None."""
-    if not lock_file(home).exists():
-        return None
-    with contextlib.suppress(Timeout), FileLock(lock_file(home), timeout=0):
-        return None
-    with contextlib.suppress(FileNotFoundError, ValueError, KeyError):
-        url: str = json.loads(address_file(home).read_text())["url"]
-        return url
-    return None
 
 
 @dataclass(slots=True)
@@ -88,17 +64,12 @@ def standalone(settings: Settings) -> Iterator[Standalone]:
     Raises Misconfigured: `home_in_use` for a folder that another server has, `address_in_use`.
     """
     home = settings.placewise_home
-    try:
-        home.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise Misconfigured(
-            "home_unwritable",
-            f"Can't make the folder {home}: {error.strerror}. Choose another PLACEWISE_HOME.",
-        ) from error
-    with _folder_lock(home), _listener(settings) as listener:
+    with contextlib.ExitStack() as held:
+        held.enter_context(lock_home(home))
+        listener = held.enter_context(_listener(settings))
         host, port = listener.getsockname()[:2]
         url = f"http://{f'[{host}]' if ':' in host else host}:{port}"
-        address_file(home).write_text(json.dumps({"url": url, "pid": os.getpid()}))
+        held.enter_context(announced(home, url))
         catalog = Catalog(settings.catalog_url())
         store = FolderStore(home / "objects")
         hints = InProcessHints()
@@ -109,7 +80,9 @@ def standalone(settings: Settings) -> Iterator[Standalone]:
         free_leases(catalog, settings.max_attempts, everyone=True)
 
         search = SearchWorker(catalog, store, settings)
-        extractor = ExtractorWorker(catalog, store, hints, settings, name=f"embedded-{os.getpid()}")
+        extractor = ExtractorWorker(
+            catalog, store, hints, settings, name=f"embedded-{os.getpid()}", only_worker=True
+        )
         steward = Steward(catalog, store, hints, settings)
         gateway = Gateway(catalog, store, hints, search, settings)
         server = uvicorn.Server(
@@ -139,25 +112,6 @@ def standalone(settings: Settings) -> Iterator[Standalone]:
                 part.join()
             extractor.close()
             catalog.close()
-            address_file(home).unlink(missing_ok=True)
-
-
-@contextlib.contextmanager
-def _folder_lock(home: Path) -> Iterator[None]:
-    lock = FileLock(lock_file(home), timeout=0)
-    try:
-        lock.acquire()
-    except Timeout:
-        where = address_of_running(home) or "another process"
-        raise Misconfigured(
-            "home_in_use",
-            f"The folder {home} is served already, by {where}. Use that server, stop it, or give "
-            "this one another PLACEWISE_HOME.",
-        ) from None
-    try:
-        yield
-    finally:
-        lock.release()
 
 
 @contextlib.contextmanager

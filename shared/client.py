@@ -203,7 +203,7 @@ def _refusal(answer: httpx2.Response) -> PlacewiseError:
     try:
         problem: Json = answer.json()
         code, detail = problem.pop("code"), problem.pop("detail")
-    except (ValueError, KeyError, TypeError):
+    except (ValueError, KeyError, TypeError, AttributeError):  # not JSON, or not a problem
         return PlacewiseError("bad_answer", f"HTTP {answer.status_code}: {answer.text[:200]}")
     for member in ("type", "title", "status", "instance"):
         problem.pop(member, None)

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import struct
 from typing import BinaryIO
 
 from PIL import Image
 
 from shared.errors import Unprocessable
 
-# MPO is what many phones write under the name JPEG: a JPEG with a second picture behind it.
-FORMATS = ("JPEG", "MPO", "PNG", "WEBP", "BMP", "TIFF")
+# MPO, which many phones write under the name JPEG (a JPEG with a second picture behind it), is
+# opened by Pillow as JPEG: naming it here is a KeyError for everything but a JPEG.
+FORMATS = ("JPEG", "PNG", "WEBP", "BMP", "TIFF")
 ACCEPTED = "JPEG, PNG, WebP, BMP or TIFF"
+# What Pillow raises for damaged photos and EXIF; UnidentifiedImageError is an OSError.
+BROKEN = (OSError, SyntaxError, ValueError, TypeError, LookupError, EOFError, struct.error)
 SNIFFED_BYTES = 16  # enough to tell every accepted format
 
 # Our own limit is checked from the header before anything is decoded.

@@ -7,9 +7,9 @@ import threading
 import time
 from collections.abc import Iterator
 
-from services.standalone import address_of_running, standalone
 from shared.client import Client
 from shared.errors import Unavailable
+from shared.home import address_of_running
 from shared.settings import Settings
 
 START_SECONDS = 30.0
@@ -24,6 +24,9 @@ def connect(server: str | None, map_name: str | None) -> Iterator[Client]:
         with Client(url, map_name) as client:
             yield client
         return
+    # Imported only here: torch takes seconds, and a client of a running server needs none of it.
+    from services.standalone import standalone
+
     own = settings.model_copy(update={"host": "127.0.0.1", "port": 0})
     with standalone(own) as running:
         # Not the main thread: uvicorn would take over the command's signals there.

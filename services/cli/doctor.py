@@ -10,10 +10,10 @@ from dataclasses import asdict, dataclass
 import typer
 
 from services.cli.output import JsonOption, answers, print_json
-from services.standalone import address_of_running
 from shared.catalog.session import Catalog
 from shared.client import Client
 from shared.errors import PlacewiseError
+from shared.home import address_of_running
 from shared.objects import FolderStore
 from shared.settings import Settings
 

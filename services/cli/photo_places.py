@@ -93,12 +93,12 @@ def _read_table(folder: Path, table: Path, paths: set[Path]) -> dict[Path, dict[
                     f"beside it may stand {', '.join(CSV_COLUMNS)}.",
                 )
             said = {}
-            for number, row in enumerate(reader, start=2):
-                path = folder / row[name_column]
+            for row in reader:
+                path = folder / (row[name_column] or "")  # a short row has None
                 if path not in paths:
                     raise InvalidRequest(
                         "bad_table",
-                        f"{table}, line {number}: there is no photo {path}.",
+                        f"{table}, line {reader.line_num}: there is no photo {path}.",
                     )
                 said[path] = {c: row[c] for c in CSV_COLUMNS if row.get(c)}
             return said

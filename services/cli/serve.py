@@ -6,13 +6,14 @@ import ipaddress
 import logging
 
 from services.cli.output import explained, messages
-from services.standalone import standalone
 from shared.settings import Settings
 
 
 def serve() -> None:
     """Serve the embedded Placewise (HOST, PORT, PLACEWISE_HOME) until Ctrl-C."""
     with explained(as_json=False):
+        from services.standalone import standalone  # brings torch, as `connect` says
+
         settings = Settings()
         logging.getLogger().setLevel(logging.INFO)
         logging.getLogger("alembic").setLevel(logging.WARNING)

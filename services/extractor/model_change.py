@@ -23,9 +23,8 @@ from shared.catalog.generations import active_generation
 from shared.catalog.maps import Map
 from shared.catalog.photos import Photo, count_live, live_photos
 from shared.catalog.session import Catalog
-from shared.catalog.vocabularies import Vocabulary, VocabularyOrigin, get_vocabulary
+from shared.catalog.vocabularies import VocabularyOrigin, add_vocabulary, get_vocabulary
 from shared.errors import Conflict, NotFound, PlacewiseError, Unprocessable
-from shared.ids import new_id
 from shared.jobs import Job, JobKind
 from shared.jobs.finish import release
 from shared.jobs.leases import held
@@ -252,18 +251,15 @@ class ModelChanges:
         self._store.put(key, encode_centres(centres))
         with self._catalog.write() as session:
             for mine in held(session, _token(job), [job]):
-                vocabulary = Vocabulary(
-                    id=new_id(),
-                    map_id=job.map_id,
-                    origin=origin,
-                    clusters=centres.clusters,
-                    dimension=centres.dimension,
+                vocabulary = add_vocabulary(
+                    session,
+                    job.map_id,
+                    origin,
+                    shape=centres.array.shape,
                     object_key=key,
                     sha256=centres.sha256,
                     provenance=provenance,
                 )
-                session.add(vocabulary)
-                session.flush()
                 begin_generation(
                     session,
                     mine,

@@ -11,7 +11,7 @@ from shared.catalog.base import db_now
 from shared.catalog.generations import Generation, GenerationState, active_generation
 from shared.catalog.maps import Map, bump_version, lock_map
 from shared.catalog.session import Catalog
-from shared.catalog.vocabularies import Vocabulary, VocabularyOrigin
+from shared.catalog.vocabularies import Vocabulary, VocabularyOrigin, add_vocabulary
 from shared.ids import new_id
 from shared.jobs import Job, JobKind
 from shared.jobs.model_changes import release_vocabulary_waiters
@@ -78,17 +78,15 @@ def _make_first_generation(
         vocabulary, centres = None, None
         if shipped is not None:
             centres, provenance = shipped
-            vocabulary = Vocabulary(
-                id=new_id(),
-                map_id=map_id,
-                origin=VocabularyOrigin.SHIPPED,
-                clusters=centres.clusters,
-                dimension=centres.dimension,
+            vocabulary = add_vocabulary(
+                session,
+                map_id,
+                VocabularyOrigin.SHIPPED,
+                shape=centres.array.shape,
                 object_key=key,
                 sha256=centres.sha256,
                 provenance=provenance,
             )
-            session.add(vocabulary)
         generation = Generation(
             id=new_id(),
             map_id=map_id,
@@ -101,7 +99,6 @@ def _make_first_generation(
                 vocabulary.id if vocabulary else None,
             ),
         )
-        session.flush()
         session.add(generation)
         session.flush()
         release_vocabulary_waiters(session, map_id)

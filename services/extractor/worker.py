@@ -23,6 +23,7 @@ from services.extractor.loaded import LoadedModels
 from services.extractor.model_change import ModelChanges
 from services.extractor.prepare import Batch, prepare
 from services.extractor.publish import Published, publish
+from services.extractor.renew import renew_outdated_generations
 from services.extractor.target import find_target
 from shared.catalog.generations import active_generation
 from shared.catalog.maps import lock_map
@@ -80,12 +81,16 @@ class ExtractorWorker:
         hints: Hints,
         settings: Settings,
         name: str,
+        *,
+        only_worker: bool = False,
     ) -> None:
+        """`only_worker`: no other can be of another release, so this one renews what is old."""
         self._catalog = catalog
         self._store = store
         self._hints = hints
         self._settings = settings
         self._name = name
+        self._only_worker = only_worker
         self._models = LoadedModels(store, settings)
         self._decoders = DecoderPool(settings)
         self._changes = ModelChanges(catalog, store, self._models, self._decoders, settings)
@@ -93,6 +98,13 @@ class ExtractorWorker:
 
     def run(self, stop: threading.Event) -> None:
         """Drain whenever there is work, until `stop` is set."""
+        try:
+            self._models.extractor(self._settings.extractor)
+        except PlacewiseError as error:
+            # Maps may use another one; photos that need this one will say the same.
+            log.error("the extractor of new maps can't be loaded: %s", error.detail)
+        if self._only_worker:
+            renew_outdated_generations(self._catalog, self._models)
         while not stop.is_set():
             try:
                 result = self.drain(stop)

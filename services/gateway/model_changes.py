@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from starlette.concurrency import run_in_threadpool
 
 from services.gateway.context import DEFAULT_MAP, Gateway, GatewayDep, MapName
-from services.gateway.receive import receive_file
+from services.gateway.receive import describe_form, receive_file
 from services.gateway.schemas import (
     GenerationAnswer,
     JobStarted,
@@ -81,20 +81,7 @@ def fit_vocabulary(
     operation_id="import_vocabulary",
     status_code=202,
     response_model=JobStarted,
-    openapi_extra={
-        "requestBody": {
-            "required": True,
-            "content": {
-                "multipart/form-data": {
-                    "schema": {
-                        "type": "object",
-                        "required": ["file"],
-                        "properties": {"file": {"type": "string", "format": "binary"}},
-                    }
-                }
-            },
-        }
-    },
+    openapi_extra=describe_form("a `.npy` file of (clusters, dimension) floats"),
 )
 async def import_vocabulary(
     request: Request,

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any
 
-from shared.errors import PlacewiseError, Unprocessable, invalid_field
+from shared.errors import PlacewiseError, invalid_field
 
 MAX_TAGS = 50
 MAX_TEXT = 500  # characters of a tag or a place
+
+# A NUL as JSON writes it; after an escaped backslash the same letters are plain text.
+JSON_NUL = re.compile(r"(?<!\\)(?:\\\\)*\\u0000")
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,10 +123,17 @@ def _metadata(text: str) -> dict[str, Any]:
 
 
 def check_metadata(value: dict[str, Any]) -> None:
-    """What a JSON column can't hold: NUL characters."""
-    if "\\u0000" in json.dumps(value):
+    """Refuse what a JSON column can't hold."""
+    try:
+        text = json.dumps(value, ensure_ascii=False, allow_nan=False)
+        text.encode()
+    except UnicodeEncodeError:
+        raise invalid_field("metadata", "holds half of a surrogate pair") from None
+    except ValueError:
+        raise invalid_field("metadata", "holds a number that is not finite") from None
+    if JSON_NUL.search(text):
         raise invalid_field("metadata", "holds a NUL character")
 
 
 def _no_constant(name: str) -> Any:
-    raise Unprocessable("invalid_field", f"metadata: {name} is not JSON")
+    raise invalid_field("metadata", f"{name} is not JSON")

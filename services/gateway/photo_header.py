@@ -11,11 +11,11 @@ from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from typing import Any, BinaryIO
 
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 from PIL.ExifTags import GPS, IFD, Base
 
 from shared.errors import Unprocessable
-from shared.photo_formats import check_pixels, open_photo
+from shared.photo_formats import BROKEN, check_pixels, open_photo
 
 ROTATED = (5, 6, 7, 8)  # EXIF orientations that swap width and height
 
@@ -41,13 +41,7 @@ def read_photo_header(file: BinaryIO, max_pixels: int) -> PhotoHeader:
             with open_photo(file) as image:
                 check_pixels(image, max_pixels)
                 return _header(image)
-    except (
-        OSError,
-        SyntaxError,
-        ValueError,
-        EOFError,
-        UnidentifiedImageError,
-    ) as error:
+    except BROKEN as error:
         raise Unprocessable(
             "undecodable_photo", "The photo's header is broken: it can't be decoded."
         ) from error
@@ -56,11 +50,12 @@ def read_photo_header(file: BinaryIO, max_pixels: int) -> PhotoHeader:
 def _header(image: Image.Image) -> PhotoHeader:
     width, height = image.size
     exif = _exif(image)
-    if exif.get(Base.Orientation) in ROTATED:
+    # Pillow gives the size of a TIFF as it stands upright, that of all others as stored.
+    if image.format != "TIFF" and _orientation(exif) in ROTATED:
         width, height = height, width
-    gps = dict(exif.get_ifd(IFD.GPSInfo))
-    latitude = _degrees(gps.get(GPS.GPSLatitude), gps.get(GPS.GPSLatitudeRef), "S", limit=90)
-    longitude = _degrees(gps.get(GPS.GPSLongitude), gps.get(GPS.GPSLongitudeRef), "W", limit=180)
+    gps = _directory(exif, IFD.GPSInfo)
+    latitude = _degrees(gps.get(GPS.GPSLatitude), gps.get(GPS.GPSLatitudeRef), "NS", limit=90)
+    longitude = _degrees(gps.get(GPS.GPSLongitude), gps.get(GPS.GPSLongitudeRef), "EW", limit=180)
     if latitude is None or longitude is None:
         latitude = longitude = None
     heading = _number(gps.get(GPS.GPSImgDirection))
@@ -70,21 +65,36 @@ def _header(image: Image.Image) -> PhotoHeader:
         latitude=latitude,
         longitude=longitude,
         heading=heading % 360 if heading is not None else None,
-        captured_at=_captured_at(gps, dict(exif.get_ifd(IFD.Exif))),
+        captured_at=_captured_at(gps, _directory(exif, IFD.Exif)),
     )
 
 
 def _exif(image: Image.Image) -> Image.Exif:
     """The EXIF block; for PNG only if it stands before the pixels, which are not decoded here."""
-    if image.format == "TIFF":
-        return image.getexif()
     exif = Image.Exif()
-    if block := image.info.get("exif"):
-        try:
+    try:
+        if image.format == "TIFF":
+            return image.getexif()
+        if block := image.info.get("exif"):
             exif.load(block)
-        except (OSError, SyntaxError, ValueError):
-            return Image.Exif()
+    except BROKEN:
+        return Image.Exif()
     return exif
+
+
+def _orientation(exif: Image.Exif) -> Any:
+    try:
+        return exif.get(Base.Orientation)
+    except BROKEN:
+        return None
+
+
+def _directory(exif: Image.Exif, tag: int) -> dict[int, Any]:
+    """One of EXIF's inner directories; empty when it is broken."""
+    try:
+        return dict(exif.get_ifd(tag))
+    except BROKEN:
+        return {}
 
 
 def _number(value: Any) -> float | None:
@@ -95,16 +105,22 @@ def _number(value: Any) -> float | None:
     return number if math.isfinite(number) else None
 
 
-def _degrees(parts: Any, reference: Any, negative: str, limit: float) -> float | None:
-    """EXIF's (degrees, minutes, seconds) as one signed number."""
+def _degrees(parts: Any, reference: Any, signs: str, limit: float) -> float | None:
+    """EXIF's (degrees, minutes, seconds) as one number; `signs` are the letters of + and -.
+
+    Without either letter it is left out: the other hemisphere is no small error.
+    """
     if not isinstance(parts, tuple) or len(parts) != 3 or not isinstance(reference, str):
+        return None
+    sign = signs.find(reference.strip("\0 ").upper()[:1] or "?")
+    if sign < 0:
         return None
     numbers = [_number(part) for part in parts]
     if any(number is None for number in numbers):
         return None
     degrees, minutes, seconds = (number or 0.0 for number in numbers)
     value = degrees + minutes / 60 + seconds / 3600
-    if reference.strip().upper().startswith(negative):
+    if sign:
         value = -value
     return value if abs(value) <= limit else None
 
@@ -129,7 +145,7 @@ def _captured_at(gps: dict[int, Any], exif: dict[int, Any]) -> datetime | None:
         local = datetime.strptime(taken.strip("\0 "), "%Y:%m:%d %H:%M:%S").replace(tzinfo=UTC)
         if isinstance(offset, str) and offset.strip("\0 "):
             zone = datetime.fromisoformat(f"2000-01-01T00:00:00{offset.strip(chr(0) + ' ')}").tzinfo
-            return local.replace(tzinfo=zone or UTC)
+            return local.replace(tzinfo=zone or UTC).astimezone(UTC)
         return local
-    except ValueError:
+    except (ValueError, OverflowError):
         return None

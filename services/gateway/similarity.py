@@ -21,7 +21,12 @@ from services.gateway.context import (
 )
 from services.gateway.find_similar import find_similar, query_by_job, query_by_photo
 from services.gateway.photo_header import read_photo_header
-from services.gateway.receive import Received, check_photo_begin, receive_file
+from services.gateway.receive import (
+    Received,
+    check_photo_begin,
+    describe_form,
+    receive_file,
+)
 from services.gateway.schemas import JobStarted, SimilarityAnswer, job_started
 from services.gateway.waiting import preferred_wait, wait_for_job
 from shared.catalog.maps import get_map
@@ -32,21 +37,6 @@ from shared.jobs.table import UNFINISHED, get_job
 from shared.objects.keys import query_key
 
 router = APIRouter(tags=["similarity"])
-
-_FORM: dict[str, Any] = {
-    "requestBody": {
-        "required": True,
-        "content": {
-            "multipart/form-data": {
-                "schema": {
-                    "type": "object",
-                    "required": ["file"],
-                    "properties": {"file": {"type": "string", "format": "binary"}},
-                }
-            }
-        },
-    }
-}
 
 
 @router.post(
@@ -70,7 +60,7 @@ def similar_to_stored(
     operation_id="similar_to_upload",
     response_model=SimilarityAnswer,
     responses={202: {"model": JobStarted, "description": "Being described; poll, then fetch."}},
-    openapi_extra=_FORM,
+    openapi_extra=describe_form("the photo to ask with"),
 )
 async def similar_to_upload(
     request: Request,

@@ -34,36 +34,33 @@ class Stored:
     """False: the same bytes were there already and need no work."""
 
 
-def store_photo(
-    gateway: Gateway,
-    map_name: str,
-    received: Received,
-    media_type: str,
-    header: PhotoHeader,
-    fields: PhotoFields,
-) -> Stored:
+@dataclass(frozen=True, slots=True)
+class Incoming:
+    """A checked photo whose bytes lie in the object store."""
+
+    received: Received
+    media_type: str
+    header: PhotoHeader
+    fields: PhotoFields
+
+
+def store_photo(gateway: Gateway, map_name: str, incoming: Incoming) -> Stored:
     """Acknowledge the photo, or the one with the same bytes that the map has already.
 
     Raises Conflict (`photo_differs`) when that one has other coordinates or another place.
     """
     try:
-        stored = _store(gateway, map_name, received, media_type, header, fields)
+        stored = _store(gateway, map_name, incoming)
     except IntegrityError:
         # The same bytes were committed between our look and our insert: look again.
-        stored = _store(gateway, map_name, received, media_type, header, fields)
+        stored = _store(gateway, map_name, incoming)
     if stored.queued:
         gateway.hints.send()
     return stored
 
 
-def _store(
-    gateway: Gateway,
-    map_name: str,
-    received: Received,
-    media_type: str,
-    header: PhotoHeader,
-    fields: PhotoFields,
-) -> Stored:
+def _store(gateway: Gateway, map_name: str, incoming: Incoming) -> Stored:
+    received, header, fields = incoming.received, incoming.header, incoming.fields
     with gateway.catalog.write() as session:
         map_ = get_map(session, map_name)
         existing = find_live_by_sha256(session, map_.id, received.sha256)
@@ -78,7 +75,7 @@ def _store(
             sha256=received.sha256,
             object_key=received.key,
             filename=received.filename,
-            media_type=media_type,
+            media_type=incoming.media_type,
             size_bytes=received.size_bytes,
             width=header.width,
             height=header.height,

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from fastapi import APIRouter, Request, Response
 from starlette.concurrency import run_in_threadpool
 
 from services.gateway.context import DEFAULT_MAP, Gateway, GatewayDep, MapName
-from services.gateway.photo_fields import PhotoFields, read_form_fields
+from services.gateway.photo_fields import read_form_fields
 from services.gateway.photo_header import read_photo_header
-from services.gateway.receive import Received, check_photo_begin, receive_file
+from services.gateway.receive import (
+    Received,
+    check_photo_begin,
+    describe_form,
+    receive_file,
+)
 from services.gateway.schemas import UploadAnswer, job_url
-from services.gateway.store_photo import Stored, store_photo
+from services.gateway.store_photo import Incoming, Stored, store_photo
 from services.gateway.waiting import preferred_wait, wait_for_job
 from shared.errors import PlacewiseError
 from shared.jobs import JobState
@@ -21,40 +24,16 @@ from shared.objects.keys import new_original_key
 router = APIRouter(tags=["photos"])
 
 _TEXT = {"type": "string"}
-FORM_DESCRIPTION: dict[str, Any] = {
-    "requestBody": {
-        "required": True,
-        "content": {
-            "multipart/form-data": {
-                "schema": {
-                    "type": "object",
-                    "required": ["file"],
-                    "properties": {
-                        "file": {
-                            "type": "string",
-                            "format": "binary",
-                            "description": "JPEG, PNG, WebP, BMP or TIFF",
-                        },
-                        "latitude": {"type": "number", "minimum": -90, "maximum": 90},
-                        "longitude": {
-                            "type": "number",
-                            "minimum": -180,
-                            "maximum": 180,
-                        },
-                        "heading": {"type": "number", "minimum": 0, "maximum": 360},
-                        "captured_at": {"type": "string", "format": "date-time"},
-                        "place": {
-                            **_TEXT,
-                            "description": "a label, where coordinates say little",
-                        },
-                        "tags": {**_TEXT, "description": "separated by commas"},
-                        "metadata": {**_TEXT, "description": "a JSON object"},
-                    },
-                }
-            }
-        },
-    }
-}
+FORM = describe_form(
+    "JPEG, PNG, WebP, BMP or TIFF",
+    latitude={"type": "number", "minimum": -90, "maximum": 90},
+    longitude={"type": "number", "minimum": -180, "maximum": 180},
+    heading={"type": "number", "minimum": 0, "maximum": 360},
+    captured_at={"type": "string", "format": "date-time"},
+    place={**_TEXT, "description": "a label, where coordinates say little"},
+    tags={**_TEXT, "description": "separated by commas"},
+    metadata={**_TEXT, "description": "a JSON object"},
+)
 
 
 @router.post(
@@ -69,7 +48,7 @@ FORM_DESCRIPTION: dict[str, Any] = {
             "description": "Searchable (with `Prefer: wait=N`).",
         },
     },
-    openapi_extra=FORM_DESCRIPTION,
+    openapi_extra=FORM,
 )
 async def upload(
     request: Request,
@@ -121,10 +100,11 @@ def _store(gateway: Gateway, map_name: str, received: Received) -> tuple[Stored,
     """Check what came and acknowledge it; whatever is not kept leaves no bytes behind."""
     try:
         media_type = check_photo_begin(received.begin)
-        fields: PhotoFields = read_form_fields(received.fields)
+        fields = read_form_fields(received.fields)
         with gateway.store.open(received.key) as file:
             header = read_photo_header(file, gateway.settings.max_image_pixels)
-        stored = store_photo(gateway, map_name, received, media_type, header, fields)
+        incoming = Incoming(received, media_type, header, fields)
+        stored = store_photo(gateway, map_name, incoming)
     except PlacewiseError:
         # Only what is certainly refused: after a lost connection the row may be committed.
         gateway.store.delete(received.key)

@@ -119,6 +119,8 @@ class SearchWorker:
     def _query(self, snapshot: Snapshot, request: SearchRequest) -> NDArray[np.float32]:
         """The descriptor that the request refers to."""
         loaded = snapshot.chunk_at(request.object_key)
+        if request.object_key in snapshot.missing:
+            raise _unreadable(request.object_key)
         try:
             rows = loaded.rows if loaded else decode_rows(self._store.get(request.object_key))
         except NotFound:
@@ -126,5 +128,16 @@ class SearchWorker:
                 "query_expired",
                 f"The descriptor {request.object_key} is no longer kept. Ask with the photo again.",
             ) from None
+        except ValueError as error:
+            raise _unreadable(request.object_key) from error
         row: NDArray[np.float32] = rows[request.row]
         return row
+
+
+def _unreadable(object_key: str) -> Unavailable:
+    return Unavailable(
+        "chunk_unreadable",
+        f"The descriptor in {object_key} can't be read: the object is missing or damaged. "
+        "Ask with the photo itself, or restore the object from a backup.",
+        object_key=object_key,
+    )

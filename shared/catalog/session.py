@@ -101,4 +101,5 @@ def _begin_sqlite(connection: Any) -> None:
     # IMMEDIATE takes the write lock at once: a transaction that reads before it writes can then
     # never fail half way because another one wrote in between.
     writes = connection.get_execution_options().get("placewise_write", True)
+    connection.exec_driver_sql(f"PRAGMA query_only = {'OFF' if writes else 'ON'}")
     connection.exec_driver_sql("BEGIN IMMEDIATE" if writes else "BEGIN")

@@ -42,6 +42,32 @@ class Vocabulary(Base):
         return "own" if self.origin == VocabularyOrigin.FITTED else "foreign"
 
 
+def add_vocabulary(
+    session: Session,
+    map_id: UUID,
+    origin: VocabularyOrigin,
+    *,
+    shape: tuple[int, int],
+    object_key: str,
+    sha256: str,
+    provenance: dict[str, Any],
+) -> Vocabulary:
+    """Make centres that lie under `object_key` known; `shape` is (clusters, dimension)."""
+    vocabulary = Vocabulary(
+        id=new_id(),
+        map_id=map_id,
+        origin=origin,
+        clusters=shape[0],
+        dimension=shape[1],
+        object_key=object_key,
+        sha256=sha256,
+        provenance=provenance,
+    )
+    session.add(vocabulary)
+    session.flush()
+    return vocabulary
+
+
 def get_vocabulary(session: Session, map_id: UUID, vocabulary_id: UUID) -> Vocabulary:
     """A vocabulary of the map; 404 when there is none."""
     found = session.scalar(

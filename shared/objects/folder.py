@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import stat
 from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path, PurePosixPath
@@ -13,6 +14,8 @@ from shared.errors import NotFound, Unavailable
 from shared.ids import new_id
 from shared.objects.port import ObjectInfo
 
+# No file there, or a folder on the way or at the end: to a store of keys it is all the same.
+MISSING = (FileNotFoundError, NotADirectoryError, IsADirectoryError)
 PARTIAL = ".partial"  # the folder of files being written: same file system, so rename is atomic
 
 
@@ -27,9 +30,9 @@ class FolderStore:
             left_over.unlink()
 
     def path(self, key: str) -> Path:
-        """The file of a key. Keys are relative, without `.` or `..`."""
-        parts = PurePosixPath(key).parts
-        if not parts or key.startswith("/") or any(p in (".", "..") for p in key.split("/")):
+        """The file of a key. Keys are names joined by single slashes, none of them `.` or `..`."""
+        parts = key.split("/")
+        if any(part in ("", ".", "..") for part in parts):
             raise ValueError(f"not an object key: {key!r}")
         if parts[0] == PARTIAL:
             raise ValueError(f"the name {PARTIAL} is the store's own: {key!r}")
@@ -53,7 +56,7 @@ class FolderStore:
     def open(self, key: str) -> BinaryIO:
         try:
             return self.path(key).open("rb")
-        except FileNotFoundError:
+        except MISSING:
             raise NotFound(
                 "object_not_found", f"The object store has no {key!r}.", key=key
             ) from None
@@ -61,12 +64,13 @@ class FolderStore:
     def head(self, key: str) -> ObjectInfo | None:
         try:
             status = self.path(key).stat()
-        except FileNotFoundError:
+        except MISSING:
             return None
-        return _info(key, status)
+        return _info(key, status) if stat.S_ISREG(status.st_mode) else None
 
     def delete(self, key: str) -> None:
-        self.path(key).unlink(missing_ok=True)
+        with contextlib.suppress(*MISSING):
+            self.path(key).unlink()
 
     def list(self, prefix: str) -> Iterator[ObjectInfo]:
         folder = self.root.joinpath(*PurePosixPath(prefix).parts[: prefix.count("/")])

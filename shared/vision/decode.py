@@ -12,15 +12,25 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, ImageOps, UnidentifiedImageError
+from PIL import Image
 from PIL import __version__ as pillow_version
+from PIL.ExifTags import Base
 
 from shared.errors import Unprocessable
-from shared.photo_formats import check_pixels, open_photo
+from shared.photo_formats import BROKEN, check_pixels, open_photo
 from shared.vision.preprocessing import Preprocessing
 
 THUMBNAIL_PIXELS = 256  # the longer side
 DECODER = f"pillow-{pillow_version}"
+UPRIGHT = {  # by EXIF orientation; 1 is upright already
+    2: Image.Transpose.FLIP_LEFT_RIGHT,
+    3: Image.Transpose.ROTATE_180,
+    4: Image.Transpose.FLIP_TOP_BOTTOM,
+    5: Image.Transpose.TRANSPOSE,
+    6: Image.Transpose.ROTATE_270,
+    7: Image.Transpose.TRANSVERSE,
+    8: Image.Transpose.ROTATE_90,
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,16 +53,10 @@ def decode(data: bytes, preprocessing: Preprocessing, max_pixels: int) -> Decode
             with open_photo(io.BytesIO(data)) as image:
                 check_pixels(image, max_pixels)
                 image.load()
-                rgb = _to_rgb(ImageOps.exif_transpose(image))
+                rgb = _upright(image, _to_rgb(image))
             pixels = np.asarray(preprocessing.apply(rgb), dtype=np.uint8)
             return Decoded(pixels=pixels, thumbnail=_thumbnail(rgb))
-    except (
-        OSError,
-        SyntaxError,
-        ValueError,
-        EOFError,
-        UnidentifiedImageError,
-    ) as error:
+    except BROKEN as error:
         raise Unprocessable(
             "undecodable_photo",
             f"The photo can't be decoded: {error or type(error).__name__}.",
@@ -62,6 +66,18 @@ def decode(data: bytes, preprocessing: Preprocessing, max_pixels: int) -> Decode
             "undecodable_photo",
             "The photo needs more memory to decode than one photo may have.",
         ) from error
+
+
+def _upright(image: Image.Image, rgb: Image.Image) -> Image.Image:
+    """`rgb` turned as the EXIF of `image` says. Not Pillow's `exif_transpose`: that also writes
+    the EXIF anew, and fails where any other tag of it is broken.
+    """
+    try:
+        orientation = image.getexif().get(Base.Orientation)
+    except BROKEN:
+        return rgb  # broken EXIF is no reason to refuse the pixels
+    method = UPRIGHT.get(orientation) if isinstance(orientation, int) else None
+    return rgb if method is None else rgb.transpose(method)
 
 
 def _to_rgb(image: Image.Image) -> Image.Image:

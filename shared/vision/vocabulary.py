@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import io
+import struct
+import tokenize
+import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,6 +14,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared.errors import Unprocessable
+
+# What reading raises for bytes that are no array, or whose header promises an impossible one.
+NO_ARRAY = (
+    ValueError,
+    TypeError,
+    LookupError,
+    EOFError,
+    OSError,
+    OverflowError,
+    MemoryError,
+    struct.error,
+    tokenize.TokenError,
+    zipfile.BadZipFile,
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,7 +59,8 @@ def check_centres(array: NDArray[np.float32], *, width: int | None = None) -> Ce
         raise refuse(f"its shape is {array.shape}, not (clusters, dimension)")
     if array.dtype.kind != "f":
         raise refuse(f"its numbers are {array.dtype}, not floating point")
-    array = np.ascontiguousarray(array, dtype=np.float32)
+    with np.errstate(over="ignore"):  # what float32 can't hold is infinite, and refused below
+        array = np.ascontiguousarray(array, dtype=np.float32)
     if width is not None and array.shape[1] != width:
         raise refuse(
             f"its centres have {array.shape[1]} dimensions, the extractor's local features {width}"
@@ -69,7 +87,7 @@ def decode_centres(data: bytes, *, width: int | None = None) -> Centres:
     """The centres in the bytes of a `.npy` file, checked."""
     try:
         array = np.load(io.BytesIO(data), allow_pickle=False)
-    except (ValueError, EOFError, OSError) as error:
+    except NO_ARRAY as error:
         raise Unprocessable(
             "vocabulary_unfit",
             f"This is not a NumPy .npy file of cluster centres: {error}.",
@@ -89,7 +107,7 @@ def read_centres(path: Path) -> Centres:
 
     try:
         tensor = torch.load(path, map_location="cpu", weights_only=True)
-    except (pickle.UnpicklingError, RuntimeError, EOFError) as error:
+    except (pickle.UnpicklingError, RuntimeError, AssertionError, *NO_ARRAY) as error:
         raise Unprocessable(
             "vocabulary_unfit", f"{path.name} is not a file of tensors: {error}"
         ) from error
@@ -98,4 +116,7 @@ def read_centres(path: Path) -> Centres:
             "vocabulary_unfit",
             f"{path.name} holds a {type(tensor).__name__}, not one tensor.",
         )
+    tensor = tensor.detach().to_dense()
+    if tensor.is_floating_point():
+        tensor = tensor.to(torch.float32)  # NumPy has no bfloat16
     return check_centres(tensor.numpy())

@@ -11,7 +11,6 @@ import hashlib
 from pathlib import Path
 from typing import Any, cast
 
-import timm
 import torch
 from torch.nn.functional import normalize
 
@@ -31,6 +30,8 @@ class EfficientNetLite0:
     facet: str | None = None
 
     def __init__(self, device: torch.device) -> None:
+        import timm  # takes seconds, which other extractors and commands need not pay
+
         path = weights_path()
         data = path.read_bytes()
         self.fingerprint = hashlib.sha256(data).hexdigest()
