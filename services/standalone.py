@@ -14,6 +14,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
+import signal
 import socket
 import threading
 from collections.abc import Callable, Iterator
@@ -34,9 +35,11 @@ from shared.home import announced, lock_home
 from shared.jobs import InProcessHints
 from shared.objects import FolderStore
 from shared.settings import Settings
+from shared.vision.extractors import get_recipe
 
 log = logging.getLogger(__name__)
 
+BACKLOG = 2048  # connections that wait to be accepted
 GRACEFUL_SECONDS = 10  # for requests under way when the server is asked to stop
 
 
@@ -52,7 +55,8 @@ class Standalone:
 
     def serve(self) -> None:
         """Answer HTTP until the process is asked to stop."""
-        self.server.run(sockets=[self.listener])
+        with _stopped_by_signals(self.server):
+            self.server.run(sockets=[self.listener])
         if self.failed.is_set():
             raise Misconfigured("part_died", "A part of Placewise died; the log above says why.")
 
@@ -61,8 +65,10 @@ class Standalone:
 def standalone(settings: Settings) -> Iterator[Standalone]:
     """Lock the folder, recover what a killed process left, and start every part.
 
-    Raises Misconfigured: `home_in_use` for a folder that another server has, `address_in_use`.
+    Raises Misconfigured: `home_in_use` for a folder that another server has, `address_in_use`,
+    and for an extractor of new maps that is unknown: no photo could ever be described.
     """
+    get_recipe(settings.extractor, allow_test_extractors=settings.allow_test_extractors)
     home = settings.placewise_home
     with contextlib.ExitStack() as held:
         held.enter_context(lock_home(home))
@@ -115,16 +121,41 @@ def standalone(settings: Settings) -> Iterator[Standalone]:
 
 
 @contextlib.contextmanager
+def _stopped_by_signals(server: uvicorn.Server) -> Iterator[None]:
+    """SIGTERM and Ctrl-C end the block in good order, not the process.
+
+    uvicorn raises the signal that stopped it once more. By Python's own handlers that would end
+    the process there, before its parts have given back what they hold.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield  # signals are the main thread's, and so is their handling
+        return
+
+    def stop(_number: int, _frame: object) -> None:
+        server.should_exit = True
+
+    before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextlib.contextmanager
 def _listener(settings: Settings) -> Iterator[socket.socket]:
     """The listening socket; port 0 takes a free one."""
     try:
-        family = socket.getaddrinfo(settings.host, settings.port, type=socket.SOCK_STREAM)[0][0]
-        listener = socket.create_server(
-            (settings.host, settings.port),
-            family=family,
-            backlog=2048,
-            reuse_port=False,
-        )
+        family, kind, protocol, _, address = socket.getaddrinfo(
+            settings.host, settings.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+        )[0]
+        listener = socket.socket(family, kind, protocol)
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        # Inherited by every connection: an answer's second packet waits for no acknowledgement,
+        # which costs 40 ms a call. (asyncio sets it only on sockets that it has made.)
+        listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        listener.bind(address)
+        listener.listen(BACKLOG)
     except OSError as error:
         raise Misconfigured(
             "address_in_use",

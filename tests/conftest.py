@@ -15,6 +15,9 @@ from tests.support.postgres import PostgresServer, start_postgres
 
 REAL_PHOTOS = "PLACEWISE_TEST_DATA"
 
+# As the command does before torch is loaded; see services/cli/__init__.py.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Without the real photos, the tests that need them are deselected, and one line says so."""

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
+import os
 import statistics
+import subprocess
+import sys
 import tempfile
 import time
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Annotated
@@ -15,9 +20,12 @@ import typer
 from PIL import Image
 from rich.table import Table
 
-from services.cli.connect import connect
 from services.cli.output import JsonOption, answers, explained, print_json, progress_bar
-from shared.client import Client, Json
+from shared.client import Client, Json, retry_while_away
+from shared.errors import Unavailable
+from shared.home import address_of_running
+
+START_SECONDS = 60.0
 
 app = typer.Typer(help="Timings on this machine.", no_args_is_help=True)
 
@@ -37,12 +45,9 @@ def spine(
 
     The photos are random textures of 320 x 240 pixels: timings need no places.
     """
-    import os
-
-    with explained(as_json), tempfile.TemporaryDirectory() as home:
-        os.environ["PLACEWISE_HOME"] = home
-        made = _make_photos(Path(home, "photos"), photos)
-        with connect(None, None) as client, progress_bar() as progress:
+    with explained(as_json), tempfile.TemporaryDirectory() as folder, progress_bar() as progress:
+        made = _make_photos(Path(folder, "photos"), photos)
+        with _server(Path(folder, "home")) as url, Client(url) as client:
             figures = _measure(client, made, queries, progress)
     if as_json:
         print_json(figures)
@@ -57,6 +62,24 @@ def spine(
         )
     answers.print(table)
     answers.print(f"{photos} photos, searchable {figures['searchable_after_seconds']:.1f} s in all")
+
+
+@contextlib.contextmanager
+def _server(home: Path) -> Iterator[str]:
+    """A server in a process of its own: in ours it would share the interpreter with the client."""
+    command = [str(Path(sys.executable).with_name("placewise")), "serve"]
+    environment = {**os.environ, "PLACEWISE_HOME": str(home), "HOST": "127.0.0.1", "PORT": "0"}
+    with subprocess.Popen(command, env=environment, stderr=subprocess.DEVNULL) as server:  # noqa: S603
+        try:
+            deadline = time.monotonic() + START_SECONDS
+            while (url := address_of_running(home)) is None:
+                if server.poll() is not None or time.monotonic() > deadline:
+                    raise Unavailable("server_unreachable", "The server did not start.")
+                time.sleep(0.1)
+            retry_while_away(lambda: Client(url).stats(), START_SECONDS)
+            yield url
+        finally:
+            server.terminate()
 
 
 def _measure(client: Client, photos: list[Path], queries: int, progress) -> Json:  # type: ignore[no-untyped-def]

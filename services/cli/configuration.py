@@ -2,15 +2,30 @@
 
 from __future__ import annotations
 
+from pydantic import ValidationError
 from rich.table import Table
 
-from services.cli.output import JsonOption, answers, print_json
+from services.cli.output import JsonOption, answers, explained, print_json
+from shared.errors import Misconfigured
 from shared.settings import Settings
+
+
+def read_settings() -> Settings:
+    """The settings in force; Misconfigured (`bad_setting`) names what can't be read."""
+    try:
+        return Settings()
+    except ValidationError as error:
+        faults = [
+            f"{'.'.join(str(part) for part in fault['loc']).upper()}: {fault['msg']}"
+            for fault in error.errors(include_input=False)  # a value may hold a password
+        ]
+        raise Misconfigured("bad_setting", "; ".join(faults)) from None
 
 
 def config(as_json: JsonOption = False) -> None:
     """Print every setting that is in force, secrets masked."""
-    settings = Settings()
+    with explained(as_json):
+        settings = read_settings()
     values = settings.model_dump(mode="json")
     if as_json:
         print_json({name.upper(): value for name, value in values.items()})

@@ -7,10 +7,10 @@ import threading
 import time
 from collections.abc import Iterator
 
+from services.cli.configuration import read_settings
 from shared.client import Client
 from shared.errors import Unavailable
 from shared.home import address_of_running
-from shared.settings import Settings
 
 START_SECONDS = 30.0
 
@@ -18,7 +18,7 @@ START_SECONDS = 30.0
 @contextlib.contextmanager
 def connect(server: str | None, map_name: str | None) -> Iterator[Client]:
     """A client of `server`, else of the server on PLACEWISE_HOME, else of one started for it."""
-    settings = Settings()
+    settings = read_settings()
     url = server or address_of_running(settings.placewise_home)
     if url is not None:
         with Client(url, map_name) as client:

@@ -9,7 +9,8 @@ from dataclasses import asdict, dataclass
 
 import typer
 
-from services.cli.output import JsonOption, answers, print_json
+from services.cli.configuration import read_settings
+from services.cli.output import JsonOption, answers, explained, print_json
 from shared.catalog.session import Catalog
 from shared.client import Client
 from shared.errors import PlacewiseError
@@ -29,7 +30,8 @@ class Finding:
 
 def doctor(as_json: JsonOption = False) -> None:
     """Check this installation; exit code 1 when something needs attention."""
-    settings = Settings()
+    with explained(as_json):
+        settings = read_settings()
     checks: list[tuple[str, Callable[[Settings], str]]] = [
         ("python", _python),
         ("folder", _folder),

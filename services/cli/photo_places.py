@@ -48,7 +48,8 @@ def find_photos(folder: Path, table: Path | None, utm_zone: str | None) -> list[
         )
     said = _read_table(folder, table, set(paths)) if table else {}
     return [
-        FoundPhoto(path, said.get(path) or fields_of_name(path.name, utm_zone)) for path in paths
+        FoundPhoto(path, {**fields_of_name(path.name, utm_zone), **said.get(path, {})})
+        for path in paths
     ]
 
 

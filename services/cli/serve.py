@@ -5,6 +5,7 @@ from __future__ import annotations
 import ipaddress
 import logging
 
+from services.cli.configuration import read_settings
 from services.cli.output import explained, messages
 from shared.settings import Settings
 
@@ -14,7 +15,7 @@ def serve() -> None:
     with explained(as_json=False):
         from services.standalone import standalone  # brings torch, as `connect` says
 
-        settings = Settings()
+        settings = read_settings()
         logging.getLogger().setLevel(logging.INFO)
         logging.getLogger("alembic").setLevel(logging.WARNING)
         with standalone(settings) as running:

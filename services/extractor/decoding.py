@@ -9,9 +9,11 @@ from __future__ import annotations
 import logging
 import multiprocessing
 import resource
+import threading
 from collections.abc import Sequence
 from concurrent.futures import TimeoutError as TimedOut
 from concurrent.futures import wait
+from concurrent.futures.process import BrokenProcessPool
 
 from pebble import ProcessExpired, ProcessFuture, ProcessPool
 
@@ -33,16 +35,18 @@ class DecoderPool:
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
+        self._renewing = threading.Lock()
         self._pool = self._new_pool()
 
     def decode(
         self, photos: Sequence[bytes], preprocessing: Preprocessing
     ) -> list[Decoded | PlacewiseError]:
         """Each photo decoded, or the reason why it can't be."""
-        if not self._pool.active:
-            log.error("the decoder pool broke; starting a new one")
-            self.close()
-            self._pool = self._new_pool()
+        with self._renewing:  # batches and model changes decode from different threads
+            if not self._pool.active:
+                log.error("the decoder pool broke; starting a new one")
+                self.close()
+                self._pool = self._new_pool()
         pending = [self._schedule(data, preprocessing) for data in photos]
         return [
             self._result(future, data, preprocessing)
@@ -64,11 +68,14 @@ class DecoderPool:
         )
 
     def _schedule(self, data: bytes, preprocessing: Preprocessing) -> ProcessFuture[Decoded]:
-        return self._pool.schedule(
-            decode,
-            args=[data, preprocessing, self._settings.max_image_pixels],
-            timeout=self._settings.decode_timeout_seconds,
-        )
+        try:
+            return self._pool.schedule(
+                decode,
+                args=[data, preprocessing, self._settings.max_image_pixels],
+                timeout=self._settings.decode_timeout_seconds,
+            )
+        except RuntimeError as error:  # how pebble says that the pool no longer runs
+            raise _broke() from error
 
     def _result(
         self, future: ProcessFuture[Decoded], data: bytes, preprocessing: Preprocessing
@@ -101,9 +108,16 @@ class DecoderPool:
         while True:
             done, _ = wait([future], timeout=LOOK_SECONDS)
             if done:
-                return future.result()
+                try:
+                    return future.result()
+                except BrokenProcessPool as error:  # a child was killed between two photos
+                    raise _broke() from error
             if not self._pool.active:
-                raise Unavailable("decoders_broke", "The decoder processes broke; trying again.")
+                raise _broke()
+
+
+def _broke() -> Unavailable:
+    return Unavailable("decoders_broke", "The decoder processes broke; trying again.")
 
 
 def _limit_memory(limit_bytes: int) -> None:

@@ -7,6 +7,7 @@ from uuid import UUID
 
 from fastapi import APIRouter, Request, Response
 from fastapi import Path as PathParameter
+from fastapi.responses import JSONResponse
 from starlette.concurrency import run_in_threadpool
 
 from services.gateway.context import (
@@ -90,10 +91,10 @@ async def similar_to_upload(
         raise _expired()
     if job.state in UNFINISHED:
         started = job_started(job)
-        response.status_code = 202
         response.headers["Location"] = started.status_url
         response.headers["Retry-After"] = "1"
-        return started
+        # As a response of its own: the route's model is that of the 200.
+        return JSONResponse(started.model_dump(mode="json"), 202, dict(response.headers))
     return await run_in_threadpool(_result, gateway, job)
 
 

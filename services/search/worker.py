@@ -96,7 +96,9 @@ class SearchWorker:
             if snapshot is not None and snapshot.version >= min_version:
                 return snapshot
             snapshot = self._advance(generation_id, min_version)
-            if snapshot is not None and snapshot.version >= min_version:
+            if snapshot is None:
+                raise _expired(f"generation {generation_id}")
+            if snapshot.version >= min_version:
                 return snapshot
             if time.monotonic() > deadline:
                 raise Unavailable(
@@ -124,14 +126,17 @@ class SearchWorker:
         try:
             rows = loaded.rows if loaded else decode_rows(self._store.get(request.object_key))
         except NotFound:
-            raise Gone(
-                "query_expired",
-                f"The descriptor {request.object_key} is no longer kept. Ask with the photo again.",
-            ) from None
+            raise _expired(f"descriptor {request.object_key}") from None
         except ValueError as error:
             raise _unreadable(request.object_key) from error
+        if request.row >= len(rows):
+            raise _expired(f"row {request.row} of {request.object_key}")
         row: NDArray[np.float32] = rows[request.row]
         return row
+
+
+def _expired(what: str) -> Gone:
+    return Gone("query_expired", f"The {what} is no longer kept. Ask with the photo again.")
 
 
 def _unreadable(object_key: str) -> Unavailable:

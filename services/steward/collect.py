@@ -6,6 +6,7 @@ harms nothing, while the other order would leave bytes that no one knows of.
 
 from __future__ import annotations
 
+import contextlib
 import logging
 from collections.abc import Callable, Iterable
 from datetime import timedelta
@@ -134,17 +135,16 @@ def collect_work(catalog: Catalog, store: ObjectStore) -> None:
     if not keys:
         return
     with catalog.read() as session:
-        needed = set(
-            session.scalars(
-                select(Job.id).where(
-                    Job.kind.in_(MODEL_CHANGES),
-                    Job.state.in_(UNFINISHED),
-                    Job.generation_id.is_(None),
-                )
+        unfinished = session.scalars(
+            select(Job.id).where(
+                Job.kind.in_(MODEL_CHANGES),
+                Job.state.in_(UNFINISHED),
+                Job.generation_id.is_(None),
             )
         )
+        needed = {str(job_id) for job_id in unfinished}
     for key in keys:
-        if UUID(key.split("/")[1]) not in needed:
+        if key.split("/")[1] not in needed:
             store.delete(key)
 
 
@@ -183,11 +183,11 @@ def _known_originals(session: Session, keys: list[str]) -> Iterable[str]:
 
 
 def _known_thumbnails(session: Session, keys: list[str]) -> Iterable[str]:
-    by_photo = {UUID(key.removeprefix(THUMBNAILS).removesuffix(".jpg")): key for key in keys}
+    photo_ids = _ids(key.removeprefix(THUMBNAILS).removesuffix(".jpg") for key in keys)
     live = session.scalars(
-        select(Photo.id).where(Photo.id.in_(by_photo), Photo.deleted_at.is_(None))
+        select(Photo.id).where(Photo.id.in_(photo_ids), Photo.deleted_at.is_(None))
     )
-    return [by_photo[photo_id] for photo_id in live]
+    return [thumbnail_key(photo_id) for photo_id in live]
 
 
 def _known_chunks(session: Session, keys: list[str]) -> Iterable[str]:
@@ -205,9 +205,18 @@ def _known_vocabularies(session: Session, keys: list[str]) -> Iterable[str]:
 
 
 def _known_queries(session: Session, keys: list[str]) -> Iterable[str]:
-    by_job = {key: UUID(key.removeprefix(QUERIES).removesuffix(".npy")) for key in keys}
-    known = set(session.scalars(select(Job.id).where(Job.id.in_(by_job.values()))))
-    return [key for key, job_id in by_job.items() if job_id in known]
+    job_ids = _ids(key.removeprefix(QUERIES).removesuffix(".npy") for key in keys)
+    known = session.scalars(select(Job.id).where(Job.id.in_(job_ids)))
+    return [key for job_id in known for key in (query_key(job_id), query_vector_key(job_id))]
+
+
+def _ids(names: Iterable[str]) -> set[UUID]:
+    """Those of the names that are ids: what else lies in the store belongs to no row."""
+    found = set()
+    for name in names:
+        with contextlib.suppress(ValueError):
+            found.add(UUID(name))
+    return found
 
 
 REFERENCED: dict[str, Callable[[Session, list[str]], Iterable[str]]] = {

@@ -94,7 +94,7 @@ def _advance(session: Session, job: Job, generation_id: UUID) -> int:
     if queued or session.scalar(select(exists().where(open_jobs, Job.state.in_(UNFINISHED)))):
         sampled = int(job.params.get("sampled", 0))
         done = count_searchable(session, generation_id)
-        job.progress_done = min(sampled + done, job.progress_total - 1)
+        job.progress_done = max(0, min(sampled + done, job.progress_total - 1))
         return queued
     failed = _count(session, open_jobs & (Job.state == JobState.FAILED))
     if generation.state == GenerationState.BUILDING:
@@ -134,7 +134,9 @@ def _queue_missing(session: Session, generation: Generation) -> int:
                 described.photo_id == Photo.id, described.generation_id == generation.id
             ),
             ~exists().where(
-                reindexed.photo_id == Photo.id, reindexed.generation_id == generation.id
+                reindexed.photo_id == Photo.id,
+                reindexed.generation_id == generation.id,
+                reindexed.state != JobState.CANCELLED,  # by someone, alone: the photo is missing
             ),
         )
         .order_by(Photo.id)

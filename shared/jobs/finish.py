@@ -16,6 +16,7 @@ from shared.jobs.table import (
     Job,
     JobKind,
     JobState,
+    Priority,
     WaitingFor,
 )
 
@@ -92,15 +93,17 @@ def retry(session: Session, job: Job) -> None:
             job_id=str(job.id),
             state=job.state,
         )
-    if job.kind in MODEL_CHANGES or job.kind == JobKind.REINDEX:
+    photo = session.get_one(Photo, job.photo_id) if job.photo_id is not None else None
+    # A failed reindex job becomes its photo's own job at the switch: from then on it may.
+    part_of_a_change = job.kind == JobKind.REINDEX and (photo is None or photo.job_id != job.id)
+    if job.kind in MODEL_CHANGES or part_of_a_change:
         raise Conflict(
             "job_not_retryable",
             "A model change is started anew, not retried: POST /api/v1/vocabularies or "
             "/api/v1/generations.",
             job_id=str(job.id),
         )
-    if job.photo_id is not None:
-        photo = session.get_one(Photo, job.photo_id)
+    if photo is not None:
         if photo.deleted_at is not None:
             raise Conflict("photo_deleted", "The job's photo was deleted.", job_id=str(job.id))
         photo.job_id = job.id
@@ -109,6 +112,9 @@ def retry(session: Session, job: Job) -> None:
 
 def requeue(job: Job) -> None:
     """Back to the start, as if it were new."""
+    if job.kind == JobKind.REINDEX:
+        # The generation that it failed in may be gone: the photo goes to the one that answers.
+        job.kind, job.priority, job.generation_id = JobKind.INDEX, Priority.UPLOAD, None
     job.state = JobState.QUEUED
     job.attempts = 0
     job.alone = False

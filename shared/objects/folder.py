@@ -111,18 +111,26 @@ class FolderWriter:
         self._file.flush()
         os.fsync(self._file.fileno())
         self._file.close()
+        # The rename has to survive a power cut, too, and so has every folder made for it.
+        changed = [self._target.parent]
+        while not changed[-1].exists():
+            changed.append(changed[-1].parent)
         self._target.parent.mkdir(parents=True, exist_ok=True)
         self._partial.replace(self._target)
-        # The rename itself has to survive a power cut, too.
-        directory = os.open(self._target.parent, os.O_RDONLY)
-        try:
-            os.fsync(directory)
-        finally:
-            os.close(directory)
+        for folder in changed:
+            _sync_folder(folder)
 
     def abort(self) -> None:
         self._file.close()
         self._partial.unlink(missing_ok=True)
+
+
+def _sync_folder(folder: Path) -> None:
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
 
 
 def _info(key: str, status: os.stat_result) -> ObjectInfo:

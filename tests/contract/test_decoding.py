@@ -1,0 +1,180 @@
+"""The decoder pool: a poisonous photo harms itself alone, whatever it does to its process.
+
+The poison is carried by the preprocessing, which runs in the child right after the decoder.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import multiprocessing
+import os
+import signal
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from services.extractor.decoding import TRIES, DecoderPool
+from shared.errors import PlacewiseError, Unavailable, Unprocessable
+from shared.settings import Settings
+from shared.vision.decode import Decoded
+from shared.vision.preprocessing import Preprocessing, get_preprocessing
+from tests.support.photos import photo_bytes
+
+SQUARE = get_preprocessing("square32")
+GOOD = photo_bytes(1)
+CRASHES, HANGS, SWALLOWS_MEMORY = (255, 0, 0), (0, 255, 0), (0, 0, 255)
+
+
+def photo_of(colour: tuple[int, int, int], side: int = 8) -> bytes:
+    buffer = io.BytesIO()
+    Image.new("RGB", (side, side), colour).save(buffer, "PNG")
+    return buffer.getvalue()
+
+
+class Poisoned(Preprocessing):
+    """Does to its process what a fault in a decoder could do, if the photo's colour says so."""
+
+    def apply(self, image: Image.Image) -> Image.Image:
+        colour: Any = image.getpixel((0, 0))
+        if colour == CRASHES:
+            os.kill(os.getpid(), signal.SIGSEGV)
+        while colour == HANGS:
+            pass
+        if colour == SWALLOWS_MEMORY:
+            np.ones(10**9)
+        return super().apply(image)
+
+
+POISONED = Poisoned("poisoned", version=1, height=32, width=32)
+
+
+@contextlib.contextmanager
+def pool_with(settings: Settings, **changes: Any) -> Iterator[DecoderPool]:
+    pool = DecoderPool(settings.model_copy(update={"decode_processes": 1, **changes}))
+    try:
+        yield pool
+    finally:
+        pool.close()
+
+
+@pytest.fixture
+def pool(settings: Settings) -> Iterator[DecoderPool]:
+    with pool_with(settings) as made:
+        yield made
+
+
+def in_child(pool: DecoderPool, expression: str) -> Any:
+    """What the child process makes of a Python expression."""
+    return pool._pool.schedule(eval, args=[expression]).result()
+
+
+def is_good(outcome: Decoded | PlacewiseError) -> bool:
+    assert isinstance(outcome, Decoded), outcome
+    return outcome.pixels.shape == (32, 32, 3)
+
+
+def refusal(outcome: Decoded | PlacewiseError) -> str:
+    assert isinstance(outcome, Unprocessable)
+    assert outcome.code == "undecodable_photo"
+    return outcome.detail
+
+
+def test_good_photos_are_decoded_beside_bad_ones_in_their_order(pool: DecoderPool) -> None:
+    huge = photo_of((9, 9, 9), side=64)
+    photos = [GOOD, b"no photo", photo_of((1, 2, 3)), GOOD[:300], huge, photo_bytes(2)]
+    outcomes = pool.decode(photos, SQUARE)
+    first, text, third, truncated, fifth, last = outcomes
+    assert is_good(first)
+    assert is_good(last)
+    assert "can't be decoded" in refusal(text)
+    assert refusal(truncated)
+    for outcome, colour in ((third, [1, 2, 3]), (fifth, [9, 9, 9])):
+        assert isinstance(outcome, Decoded)
+        assert outcome.pixels[0, 0].tolist() == colour
+    assert not np.array_equal(first.pixels, last.pixels)  # type: ignore[union-attr]
+
+
+def test_nothing_to_decode_is_nothing(pool: DecoderPool) -> None:
+    assert pool.decode([], SQUARE) == []
+
+
+def test_too_many_pixels_are_refused_by_the_settings_limit(settings: Settings) -> None:
+    with pool_with(settings, max_image_pixels=100) as pool:
+        (outcome,) = pool.decode([GOOD], SQUARE)
+    assert isinstance(outcome, Unprocessable)
+    assert outcome.code == "too_many_pixels"
+
+
+def test_photo_that_crashes_the_decoder_harms_only_itself(pool: DecoderPool) -> None:
+    first, poison, last = pool.decode([GOOD, photo_of(CRASHES), GOOD], POISONED)
+    assert f"crashed on this photo {TRIES} times" in refusal(poison)
+    assert is_good(first)
+    assert is_good(last)
+    assert is_good(pool.decode([GOOD], POISONED)[0]), "the next batch, too"
+
+
+def test_photo_that_takes_too_long_harms_only_itself(settings: Settings) -> None:
+    with pool_with(settings, decode_timeout_seconds=0.3) as pool:
+        pool.decode([GOOD], POISONED)
+        first, poison, last = pool.decode([GOOD, photo_of(HANGS), GOOD], POISONED)
+    assert "within 0.3 s" in refusal(poison)
+    assert is_good(first)
+    assert is_good(last)
+
+
+def test_photo_that_swallows_memory_harms_only_itself(pool: DecoderPool) -> None:
+    first, poison, last = pool.decode([GOOD, photo_of(SWALLOWS_MEMORY), GOOD], POISONED)
+    assert "memory" in refusal(poison)
+    assert is_good(first)
+    assert is_good(last)
+
+
+def test_photo_of_allowed_size_but_too_large_for_the_memory_is_refused(
+    settings: Settings,
+) -> None:
+    buffer = io.BytesIO()
+    Image.new("L", (7000, 7000)).save(buffer, "PNG", compress_level=1)
+    with pool_with(settings, decode_memory_bytes=400_000_000) as pool:
+        large, small = pool.decode([buffer.getvalue(), GOOD], SQUARE)
+    assert "memory" in refusal(large)
+    assert is_good(small)
+
+
+def test_child_that_the_machine_kills_costs_no_photo(pool: DecoderPool) -> None:
+    before = in_child(pool, "__import__('os').getpid()")
+    os.kill(before, signal.SIGKILL)
+    try:
+        outcomes = pool.decode([GOOD] * 3, SQUARE)
+    except Unavailable as error:  # the jobs are given back, and no photo is to blame
+        assert error.code == "decoders_broke"  # noqa: PT017
+        outcomes = pool.decode([GOOD] * 3, SQUARE)
+    assert all(is_good(outcome) for outcome in outcomes)
+    assert in_child(pool, "__import__('os').getpid()") != before
+
+
+def test_pool_that_broke_is_made_anew(pool: DecoderPool) -> None:
+    pool._pool.stop()  # type: ignore[no-untyped-call]
+    pool._pool.join()
+    assert is_good(pool.decode([GOOD], SQUARE)[0])
+
+
+def test_children_import_no_torch_and_know_their_limit(pool: DecoderPool) -> None:
+    pool.decode([GOOD], SQUARE)
+    modules = in_child(pool, "sorted(__import__('sys').modules)")
+    assert "shared.vision.decode" in modules, "the question went to another process"
+    assert {"torch", "torchvision", "timm"}.isdisjoint(modules)
+    resource = "__import__('resource')"
+    limit = in_child(pool, f"{resource}.getrlimit({resource}.RLIMIT_AS)")
+    assert limit == (2_000_000_000, 2_000_000_000)
+
+
+def test_closing_ends_the_children(settings: Settings) -> None:
+    with pool_with(settings) as pool:
+        child = in_child(pool, "__import__('os').getpid()")
+    assert child not in {process.pid for process in multiprocessing.active_children()}
+    with pytest.raises(ProcessLookupError):
+        os.kill(child, 0)

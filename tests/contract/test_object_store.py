@@ -1,0 +1,356 @@
+"""What every object store promises (`shared.objects.port`), and what only the folder does."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Iterable
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+
+from shared.errors import NotFound, Unavailable
+from shared.objects import FolderStore, ObjectStore
+
+MEGABYTE = 1_000_000
+
+
+def keys_of(store: ObjectStore, prefix: str = "") -> list[str]:
+    return sorted(info.key for info in store.list(prefix))
+
+
+class ObjectStoreContract:
+    """Every promise of the port. A store's test class gives it a fixture named `store`."""
+
+    def test_what_is_put_is_what_is_got(self, store: ObjectStore) -> None:
+        for key, data in {"a": b"one", "a-folder/b": bytes(range(256)), "empty": b""}.items():
+            store.put(key, data)
+            assert store.get(key) == data
+
+    def test_put_replaces_the_whole_object(self, store: ObjectStore) -> None:
+        store.put("a/b", b"a long first version")
+        store.put("a/b", b"short")
+        assert store.get("a/b") == b"short"
+        assert keys_of(store) == ["a/b"]
+
+    def test_range_is_read_by_seeking(self, store: ObjectStore) -> None:
+        data = os.urandom(MEGABYTE)
+        store.put("big", data)
+        with store.open("big") as file:
+            assert file.seekable()
+            file.seek(500_000)
+            assert file.read(10) == data[500_000:500_010]
+            assert file.read(5) == data[500_010:500_015]
+            file.seek(-3, os.SEEK_END)
+            assert file.read() == data[-3:]
+            assert file.read(1) == b""
+            file.seek(2)
+            file.seek(3, os.SEEK_CUR)
+            assert file.tell() == 5
+            assert file.read(1) == data[5:6]
+
+    def test_writer_joins_what_is_written_piece_by_piece(self, store: ObjectStore) -> None:
+        pieces = [os.urandom(size) for size in (1, 0, 100_000, 7, 300_000)]
+        writer = store.writer("originals/pieces")
+        for piece in pieces:
+            writer.write(piece)
+        writer.commit()
+        assert store.get("originals/pieces") == b"".join(pieces)
+
+    def test_writer_of_nothing_makes_an_empty_object(self, store: ObjectStore) -> None:
+        store.writer("empty").commit()
+        assert store.get("empty") == b""
+
+    def test_nothing_is_visible_before_commit(self, store: ObjectStore) -> None:
+        writer = store.writer("originals/a")
+        writer.write(os.urandom(MEGABYTE))
+        assert keys_of(store) == []
+        assert store.head("originals/a") is None
+        with pytest.raises(NotFound):
+            store.get("originals/a")
+        writer.commit()
+        assert keys_of(store) == ["originals/a"]
+
+    def test_old_object_stands_until_the_new_one_is_committed(self, store: ObjectStore) -> None:
+        store.put("a", b"old")
+        writer = store.writer("a")
+        writer.write(b"new")
+        assert store.get("a") == b"old"
+        writer.commit()
+        assert store.get("a") == b"new"
+
+    def test_abort_leaves_nothing(self, store: ObjectStore) -> None:
+        writer = store.writer("a")
+        writer.write(b"some")
+        writer.abort()
+        assert keys_of(store) == []
+        assert store.head("a") is None
+
+    def test_abort_leaves_what_was_there(self, store: ObjectStore) -> None:
+        store.put("a", b"old")
+        writer = store.writer("a")
+        writer.write(b"new")
+        writer.abort()
+        assert store.get("a") == b"old"
+
+    def test_abort_after_commit_is_harmless(self, store: ObjectStore) -> None:
+        writer = store.writer("a")
+        writer.write(b"some")
+        writer.commit()
+        writer.abort()
+        writer.abort()
+        assert store.get("a") == b"some"
+
+    def test_two_writers_of_one_key_do_not_mix(self, store: ObjectStore) -> None:
+        first, second = store.writer("a"), store.writer("a")
+        first.write(b"1" * 1000)
+        second.write(b"2" * 1000)
+        first.write(b"1" * 1000)
+        second.commit()
+        assert store.get("a") == b"2" * 1000
+        first.commit()
+        assert store.get("a") == b"1" * 2000
+
+    def test_overwriting_is_atomic_for_readers(self, store: ObjectStore) -> None:
+        versions = [bytes([number]) * 50_000 for number in range(8)]
+        store.put("a", versions[0])
+        torn: list[bytes] = []
+        done = threading.Event()
+
+        def read() -> None:
+            while not done.is_set():
+                found = store.get("a")
+                if found not in versions:
+                    torn.append(found)
+
+        reader = threading.Thread(target=read)
+        reader.start()
+        try:
+            for version in versions * 3:
+                store.put("a", version)
+        finally:
+            done.set()
+            reader.join()
+        assert torn == []
+
+    def test_open_reader_keeps_the_version_that_it_opened(self, store: ObjectStore) -> None:
+        store.put("a", b"old" * 1000)
+        with store.open("a") as file:
+            begin = file.read(3)
+            store.put("a", b"new" * 1000)
+            assert begin + file.read() in (b"old" * 1000, b"new" * 1000)
+
+    def test_missing_object_is_not_found_and_named(self, store: ObjectStore) -> None:
+        for read in (store.get, store.open):
+            with pytest.raises(NotFound) as caught:
+                read("not/there")
+            assert caught.value.code == "object_not_found"
+            assert "not/there" in caught.value.detail
+        assert store.head("not/there") is None
+
+    def test_prefix_of_a_key_is_no_object(self, store: ObjectStore) -> None:
+        store.put("a/b/c", b"x")
+        for key in ("a", "a/b"):
+            assert store.head(key) is None
+            with pytest.raises(NotFound):
+                store.get(key)
+            store.delete(key)
+        assert keys_of(store) == ["a/b/c"]
+
+    def test_key_below_an_object_is_not_there(self, store: ObjectStore) -> None:
+        store.put("a/b", b"x")
+        assert store.head("a/b/c") is None
+        with pytest.raises(NotFound):
+            store.get("a/b/c")
+        store.delete("a/b/c")
+        assert keys_of(store) == ["a/b"]
+
+    def test_delete_removes_one_object(self, store: ObjectStore) -> None:
+        store.put("a/b", b"x")
+        store.put("a/bc", b"x")
+        store.delete("a/b")
+        assert keys_of(store) == ["a/bc"]
+        with pytest.raises(NotFound):
+            store.get("a/b")
+
+    def test_delete_of_a_missing_object_is_no_error(self, store: ObjectStore) -> None:
+        store.delete("not/there")
+        store.put("a", b"x")
+        store.delete("a")
+        store.delete("a")
+
+    def test_deleted_key_can_be_written_again(self, store: ObjectStore) -> None:
+        store.put("a", b"one")
+        store.delete("a")
+        store.put("a", b"two")
+        assert store.get("a") == b"two"
+
+    def test_head_tells_size_and_time(self, store: ObjectStore) -> None:
+        store.put("a/b", b"12345")
+        info = store.head("a/b")
+        assert info is not None
+        assert (info.key, info.size_bytes) == ("a/b", 5)
+        assert info.modified_at.utcoffset() == timedelta(0)
+        # The store's clock may differ from this process's.
+        assert abs(datetime.now(UTC) - info.modified_at) < timedelta(minutes=5)
+
+    @pytest.mark.parametrize(
+        ("prefix", "found"),
+        [
+            ("", ["a/b/1", "a/b/2", "a/bc/3", "ab", "work/1/features-0.npy"]),
+            ("a", ["a/b/1", "a/b/2", "a/bc/3", "ab"]),
+            ("a/", ["a/b/1", "a/b/2", "a/bc/3"]),
+            ("a/b", ["a/b/1", "a/b/2", "a/bc/3"]),
+            ("a/b/", ["a/b/1", "a/b/2"]),
+            ("a/b/1", ["a/b/1"]),
+            ("a/b/1/", []),
+            ("work/1/feat", ["work/1/features-0.npy"]),
+            ("b", []),
+            ("not/there/", []),
+        ],
+    )
+    def test_list_gives_every_key_with_the_prefix(
+        self, store: ObjectStore, prefix: str, found: list[str]
+    ) -> None:
+        for key in ("a/b/1", "a/b/2", "a/bc/3", "ab", "work/1/features-0.npy"):
+            store.put(key, key.encode())
+        assert keys_of(store, prefix) == found
+        for info in store.list(prefix):
+            assert info.size_bytes == len(info.key)
+            assert info == store.head(info.key)
+
+    def test_objects_may_go_while_they_are_listed(self, store: ObjectStore) -> None:
+        for number in range(20):
+            store.put(f"a/{number:02}", b"x")
+        seen = []
+        for info in store.list("a/"):
+            seen.append(info.key)
+            for number in range(20):
+                store.delete(f"a/{number:02}")
+        assert set(seen) <= {f"a/{number:02}" for number in range(20)}
+
+    def test_many_objects_are_listed_whole(self, store: ObjectStore) -> None:
+        # More than a page of S3's, which is 1,000.
+        keys = [f"chunks/{number:04}" for number in range(1050)]
+        writers = [
+            threading.Thread(target=self._put_all, args=(store, keys[i::8])) for i in range(8)
+        ]
+        for thread in writers:
+            thread.start()
+        for thread in writers:
+            thread.join()
+        assert keys_of(store, "chunks/") == keys
+
+    @staticmethod
+    def _put_all(store: ObjectStore, keys: Iterable[str]) -> None:
+        for key in keys:
+            store.put(key, b"")
+
+    @pytest.mark.parametrize(
+        "key",
+        [
+            "with space/and+plus",
+            "percent%2F%00",
+            "question?and=hash#1",
+            "üñí/日本",
+            "..two-dots/three...dots",
+            ".hidden/.file",
+            "quote'\"<>&",
+            "back\\slash",
+            "UPPER/lower",
+            "x" * 200,
+        ],
+    )
+    def test_odd_but_legal_keys_are_kept_as_they_are(self, store: ObjectStore, key: str) -> None:
+        store.put(key, b"odd")
+        assert store.get(key) == b"odd"
+        assert keys_of(store) == [key]
+        assert keys_of(store, key[:3]) == [key]
+        store.delete(key)
+        assert keys_of(store) == []
+
+    def test_keys_that_differ_in_case_are_two_objects(self, store: ObjectStore) -> None:
+        store.put("a/B", b"upper")
+        store.put("a/b", b"lower")
+        assert (store.get("a/B"), store.get("a/b")) == (b"upper", b"lower")
+
+    def test_check_is_silent_when_all_is_well_and_leaves_nothing(self, store: ObjectStore) -> None:
+        store.check()
+        assert keys_of(store) == []
+
+
+class TestFolderStore(ObjectStoreContract):
+    @pytest.mark.parametrize(
+        "key",
+        [
+            "",
+            ".",
+            "..",
+            "../a",
+            "a/../b",
+            "a/..",
+            "a/./b",
+            "/etc/passwd",
+            "a//b",
+            "a/",
+            "a\0b",
+            ".partial/a",
+        ],
+    )
+    def test_keys_that_could_leave_the_folder_or_alias_another_are_refused(
+        self, store: FolderStore, key: str
+    ) -> None:
+        for use in (store.get, store.open, store.head, store.delete):
+            with pytest.raises(ValueError):
+                use(key)
+        with pytest.raises(ValueError):
+            store.put(key, b"x")
+        assert keys_of(store) == []
+
+    def test_leftovers_of_a_killed_writer_go_at_start(self, store: FolderStore) -> None:
+        store.put("a", b"whole")
+        killed = store.writer("b")
+        killed.write(b"half")
+        partial = store.root / ".partial"
+        assert len(list(partial.iterdir())) == 1
+        again = FolderStore(store.root)
+        assert list(partial.iterdir()) == []
+        assert keys_of(again) == ["a"]
+        killed.abort()
+
+    def test_half_written_objects_are_never_listed(self, store: FolderStore) -> None:
+        writer = store.writer("a")
+        writer.write(b"half")
+        for prefix in ("", ".", ".partial", ".partial/"):
+            assert keys_of(store, prefix) == []
+        writer.abort()
+
+    def test_what_is_stored_outlives_the_process(self, store: FolderStore) -> None:
+        store.put("a/b", b"kept")
+        assert FolderStore(store.root).get("a/b") == b"kept"
+
+    def test_commit_reaches_the_disk_before_it_is_told(
+        self, store: FolderStore, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        order: list[str] = []
+        fsync, replace = os.fsync, Path.replace
+
+        def noted_fsync(descriptor: int) -> None:
+            order.append("fsync")
+            fsync(descriptor)
+
+        def noted_replace(source: Path, target: Path) -> Path:
+            order.append("rename")
+            return replace(source, target)
+
+        monkeypatch.setattr(os, "fsync", noted_fsync)
+        monkeypatch.setattr(Path, "replace", noted_replace)
+        store.put("a", b"x")
+        assert order == ["fsync", "rename", "fsync"], "file, name, folder"
+
+    def test_folder_that_cannot_be_written_is_unavailable(self, store: FolderStore) -> None:
+        (store.root / ".partial").rmdir()
+        with pytest.raises(Unavailable) as caught:
+            store.check()
+        assert caught.value.code == "object_store_unavailable"

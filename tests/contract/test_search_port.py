@@ -1,0 +1,590 @@
+"""What every search tier promises (`shared.search_protocol`): exact, current, honest about gaps."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from uuid import UUID
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, assume
+from hypothesis import settings as how
+from hypothesis import strategies as st
+from hypothesis.stateful import (
+    RuleBasedStateMachine,
+    initialize,
+    invariant,
+    rule,
+    run_state_machine_as_test,
+)
+from numpy.typing import NDArray
+
+from services.search.worker import SearchWorker
+from services.steward.compact import merge_slot
+from shared.catalog.chunks import Chunk, Descriptor, live_chunks
+from shared.catalog.generations import Generation, GenerationState
+from shared.catalog.maps import Map, bump_version, lock_map
+from shared.catalog.models import ensure_model
+from shared.catalog.photos import Photo, mark_deleted
+from shared.catalog.session import Catalog
+from shared.chunks import decode_rows, encode_rows, manifest_key, write_chunk
+from shared.errors import Gone, Unavailable
+from shared.ids import new_id
+from shared.objects import FolderStore, ObjectStore
+from shared.search_protocol import SearchPort, SearchRequest, SearchResponse
+from shared.settings import Settings
+
+DIMENSION = 12
+Rows = NDArray[np.float32]
+Reference = tuple[str, int]
+"""A descriptor: object key and row."""
+
+
+def unit_rows(seed: int, count: int, dimension: int = DIMENSION) -> Rows:
+    rows = np.random.default_rng(seed).standard_normal((count, dimension))
+    found: Rows = (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32)
+    return found
+
+
+class SmallMap:
+    """A map with one generation, changed as the extractor, the gateway and the steward do.
+
+    `rows` is the model to compare with: every live photo with its descriptor.
+    """
+
+    def __init__(self, catalog: Catalog, store: ObjectStore) -> None:
+        self.catalog = catalog
+        self.store = store
+        self.map_id, self.generation_id = new_id(), new_id()
+        self.rows: dict[UUID, Rows] = {}
+        with catalog.write() as session:
+            session.add(Map(id=self.map_id, name=f"map-{self.map_id}", extractor="test"))
+            session.flush()
+            model = ensure_model(session, "test", "0" * 64, "MIT", {})
+            session.add(
+                Generation(
+                    id=self.generation_id,
+                    map_id=self.map_id,
+                    state=GenerationState.ACTIVE,
+                    extractor="test",
+                    spec={"extractor": "test"},
+                    spec_fingerprint="0" * 64,
+                    dimension=DIMENSION,
+                    model_id=model.id,
+                )
+            )
+
+    @property
+    def version(self) -> int:
+        with self.catalog.read() as session:
+            return session.get_one(Map, self.map_id).version
+
+    def add(self, rows: Rows, slot: int = 0, dead: int = 0) -> list[UUID]:
+        """Publish a chunk of photos; its first `dead` rows belong to none (a lease was lost)."""
+        chunk_id, photo_ids = new_id(), [new_id() for _ in rows]
+        written = write_chunk(
+            self.store,
+            generation_id=self.generation_id,
+            chunk_id=chunk_id,
+            rows=rows,
+            photo_ids=photo_ids,
+            spec={"extractor": "test"},
+        )
+        with self.catalog.write() as session:
+            lock_map(session, self.map_id)
+            session.add_all(self._photo(photo_id) for photo_id in photo_ids)
+            session.add(
+                Chunk(
+                    id=chunk_id,
+                    generation_id=self.generation_id,
+                    slot=slot,
+                    object_key=written.object_key,
+                    rows=written.rows,
+                    size_bytes=written.size_bytes,
+                    sha256=written.sha256,
+                )
+            )
+            session.flush()
+            session.add_all(
+                Descriptor(
+                    generation_id=self.generation_id, photo_id=photo_id, chunk_id=chunk_id, row=row
+                )
+                for row, photo_id in enumerate(photo_ids)
+                if row >= dead
+            )
+            bump_version(session, self.map_id)
+        self.rows |= dict(list(zip(photo_ids, rows, strict=True))[dead:])
+        return photo_ids
+
+    def _photo(self, photo_id: UUID) -> Photo:
+        return Photo(
+            id=photo_id,
+            map_id=self.map_id,
+            sha256=photo_id.hex * 2,
+            object_key=f"originals/{photo_id}",
+            filename="photo.jpg",
+            media_type="image/jpeg",
+            size_bytes=1,
+            width=1,
+            height=1,
+        )
+
+    def delete(self, photo_id: UUID) -> None:
+        with self.catalog.write() as session:
+            lock_map(session, self.map_id)
+            photo = session.get_one(Photo, photo_id)
+            mark_deleted(session, photo, bump_version(session, self.map_id))
+        del self.rows[photo_id]
+
+    def merge(self, slot: int = 0) -> bool:
+        return merge_slot(self.catalog, self.store, self.generation_id, slot)
+
+    def chunk_keys(self) -> list[str]:
+        with self.catalog.read() as session:
+            return [chunk.object_key for chunk in live_chunks(session, self.generation_id)]
+
+    def reference(self, photo_id: UUID) -> Reference:
+        with self.catalog.read() as session:
+            descriptor = session.get_one(Descriptor, (self.generation_id, photo_id))
+            return session.get_one(Chunk, descriptor.chunk_id).object_key, descriptor.row
+
+    def query(self, vector: Rows) -> Reference:
+        """Store a query's descriptor, as a `describe` job does."""
+        key = f"queries/{new_id()}.npy"
+        self.store.put(key, encode_rows(vector[np.newaxis]))
+        return key, 0
+
+    def request(
+        self,
+        reference: Reference,
+        k: int = 10,
+        min_version: int | None = None,
+        min_score: float | None = None,
+        exclude: tuple[UUID, ...] = (),
+    ) -> SearchRequest:
+        return SearchRequest(
+            map_id=self.map_id,
+            generation_id=self.generation_id,
+            object_key=reference[0],
+            row=reference[1],
+            min_version=self.version if min_version is None else min_version,
+            k=k,
+            min_score=min_score,
+            exclude=exclude,
+        )
+
+    def brute_force(self, vector: Rows, k: int = 10) -> list[tuple[UUID, float]]:
+        exact = vector.astype(np.float64)
+        exact /= np.linalg.norm(exact)
+        scored = [(-float(row.astype(np.float64) @ exact), p) for p, row in self.rows.items()]
+        return [(photo_id, -score) for score, photo_id in sorted(scored)[:k]]
+
+
+def assert_answers(response: SearchResponse, expected: list[tuple[UUID, float]]) -> None:
+    assert [hit.photo_id for hit in response.hits] == [photo_id for photo_id, _ in expected]
+    np.testing.assert_allclose(
+        [hit.score for hit in response.hits], [score for _, score in expected], atol=1e-12
+    )
+
+
+OpenPort = Callable[..., SearchPort]
+
+
+class SearchPortContract:
+    """Every promise of the port. A subclass's fixture `port` opens one on the map `places`.
+
+    It takes settings by name, for example `port(search_wait_seconds=0.05)`.
+    """
+
+    @pytest.fixture
+    def places(self, catalog: Catalog, store: FolderStore) -> SmallMap:
+        return SmallMap(catalog, store)
+
+    def test_order_and_scores_equal_brute_force(self, places: SmallMap, port: OpenPort) -> None:
+        for seed, count in enumerate((1, 30, 7)):
+            places.add(unit_rows(seed, count), slot=seed // 2, dead=seed)
+        search = port()
+        for seed in range(5):
+            vector = unit_rows(100 + seed, 1)[0]
+            for k in (1, 10, 100):
+                response = search.search(places.request(places.query(vector), k=k))
+                assert_answers(response, places.brute_force(vector, k))
+        assert response.snapshot_version == places.version
+        assert response.missing == ()
+        assert response.certificate == "exhaustive"
+        assert response.rows_scanned == 38
+
+    def test_equal_scores_come_in_the_order_of_the_photos(
+        self, places: SmallMap, port: OpenPort
+    ) -> None:
+        same = np.repeat(unit_rows(1, 1), 4, axis=0)
+        for _ in range(3):
+            places.add(same)
+        response = port().search(places.request(places.query(same[0]), k=7))
+        assert [hit.photo_id for hit in response.hits] == sorted(places.rows)[:7]
+
+    def test_stored_photo_is_a_query_without_finding_itself(
+        self, places: SmallMap, port: OpenPort
+    ) -> None:
+        photo_ids = places.add(unit_rows(1, 9))
+        request = places.request(places.reference(photo_ids[4]), k=9, exclude=(photo_ids[4],))
+        response = port().search(request)
+        expected = places.brute_force(places.rows[photo_ids[4]], 9)
+        assert expected[0][0] == photo_ids[4]
+        assert_answers(response, expected[1:])
+
+    def test_hits_below_the_least_score_are_left_out(
+        self, places: SmallMap, port: OpenPort
+    ) -> None:
+        places.add(unit_rows(1, 30))
+        vector = unit_rows(2, 1)[0]
+        expected = places.brute_force(vector, 30)
+        bound = (expected[7][1] + expected[8][1]) / 2
+        request = places.request(places.query(vector), k=30, min_score=bound)
+        assert_answers(port().search(request), expected[:8])
+
+    def test_map_without_photos_answers_nothing(self, places: SmallMap, port: OpenPort) -> None:
+        response = port().search(places.request(places.query(unit_rows(1, 1)[0])))
+        assert (response.hits, response.missing) == ((), ())
+
+    def test_photo_that_was_just_published_is_found_in_the_same_call(
+        self, places: SmallMap, port: OpenPort
+    ) -> None:
+        places.add(unit_rows(1, 3))
+        search = port()
+        vector = unit_rows(2, 1)
+        search.search(places.request(places.query(vector[0])))
+        for _ in range(3):
+            (fresh,) = places.add(vector)
+            response = search.search(places.request(places.query(vector[0]), k=20))
+            assert fresh in {hit.photo_id for hit in response.hits}
+            assert response.snapshot_version == places.version
+
+    def test_version_that_never_comes_is_search_behind(
+        self, places: SmallMap, port: OpenPort
+    ) -> None:
+        places.add(unit_rows(1, 3))
+        reference = places.query(unit_rows(2, 1)[0])
+        search = port(search_wait_seconds=0.05)
+        with pytest.raises(Unavailable) as caught:
+            search.search(places.request(reference, min_version=places.version + 1))
+        assert caught.value.code == "search_behind"
+        assert search.search(places.request(reference)).hits, "others are served as before"
+
+    def test_version_that_comes_while_it_is_waited_for_is_answered(
+        self, places: SmallMap, port: OpenPort
+    ) -> None:
+        places.add(unit_rows(1, 3))
+        vector = unit_rows(2, 1)
+        request = places.request(places.query(vector[0]), min_version=places.version + 1)
+        search = port(search_wait_seconds=30)
+        search.search(places.request((request.object_key, 0)))
+        publisher = threading.Timer(0.05, places.add, [vector])
+        publisher.start()
+        response = search.search(request)
+        publisher.join()
+        assert response.hits[0].score == pytest.approx(1.0)
+        assert response.snapshot_version == request.min_version
+
+    def test_deleted_photo_is_gone_in_the_next_call(self, places: SmallMap, port: OpenPort) -> None:
+        photo_ids = places.add(unit_rows(1, 6)) + places.add(unit_rows(2, 6))
+        vector = places.rows[photo_ids[3]]
+        reference = places.query(vector)
+        search = port()
+        assert search.search(places.request(reference)).hits[0].photo_id == photo_ids[3]
+        for gone in (photo_ids[3], photo_ids[9]):
+            places.delete(gone)
+            response = search.search(places.request(reference, k=20))
+            assert_answers(response, places.brute_force(vector, 20))
+
+    def test_photo_deleted_before_anything_was_loaded_is_never_answered(
+        self, places: SmallMap, port: OpenPort
+    ) -> None:
+        photo_ids = places.add(unit_rows(1, 6))
+        places.delete(photo_ids[0])
+        response = port().search(places.request(places.query(unit_rows(1, 1)[0]), k=20))
+        assert {hit.photo_id for hit in response.hits} == set(photo_ids[1:])
+
+    @pytest.mark.parametrize("damage", ["flipped", "truncated", "gone"])
+    def test_chunk_that_cannot_be_read_is_named_and_the_rest_served(
+        self, places: SmallMap, port: OpenPort, damage: str
+    ) -> None:
+        places.add(unit_rows(1, 5))
+        broken = places.add(unit_rows(2, 5))
+        places.add(unit_rows(3, 5))
+        key, _ = places.reference(broken[0])
+        whole = places.store.get(key)
+        if damage == "gone":
+            places.store.delete(key)
+        else:
+            places.store.put(key, _damaged(whole, damage))
+        for photo_id in broken:
+            del places.rows[photo_id]
+        vector = unit_rows(4, 1)[0]
+        search = port()
+        response = search.search(places.request(places.query(vector), k=20))
+        assert response.missing == (key,)
+        assert_answers(response, places.brute_force(vector, 20))
+        assert search.status().missing == (key,)
+
+    @pytest.mark.parametrize("damage", ["flipped", "truncated"])
+    def test_damaged_descriptor_is_no_query(
+        self, places: SmallMap, port: OpenPort, damage: str
+    ) -> None:
+        photo_ids = places.add(unit_rows(1, 5))
+        reference = places.reference(photo_ids[2])
+        places.store.put(reference[0], _damaged(places.store.get(reference[0]), damage))
+        with pytest.raises(Unavailable) as caught:
+            port().search(places.request(reference))
+        assert caught.value.code == "chunk_unreadable"
+
+    def test_descriptor_that_is_no_longer_kept_is_gone(
+        self, places: SmallMap, port: OpenPort
+    ) -> None:
+        places.add(unit_rows(1, 3))
+        reference = places.query(unit_rows(2, 1)[0])
+        search = port()
+        search.search(places.request(reference))
+        places.store.delete(reference[0])
+        for unknown in (reference, ("chunks/no/such.npy", 0)):
+            with pytest.raises(Gone) as caught:
+                search.search(places.request(unknown))
+            assert caught.value.code == "query_expired"
+
+    def test_reference_into_a_superseded_chunk_still_answers(
+        self, places: SmallMap, port: OpenPort
+    ) -> None:
+        photo_ids = places.add(unit_rows(1, 4)) + places.add(unit_rows(2, 4))
+        old = places.reference(photo_ids[6])
+        search = port()
+        before = search.search(places.request(old, k=20))
+        assert places.merge()
+        assert old[0] not in places.chunk_keys()
+        after = search.search(places.request(old, k=20))
+        assert after.hits == before.hits
+        assert after.snapshot_version == before.snapshot_version + 1
+
+    def test_maps_do_not_see_each_other(
+        self, places: SmallMap, port: OpenPort, catalog: Catalog, store: FolderStore
+    ) -> None:
+        other = SmallMap(catalog, store)
+        places.add(unit_rows(1, 5))
+        other.add(unit_rows(1, 5))
+        search = port()
+        for one in (places, other):
+            response = search.search(one.request(one.query(unit_rows(1, 1)[0]), k=20))
+            assert {hit.photo_id for hit in response.hits} == set(one.rows)
+
+    def test_status_tells_rows_versions_and_memory(self, places: SmallMap, port: OpenPort) -> None:
+        photo_ids = places.add(unit_rows(1, 5), dead=1)
+        places.delete(photo_ids[2])
+        search = port()
+        search.search(places.request(places.query(unit_rows(2, 1)[0])))
+        status = search.status()
+        assert status.rows == 3
+        assert status.versions == {places.generation_id: places.version}
+        assert status.resident_bytes >= 5 * DIMENSION * 4
+        assert status.missing == ()
+
+    def test_queries_from_many_threads_are_exact_while_photos_come_and_go(
+        self, places: SmallMap, port: OpenPort
+    ) -> None:
+        """What a query may see is a whole version: every photo with its own score."""
+        seen: dict[UUID, Rows] = {}
+        seen |= dict(zip(places.add(unit_rows(0, 20)), unit_rows(0, 20), strict=True))
+        vector = unit_rows(99, 1)[0]
+        reference = places.query(vector)
+        search = port()
+        responses: list[SearchResponse] = []
+        done = threading.Event()
+
+        def ask() -> None:
+            while not done.is_set():
+                responses.append(search.search(places.request(reference, k=500)))
+
+        threads = [threading.Thread(target=ask) for _ in range(3)]
+        for thread in threads:
+            thread.start()
+        try:
+            for seed in range(1, 6):
+                rows = unit_rows(seed, 4)
+                photo_ids = places.add(rows)
+                seen |= dict(zip(photo_ids, rows, strict=True))
+                places.delete(photo_ids[1])
+                places.merge()
+        finally:
+            done.set()
+            for thread in threads:
+                thread.join()
+        exact = vector.astype(np.float64) / np.linalg.norm(vector.astype(np.float64))
+        for response in responses:
+            for hit in response.hits:
+                assert hit.score == pytest.approx(float(seen[hit.photo_id] @ exact), abs=1e-6)
+        final = search.search(places.request(reference, k=500))
+        assert_answers(final, places.brute_force(vector, 500))
+
+
+def _damaged(whole: bytes, damage: str) -> bytes:
+    if damage == "truncated":
+        return whole[:-5]
+    return whole[:-1] + bytes([whole[-1] ^ 1])
+
+
+class TestSearchWorker(SearchPortContract):
+    @pytest.fixture
+    def port(self, catalog: Catalog, store: FolderStore, settings: Settings) -> OpenPort:
+        def open_port(**changes: object) -> SearchPort:
+            return SearchWorker(catalog, store, settings.model_copy(update=changes))
+
+        return open_port
+
+    def test_repaired_chunk_is_served_again_without_a_new_version(
+        self, catalog: Catalog, store: FolderStore, settings: Settings
+    ) -> None:
+        places = SmallMap(catalog, store)
+        places.add(unit_rows(1, 5))
+        (key,) = places.chunk_keys()
+        whole = store.get(key)
+        store.put(key, _damaged(whole, "flipped"))
+        worker = SearchWorker(catalog, store, settings)
+        worker.follow()
+        assert worker.status().missing == (key,)
+        store.put(key, whole)
+        worker.follow()
+        assert worker.status().missing == ()
+        assert worker.status().rows == 5
+
+    def test_following_forgets_what_is_no_longer_searched(
+        self, catalog: Catalog, store: FolderStore, settings: Settings
+    ) -> None:
+        places = SmallMap(catalog, store)
+        places.add(unit_rows(1, 5))
+        worker = SearchWorker(catalog, store, settings)
+        worker.follow()
+        assert worker.status().versions == {places.generation_id: places.version}
+        with catalog.write() as session:
+            session.get_one(Generation, places.generation_id).state = GenerationState.RETIRED
+        worker.follow()
+        assert worker.status().versions == {}
+        assert worker.status().resident_bytes == 0
+
+    def test_followed_versions_reuse_the_chunks_that_are_loaded(
+        self, catalog: Catalog, store: FolderStore, settings: Settings
+    ) -> None:
+        places = SmallMap(catalog, store)
+        first = places.add(unit_rows(1, 5))
+        worker = SearchWorker(catalog, store, settings)
+        worker.follow()
+        store.delete(places.reference(first[0])[0])
+        places.add(unit_rows(2, 5))
+        worker.follow()
+        assert worker.status().missing == (), "a loaded chunk was read again"
+        assert worker.status().rows == 10
+
+
+class AddDeleteMerge(RuleBasedStateMachine):
+    """Any order of publishing, deleting, merging and following equals a brute-force model."""
+
+    migrated: Path  # a catalog that every example copies: migrating takes longer than an example
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.seed = 0
+        self.references: list[tuple[Reference, Rows]] = []
+
+    @initialize()
+    def open(self) -> None:
+        self.folder = Path(tempfile.mkdtemp(prefix="pw-search-"))
+        shutil.copy(self.migrated, self.folder / "catalog.sqlite")
+        self.catalog = Catalog(f"sqlite:///{self.folder / 'catalog.sqlite'}")
+        self.store = FolderStore(self.folder / "objects")
+        self.places = SmallMap(self.catalog, self.store)
+        self.worker = SearchWorker(self.catalog, self.store, Settings())
+
+    def teardown(self) -> None:
+        if hasattr(self, "folder"):
+            self.catalog.close()
+            shutil.rmtree(self.folder)
+
+    @rule(count=st.integers(1, 4), slot=st.integers(0, 1), dead=st.integers(0, 2))
+    def add(self, count: int, slot: int, dead: int) -> None:
+        self.seed += 1
+        self.places.add(unit_rows(self.seed, count), slot, dead)
+
+    @rule(slot=st.integers(0, 1))
+    def add_duplicates(self, slot: int) -> None:
+        self.places.add(np.repeat(unit_rows(0, 1), 2, axis=0), slot)
+
+    @rule(which=st.integers(0, 1000))
+    def delete(self, which: int) -> None:
+        assume(self.places.rows)
+        photo_ids = sorted(self.places.rows)
+        self.places.delete(photo_ids[which % len(photo_ids)])
+
+    @rule(slot=st.integers(0, 1))
+    def merge(self, slot: int) -> None:
+        assert self.places.merge(slot)
+
+    @rule()
+    def follow(self) -> None:
+        self.worker.follow()
+
+    @rule()
+    def forget_everything(self) -> None:
+        self.worker = SearchWorker(self.catalog, self.store, Settings())
+
+    @rule(which=st.integers(0, 1000))
+    def remember_a_reference(self, which: int) -> None:
+        """Later merges supersede its chunk, and it must still mean this photo's descriptor."""
+        assume(self.places.rows)
+        photo_ids = sorted(self.places.rows)
+        photo_id = photo_ids[which % len(photo_ids)]
+        self.references.append((self.places.reference(photo_id), self.places.rows[photo_id]))
+
+    @rule(k=st.integers(1, 30))
+    def ask(self, k: int) -> None:
+        vector = unit_rows(1000 + self.seed, 1)[0]
+        self.check(self.places.query(vector), vector, k)
+        self.check(self.places.query(unit_rows(0, 1)[0]), unit_rows(0, 1)[0], k)
+        for reference, remembered in self.references:
+            self.check(reference, remembered, k)
+
+    def check(self, reference: Reference, vector: Rows, k: int) -> None:
+        response = self.worker.search(self.places.request(reference, k=k))
+        assert_answers(response, self.places.brute_force(vector, k))
+        assert response.missing == ()
+
+    @invariant()
+    def rows_in_the_store_are_those_of_their_photos(self) -> None:
+        if not hasattr(self, "places"):
+            return
+        for photo_id, row in self.places.rows.items():
+            key, number = self.places.reference(photo_id)
+            np.testing.assert_array_equal(decode_rows(self.store.get(key))[number], row)
+            assert self.store.head(manifest_key(key)) is not None
+
+
+@pytest.fixture
+def migrated(tmp_path: Path) -> None:
+    path = tmp_path / "migrated.sqlite"
+    catalog = Catalog(f"sqlite:///{path}")
+    catalog.migrate()
+    catalog.close()  # the last connection writes everything into the one file
+    AddDeleteMerge.migrated = path
+
+
+@pytest.mark.usefixtures("migrated")
+def test_no_order_of_adding_deleting_and_merging_attaches_a_score_to_another_photo() -> None:
+    run_state_machine_as_test(
+        AddDeleteMerge,
+        settings=how(
+            max_examples=15,
+            stateful_step_count=15,
+            deadline=None,
+            suppress_health_check=list(HealthCheck),
+        ),
+    )

@@ -1,0 +1,177 @@
+"""The chunk format: what is written is what is read, and anything else is noticed."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+from typing import Any
+from uuid import UUID
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from shared.chunks import (
+    WrittenChunk,
+    chunk_key,
+    decode_rows,
+    delete_chunk,
+    encode_rows,
+    manifest_key,
+    read_chunk,
+    write_chunk,
+)
+from shared.errors import NotFound, Unavailable
+from shared.ids import new_id
+from shared.objects import FolderStore
+
+GENERATION, CHUNK = new_id(), new_id()
+
+
+def some_rows(count: int = 5, dimension: int = 7) -> NDArray[np.float32]:
+    return np.random.default_rng(count).standard_normal((count, dimension)).astype(np.float32)
+
+
+def written(store: FolderStore, rows: NDArray[np.float32], photo_ids: list[UUID]) -> WrittenChunk:
+    return write_chunk(
+        store,
+        generation_id=GENERATION,
+        chunk_id=CHUNK,
+        rows=rows,
+        photo_ids=photo_ids,
+        spec={"extractor": "test", "dimension": rows.shape[1]},
+    )
+
+
+def test_rows_come_back_as_they_were_written(store: FolderStore) -> None:
+    rows = some_rows()
+    chunk = written(store, rows, [new_id() for _ in rows])
+    back = read_chunk(store, chunk.object_key, chunk.sha256)
+    np.testing.assert_array_equal(back, rows)
+    assert back.dtype == np.float32
+    assert not back.flags.writeable
+
+
+@given(
+    count=st.integers(0, 6),
+    dimension=st.integers(1, 9),
+    order=st.sampled_from(["C", "F"]),
+    data=st.data(),
+)
+def test_any_float32_rows_survive_encoding(
+    count: int, dimension: int, order: Any, data: st.DataObject
+) -> None:
+    bits = data.draw(st.binary(min_size=4 * count * dimension, max_size=4 * count * dimension))
+    rows = np.asarray(np.frombuffer(bits, dtype=np.float32).reshape(count, dimension), order=order)
+    back = decode_rows(encode_rows(rows))
+    assert back.shape == rows.shape
+    assert back.tobytes() == rows.tobytes("C"), "every bit, NaNs too"
+
+
+def test_file_is_a_plain_npy_file_that_numpy_itself_reads(store: FolderStore) -> None:
+    rows = some_rows()
+    chunk = written(store, rows, [new_id() for _ in rows])
+    data = store.get(chunk.object_key)
+    np.testing.assert_array_equal(np.load(io.BytesIO(data), allow_pickle=False), rows)
+    assert chunk.size_bytes == len(data)
+    assert chunk.sha256 == hashlib.sha256(data).hexdigest()
+    assert chunk.object_key == chunk_key(GENERATION, CHUNK)
+
+
+def test_every_other_row_of_an_array_is_written_whole() -> None:
+    rows = some_rows(8)[::2, ::-1]
+    np.testing.assert_array_equal(decode_rows(encode_rows(rows)), rows)
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float16, np.int32, ">f4"])
+def test_other_dtypes_are_refused_when_written_and_when_read(dtype: Any) -> None:
+    rows = some_rows().astype(dtype)
+    with pytest.raises(ValueError, match="2-D float32"):
+        encode_rows(rows)
+    buffer = io.BytesIO()
+    np.save(buffer, rows)
+    with pytest.raises(ValueError, match="not a chunk"):
+        decode_rows(buffer.getvalue())
+
+
+def test_arrays_that_are_no_table_are_refused() -> None:
+    for rows in (some_rows()[0], some_rows()[None]):
+        with pytest.raises(ValueError, match="2-D float32"):
+            encode_rows(rows)
+        buffer = io.BytesIO()
+        np.save(buffer, rows)
+        with pytest.raises(ValueError, match="not a chunk"):
+            decode_rows(buffer.getvalue())
+
+
+def test_columns_first_is_refused_when_read() -> None:
+    buffer = io.BytesIO()
+    np.save(buffer, np.asfortranarray(some_rows()))
+    with pytest.raises(ValueError, match="fortran_order=True"):
+        decode_rows(buffer.getvalue())
+
+
+@pytest.mark.parametrize("cut", [0, 5, 60, -1, -4])
+def test_truncated_file_is_an_error(cut: int) -> None:
+    with pytest.raises(ValueError):
+        decode_rows(encode_rows(some_rows())[:cut])
+
+
+def test_flipped_bit_is_an_unavailable_chunk_that_is_named(store: FolderStore) -> None:
+    rows = some_rows()
+    chunk = written(store, rows, [new_id() for _ in rows])
+    data = bytearray(store.get(chunk.object_key))
+    data[-3] ^= 1
+    store.put(chunk.object_key, bytes(data))
+    with pytest.raises(Unavailable) as caught:
+        read_chunk(store, chunk.object_key, chunk.sha256)
+    assert caught.value.code == "chunk_corrupt"
+    assert caught.value.extra["object_key"] == chunk.object_key
+
+
+def test_missing_chunk_is_not_found(store: FolderStore) -> None:
+    with pytest.raises(NotFound):
+        read_chunk(store, chunk_key(GENERATION, CHUNK), "0" * 64)
+
+
+def test_manifest_tells_which_photo_is_which_row(store: FolderStore) -> None:
+    rows = some_rows()
+    photo_ids = [new_id() for _ in rows][::-1]
+    chunk = written(store, rows, photo_ids)
+    manifest = json.loads(store.get(manifest_key(chunk.object_key)))
+    assert manifest["photo_ids"] == [str(photo_id) for photo_id in photo_ids]
+    assert manifest["sha256"] == chunk.sha256
+    assert manifest["generation_id"] == str(GENERATION)
+    assert manifest["chunk_id"] == str(CHUNK)
+    assert (manifest["rows"], manifest["dimension"]) == (5, 7)
+    assert manifest["spec"] == {"extractor": "test", "dimension": 7}
+
+
+def test_manifest_lies_there_before_its_chunk(
+    store: FolderStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    put, order = store.put, []
+
+    def noted(key: str, data: bytes) -> None:
+        order.append(key)
+        put(key, data)
+
+    monkeypatch.setattr(store, "put", noted)
+    chunk = written(store, some_rows(1), [new_id()])
+    assert order == [manifest_key(chunk.object_key), chunk.object_key]
+
+
+def test_every_row_needs_its_photo(store: FolderStore) -> None:
+    with pytest.raises(ValueError, match="5 rows for 4 photos"):
+        written(store, some_rows(), [new_id() for _ in range(4)])
+    assert list(store.list("")) == []
+
+
+def test_deleting_a_chunk_takes_its_manifest_along(store: FolderStore) -> None:
+    chunk = written(store, some_rows(), [new_id() for _ in range(5)])
+    delete_chunk(store, chunk.object_key)
+    assert list(store.list("")) == []
+    delete_chunk(store, chunk.object_key)

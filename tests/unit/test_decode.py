@@ -1,0 +1,250 @@
+"""Decoding: every accepted format, upright, at the right brightness, or refused with a reason."""
+
+from __future__ import annotations
+
+import io
+import random
+import struct
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import Image
+from PIL.ExifTags import GPS, IFD, Base
+
+from shared.errors import Unprocessable
+from shared.photo_formats import sniff_media_type
+from shared.vision.decode import THUMBNAIL_PIXELS, decode
+from shared.vision.preprocessing import get_preprocessing
+from tests.support.photos import photo_bytes, photo_image
+
+SQUARE = get_preprocessing("square32")
+PIXELS = 50_000_000
+LOSSLESS = ("PNG", "BMP", "TIFF")
+
+
+def encoded(image: Image.Image, media: str, **options: Any) -> bytes:
+    buffer = io.BytesIO()
+    image.save(buffer, media, **options)
+    return buffer.getvalue()
+
+
+def mean_colour(data: bytes) -> tuple[int, int, int]:
+    red, green, blue = decode(data, SQUARE, PIXELS).pixels.reshape(-1, 3).mean(axis=0)
+    return round(red), round(green), round(blue)
+
+
+def reason(data: bytes, max_pixels: int = PIXELS) -> Unprocessable:
+    with pytest.raises(Unprocessable) as caught:
+        decode(data, SQUARE, max_pixels)
+    return caught.value
+
+
+def multi_picture() -> bytes:
+    """What phones write under the name JPEG."""
+    return encoded(photo_image(1), "MPO", save_all=True, append_images=[photo_image(2)])
+
+
+FORMATS: dict[str, bytes] = {
+    "JPEG": photo_bytes(1),
+    "progressive JPEG": photo_bytes(1, progressive=True),
+    "MPO": multi_picture(),
+    "PNG": photo_bytes(1, "PNG"),
+    "WebP": photo_bytes(1, "WEBP", quality=95),
+    "lossless WebP": photo_bytes(1, "WEBP", lossless=True),
+    "BMP": photo_bytes(1, "BMP"),
+    "TIFF": photo_bytes(1, "TIFF"),
+    "LZW TIFF": photo_bytes(1, "TIFF", compression="tiff_lzw"),
+    "JPEG TIFF": photo_bytes(1, "TIFF", compression="jpeg"),
+}
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_every_accepted_format_decodes_to_the_size_of_the_preprocessing(name: str) -> None:
+    decoded = decode(FORMATS[name], SQUARE, PIXELS)
+    assert decoded.pixels.shape == (32, 32, 3)
+    assert decoded.pixels.dtype == np.uint8
+    expected = np.asarray(SQUARE.apply(photo_image(1)), dtype=float)
+    assert np.abs(decoded.pixels - expected).mean() < 12, "these are not the photo's pixels"
+    assert sniff_media_type(FORMATS[name][:16]) is not None
+
+
+@pytest.mark.parametrize("media", LOSSLESS)
+def test_lossless_formats_keep_every_pixel(media: str) -> None:
+    decoded = decode(photo_bytes(3, media), SQUARE, PIXELS)
+    np.testing.assert_array_equal(decoded.pixels, np.asarray(SQUARE.apply(photo_image(3))))
+
+
+UNDO_OF_ORIENTATION = {
+    1: None,
+    2: Image.Transpose.FLIP_LEFT_RIGHT,
+    3: Image.Transpose.ROTATE_180,
+    4: Image.Transpose.FLIP_TOP_BOTTOM,
+    5: Image.Transpose.TRANSPOSE,
+    6: Image.Transpose.ROTATE_90,
+    7: Image.Transpose.TRANSVERSE,
+    8: Image.Transpose.ROTATE_270,
+}
+
+
+def corners(pixels: Any) -> list[str]:
+    """The colours of the four corners, clockwise from the top left."""
+    names = {(1, 0, 0): "red", (0, 1, 0): "green", (0, 0, 1): "blue", (1, 1, 0): "yellow"}
+    found = [pixels[2, 2], pixels[2, -3], pixels[-3, -3], pixels[-3, 2]]
+    return [names[tuple(int(v > 128) for v in colour)] for colour in found]  # type: ignore[index]
+
+
+@pytest.mark.parametrize("media", ["JPEG", "PNG", "WEBP", "TIFF"])
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_every_exif_orientation_comes_out_upright(orientation: int, media: str) -> None:
+    upright = Image.new("RGB", (48, 32), (255, 0, 0))
+    upright.paste((0, 255, 0), (24, 0, 48, 16))
+    upright.paste((0, 0, 255), (24, 16, 48, 32))
+    upright.paste((255, 255, 0), (0, 16, 24, 32))
+    undo = UNDO_OF_ORIENTATION[orientation]
+    as_the_camera_stores_it = upright.transpose(undo) if undo is not None else upright
+    exif = Image.Exif()
+    exif[Base.Orientation] = orientation
+    decoded = decode(encoded(as_the_camera_stores_it, media, exif=exif), SQUARE, PIXELS)
+    assert corners(decoded.pixels) == ["red", "green", "blue", "yellow"]
+    thumbnail = Image.open(io.BytesIO(decoded.thumbnail))
+    assert thumbnail.size == (48, 32)
+    assert corners(np.asarray(thumbnail)) == ["red", "green", "blue", "yellow"]
+
+
+@pytest.mark.parametrize("media", ["PNG", "TIFF"])
+def test_16_bit_grey_is_scaled_and_not_clipped_to_white(media: str) -> None:
+    samples = np.full((20, 30), 0x8000, dtype=np.uint16)
+    assert mean_colour(encoded(Image.fromarray(samples), media)) == (128, 128, 128)
+
+
+def test_samples_without_a_brightness_range_are_refused() -> None:
+    depth = Image.fromarray(np.full((20, 30), 1.5, dtype=np.float32))
+    assert "brightness range" in reason(encoded(depth, "TIFF")).detail
+
+
+def test_cmyk_jpeg_has_its_colours() -> None:
+    red = Image.new("RGB", (40, 40), (220, 30, 30)).convert("CMYK")
+    r, g, b = mean_colour(encoded(red, "JPEG", quality=95))
+    assert abs(r - 220) < 8
+    assert abs(g - 30) < 8
+    assert abs(b - 30) < 8
+
+
+def test_palette_with_transparency_has_the_colours_of_its_palette() -> None:
+    image = Image.new("P", (16, 16), 1)
+    image.putpalette([0, 0, 0, 10, 200, 90])
+    assert mean_colour(encoded(image, "PNG", transparency=0)) == (10, 200, 90)
+    assert mean_colour(encoded(image, "PNG", transparency=bytes([255, 128]))) == (10, 200, 90)
+
+
+@pytest.mark.parametrize(
+    ("mode", "colour", "expected"),
+    [
+        ("1", 1, (255, 255, 255)),
+        ("L", 77, (77, 77, 77)),
+        ("LA", (77, 255), (77, 77, 77)),
+        ("RGBA", (9, 8, 7, 255), (9, 8, 7)),
+    ],
+)
+def test_other_pixel_modes_become_rgb(
+    mode: str, colour: Any, expected: tuple[int, int, int]
+) -> None:
+    assert mean_colour(encoded(Image.new(mode, (10, 10), colour), "PNG")) == expected
+
+
+def test_animated_webp_shows_its_first_frame() -> None:
+    frames = [Image.new("RGB", (20, 20), colour) for colour in ("#ff0000", "#00ff00", "#0000ff")]
+    data = encoded(frames[0], "WEBP", save_all=True, append_images=frames[1:], lossless=True)
+    assert mean_colour(data) == (255, 0, 0)
+
+
+def test_photo_of_one_pixel_decodes() -> None:
+    decoded = decode(encoded(Image.new("RGB", (1, 1), (5, 6, 7)), "PNG"), SQUARE, PIXELS)
+    assert set(map(tuple, decoded.pixels.reshape(-1, 3).tolist())) == {(5, 6, 7)}
+    assert Image.open(io.BytesIO(decoded.thumbnail)).size == (1, 1)
+
+
+@pytest.mark.parametrize("media", ["JPEG", "PNG", "WEBP", "BMP", "TIFF"])
+def test_truncated_photo_is_an_error_and_not_a_grey_picture(media: str) -> None:
+    whole = photo_bytes(1, media)
+    assert reason(whole[: len(whole) * 2 // 3]).code == "undecodable_photo"
+
+
+@pytest.mark.parametrize("data", [b"", b"this is a text\n" * 40, b"\xff\xd8\xff\xe0", b"GIF89a"])
+def test_what_is_no_photo_is_an_error(data: bytes) -> None:
+    assert reason(data).code == "undecodable_photo"
+
+
+def test_formats_that_are_not_accepted_are_not_decoded() -> None:
+    for media in ("GIF", "PPM", "TGA"):
+        assert reason(photo_bytes(1, media)).code == "undecodable_photo"
+
+
+def test_too_many_pixels_are_an_error_that_names_the_limit() -> None:
+    error = reason(photo_bytes(1, "PNG"), max_pixels=64 * 48 - 1)
+    assert error.code == "too_many_pixels"
+    assert "64 x 48" in error.detail
+    assert str(64 * 48 - 1) in error.detail
+    decode(photo_bytes(1, "PNG"), SQUARE, max_pixels=64 * 48)
+
+
+def private_exif() -> Image.Exif:
+    exif = Image.Exif()
+    exif[Base.Make] = "SecretCamera"
+    exif.get_ifd(IFD.GPSInfo)[GPS.GPSLatitudeRef] = "N"
+    exif.get_ifd(IFD.GPSInfo)[GPS.GPSLatitude] = (45.0, 4.0, 12.5)
+    return exif
+
+
+@pytest.mark.parametrize("media", ["JPEG", "PNG", "WEBP", "TIFF"])
+def test_thumbnails_carry_nothing_that_the_camera_wrote(media: str) -> None:
+    options: dict[str, Any] = {"exif": private_exif()}
+    if media == "JPEG":
+        options |= {"comment": b"SecretComment", "dpi": (72, 72), "xmp": b"<x>SecretXmp</x>"}
+    data = encoded(photo_image(1), media, **options)
+    thumbnail = decode(data, SQUARE, PIXELS).thumbnail
+    assert b"Secret" in data
+    assert b"Secret" not in thumbnail
+    assert b"Exif" not in thumbnail
+    assert len(Image.open(io.BytesIO(thumbnail)).getexif()) == 0
+
+
+def test_thumbnail_is_a_small_jpeg_of_the_same_shape() -> None:
+    data = encoded(Image.new("RGB", (1000, 500), (1, 2, 3)), "PNG")
+    thumbnail = Image.open(io.BytesIO(decode(data, SQUARE, PIXELS).thumbnail))
+    assert thumbnail.format == "JPEG"
+    assert thumbnail.size == (THUMBNAIL_PIXELS, THUMBNAIL_PIXELS // 2)
+
+
+def test_small_photos_are_not_enlarged_for_their_thumbnail() -> None:
+    decoded = decode(photo_bytes(1), SQUARE, PIXELS)
+    assert Image.open(io.BytesIO(decoded.thumbnail)).size == (64, 48)
+
+
+def test_broken_exif_is_no_reason_to_refuse_the_pixels() -> None:
+    """A tag of text that holds a fraction: Pillow reads it, but can't write it again."""
+    entry = struct.pack("<HHIHHII", 1, 0x010F, 0, 0, 0, 0, 0)
+    for exif in (
+        b"Exif\0\0nonsense",
+        b"Exif\0\0II*\0\x08\0\0\0" + entry,
+        b"Exif\0\0II*\0\xff\xff\xff\xff",
+        b"Exif\0\0II*\0\x08\0\0\0\x01\0\x0f\x01\x05\0\x01\0\0\0\x08\0\0\0\0\0\0\0",
+    ):
+        data = encoded(photo_image(1), "JPEG", exif=exif)
+        assert decode(data, SQUARE, PIXELS).pixels.shape == (32, 32, 3)
+
+
+@settings(max_examples=60, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), media=st.sampled_from(sorted(FORMATS)))
+def test_damaged_photos_decode_or_are_refused_and_raise_nothing_else(seed: int, media: str) -> None:
+    rng = random.Random(seed)
+    data = bytearray(FORMATS[media])
+    for _ in range(rng.choice([1, 3, 10])):
+        data[rng.randrange(len(data))] = rng.randrange(256)
+    try:
+        decode(bytes(data), SQUARE, 1_000_000)
+    except Unprocessable as error:
+        assert error.code in ("undecodable_photo", "too_many_pixels")  # noqa: PT017

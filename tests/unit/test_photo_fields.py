@@ -1,0 +1,160 @@
+"""Form fields: what people say of a photo, and every error naming its field."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+
+import pytest
+
+from services.gateway.photo_fields import (
+    MAX_TAGS,
+    MAX_TEXT,
+    PhotoFields,
+    check_metadata,
+    read_form_fields,
+)
+from shared.errors import Unprocessable
+
+
+def refused(form: dict[str, str]) -> Unprocessable:
+    with pytest.raises(Unprocessable) as caught:
+        read_form_fields(form)
+    assert caught.value.code == "invalid_field"
+    return caught.value
+
+
+def refused_field(form: dict[str, str]) -> str:
+    """The field that the error names for programs."""
+    field: str = refused(form).extra["errors"][0]["field"]
+    return field
+
+
+def test_every_field_is_read() -> None:
+    found = read_form_fields(
+        {
+            "latitude": " 45.07 ",
+            "longitude": "-7.5",
+            "heading": "90",
+            "captured_at": "2026-05-01T12:30:00+02:00",
+            "place": "corridor 3",
+            "tags": "night, indoor ,night,,",
+            "metadata": '{"camera": {"f": 1.8}, "n": null}',
+        }
+    )
+    assert found == PhotoFields(
+        latitude=45.07,
+        longitude=-7.5,
+        heading=90.0,
+        captured_at=datetime(2026, 5, 1, 10, 30, tzinfo=UTC),
+        place="corridor 3",
+        tags=["night", "indoor"],
+        metadata={"camera": {"f": 1.8}, "n": None},
+    )
+
+
+def test_what_is_empty_or_left_out_is_not_said() -> None:
+    assert read_form_fields({}) == PhotoFields()
+    assert read_form_fields({"latitude": "", "place": "  ", "tags": "", "metadata": ""}) == (
+        PhotoFields()
+    )
+
+
+def test_unknown_field_is_refused_and_the_known_are_named() -> None:
+    error = refused({"lattitude": "45"})
+    assert error.extra["errors"][0]["field"] == "lattitude"
+    assert "latitude" in error.detail
+
+
+@pytest.mark.parametrize("value", ["90.0001", "-91", "nan", "inf", "north", "45,07", "0x10"])
+def test_latitude_that_is_none_is_refused(value: str) -> None:
+    assert refused_field({"latitude": value, "longitude": "0"}) == "latitude"
+
+
+@pytest.mark.parametrize("value", ["180.0001", "-181", "NaN", "-Infinity", "east"])
+def test_longitude_that_is_none_is_refused(value: str) -> None:
+    assert refused_field({"latitude": "0", "longitude": value}) == "longitude"
+
+
+@pytest.mark.parametrize(("latitude", "longitude"), [("90", "180"), ("-90", "-180"), ("0", "0")])
+def test_ends_of_the_ranges_are_places(latitude: str, longitude: str) -> None:
+    found = read_form_fields({"latitude": latitude, "longitude": longitude})
+    assert (found.latitude, found.longitude) == (float(latitude), float(longitude))
+
+
+def test_coordinates_come_in_pairs() -> None:
+    assert refused_field({"latitude": "45"}) == "longitude"
+    assert refused_field({"longitude": "7"}) == "latitude"
+
+
+def test_heading_is_between_0_and_360_and_full_circle_is_north() -> None:
+    assert read_form_fields({"heading": "360"}).heading == 0.0
+    assert read_form_fields({"heading": "359.5"}).heading == 359.5
+    assert refused_field({"heading": "-1"}) == "heading"
+    assert refused_field({"heading": "361"}) == "heading"
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("2026-05-01T12:30:00", datetime(2026, 5, 1, 12, 30, tzinfo=UTC)),
+        ("2026-05-01T12:30:00Z", datetime(2026, 5, 1, 12, 30, tzinfo=UTC)),
+        ("2026-05-01T00:30:00-05:00", datetime(2026, 5, 1, 5, 30, tzinfo=UTC)),
+        ("2026-05-01", datetime(2026, 5, 1, tzinfo=UTC)),
+    ],
+)
+def test_times_become_utc(text: str, expected: datetime) -> None:
+    assert read_form_fields({"captured_at": text}).captured_at == expected
+
+
+@pytest.mark.parametrize("text", ["yesterday", "1714559400", "0001-01-01T00:00:00+05:00"])
+def test_times_that_are_none_are_refused(text: str) -> None:
+    assert refused_field({"captured_at": text}) == "captured_at"
+
+
+def test_texts_have_a_length_and_no_nul() -> None:
+    assert read_form_fields({"place": "x" * MAX_TEXT}).place == "x" * MAX_TEXT
+    assert refused_field({"place": "x" * (MAX_TEXT + 1)}) == "place"
+    assert refused_field({"tags": "a," + "x" * (MAX_TEXT + 1)}) == "tags"
+    assert refused_field({"place": "a\0b"}) == "place"
+    assert refused_field({"tags": "a\0b"}) == "tags"
+
+
+def test_tags_have_a_number() -> None:
+    many = ",".join(str(number) for number in range(MAX_TAGS))
+    tags = read_form_fields({"tags": many}).tags
+    assert tags is not None
+    assert len(tags) == MAX_TAGS
+    assert refused_field({"tags": f"{many},one more"}) == "tags"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "{",
+        "[]",
+        '"text"',
+        "1",
+        "null",
+        '{"a": NaN}',
+        '{"a": -Infinity}',
+        '{"a": 1e999}',
+        '{"a": "\\u0000"}',
+        '{"a\\u0000": 1}',
+        '{"a": ["\\\\\\u0000"]}',
+        '{"a": "\\ud800"}',
+        "[" * 100_000,
+        '{"a":' * 100_000,
+        '{"a": ' + "9" * 5000 + "}",
+    ],
+)
+def test_metadata_that_no_json_column_can_hold_is_refused(text: str) -> None:
+    assert refused_field({"metadata": text}) == "metadata"
+
+
+@pytest.mark.parametrize("text", ['{"a": "\\\\u0000"}', '{"a": "\\ud83d\\ude00"}', "{}"])
+def test_metadata_that_only_looks_strange_is_kept(text: str) -> None:
+    read_form_fields({"metadata": text})
+
+
+def test_backslash_u0000_spelt_out_is_text() -> None:
+    check_metadata({"path": "C:\\u0000"})

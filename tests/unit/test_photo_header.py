@@ -1,0 +1,277 @@
+"""What the gateway reads from a photo's header, without decoding a pixel."""
+
+from __future__ import annotations
+
+import io
+import random
+import struct
+import zlib
+from datetime import UTC, datetime
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import Image, ImageFile
+from PIL.ExifTags import GPS, IFD, Base
+from PIL.TiffImagePlugin import IFDRational, TiffImageFile
+from PIL.WebPImagePlugin import WebPImageFile
+
+from services.gateway.photo_header import PhotoHeader, read_photo_header
+from shared.errors import Unprocessable
+from tests.support.photos import photo_bytes, photo_image
+
+PIXELS = 50_000_000
+Tags = dict[Any, Any]
+
+
+def encoded(media: str = "JPEG", **options: Any) -> bytes:
+    return photo_bytes(1, media, **options)
+
+
+def header(data: bytes, max_pixels: int = PIXELS) -> PhotoHeader:
+    """The header, read while no plugin can decode anything."""
+
+    def refuse(*_: Any) -> Any:
+        raise AssertionError("the gateway decoded a picture")
+
+    with pytest.MonkeyPatch.context() as patch:
+        for kind in (Image.Image, ImageFile.ImageFile, TiffImageFile, WebPImageFile):
+            patch.setattr(kind, "load", refuse)
+        return read_photo_header(io.BytesIO(data), max_pixels)
+
+
+def exif_with(
+    gps: Tags | None = None,
+    camera: Tags | None = None,
+    main: Tags | None = None,
+) -> Image.Exif:
+    exif = Image.Exif()
+    exif.update(main or {})
+    for directory, tags in ((IFD.GPSInfo, gps), (IFD.Exif, camera)):
+        if tags:  # twice, because Pillow's writers look in different places
+            exif.get_ifd(directory).update(tags)
+            exif[directory] = tags
+    return exif
+
+
+def position(north: str, east: str) -> Tags:
+    return {
+        GPS.GPSLatitudeRef: north,
+        GPS.GPSLatitude: (45.0, 4.0, 12.0),
+        GPS.GPSLongitudeRef: east,
+        GPS.GPSLongitude: (7.0, 30.0, 36.0),
+    }
+
+
+def taken(gps: Tags | None, camera: Tags | None) -> datetime | None:
+    return header(encoded(exif=exif_with(gps, camera))).captured_at
+
+
+def reason(data: bytes, max_pixels: int = PIXELS) -> Unprocessable:
+    with pytest.raises(Unprocessable) as caught:
+        header(data, max_pixels)
+    return caught.value
+
+
+@pytest.mark.parametrize("media", ["JPEG", "PNG", "WEBP", "BMP", "TIFF"])
+def test_every_accepted_format_tells_its_size(media: str) -> None:
+    found = header(encoded(media))
+    assert found == PhotoHeader(width=64, height=48)
+
+
+def test_phone_photo_with_a_second_picture_behind_it_is_read() -> None:
+    data = encoded("MPO", save_all=True, append_images=[photo_image(2)])
+    assert header(data) == PhotoHeader(width=64, height=48)
+
+
+@pytest.mark.parametrize("media", ["JPEG", "PNG", "WEBP", "TIFF"])
+@pytest.mark.parametrize(
+    ("north", "east", "latitude", "longitude"),
+    [
+        ("N", "E", 45.07, 7.51),
+        ("N", "W", 45.07, -7.51),
+        ("S", "E", -45.07, 7.51),
+        ("S", "W", -45.07, -7.51),
+    ],
+)
+def test_gps_position_is_read_in_all_four_hemispheres(
+    media: str, north: str, east: str, latitude: float, longitude: float
+) -> None:
+    found = header(encoded(media, exif=exif_with(position(north, east))))
+    assert found.latitude == pytest.approx(latitude, abs=1e-9)
+    assert found.longitude == pytest.approx(longitude, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    "broken",
+    [
+        {GPS.GPSLatitude: (91.0, 0.0, 0.0)},
+        {GPS.GPSLongitude: (180.0, 0.0, 1.0)},
+        {GPS.GPSLatitude: (45.0, 4.0)},
+        {GPS.GPSLatitude: (IFDRational(45, 0), 4.0, 1.0)},
+        {GPS.GPSLatitudeRef: b"\x00\x01"},
+        {GPS.GPSLongitudeRef: ""},
+        {GPS.GPSLatitudeRef: "E"},
+    ],
+)
+def test_position_out_of_range_or_half_is_left_out_whole(broken: Tags) -> None:
+    found = header(encoded(exif=exif_with({**position("N", "E"), **broken})))
+    assert (found.latitude, found.longitude) == (None, None)
+    assert (found.width, found.height) == (64, 48)
+
+
+def test_latitude_without_longitude_is_left_out() -> None:
+    half = {key: value for key, value in position("N", "E").items() if key < GPS.GPSLongitudeRef}
+    found = header(encoded(exif=exif_with(half)))
+    assert (found.latitude, found.longitude) == (None, None)
+
+
+@pytest.mark.parametrize(("said", "heading"), [(12.5, 12.5), (0, 0), (360, 0), (372.5, 12.5)])
+def test_heading_is_brought_below_360_degrees(said: float, heading: float) -> None:
+    found = header(encoded(exif=exif_with({GPS.GPSImgDirection: said})))
+    assert found.heading == pytest.approx(heading)
+
+
+GPS_TIME: Tags = {GPS.GPSDateStamp: "2024:05:06", GPS.GPSTimeStamp: (10.0, 20.0, 30.5)}
+CAMERA_TIME: Tags = {
+    Base.DateTimeOriginal: "2024:05:06 12:20:31",
+    Base.OffsetTimeOriginal: "+02:00",
+}
+
+
+def test_gps_time_is_utc_and_goes_before_the_cameras() -> None:
+    expected = datetime(2024, 5, 6, 10, 20, 30, 500_000, tzinfo=UTC)
+    assert taken(GPS_TIME, {Base.DateTimeOriginal: "2020:01:01 00:00:00"}) == expected
+
+
+def test_camera_time_is_brought_to_utc_by_its_offset() -> None:
+    found = taken(None, CAMERA_TIME)
+    assert found == datetime(2024, 5, 6, 10, 20, 31, tzinfo=UTC)
+    assert found is not None
+    assert found.utcoffset() == UTC.utcoffset(None)
+
+
+def test_camera_time_without_an_offset_counts_as_utc() -> None:
+    camera = {Base.DateTimeOriginal: "2024:05:06 12:20:31"}
+    assert taken(None, camera) == datetime(2024, 5, 6, 12, 20, 31, tzinfo=UTC)
+
+
+@pytest.mark.parametrize(
+    "gps",
+    [
+        {GPS.GPSDateStamp: "2024:05:06"},
+        {**GPS_TIME, GPS.GPSDateStamp: "yesterday"},
+        {**GPS_TIME, GPS.GPSTimeStamp: (10.0, 20.0)},
+        {GPS.GPSDateStamp: "9999:12:31", GPS.GPSTimeStamp: (4e9, 0.0, 0.0)},
+    ],
+)
+def test_broken_gps_time_gives_way_to_the_cameras(gps: Tags) -> None:
+    assert taken(gps, CAMERA_TIME) == datetime(2024, 5, 6, 10, 20, 31, tzinfo=UTC)
+
+
+@pytest.mark.parametrize(
+    "camera",
+    [
+        {Base.DateTimeOriginal: "0000:00:00 00:00:00"},
+        {Base.DateTimeOriginal: "a long time ago"},
+        {Base.DateTimeOriginal: "2024:05:06 12:20:31", Base.OffsetTimeOriginal: "+99:00"},
+        {Base.DateTimeOriginal: "0001:01:01 00:00:00", Base.OffsetTimeOriginal: "+05:00"},
+    ],
+)
+def test_broken_camera_time_is_left_out(camera: Tags) -> None:
+    assert taken(None, camera) is None
+
+
+@pytest.mark.parametrize("media", ["JPEG", "PNG", "WEBP", "TIFF"])
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_size_is_that_of_the_upright_photo(orientation: int, media: str) -> None:
+    found = header(encoded(media, exif=exif_with(main={Base.Orientation: orientation})))
+    upright = (48, 64) if orientation >= 5 else (64, 48)
+    assert (found.width, found.height) == upright
+
+
+@pytest.mark.parametrize(
+    "exif",
+    [
+        b"Exif\0\0nonsense",
+        b"Exif\0\0",
+        b"Exif\0\0II*\0\xff\xff\xff\xff",
+        b"Exif\0\0II*\0\x08\0\0\0\xff\xff" + bytes(40),
+    ],
+)
+def test_broken_exif_is_ignored(exif: bytes) -> None:
+    assert header(encoded(exif=exif)) == PhotoHeader(width=64, height=48)
+
+
+def whole_exif() -> bytes:
+    everything: Tags = {**position("N", "E"), **GPS_TIME, GPS.GPSImgDirection: 12.5}
+    data: bytes = exif_with(
+        everything, CAMERA_TIME, {Base.Orientation: 6, Base.Make: "m"}
+    ).tobytes()
+    return data
+
+
+@settings(max_examples=100, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), media=st.sampled_from(["JPEG", "PNG", "WEBP"]))
+def test_no_damage_to_the_exif_refuses_a_photo(seed: int, media: str) -> None:
+    rng = random.Random(seed)
+    exif = bytearray(whole_exif())
+    for _ in range(rng.choice([1, 2, 10, 40])):
+        exif[rng.randrange(6, len(exif))] = rng.choice(
+            [0, 1, 2, 5, 10, 12, 255, rng.randrange(256)]
+        )
+    exif = exif[: rng.choice([len(exif), rng.randrange(6, len(exif))])]
+    found = header(encoded(media, exif=bytes(exif)))
+    assert sorted((found.width, found.height)) == [48, 64]
+    assert found.heading is None or 0 <= found.heading < 360
+    assert (found.latitude is None) == (found.longitude is None)
+    assert found.captured_at is None or found.captured_at.utcoffset() == UTC.utcoffset(None)
+
+
+def png_chunk(kind: bytes, data: bytes) -> bytes:
+    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+
+def png(width: int, height: int, *between: bytes) -> bytes:
+    """A PNG whose pixels are missing: only a reader of headers can make sense of it."""
+    size = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + png_chunk(b"IHDR", size) + b"".join(between)
+
+
+def test_png_tells_its_exif_when_it_stands_before_the_pixels() -> None:
+    exif = whole_exif().removeprefix(b"Exif\0\0")
+    data = png(30, 20, png_chunk(b"eXIf", exif), png_chunk(b"IDAT", b"no pixels at all"))
+    found = header(data)
+    assert (found.width, found.height) == (20, 30)
+    assert found.latitude == pytest.approx(45.07)
+    assert found.captured_at == datetime(2024, 5, 6, 10, 20, 30, 500_000, tzinfo=UTC)
+
+
+def test_exif_behind_the_pixels_is_not_waited_for() -> None:
+    exif = whole_exif().removeprefix(b"Exif\0\0")
+    data = png(30, 20, png_chunk(b"IDAT", b"no pixels"), png_chunk(b"eXIf", exif))
+    assert header(data) == PhotoHeader(width=30, height=20)
+
+
+def test_too_many_pixels_are_refused_from_the_header_alone() -> None:
+    bomb = png(60_000, 60_000, png_chunk(b"IDAT", b""))
+    error = reason(bomb)
+    assert error.code == "too_many_pixels"
+    assert "60000 x 60000" in error.detail
+    assert str(PIXELS) in error.detail
+
+
+def test_limit_of_pixels_is_inclusive() -> None:
+    header(encoded(), max_pixels=64 * 48)
+    assert reason(encoded(), max_pixels=64 * 48 - 1).code == "too_many_pixels"
+
+
+@pytest.mark.parametrize("media", ["JPEG", "PNG", "WEBP", "BMP", "TIFF"])
+def test_truncated_header_is_undecodable(media: str) -> None:
+    assert reason(encoded(media)[:20]).code == "undecodable_photo"
+
+
+@pytest.mark.parametrize("data", [b"", b"\xff\xd8\xff", b"not a photo", b"GIF89a" + bytes(30)])
+def test_what_is_no_photo_is_undecodable(data: bytes) -> None:
+    assert reason(data).code == "undecodable_photo"

@@ -1,0 +1,176 @@
+"""Where the photos of a folder were taken: `@UTM@` names and CSV tables."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from services.cli.photo_places import fields_of_name, find_photos
+from shared.errors import InvalidRequest
+
+# The Mole Antonelliana in Turin, zone 32T.
+EAST, NORTH = "396544.00", "4991543.00"
+LATITUDE, LONGITUDE = 45.0691, 7.6853
+
+
+def make(folder: Path, *names: str) -> Path:
+    for name in names:
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(b"a photo")
+    return folder
+
+
+def refused(folder: Path, table: Path | None = None, zone: str | None = None) -> InvalidRequest:
+    with pytest.raises(InvalidRequest) as caught:
+        find_photos(folder, table, zone)
+    return caught.value
+
+
+def table_of(folder: Path, text: str, encoding: str = "utf-8") -> Path:
+    path = folder / "photos.csv"
+    path.write_text(text, encoding=encoding)
+    return path
+
+
+def test_name_with_latitude_and_longitude_needs_no_zone() -> None:
+    name = f"@{EAST}@{NORTH}@32@T@45.0691@7.6931@pano@tile@370.5@@@@@@.jpg"
+    expected = {"latitude": "45.0691", "longitude": "7.6931", "heading": "10.5"}
+    assert fields_of_name(name, None) == expected
+
+
+@pytest.mark.parametrize("zone", [None, "33T"])
+def test_name_with_its_own_zone_goes_before_the_option(zone: str | None) -> None:
+    fields = fields_of_name(f"@{EAST}@{NORTH}@32@T@@@@@@@@@@@.jpg", zone)
+    assert float(fields["latitude"]) == pytest.approx(LATITUDE, abs=1e-3)
+    assert float(fields["longitude"]) == pytest.approx(LONGITUDE, abs=1e-3)
+    assert "heading" not in fields
+
+
+@pytest.mark.parametrize("name", [f"@{EAST}@{NORTH}@.jpg", f"@{EAST}@{NORTH}@@@@@@@@@@@@@.jpg"])
+@pytest.mark.parametrize("zone", ["32T", "32t"])
+def test_name_without_a_zone_takes_the_option(name: str, zone: str) -> None:
+    fields = fields_of_name(name, zone)
+    assert float(fields["latitude"]) == pytest.approx(LATITUDE, abs=1e-3)
+    assert float(fields["longitude"]) == pytest.approx(LONGITUDE, abs=1e-3)
+
+
+def test_southern_zone_lies_south() -> None:
+    fields = fields_of_name("@334000@6252000@56@H@@@@@@@@@@@.jpg", None)
+    assert float(fields["latitude"]) == pytest.approx(-33.86, abs=0.02)
+    assert float(fields["longitude"]) == pytest.approx(151.2, abs=0.02)
+
+
+def test_name_without_any_zone_is_an_error_that_names_the_option() -> None:
+    with pytest.raises(InvalidRequest) as caught:
+        fields_of_name(f"@{EAST}@{NORTH}@@@@@@@@@@@@@.jpg", None)
+    assert caught.value.code == "no_utm_zone"
+    assert "--utm-zone" in caught.value.detail
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        f"@east@{NORTH}@32@T@@@@@@@@@@@.jpg",
+        f"@{EAST}@{NORTH}@99@T@@@@@@@@@@@.jpg",
+        f"@{EAST}@{NORTH}@32@I@@@@@@@@@@@.jpg",
+        f"@9{EAST}@{NORTH}@32@T@@@@@@@@@@@.jpg",
+        f"@{EAST}@{NORTH}@thirty-two@T@@@@@@@@@@@.jpg",
+    ],
+)
+def test_coordinates_that_are_none_are_an_error_that_names_the_file(name: str) -> None:
+    with pytest.raises(InvalidRequest) as caught:
+        fields_of_name(name, None)
+    assert caught.value.code == "bad_coordinates"
+    assert name in caught.value.detail
+
+
+@pytest.mark.parametrize("name", ["photo.jpg", "me@home.jpg", "a@1@2@3@4@.jpg", "@me.jpg"])
+def test_ordinary_names_say_nothing(name: str) -> None:
+    assert fields_of_name(name, "32T") == {}
+
+
+def test_photos_are_found_below_the_folder_in_the_order_of_their_paths(tmp_path: Path) -> None:
+    make(tmp_path, "b.JPG", "a/z.png", "a/b/c.webp", "notes.txt", "a/photos.csv", "c.tiff")
+    found = [
+        photo.path.relative_to(tmp_path).as_posix() for photo in find_photos(tmp_path, None, None)
+    ]
+    assert found == ["a/b/c.webp", "a/z.png", "b.JPG", "c.tiff"]
+
+
+def test_hidden_files_are_ignored(tmp_path: Path) -> None:
+    make(tmp_path, "a.jpg", ".b.jpg", "._a.jpg")
+    assert [photo.path.name for photo in find_photos(tmp_path, None, None)] == ["a.jpg"]
+
+
+def test_folder_without_photos_is_an_error(tmp_path: Path) -> None:
+    make(tmp_path, "notes.txt", ".hidden.jpg")
+    assert refused(tmp_path).code == "no_photos"
+
+
+def test_table_says_what_is_known_of_each_photo(tmp_path: Path) -> None:
+    make(tmp_path, "a.jpg", "in/b.jpg", "c.jpg")
+    table = table_of(
+        tmp_path,
+        "filename,latitude,longitude,place,tags,colour\n"
+        'a.jpg,45.1,7.6,,"night,rain",red\n'
+        "in/b.jpg,,,corridor,,\n",
+    )
+    found = {photo.path.name: photo.fields for photo in find_photos(tmp_path, table, None)}
+    assert found == {
+        "a.jpg": {"latitude": "45.1", "longitude": "7.6", "tags": "night,rain"},
+        "b.jpg": {"place": "corridor"},
+        "c.jpg": {},
+    }
+
+
+def test_table_goes_before_the_name(tmp_path: Path) -> None:
+    name = f"@{EAST}@{NORTH}@32@T@45.0@7.0@@@@@@@@@.jpg"
+    make(tmp_path, name)
+    table = table_of(tmp_path, f"file,latitude,longitude\n{name},1,2\n")
+    assert find_photos(tmp_path, table, None)[0].fields == {"latitude": "1", "longitude": "2"}
+
+
+def test_table_with_a_byte_order_mark_is_read(tmp_path: Path) -> None:
+    make(tmp_path, "a.jpg")
+    table = table_of(tmp_path, "filename,place\na.jpg,Café\n", encoding="utf-8-sig")
+    assert find_photos(tmp_path, table, None)[0].fields == {"place": "Café"}
+
+
+@pytest.mark.parametrize("column", ["filename", "file", "path"])
+def test_column_of_names_may_have_any_of_three_names(tmp_path: Path, column: str) -> None:
+    make(tmp_path, "a.jpg")
+    table = table_of(tmp_path, f"place,{column}\nhall,a.jpg\n")
+    assert find_photos(tmp_path, table, None)[0].fields == {"place": "hall"}
+
+
+def test_table_that_names_a_missing_photo_is_an_error_with_its_line(tmp_path: Path) -> None:
+    make(tmp_path, "a.jpg")
+    table = table_of(tmp_path, 'filename,place\na.jpg,"two\nlines"\n\nmissing.jpg,hall\n')
+    error = refused(tmp_path, table)
+    assert error.code == "bad_table"
+    assert "line 5" in error.detail
+    assert "missing.jpg" in error.detail
+
+
+def test_short_line_is_an_error_with_its_line(tmp_path: Path) -> None:
+    make(tmp_path, "a.jpg")
+    error = refused(tmp_path, table_of(tmp_path, "place,filename\nhall\n"))
+    assert error.code == "bad_table"
+    assert "line 2" in error.detail
+
+
+@pytest.mark.parametrize("text", ["", "latitude,longitude\n1,2\n"])
+def test_table_without_a_column_of_names_is_an_error(tmp_path: Path, text: str) -> None:
+    make(tmp_path, "a.jpg")
+    error = refused(tmp_path, table_of(tmp_path, text))
+    assert error.code == "bad_table"
+    assert "filename" in error.detail
+
+
+def test_table_in_another_encoding_or_missing_is_an_error(tmp_path: Path) -> None:
+    make(tmp_path, "a.jpg")
+    table = table_of(tmp_path, "filename,place\na.jpg,Café\n", encoding="latin-1")
+    assert refused(tmp_path, table).code == "bad_table"
+    assert refused(tmp_path, tmp_path / "nothing.csv").code == "bad_table"

@@ -1,0 +1,224 @@
+"""Vocabulary files: what is read, and everything that is refused before it spoils a descriptor."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import pickle
+import struct
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from shared.errors import Unprocessable
+from shared.vision.vocabulary import check_centres, decode_centres, encode_centres, read_centres
+
+
+def good_centres(clusters: int = 4, width: int = 6) -> NDArray[np.float32]:
+    return np.random.default_rng(1).standard_normal((clusters, width)).astype(np.float32)
+
+
+def npy(array: NDArray[Any]) -> bytes:
+    buffer = io.BytesIO()
+    np.save(buffer, array)
+    return buffer.getvalue()
+
+
+def npy_header(shape: str) -> bytes:
+    """A `.npy` file that promises `shape` and holds four numbers."""
+    text = f"{{'descr': '<f4', 'fortran_order': False, 'shape': {shape}, }}"
+    text += " " * (-(len(text) + 11) % 64) + "\n"
+    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text.encode() + bytes(16)
+
+
+def refusal(array: NDArray[Any], width: int | None = None) -> str:
+    with pytest.raises(Unprocessable) as caught:
+        check_centres(array, width=width)
+    assert caught.value.code == "vocabulary_unfit"
+    return caught.value.detail
+
+
+def test_centres_survive_writing_and_reading() -> None:
+    array = good_centres()
+    checked = check_centres(array, width=6)
+    back = decode_centres(encode_centres(checked), width=6)
+    np.testing.assert_array_equal(back.array, array)
+    assert (back.clusters, back.dimension) == (4, 6)
+    assert back.sha256 == checked.sha256 == hashlib.sha256(array.tobytes()).hexdigest()
+
+
+@pytest.mark.parametrize("dtype", ["<f2", "<f8", ">f4"])
+def test_other_floating_point_types_become_float32(dtype: str) -> None:
+    array = good_centres()
+    checked = check_centres(array.astype(dtype))
+    assert checked.array.dtype == np.float32
+    np.testing.assert_allclose(checked.array, array, atol=2e-3)
+
+
+def test_fortran_order_does_not_change_the_hash() -> None:
+    array = good_centres()
+    assert check_centres(np.asfortranarray(array)).sha256 == check_centres(array).sha256
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_numbers_that_are_not_finite_are_refused(bad: float) -> None:
+    array = good_centres()
+    array[2, 3] = bad
+    assert "NaN or infinite" in refusal(array)
+
+
+def test_numbers_that_float32_cannot_hold_are_refused() -> None:
+    array = good_centres().astype(np.float64)
+    array[0, 0] = 1e300
+    assert "NaN or infinite" in refusal(array)
+
+
+def test_zero_centre_is_refused_by_its_number() -> None:
+    array = good_centres()
+    array[2] = 0
+    assert "centre 2 is zero" in refusal(array)
+
+
+def test_duplicate_centres_are_refused_and_counted() -> None:
+    array = good_centres()
+    array[3] = array[0]
+    assert "only 3 of its 4 centres are distinct" in refusal(array)
+
+
+def test_centres_of_another_width_are_refused_naming_both() -> None:
+    detail = refusal(good_centres(width=6), width=7)
+    assert "6 dimensions" in detail
+    assert "7" in detail
+
+
+@pytest.mark.parametrize("shape", [(), (6,), (2, 3, 4), (0, 6), (4, 0)])
+def test_only_a_filled_table_is_a_vocabulary(shape: tuple[int, ...]) -> None:
+    assert "its shape is" in refusal(np.ones(shape, dtype=np.float32))
+
+
+@pytest.mark.parametrize("dtype", [np.int64, np.uint8, np.bool_, np.complex64, "S4", "U4"])
+def test_only_floating_point_numbers_are_accepted(dtype: Any) -> None:
+    assert "not floating point" in refusal(good_centres().astype(dtype))
+
+
+class Untrustworthy:
+    """Unpickling this would be noticed."""
+
+    unpickled = False
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _notice, ()
+
+
+def _notice() -> None:
+    Untrustworthy.unpickled = True
+
+
+def junk_files() -> dict[str, bytes]:
+    npz = io.BytesIO()
+    np.savez(npz, centres=good_centres())
+    return {
+        "nothing": b"",
+        "text": b"these are not centres",
+        "an archive": npz.getvalue(),
+        "the beginning of an archive": b"PK\x03\x04 and no more",
+        "a truncated array": npy(good_centres())[:-7],
+        "a broken header": b"\x93NUMPY\x01\x00\x10\x00((((((((((((((((",
+        "an unknown version": b"\x93NUMPY\x09\x00",
+        "objects": npy(np.array([[Untrustworthy()]], dtype=object)),
+        "a bare pickle": pickle.dumps(Untrustworthy()),
+        "more rows than memory": npy_header("(10000000000000, 112)"),
+        "more rows than numbers": npy_header("(10000000000000000000000000000, 2)"),
+        "a negative shape": npy_header("(-1, 2)"),
+        "a shape of truth values": npy_header("(True, 4)"),
+    }
+
+
+@pytest.mark.parametrize("name", junk_files())
+def test_files_that_are_no_array_are_refused(name: str) -> None:
+    with pytest.raises(Unprocessable) as caught:
+        decode_centres(junk_files()[name])
+    assert caught.value.code == "vocabulary_unfit"
+    assert not Untrustworthy.unpickled
+
+
+def test_archive_is_refused_by_name() -> None:
+    with pytest.raises(Unprocessable, match=r"\.npz archive"):
+        decode_centres(junk_files()["an archive"])
+
+
+def test_npy_file_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "centres.npy"
+    path.write_bytes(npy(good_centres()))
+    np.testing.assert_array_equal(read_centres(path).array, good_centres())
+
+
+def test_anyloc_tensor_file_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "c_centers.pt"
+    torch.save(torch.from_numpy(good_centres(32, 24)), path)
+    found = read_centres(path)
+    assert (found.clusters, found.dimension) == (32, 24)
+    np.testing.assert_array_equal(found.array, good_centres(32, 24))
+
+
+def test_parameter_and_half_precision_tensors_are_read(tmp_path: Path) -> None:
+    path = tmp_path / "c_centers.pt"
+    torch.save(torch.nn.Parameter(torch.from_numpy(good_centres())), path)
+    np.testing.assert_array_equal(read_centres(path).array, good_centres())
+    torch.save(torch.from_numpy(good_centres()).bfloat16(), path)
+    np.testing.assert_allclose(read_centres(path).array, good_centres(), atol=0.02)
+
+
+def test_tensor_file_holding_a_dictionary_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "c_centers.pt"
+    torch.save({"centres": torch.ones(2, 3)}, path)
+    with pytest.raises(Unprocessable, match="holds a dict, not one tensor"):
+        read_centres(path)
+
+
+def test_tensor_of_whole_numbers_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "c_centers.pt"
+    torch.save(torch.arange(6).reshape(2, 3), path)
+    with pytest.raises(Unprocessable, match="not floating point"):
+        read_centres(path)
+
+
+def broken_tensor_files() -> dict[str, bytes]:
+    whole = io.BytesIO()
+    torch.save(torch.from_numpy(good_centres()), whole)
+    empty = io.BytesIO()
+    with zipfile.ZipFile(empty, "w"):
+        pass
+    return {
+        "nothing": b"",
+        "text": b"hello",
+        "truncated": whole.getvalue()[:-200],
+        "an empty archive": empty.getvalue(),
+        "a pickle that runs code": pickle.dumps(Untrustworthy(), protocol=2),
+    }
+
+
+@pytest.mark.parametrize("name", broken_tensor_files())
+def test_broken_tensor_files_are_refused_and_run_nothing(name: str, tmp_path: Path) -> None:
+    path = tmp_path / "c_centers.pt"
+    path.write_bytes(broken_tensor_files()[name])
+    with pytest.raises(Unprocessable) as caught:
+        read_centres(path)
+    assert caught.value.code == "vocabulary_unfit"
+    assert not Untrustworthy.unpickled
+
+
+@pytest.mark.real_photos
+def test_published_anyloc_vocabularies_load(real_photos: Path) -> None:
+    files = sorted((real_photos / "anyloc-vocabularies").glob("*.pt"))
+    assert len(files) == 3
+    for file in files:
+        found = read_centres(file)
+        assert (found.clusters, found.dimension) == (32, 1536), file.name
+        lengths = np.linalg.norm(found.array, axis=1)
+        assert lengths.min() < 0.7, "AnyLoc's centres are means of unit vectors, not unit vectors"
