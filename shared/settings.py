@@ -7,9 +7,9 @@ Durations end in `_seconds`, sizes in `_bytes` unless the predecessor's name is 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Self
 
-from pydantic import Field, SecretStr, field_validator
+from pydantic import Field, SecretStr, field_validator, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 
@@ -71,6 +71,15 @@ class Settings(BaseSettings):
     @classmethod
     def _absolute(cls, value: Path) -> Path:
         return value.expanduser().resolve()
+
+    @model_validator(mode="after")
+    def _a_batch_fits_into_a_slot(self) -> Self:
+        if self.batch_photos > self.slot_rows:
+            raise ValueError(
+                f"BATCH_PHOTOS ({self.batch_photos}) may not exceed SLOT_ROWS ({self.slot_rows}): "
+                "a batch becomes one chunk, and a chunk has to fit into a slot"
+            )
+        return self
 
     def catalog_url(self) -> str:
         """The SQLAlchemy URL of the catalog."""

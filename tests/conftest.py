@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import os
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from sqlalchemy.engine import make_url
 
 from shared.catalog.session import Catalog
 from shared.objects import FolderStore
@@ -24,23 +26,15 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     if os.environ.get(REAL_PHOTOS):
         return
     without = [item for item in items if item.get_closest_marker("real_photos")]
-    if without:
-        config.hook.pytest_deselected(items=without)
-        items[:] = [item for item in items if item not in without]
-        config.stash[DESELECTED] = len(without)
+    config.hook.pytest_deselected(items=without)
+    items[:] = [item for item in items if item not in without]
 
 
-DESELECTED = pytest.StashKey[int]()
-
-
-def pytest_terminal_summary(
-    terminalreporter: pytest.TerminalReporter, config: pytest.Config
-) -> None:
-    count = config.stash.get(DESELECTED, 0)
-    if count:
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    if not os.environ.get(REAL_PHOTOS):
         terminalreporter.write_line(
-            f"{count} tests on real photos were left out: set {REAL_PHOTOS} to a folder with "
-            "toy-places/ to run them"
+            f"The tests on real photos were left out: set {REAL_PHOTOS} to a folder with "
+            "toy-places/ and anyloc-vocabularies/ to run them."
         )
 
 
@@ -68,15 +62,38 @@ def postgres() -> Iterator[PostgresServer]:
         yield server
 
 
+@pytest.fixture(scope="session")
+def migrated_sqlite(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A migrated catalog to copy: migrating anew for each test would take most of their time."""
+    path = tmp_path_factory.mktemp("template") / "catalog.sqlite"
+    _migrate(f"sqlite:///{path}")
+    return path
+
+
+@pytest.fixture(scope="session")
+def migrated_postgres(postgres: PostgresServer) -> str:
+    """The name of a migrated database to copy."""
+    url = postgres.new_database()
+    _migrate(url)
+    return str(make_url(url).database)
+
+
+def _migrate(url: str) -> None:
+    catalog = Catalog(url)
+    catalog.migrate()
+    catalog.close()
+
+
 @pytest.fixture(params=["sqlite", "postgresql"])
 def catalog(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Catalog]:
     """An empty, migrated catalog: each test that takes it runs on SQLite and on PostgreSQL."""
     if request.param == "sqlite":
-        opened = Catalog(f"sqlite:///{tmp_path / 'catalog.sqlite'}")
+        copy = shutil.copy(request.getfixturevalue("migrated_sqlite"), tmp_path)
+        opened = Catalog(f"sqlite:///{copy}")
     else:
         server: PostgresServer = request.getfixturevalue("postgres")
-        opened = Catalog(server.new_database())
-    opened.migrate()
+        template: str = request.getfixturevalue("migrated_postgres")
+        opened = Catalog(server.new_database(template))
     yield opened
     opened.close()
 

@@ -47,7 +47,8 @@ def query(
         answers.print(table)
         answers.print(
             f"{answer['rows_scanned']} photos compared ({answer['certificate']}), "
-            f"vocabulary: {answer['vocabulary']}"
+            f"vocabulary: {answer['vocabulary']}",
+            soft_wrap=True,
         )
 
 

@@ -23,12 +23,13 @@ from services.cli.output import (
 )
 from services.cli.photo_places import FoundPhoto, find_photos
 from services.cli.vocabulary import fit_and_wait
-from shared.client import FINISHED, POLL_SECONDS, Client, Json, retry_while_away
+from shared.client import FINISHED, Client, Json, retry_while_away
 from shared.errors import PlacewiseError
 
 FIT_FROM_PHOTOS = 50
 UPLOADS_AT_ONCE = 4
 AWAY_SECONDS = 60.0
+LOOK_SECONDS = 1.0  # a job that begins to wait for a vocabulary is not seen by a longer poll
 
 
 def index(
@@ -78,6 +79,7 @@ def index(
 
 
 def _index(client: Client, photos: list[FoundPhoto], fit: bool, progress: Progress) -> Json:
+    client.stats()  # a wrong address or map is said once and now, not after each photo
     counts: Counter[str] = Counter()
     refused: list[Json] = []
     failed: list[Json] = []
@@ -139,8 +141,10 @@ def _wait_all(
     """Wait for the jobs; returns those that wait for a vocabulary and can't end before it."""
     waiting: list[tuple[Path, str]] = []
     for path, job_id in pending:
+        wait_seconds = 0.0
         while True:
-            job = client.job(job_id, wait_seconds=POLL_SECONDS if not waiting else 1.0)
+            job = client.job(job_id, wait_seconds)
+            wait_seconds = LOOK_SECONDS
             if job["state"] in FINISHED:
                 progress.advance(bar)
                 if job["state"] != "succeeded":
@@ -156,7 +160,8 @@ def _wait_all(
 def _print(report: Json) -> None:
     messages.print(
         f"{report['photos']} photos looked at, {report['already_there']} were there already, "
-        f"{report['searchable']} searchable in the map (vocabulary: {report['vocabulary']})."
+        f"{report['searchable']} searchable in the map (vocabulary: {report['vocabulary']}).",
+        soft_wrap=True,
     )
     for word in ("refused", "failed"):
         for item in report[word]:

@@ -13,9 +13,9 @@ from shared.settings import Settings
 def serve() -> None:
     """Serve the embedded Placewise (HOST, PORT, PLACEWISE_HOME) until Ctrl-C."""
     with explained(as_json=False):
+        settings = read_settings()
         from services.standalone import standalone  # brings torch, as `connect` says
 
-        settings = read_settings()
         logging.getLogger().setLevel(logging.INFO)
         logging.getLogger("alembic").setLevel(logging.WARNING)
         with standalone(settings) as running:

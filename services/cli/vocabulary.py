@@ -143,5 +143,6 @@ def _print_change(job: Json, as_json: bool) -> None:
     result = job["result"]
     answers.print(
         f"Generation {result['generation_id']} answers: {result['photos']} photos, "
-        f"{result['clusters']} clusters, {result['failed']} failed."
+        f"{result['clusters']} clusters, {result['failed']} failed.",
+        soft_wrap=True,
     )

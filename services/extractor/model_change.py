@@ -143,11 +143,13 @@ class ModelChanges:
         else:
             centres = torch.from_numpy(self._get_array(job, "centres.npy"))
         until = time.monotonic() + SLICE_SECONDS
-        movement = float("inf")
-        while done < MAX_ITERATIONS and movement > TOLERANCE and time.monotonic() < until:
+        while True:  # at least one step, however slow it is
             centres, movement = iterate(points, centres)
             done += 1
-        if done < MAX_ITERATIONS and movement > TOLERANCE:
+            settled = done >= MAX_ITERATIONS or movement <= TOLERANCE
+            if settled or time.monotonic() >= until:
+                break
+        if not settled:
             self._put_array(job, "centres.npy", centres.numpy())
             self._go_on(job, stage="cluster", params={**job.params, "iterations": done})
             return

@@ -73,7 +73,9 @@ def _make_first_generation(
         lock_map(session, map_id)
         found = active_generation(session, map_id)
         if found is not None:  # another worker was first
-            vocabulary = session.get(Vocabulary, found.vocabulary_id)
+            vocabulary = None
+            if found.vocabulary_id is not None:
+                vocabulary = session.get_one(Vocabulary, found.vocabulary_id)
             return found, vocabulary
         vocabulary, centres = None, None
         if shipped is not None:

@@ -131,21 +131,28 @@ class ExtractorWorker:
     def drain(self, stop: threading.Event) -> DrainResult:
         """Work until nothing is claimable or `stop` is set."""
         result = DrainResult()
+        work: Work | None = None
         ahead = self._take(result)
-        while ahead is not None:
-            if stop.is_set():
-                self._give_back(ahead)
-                break
-            work = ahead
-            if work.jobs[0].priority < Priority.QUERY:
-                query = self._take(result, least_priority=Priority.QUERY)
-                if query is not None:
-                    self._do(query, result)
-            # Taken before the forward pass: the next photos are decoded while it runs.
-            ahead = self._take(result)
-            self._do(work, result)
-            if ahead is None:
+        try:
+            while ahead is not None:
+                if stop.is_set():
+                    self._give_back(ahead)
+                    break
+                work = ahead
+                if work.jobs[0].priority < Priority.QUERY:
+                    query = self._take(result, least_priority=Priority.QUERY)
+                    if query is not None:
+                        self._do(query, result)
+                # Taken before the forward pass: the next photos are decoded while it runs.
                 ahead = self._take(result)
+                self._do(work, result)
+                if ahead is None:
+                    ahead = self._take(result)
+        finally:
+            # The catalog may be away: what is held then comes back when its lease expires.
+            for unfinished in (work, ahead):
+                if unfinished is not None:
+                    unfinished.lease.close()
         return result
 
     def _take(self, result: DrainResult, least_priority: int | None = None) -> Work | None:

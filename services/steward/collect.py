@@ -56,8 +56,10 @@ def collect_superseded_chunks(catalog: Catalog, store: ObjectStore, grace_second
 
 
 def collect_ended_generations(catalog: Catalog, store: ObjectStore, grace_seconds: float) -> None:
-    """Generations that no longer answer: their rows and chunks. The generation's own row stays
-    as history until its map goes."""
+    """Generations that no longer answer: their rows, chunks and unfinished photos' jobs.
+
+    The generation's own row stays as history until its map goes.
+    """
     with catalog.read() as session:
         ended = session.scalars(
             select(Chunk)
@@ -68,6 +70,19 @@ def collect_ended_generations(catalog: Catalog, store: ObjectStore, grace_second
             )
             .limit(AT_ONCE)
         ).all()
+        given_up = session.scalars(
+            select(Job.id)
+            .join(Generation, Generation.id == Job.generation_id)
+            .where(
+                Job.kind == JobKind.REINDEX,
+                Generation.state == GenerationState.ABANDONED,
+                Generation.ended_at < db_now_plus(-grace_seconds),
+            )
+            .limit(AT_ONCE)
+        ).all()
+    if given_up:
+        with catalog.write() as session:
+            session.execute(delete(Job).where(Job.id.in_(given_up)))
     for chunk in ended:
         delete_chunk(store, chunk.object_key)
     if ended:

@@ -24,9 +24,11 @@ log = logging.getLogger(__name__)
 
 def extend_lease(session: Session, token: UUID, lease_seconds: float) -> bool:
     """Keep what was claimed under `token`; False when all of it has been taken over or ended."""
+    # Locked in the order of `held`: the two run at once, and else would wait for each other.
+    mine = select(Job.id).where(Job.lease_token == token).order_by(Job.id).with_for_update()
     touched = session.execute(
         update(Job)
-        .where(Job.lease_token == token)
+        .where(Job.id.in_(session.scalars(mine).all()))
         .values(lease_until=db_now_plus(lease_seconds))
         .execution_options(synchronize_session=False)
     )

@@ -120,13 +120,19 @@ def abandon_generation(session: Session, job: Job) -> None:
         return
     generation.state = GenerationState.ABANDONED
     generation.ended_at = db_now()
-    session.execute(
-        update(Job)
+    queued = (
+        select(Job.id)
         .where(
             Job.generation_id == generation.id,
             Job.kind == JobKind.REINDEX,
             Job.state.in_(UNFINISHED),
         )
+        .order_by(Job.id)  # as `held` locks them
+        .with_for_update()
+    )
+    session.execute(
+        update(Job)
+        .where(Job.id.in_(queued))
         .values(
             state=JobState.CANCELLED,
             finished_at=db_now(),

@@ -31,12 +31,12 @@ class PostgresServer:
 
     admin: URL
 
-    def new_database(self) -> str:
-        """The SQLAlchemy URL of a fresh database."""
+    def new_database(self, template: str = "template1") -> str:
+        """The SQLAlchemy URL of a fresh database, a copy of `template`."""
         name = f"test_{new_id().hex}"
         plain = self.admin.set(drivername="postgresql").render_as_string(hide_password=False)
         with psycopg.connect(plain, autocommit=True) as connection:
-            connection.execute(f'CREATE DATABASE "{name}"')
+            connection.execute(f'CREATE DATABASE "{name}" TEMPLATE "{template}"')
         return self.admin.set(drivername="postgresql+psycopg", database=name).render_as_string(
             hide_password=False
         )
@@ -61,7 +61,12 @@ def start_postgres() -> Iterator[PostgresServer]:
             warnings.simplefilter("ignore")  # about XDG_RUNTIME_DIR, which tests don't need
             server = postgres_server.get_server(Path(folder), cleanup_mode="stop")
         try:
-            yield PostgresServer(make_url(server.get_uri()))
+            admin = make_url(server.get_uri())
+            # Nothing here has to survive a power cut, and stopping would write it all out.
+            with psycopg.connect(server.get_uri(), autocommit=True) as connection:
+                connection.execute("ALTER SYSTEM SET fsync = off")
+                connection.execute("SELECT pg_reload_conf()")
+            yield PostgresServer(admin)
         finally:
             server.cleanup()
     finally:

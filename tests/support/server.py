@@ -2,21 +2,73 @@
 
 from __future__ import annotations
 
+import atexit
+import contextlib
+import functools
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import time
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
 import httpx2
+import psutil
 
 from shared.home import address_file
+from shared.settings import Settings
 
 START_SECONDS = 60.0
+COMMAND_SECONDS = 120.0
+PLACEWISE = str(Path(sys.executable).with_name("placewise"))
+
+
+@functools.cache
+def _bytecode() -> dict[str, str]:
+    """Where no bytecode is written beside the sources, each start would compile torch anew."""
+    if not os.environ.get("PYTHONDONTWRITEBYTECODE"):
+        return {}
+    folder = tempfile.mkdtemp(prefix="pw-bytecode-")
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return {"PYTHONDONTWRITEBYTECODE": "", "PYTHONPYCACHEPREFIX": folder}
+
+
+def environment(home: Path, **settings: Any) -> dict[str, str]:
+    """For a process on `home`: the tiny extractor, and none of the developer's own settings."""
+    own = {name.upper() for name in Settings.model_fields} | {"PLACEWISE_SERVER"}
+    return {
+        **{name: value for name, value in os.environ.items() if name not in own},
+        **_bytecode(),
+        "PLACEWISE_HOME": str(home),
+        "HOST": "127.0.0.1",
+        "PORT": "0",
+        "EXTRACTOR": "test-tiny-avg",
+        "ALLOW_TEST_EXTRACTORS": "true",
+        "DECODE_PROCESSES": "1",
+        **{name.upper(): str(value) for name, value in settings.items()},
+    }
+
+
+def run_command(
+    *arguments: str | Path, env: Mapping[str, str], cwd: Path
+) -> subprocess.CompletedProcess[str]:
+    """`placewise ARGUMENTS` to its end. `cwd` should have no `.env`."""
+    return subprocess.run(
+        [PLACEWISE, *map(str, arguments)],
+        env=env,
+        cwd=cwd,
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        timeout=COMMAND_SECONDS,
+        check=False,
+    )
 
 
 class ServerProcess:
@@ -24,16 +76,7 @@ class ServerProcess:
 
     def __init__(self, home: Path, **settings: Any) -> None:
         self.home = home
-        self._environment = {
-            **os.environ,
-            "PLACEWISE_HOME": str(home),
-            "HOST": "127.0.0.1",
-            "PORT": "0",
-            "EXTRACTOR": "test-tiny-avg",
-            "ALLOW_TEST_EXTRACTORS": "true",
-            "DECODE_PROCESSES": "1",
-            **{name.upper(): str(value) for name, value in settings.items()},
-        }
+        self._environment = environment(home, **settings)
         self.log_path = home.with_name(home.name + ".log")
         self._process: subprocess.Popen[bytes] | None = None
         self.client = httpx2.Client(timeout=60)
@@ -61,8 +104,9 @@ class ServerProcess:
         address_file(self.home).unlink(missing_ok=True)
         with self.log_path.open("ab") as log:
             self._process = subprocess.Popen(
-                [str(Path(sys.executable).with_name("placewise")), "serve"],
+                [PLACEWISE, "serve"],
                 env=self._environment,
+                cwd=self.home.parent,  # the repository may hold a developer's .env
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=log,
@@ -74,7 +118,9 @@ class ServerProcess:
             url = self._address()
             if url is not None:
                 self.client.close()
-                self.client = httpx2.Client(base_url=url, timeout=90)
+                self.client = httpx2.Client(
+                    base_url=url, timeout=90, event_hooks={"response": [self._check_discreet]}
+                )
                 try:
                     if self.client.get("/livez").is_success:
                         return
@@ -82,6 +128,14 @@ class ServerProcess:
                     pass
             time.sleep(0.05)
         raise AssertionError(f"the server did not answer in {START_SECONDS} s: {self.log()}")
+
+    def _check_discreet(self, answer: httpx2.Response) -> None:
+        """No answer says where the server keeps its files, or how its code looks."""
+        if answer.headers.get("content-type", "").startswith("text/event-stream"):
+            return  # it goes on: reading it here would wait for its end
+        answer.read()
+        for secret in (str(self.home).encode(), b"Traceback"):
+            assert secret not in answer.content, f"{answer.request.url} tells of {secret!r}"
 
     def _address(self) -> str | None:
         try:
@@ -100,6 +154,19 @@ class ServerProcess:
         """SIGTERM; the exit code."""
         self.process.send_signal(signal.SIGTERM)
         return self.process.wait(timeout=30)
+
+    @contextlib.contextmanager
+    def no_decoding(self) -> Iterator[None]:
+        """While the block runs no photo is decoded, so that what needs one stays under way."""
+        decoders = psutil.Process(self.process.pid).children()
+        assert decoders, "they start with the first photo: index one before"
+        for decoder in decoders:
+            decoder.suspend()
+        try:
+            yield
+        finally:
+            for decoder in decoders:
+                decoder.resume()
 
     def log(self) -> str:
         return self.log_path.read_text(errors="replace")[-5000:]

@@ -1,0 +1,109 @@
+"""Extractors that share one pool of decoder processes: starting one takes a second."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from uuid import UUID
+
+import pytest
+import torch
+
+from services.extractor import worker as worker_module
+from services.extractor.decoding import DecoderPool
+from services.extractor.worker import ExtractorWorker
+from shared.catalog.session import Catalog
+from shared.errors import PlacewiseError
+from shared.jobs import InProcessHints
+from shared.objects import FolderStore
+from shared.settings import Settings
+from shared.vision.decode import Decoded
+from shared.vision.preprocessing import Preprocessing
+from tests.integration.workplace import Workplace
+from tests.support.catalog_rows import add_map
+
+BATCH_PHOTOS = 4
+
+
+class LentDecoders:
+    """The shared pool, which a closing worker leaves alone."""
+
+    def __init__(self, pool: DecoderPool) -> None:
+        self._pool = pool
+
+    def decode(
+        self, photos: Sequence[bytes], preprocessing: Preprocessing
+    ) -> list[Decoded | PlacewiseError]:
+        return self._pool.decode(photos, preprocessing)
+
+    def close(self) -> None:
+        pass
+
+
+@pytest.fixture(scope="package", autouse=True)
+def _one_torch_thread() -> Iterator[None]:
+    """The tiny extractors are faster without a pool of threads that wait for each other."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="session")
+def decoders() -> Iterator[DecoderPool]:
+    pool = DecoderPool(Settings.model_construct(decode_processes=1))
+    yield pool
+    pool.close()
+
+
+@pytest.fixture
+def make_worker(
+    catalog: Catalog,
+    store: FolderStore,
+    settings: Settings,
+    decoders: DecoderPool,
+    monkeypatch: pytest.MonkeyPatch,
+) -> Iterator[Callable[[], ExtractorWorker]]:
+    """Makes extractors, which are closed in the end."""
+    monkeypatch.setattr(worker_module, "DecoderPool", lambda settings: LentDecoders(decoders))
+    small = settings.model_copy(update={"batch_photos": BATCH_PHOTOS, "device": "cpu"})
+    made: list[ExtractorWorker] = []
+
+    def make() -> ExtractorWorker:
+        made.append(ExtractorWorker(catalog, store, InProcessHints(), small, f"worker-{len(made)}"))
+        return made[-1]
+
+    yield make
+    for worker in made:
+        worker.close()
+
+
+@pytest.fixture
+def workplace_of(
+    catalog: Catalog,
+    store: FolderStore,
+    settings: Settings,
+    make_worker: Callable[[], ExtractorWorker],
+) -> Callable[[str], Workplace]:
+    """Makes a map with the extractor of that name; each call another map."""
+
+    def make(extractor: str) -> Workplace:
+        name = f"map-{UUID(int=len(made))}"
+        with catalog.write() as session:
+            map_id = add_map(session, name, extractor).id
+        made.append(map_id)
+        return Workplace(catalog, store, settings, map_id, make_worker)
+
+    made: list[UUID] = []
+    return make
+
+
+@pytest.fixture
+def averages(workplace_of: Callable[[str], Workplace]) -> Workplace:
+    """A map whose extractor needs no vocabulary."""
+    return workplace_of("test-tiny-avg")
+
+
+@pytest.fixture
+def vlads(workplace_of: Callable[[str], Workplace]) -> Workplace:
+    """A map whose extractor needs a vocabulary, and none comes with it."""
+    return workplace_of("test-tiny-vlad")

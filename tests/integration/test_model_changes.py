@@ -1,0 +1,582 @@
+"""Model changes from the request to the switch, while the map goes on answering."""
+
+from __future__ import annotations
+
+import functools
+import io
+import itertools
+import threading
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
+from uuid import UUID
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from sqlalchemy import select
+
+from services.extractor import model_change
+from services.extractor.model_change import ModelChanges
+from services.extractor.worker import ExtractorWorker
+from services.steward.collect import collect_work
+from shared.catalog.generations import GenerationState
+from shared.catalog.maps import Map
+from shared.catalog.photos import Photo
+from shared.errors import Conflict
+from shared.jobs import Job, JobKind, JobState
+from shared.jobs.finish import cancel, requeue, retry
+from shared.jobs.table import WaitingFor
+from shared.objects.keys import new_vocabulary_key
+from shared.vision.extractors import Extractor
+from shared.vision.vocabulary import decode_centres
+from tests.integration.workplace import FIT, Workplace, expected_row, same
+from tests.support.photos import photo_bytes
+
+PHOTOS = 6
+WIDTH = 16  # of the tiny backbone's local features
+
+
+@pytest.fixture
+def fitted(vlads: Workplace) -> Workplace:
+    """A map with a vocabulary and PHOTOS described photos."""
+    vlads.upload(*range(PHOTOS))
+    job = vlads.fit()
+    assert job.state == JobState.SUCCEEDED
+    assert vlads.searchable() == PHOTOS
+    return vlads
+
+
+def import_file(workplace: Workplace, data: bytes, name: str = "centres.npy") -> UUID:
+    """Begin the import of a vocabulary file; its job."""
+    key = new_vocabulary_key()
+    workplace.store.put(key, data)
+    return workplace.start(JobKind.IMPORT, object_key=key, filename=name)
+
+
+def npy(array: Any) -> bytes:
+    buffer = io.BytesIO()
+    np.save(buffer, array, allow_pickle=True)
+    return buffer.getvalue()
+
+
+def some_centres(clusters: int, seed: int = 3) -> NDArray[np.float32]:
+    return np.random.default_rng(seed).standard_normal((clusters, WIDTH)).astype(np.float32)
+
+
+def photo_ids(workplace: Workplace) -> list[UUID]:
+    """The map's live photos, oldest first."""
+    with workplace.catalog.read() as session:
+        return list(
+            session.scalars(
+                select(Photo.id)
+                .where(Photo.map_id == workplace.map_id, Photo.deleted_at.is_(None))
+                .order_by(Photo.id)
+            )
+        )
+
+
+def do_one_iteration_a_slice(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each look at the clock is 0.6 of a slice later than the one before."""
+    looks = itertools.count()
+    clock = SimpleNamespace(monotonic=lambda: next(looks) * 0.6 * model_change.SLICE_SECONDS)
+    monkeypatch.setattr(model_change, "time", clock)
+
+
+def do_slices(
+    monkeypatch: pytest.MonkeyPatch,
+    worker: ExtractorWorker,
+    until: Callable[[Job], bool] = lambda job: True,
+) -> None:
+    """Drain until after the slice of a job (as it was claimed) for which `until` is true."""
+    stop = threading.Event()
+    real = ModelChanges.slice
+
+    def slice_and_stop(self: ModelChanges, job: Job) -> None:
+        real(self, job)
+        if until(job):
+            stop.set()
+
+    with monkeypatch.context() as patched:
+        patched.setattr(ModelChanges, "slice", slice_and_stop)
+        worker.drain(stop)
+
+
+# --- fitting ---------------------------------------------------------------------------------
+
+
+def test_a_fit_replaces_the_generation_while_the_old_one_answers(fitted: Workplace) -> None:
+    old, before = fitted.active(), fitted.rows()
+    version = _version(fitted)
+    job_id = fitted.start(JobKind.FIT, **{**FIT, "seed": 1})
+    answering: list[tuple[UUID, int]] = []
+
+    job = fitted.finish(job_id, lambda: answering.append((fitted.active().id, fitted.searchable())))
+
+    new = fitted.active()
+    assert new.id != old.id
+    assert {count for _, count in answering} == {PHOTOS}  # at no moment fewer
+    assert [generation for generation, _ in itertools.groupby(a for a, _ in answering)] == [
+        old.id,
+        new.id,
+    ]
+    retired = fitted.generation(old.id)
+    assert (retired.state, new.state) == (GenerationState.RETIRED, GenerationState.ACTIVE)
+    assert retired.ended_at is not None
+    assert new.activated_at is not None
+    assert fitted.building() is None
+    assert job.result == {
+        "generation_id": str(new.id),
+        "vocabulary_id": str(new.vocabulary_id),
+        "clusters": 7,  # 6 photos of 64 patches, 50 for each
+        "photos": PHOTOS,
+        "failed": 0,
+    }
+    assert job.progress_done == job.progress_total == 2 * PHOTOS
+    assert _version(fitted) > version
+
+    vocabulary = fitted.vocabulary(new.vocabulary_id)
+    assert (vocabulary.origin, vocabulary.standing) == ("fitted", "own")
+    centres = decode_centres(fitted.store.get(vocabulary.object_key))
+    assert vocabulary.sha256 == centres.sha256 == new.spec["vocabulary_sha256"]
+    rows = fitted.rows()
+    for number, photo_id in enumerate(photo_ids(fitted)):
+        expected = expected_row("test-tiny-vlad", photo_bytes(number), centres)
+        assert same(rows[photo_id], expected)
+        assert not same(before[photo_id], expected)
+        assert fitted.job_of(photo_id).state == JobState.SUCCEEDED
+    assert fitted.reindex_jobs(new.id) == []
+
+
+def _version(workplace: Workplace) -> int:
+    with workplace.catalog.read() as session:
+        return session.get_one(Map, workplace.map_id).version
+
+
+def test_few_photos_bear_few_clusters(vlads: Workplace) -> None:
+    vlads.upload(1, 2, 3)
+    job = vlads.fit(clusters=64)
+    assert job.result is not None
+    assert job.result["clusters"] == 3 * 64 // model_change.PATCHES_PER_CLUSTER == 3
+    generation = vlads.active()
+    assert (generation.dimension, generation.spec["clusters"]) == (3 * WIDTH, 3)
+    provenance = vlads.vocabulary(generation.vocabulary_id).provenance
+    assert (provenance["clusters_asked"], provenance["patches"]) == (64, 3 * 64)
+    assert (provenance["photos"], provenance["seed"]) == (3, 0)
+
+
+def test_a_fit_without_photos_fails_with_the_reason(vlads: Workplace) -> None:
+    job = vlads.fit()
+    assert job.state == JobState.FAILED
+    assert job.error is not None
+    assert job.error["code"] == "no_photos"
+
+
+def test_a_fit_on_photos_that_no_one_can_decode_fails_with_the_reason(vlads: Workplace) -> None:
+    vlads.upload_bytes(b"nothing")
+    job = vlads.fit()
+    assert job.state == JobState.FAILED
+    assert job.error is not None
+    assert job.error["code"] == "no_photos"
+
+
+def test_an_extractor_without_vocabulary_has_nothing_to_fit_or_import(averages: Workplace) -> None:
+    averages.upload(1)
+    averages.drain()
+    generation = averages.active().id
+    for job in (averages.fit(), averages.finish(import_file(averages, npy(some_centres(3))))):
+        assert job.state == JobState.FAILED
+        assert job.error is not None
+        assert job.error["code"] == "vocabulary_unfit"
+    assert averages.active().id == generation
+
+
+def test_a_fit_is_the_same_for_its_seed_and_whoever_does_its_slices(
+    vlads: Workplace,
+    workplace_of: Callable[[str], Workplace],
+    make_worker: Callable[[], ExtractorWorker],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    wanted = {"clusters": 4, "sample": 5, "seed": 7}
+    vlads.upload(*range(PHOTOS))
+    whole = vlads.fit(**wanted)  # its clusters are found in one slice
+
+    do_one_iteration_a_slice(monkeypatch)
+    torn = workplace_of("test-tiny-vlad")
+    torn.upload(*range(PHOTOS))
+    job_id = torn.start(JobKind.FIT, **wanted)
+    slices = 0
+    while torn.job(job_id).waiting_for != WaitingFor.DESCRIPTORS:
+        do_slices(monkeypatch, make_worker())  # each slice by a worker that knows nothing
+        slices += 1
+        assert slices < 120
+    assert slices > 5  # plan, two of the sample, and several of the clusters
+    again = torn.finish(job_id)
+
+    other = workplace_of("test-tiny-vlad")
+    other.upload(*range(PHOTOS))
+    another = other.fit(**{**wanted, "seed": 8})
+
+    fingerprints = []
+    for workplace, job in ((vlads, whole), (torn, again), (other, another)):
+        assert job.result is not None
+        fingerprints.append(workplace.vocabulary(job.result["vocabulary_id"]).sha256)
+    assert fingerprints[0] == fingerprints[1] != fingerprints[2]
+    provenances = [
+        p.vocabulary(p.active().vocabulary_id).provenance["iterations"] for p in (vlads, torn)
+    ]
+    assert provenances[0] == provenances[1] > 1
+
+
+def test_a_slice_that_crashes_is_tried_again_and_then_fails_the_fit(
+    fitted: Workplace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    old = fitted.active().id
+    crashes = itertools.count(1)
+
+    def crash(*_: Any) -> None:
+        next(crashes)
+        raise RuntimeError("out of memory")
+
+    job_id = fitted.start(JobKind.FIT, **FIT)
+    monkeypatch.setattr(ModelChanges, "_cluster", crash)
+    fitted.drain()
+    job = fitted.job(job_id)
+    assert (job.state, job.stage) == (JobState.FAILED, "cluster")
+    assert next(crashes) == fitted.settings.max_attempts + 1
+    assert job.error is not None
+    assert job.error["code"] == "worker_fell"
+    monkeypatch.undo()
+    assert fitted.active().id == old
+
+
+# --- what happens meanwhile ------------------------------------------------------------------
+
+
+def test_photos_that_arrive_meanwhile_are_in_both_generations(fitted: Workplace) -> None:
+    old = fitted.active().id
+    job_id, new = fitted.build(seed=1)
+    fitted.advance()  # reindex jobs for what is there now
+    late = fitted.upload(101, 102)
+    fitted.drain()
+    assert set(late) <= fitted.rows(old).keys()  # searchable at once
+    assert not set(late) & fitted.rows(new).keys()
+    fitted.advance()
+    fitted.drain()
+    assert fitted.active().id == old
+    assert set(late) <= fitted.rows(new).keys()
+    fitted.advance()
+    assert fitted.active().id == new
+    assert fitted.job(job_id).state == JobState.SUCCEEDED
+    assert set(fitted.rows(new)) == set(photo_ids(fitted))
+
+
+def test_a_photo_that_is_being_described_at_the_switch_ends_up_in_the_new_generation(
+    fitted: Workplace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    old = fitted.active().id
+    job_id, new = fitted.build(seed=1)
+    fitted.advance()
+    fitted.drain()  # complete, not switched yet
+    (late,) = fitted.upload(101)
+    real = Extractor.describe
+    switched: list[UUID] = []
+
+    def describe(self: Extractor, *arguments: Any) -> Any:
+        if not switched:
+            fitted.advance()
+            switched.append(fitted.active().id)
+        return real(self, *arguments)
+
+    monkeypatch.setattr(Extractor, "describe", describe)
+    fitted.drain()
+    assert switched == [new]
+    assert fitted.job(job_id).state == JobState.SUCCEEDED
+    assert late not in fitted.rows(old)
+    assert late in fitted.rows(new)
+    assert fitted.job_of(late).state == JobState.SUCCEEDED
+    assert fitted.job_of(late).attempts == 0
+
+
+def test_deleted_photos_are_not_waited_for(fitted: Workplace) -> None:
+    job_id, new = fitted.build(seed=1)
+    before, after, *rest = photo_ids(fitted)
+    fitted.delete(before)  # before it was queued for the new generation
+    fitted.advance()
+    fitted.delete(after)  # queued, not described
+    fitted.drain()
+    fitted.delete(rest[0])  # described
+    fitted.advance()
+    job = fitted.job(job_id)
+    assert job.state == JobState.SUCCEEDED
+    assert job.result is not None
+    assert (job.result["photos"], job.result["failed"]) == (PHOTOS - 3, 0)
+    assert fitted.active().id == new
+    assert set(fitted.rows(new)) == set(rest)
+
+
+def test_all_photos_deleted_meanwhile_leave_an_empty_generation(fitted: Workplace) -> None:
+    job_id, new = fitted.build(seed=1)
+    fitted.advance()
+    for photo_id in photo_ids(fitted):
+        fitted.delete(photo_id)
+    assert fitted.finish(job_id).state == JobState.SUCCEEDED
+    assert fitted.active().id == new
+    assert fitted.searchable() == 0
+
+
+def test_a_photo_that_fails_in_the_new_generation_is_recorded_and_blocks_nothing(
+    fitted: Workplace,
+) -> None:
+    job_id, new = fitted.build(seed=1)
+    bad, *good = photo_ids(fitted)
+    with fitted.catalog.read() as session:
+        key = session.get_one(Photo, bad).object_key
+    fitted.store.put(key, b"the disk has rotted")
+    job = fitted.finish(job_id)
+    assert job.state == JobState.SUCCEEDED
+    assert job.result is not None
+    assert (job.result["photos"], job.result["failed"]) == (PHOTOS - 1, 1)
+    assert (job.progress_failed, job.progress_done) == (1, job.progress_total - 1)
+    assert fitted.active().id == new
+    assert set(fitted.rows()) == set(good)
+    (failed,) = fitted.reindex_jobs(new)
+    assert (failed.state, failed.photo_id) == (JobState.FAILED, bad)
+    assert failed.error is not None
+    assert failed.error["code"] == "undecodable_photo"
+    assert fitted.job_of(bad).id == failed.id  # the photo says so itself
+    assert all(fitted.job_of(photo_id).state == JobState.SUCCEEDED for photo_id in good)
+
+
+@pytest.mark.parametrize("later_changes", [0, 1])
+def test_a_photo_that_failed_in_a_generation_is_described_when_it_is_queued_again(
+    fitted: Workplace, later_changes: int
+) -> None:
+    bad = photo_ids(fitted)[0]
+    with fitted.catalog.read() as session:
+        key = session.get_one(Photo, bad).object_key
+    fitted.store.put(key, b"the disk has rotted")
+    for seed in range(1, later_changes + 2):
+        fitted.fit(seed=seed)
+    assert bad not in fitted.rows()
+    fitted.store.put(key, photo_bytes(0))  # restored from a backup
+    job_id = fitted.job_of(bad).id
+    with fitted.catalog.write() as session:
+        job = session.get_one(Job, job_id)
+        # Uploading the same bytes again queues the job as it is; POST /jobs/{id}/retry asks.
+        retry(session, job) if later_changes else requeue(job)
+    fitted.drain()
+    assert fitted.job(job_id).state == JobState.SUCCEEDED
+    assert bad in fitted.rows()
+
+
+def test_a_reindex_job_that_someone_cancelled_is_made_anew(fitted: Workplace) -> None:
+    job_id, new = fitted.build(seed=1)
+    fitted.advance()
+    first = fitted.reindex_jobs(new)[0]
+    with fitted.catalog.write() as session:
+        cancel(session.get_one(Job, first.id))
+    assert fitted.finish(job_id).state == JobState.SUCCEEDED
+    assert set(fitted.rows(new)) == set(photo_ids(fitted))
+
+
+# --- cancelling ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("in_the_slice", [False, True])
+def test_a_fit_can_be_cancelled_in_each_stage(
+    fitted: Workplace,
+    monkeypatch: pytest.MonkeyPatch,
+    in_the_slice: bool,
+) -> None:
+    do_one_iteration_a_slice(monkeypatch)
+    old = fitted.active().id
+    real = ModelChanges.slice
+    for stage in (None, "sample", "cluster"):
+        job_id = fitted.start(JobKind.FIT, **{**FIT, "seed": 1})
+        stop = threading.Event()
+
+        def cancel_there(
+            self: ModelChanges,
+            job: Job,
+            *,
+            stage: str | None = stage,
+            job_id: UUID = job_id,
+            stop: threading.Event = stop,
+        ) -> None:
+            if job.stage == stage:
+                fitted.cancel(job_id)
+                stop.set()
+            if job.stage != stage or in_the_slice:
+                real(self, job)
+
+        with monkeypatch.context() as patched:
+            patched.setattr(ModelChanges, "slice", cancel_there)
+            fitted.worker.drain(stop)
+        assert fitted.job(job_id).state == JobState.CANCELLED
+        assert fitted.building() is None
+        assert fitted.drain().claimed == 0
+        assert (fitted.active().id, fitted.searchable()) == (old, PHOTOS)
+        collect_work(fitted.catalog, fitted.store)
+        assert fitted.keys("work/") == set()
+    assert fitted.fit(seed=1).state == JobState.SUCCEEDED
+    assert fitted.active().id != old
+
+
+def test_a_fit_can_be_cancelled_while_photos_are_described(
+    fitted: Workplace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    old = fitted.active().id
+    for when in ("before", "in between", "in a batch"):
+        job_id, new = fitted.build(seed=1)
+        fitted.advance()
+        stop = threading.Event()
+        if when == "in between":
+            with monkeypatch.context() as patched:
+                patched.setattr(Extractor, "describe", _first(Extractor.describe, stop.set))
+                fitted.worker.drain(stop)
+            assert 0 < len(fitted.rows(new)) < PHOTOS
+        if when == "in a batch":
+            with monkeypatch.context() as patched:
+                patched.setattr(
+                    Extractor,
+                    "describe",
+                    _first(Extractor.describe, functools.partial(fitted.cancel, job_id)),
+                )
+                fitted.drain()
+            assert fitted.rows(new) == {}
+        else:
+            fitted.cancel(job_id)
+        assert fitted.job(job_id).state == JobState.CANCELLED
+        assert fitted.generation(new).state == GenerationState.ABANDONED
+        assert fitted.drain().claimed == 0
+        fitted.advance()
+        assert (fitted.active().id, fitted.searchable()) == (old, PHOTOS)
+        assert not [j for j in fitted.reindex_jobs(new) if j.state == JobState.QUEUED]
+    assert fitted.fit(seed=1).state == JobState.SUCCEEDED
+
+
+def _first(real: Callable[..., Any], do: Callable[[], None]) -> Callable[..., Any]:
+    """`real`, with something done at its first call."""
+    calls = iter([do])
+
+    def wrapped(*arguments: Any) -> Any:
+        for act in calls:
+            act()
+            break
+        return real(*arguments)
+
+    return wrapped
+
+
+def test_a_second_model_change_waits_until_the_first_has_ended(fitted: Workplace) -> None:
+    job_id, _ = fitted.build(seed=1)
+    with pytest.raises(Conflict, match=str(job_id)):
+        fitted.start(JobKind.FIT, **FIT)
+    fitted.finish(job_id)
+    assert fitted.fit(seed=2).state == JobState.SUCCEEDED
+
+
+# --- importing and switching -----------------------------------------------------------------
+
+
+def test_an_imported_vocabulary_describes_the_map(vlads: Workplace) -> None:
+    ids = vlads.upload(1, 2)
+    vlads.drain()  # they wait
+    centres = some_centres(5)
+    job = vlads.finish(import_file(vlads, npy(centres), "mine.npy"))
+    assert job.state == JobState.SUCCEEDED
+    vocabulary = vlads.vocabulary(vlads.active().vocabulary_id)
+    assert (vocabulary.origin, vocabulary.standing) == ("imported", "foreign")
+    assert (vocabulary.clusters, vocabulary.dimension) == (5, WIDTH)
+    assert vocabulary.provenance["imported_from"] == "mine.npy"
+    stored = decode_centres(vlads.store.get(vocabulary.object_key))
+    assert np.array_equal(stored.array, centres)
+    rows = vlads.rows()
+    assert set(rows) == set(ids)
+    assert same(rows[ids[0]], expected_row("test-tiny-vlad", photo_bytes(1), stored))
+
+
+def test_an_unfit_vocabulary_is_refused_with_the_reason_and_changes_nothing(
+    fitted: Workplace,
+) -> None:
+    old = fitted.active().id
+    good = some_centres(4)
+    broken = good.copy()
+    broken[2, 3] = np.nan
+    unfit = {
+        "not a NumPy": b"no vocabulary at all",
+        "16": npy(some_centres(4)[:, :8]),  # eight dimensions, and 16 are needed
+        "NaN": npy(broken),
+        "distinct": npy(np.concatenate([good, good[:1]])),
+        "zero": npy(np.concatenate([good, np.zeros((1, WIDTH), np.float32)])),
+        "shape": npy(good[0]),
+        "floating": npy(good.astype(np.int64)),
+        "pickle": npy(np.array([{"a": 1}])),
+    }
+    for reason, data in unfit.items():
+        job = fitted.finish(import_file(fitted, data))
+        assert job.state == JobState.FAILED, reason
+        assert job.error is not None
+        assert job.error["code"] == "vocabulary_unfit"
+        assert reason in job.error["detail"]
+    assert (fitted.active().id, fitted.searchable()) == (old, PHOTOS)
+    assert fitted.building() is None
+
+
+def test_switching_back_gives_the_descriptors_of_the_earlier_vocabulary(fitted: Workplace) -> None:
+    first, before = fitted.active(), fitted.rows()
+    fitted.fit(seed=1)
+    assert not any(same(before[photo_id], row) for photo_id, row in fitted.rows().items())
+    job = fitted.finish(fitted.start(JobKind.SWITCH, vocabulary_id=str(first.vocabulary_id)))
+    assert job.state == JobState.SUCCEEDED
+    again = fitted.active()
+    assert again.id != first.id  # a generation of its own
+    assert again.vocabulary_id == first.vocabulary_id
+    assert again.spec == first.spec
+    rows = fitted.rows()
+    assert set(rows) == set(before)
+    assert all(same(before[photo_id], row) for photo_id, row in rows.items())
+
+
+def test_a_switch_that_can_not_be_fails_with_the_reason(
+    fitted: Workplace, workplace_of: Callable[[str], Workplace]
+) -> None:
+    old = fitted.active()
+    elsewhere = workplace_of("test-tiny-vlad")
+    elsewhere.upload(1)
+    foreign = elsewhere.fit().result
+    assert foreign is not None
+    for vocabulary_id, code in (
+        (foreign["vocabulary_id"], "vocabulary_not_found"),  # of another map
+        (None, "vocabulary_unfit"),  # the extractor needs one
+    ):
+        job = fitted.finish(fitted.start(JobKind.SWITCH, vocabulary_id=vocabulary_id))
+        assert job.state == JobState.FAILED
+        assert job.error is not None
+        assert job.error["code"] == code
+    assert fitted.active().id == old.id
+
+
+def test_a_map_without_vocabulary_is_described_anew_by_a_switch(averages: Workplace) -> None:
+    ids = averages.upload(1, 2)
+    averages.drain()
+    old = averages.active().id
+    job = averages.finish(averages.start(JobKind.SWITCH, vocabulary_id=None))
+    assert job.state == JobState.SUCCEEDED
+    assert averages.active().id != old
+    assert set(averages.rows()) == set(ids)
+
+
+def test_progress_is_never_negative_and_never_falls(averages: Workplace) -> None:
+    averages.upload(1)
+    averages.drain()
+    (photo_id,) = photo_ids(averages)
+    averages.delete(photo_id)
+    job_id = averages.start(JobKind.SWITCH, vocabulary_id=None)
+    averages.drain()  # nothing to describe: its total is 0
+    averages.upload(2)
+    averages.drain()
+    averages.advance()
+    assert averages.job(job_id).progress_done >= 0
+    assert averages.finish(job_id).state == JobState.SUCCEEDED

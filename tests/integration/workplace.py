@@ -1,0 +1,182 @@
+"""One map with its catalog, its store and an extractor: what the integration tests work in."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+from uuid import UUID
+
+import numpy as np
+import torch
+from sqlalchemy import select
+
+from services.extractor.worker import DrainResult, ExtractorWorker
+from services.steward.model_changes import advance_model_changes
+from shared.catalog.chunks import count_searchable
+from shared.catalog.generations import Generation, active_generation, building_generation
+from shared.catalog.photos import Photo
+from shared.catalog.session import Catalog
+from shared.catalog.vocabularies import Vocabulary
+from shared.chunks import Rows
+from shared.jobs import InProcessHints, Job, JobKind, free_expired_leases
+from shared.jobs.model_changes import cancel_model_change, start_model_change
+from shared.jobs.table import UNFINISHED, get_job
+from shared.objects import FolderStore
+from shared.settings import Settings
+from shared.vision.decode import decode
+from shared.vision.extractors import Extractor, get_recipe
+from shared.vision.vocabulary import Centres
+from tests.support.catalog_rows import ask, delete, read_job, set_columns, stored_rows, upload
+from tests.support.photos import photo_bytes
+
+ROUNDS = 60  # of draining and stewarding, before a model change that does not end is a failure
+FIT = {"clusters": 8, "sample": 100, "seed": 0}
+
+
+@dataclass(slots=True)
+class Workplace:
+    catalog: Catalog
+    store: FolderStore
+    settings: Settings
+    map_id: UUID
+    make_worker: Callable[[], ExtractorWorker]
+    hints: InProcessHints = field(default_factory=InProcessHints)
+    _worker: ExtractorWorker | None = None
+
+    # --- what clients do ---
+
+    def upload(self, *numbers: int) -> list[UUID]:
+        """Store the photos of these numbers; their ids."""
+        return [self.upload_bytes(photo_bytes(number))[0] for number in numbers]
+
+    def upload_bytes(self, data: bytes) -> tuple[UUID, UUID]:
+        """Store a photo; its id and its job's."""
+        return upload(self.catalog, self.store, self.map_id, data)
+
+    def ask(self, data: bytes) -> UUID:
+        return ask(self.catalog, self.store, self.map_id, data)
+
+    def delete(self, photo_id: UUID) -> None:
+        delete(self.catalog, self.map_id, photo_id)
+
+    def start(self, kind: JobKind, **params: Any) -> UUID:
+        """Begin a model change; its job."""
+        with self.catalog.write() as session:
+            return start_model_change(session, self.map_id, kind, params).id
+
+    def cancel(self, job_id: UUID) -> None:
+        """Cancel a model change."""
+        with self.catalog.write() as session:
+            cancel_model_change(session, get_job(session, self.map_id, job_id, lock=True))
+
+    # --- what the services do ---
+
+    @property
+    def worker(self) -> ExtractorWorker:
+        if self._worker is None:
+            self._worker = self.make_worker()
+        return self._worker
+
+    def drain(self) -> DrainResult:
+        return self.worker.drain(threading.Event())
+
+    def advance(self) -> None:
+        advance_model_changes(self.catalog, self.hints)
+
+    def finish(self, job_id: UUID, each_round: Callable[[], None] = lambda: None) -> Job:
+        """Drain and steward until the job has ended; the job."""
+        for _ in range(ROUNDS):
+            self.drain()
+            each_round()
+            self.advance()
+            each_round()
+            job = read_job(self.catalog, job_id)
+            if job.state not in UNFINISHED:
+                return job
+        raise AssertionError(f"the job did not end: {job.state}, {job.stage}, {job.waiting_for}")
+
+    def fit(self, **params: Any) -> Job:
+        """A fit from its start to its end."""
+        return self.finish(self.start(JobKind.FIT, **{**FIT, **params}))
+
+    def build(self, **params: Any) -> tuple[UUID, UUID]:
+        """A fit up to where its generation waits for descriptors; the job and the generation."""
+        job_id = self.start(JobKind.FIT, **{**FIT, **params})
+        self.drain()
+        building = self.building()
+        assert building is not None
+        return job_id, building.id
+
+    def take_over(self, jobs: list[UUID]) -> None:
+        """The leases of the jobs expire and are freed."""
+        for job_id in jobs:
+            set_columns(self.catalog, job_id, lease_until=None)
+        with self.catalog.write() as session:
+            free_expired_leases(session, self.settings.max_attempts, everyone=True)
+
+    # --- what can be seen ---
+
+    def job(self, job_id: UUID) -> Job:
+        return read_job(self.catalog, job_id)
+
+    def job_of(self, photo_id: UUID) -> Job:
+        """The job that the photo names."""
+        with self.catalog.read() as session:
+            job_id = session.get_one(Photo, photo_id).job_id
+        assert job_id is not None
+        return self.job(job_id)
+
+    def active(self) -> Generation:
+        with self.catalog.read() as session:
+            found = active_generation(session, self.map_id)
+        assert found is not None
+        return found
+
+    def building(self) -> Generation | None:
+        with self.catalog.read() as session:
+            return building_generation(session, self.map_id)
+
+    def generation(self, generation_id: UUID) -> Generation:
+        with self.catalog.read() as session:
+            return session.get_one(Generation, generation_id)
+
+    def searchable(self) -> int:
+        """How many live photos the active generation finds."""
+        with self.catalog.read() as session:
+            return count_searchable(session, self.active().id)
+
+    def rows(self, generation_id: UUID | None = None) -> dict[UUID, Rows]:
+        """The stored descriptor of each photo, of the active generation if none is named."""
+        return stored_rows(self.catalog, self.store, generation_id or self.active().id)
+
+    def reindex_jobs(self, generation_id: UUID) -> list[Job]:
+        with self.catalog.read() as session:
+            return list(
+                session.scalars(
+                    select(Job)
+                    .where(Job.kind == JobKind.REINDEX, Job.generation_id == generation_id)
+                    .order_by(Job.id)
+                )
+            )
+
+    def vocabulary(self, vocabulary_id: UUID | str | None) -> Vocabulary:
+        with self.catalog.read() as session:
+            return session.get_one(Vocabulary, UUID(str(vocabulary_id)))
+
+    def keys(self, prefix: str) -> set[str]:
+        return {info.key for info in self.store.list(prefix)}
+
+
+def expected_row(extractor: str, data: bytes, centres: Centres | None = None) -> Rows:
+    """What the extractor makes of the photo, without any of the services."""
+    made = Extractor(get_recipe(extractor, allow_test_extractors=True), torch.device("cpu"))
+    pixels = decode(data, made.preprocessing, 10**9).pixels
+    row: Rows = made.describe(np.stack([pixels]), centres)[0]
+    return row
+
+
+def same(one: Rows, other: Rows) -> bool:
+    """The same descriptor, but for the order in which floats were summed."""
+    return bool(np.allclose(one, other, atol=1e-5))

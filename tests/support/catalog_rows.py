@@ -1,0 +1,258 @@
+"""Rows of the catalog that tests begin with: maps, photos, jobs, generations, chunks.
+
+Every function adds to the session it is given and flushes; the caller's `write()` commits.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+from typing import Any
+from uuid import UUID
+
+import numpy as np
+from sqlalchemy import select, update
+from sqlalchemy.orm import Session
+
+from shared.catalog.base import db_now, db_now_plus
+from shared.catalog.chunks import Chunk, Descriptor, take_slot
+from shared.catalog.generations import Generation, GenerationState, lock_generation
+from shared.catalog.maps import Map, bump_version, lock_map
+from shared.catalog.models import ensure_model
+from shared.catalog.photos import Photo, get_photo, mark_deleted
+from shared.catalog.session import Catalog
+from shared.chunks import Rows, read_chunk, write_chunk
+from shared.ids import new_id
+from shared.jobs import Job, JobKind, JobState, Priority, claim
+from shared.jobs.finish import cancel
+from shared.jobs.table import MODEL_CHANGES, UNFINISHED
+from shared.objects import ObjectStore
+from shared.objects.keys import new_original_key, query_key
+
+NUMBERS = itertools.count(1)
+PRIORITIES = {
+    JobKind.INDEX: Priority.UPLOAD,
+    JobKind.REINDEX: Priority.REINDEX,
+    JobKind.DESCRIBE: Priority.QUERY,
+    **dict.fromkeys(MODEL_CHANGES, Priority.MODEL_CHANGE),
+}
+
+
+def add_map(session: Session, name: str = "default", extractor: str = "test-tiny-avg") -> Map:
+    made = Map(id=new_id(), name=name, extractor=extractor)
+    session.add(made)
+    session.flush()
+    return made
+
+
+def add_photo(session: Session, map_id: UUID, **columns: Any) -> Photo:
+    """A live photo without bytes in any store; `columns` replace what is made up."""
+    number = next(NUMBERS)
+    photo = Photo(
+        **{
+            "id": new_id(),
+            "map_id": map_id,
+            "sha256": hashlib.sha256(str(number).encode()).hexdigest(),
+            "object_key": new_original_key(),
+            "filename": f"photo-{number}.jpg",
+            "media_type": "image/jpeg",
+            "size_bytes": 1000 + number,
+            "width": 64,
+            "height": 48,
+            **columns,
+        }
+    )
+    session.add(photo)
+    session.flush()
+    return photo
+
+
+def add_job(session: Session, map_id: UUID, kind: JobKind = JobKind.INDEX, **columns: Any) -> Job:
+    """A queued job with the priority of its kind."""
+    job = Job(
+        **{"id": new_id(), "map_id": map_id, "kind": kind, "priority": PRIORITIES[kind], **columns}
+    )
+    session.add(job)
+    session.flush()
+    return job
+
+
+def upload(catalog: Catalog, store: ObjectStore, map_id: UUID, data: bytes) -> tuple[UUID, UUID]:
+    """What the gateway leaves behind of an upload: bytes, photo and job; the ids of the two."""
+    key = new_original_key()
+    store.put(key, data)
+    with catalog.write() as session:
+        photo = add_photo(
+            session,
+            map_id,
+            object_key=key,
+            sha256=hashlib.sha256(data).hexdigest(),
+            size_bytes=len(data),
+        )
+        job = add_job(session, map_id, photo_id=photo.id)
+        photo.job_id = job.id
+        return photo.id, job.id
+
+
+def ask(catalog: Catalog, store: ObjectStore, map_id: UUID, data: bytes) -> UUID:
+    """What the gateway leaves behind of a query with a new photo; the job's id."""
+    job_id = new_id()
+    store.put(query_key(job_id), data)
+    with catalog.write() as session:
+        return add_job(session, map_id, JobKind.DESCRIBE, id=job_id).id
+
+
+def delete(catalog: Catalog, map_id: UUID, photo_id: UUID) -> None:
+    """As `DELETE /uploads/{file_id}` does it."""
+    with catalog.write() as session:
+        lock_map(session, map_id)
+        photo = get_photo(session, map_id, photo_id)
+        mark_deleted(session, photo, bump_version(session, map_id))
+        for job in session.scalars(
+            select(Job).where(Job.photo_id == photo_id, Job.state.in_(UNFINISHED))
+        ):
+            cancel(job)
+
+
+def add_generation(
+    session: Session,
+    map_id: UUID,
+    state: GenerationState = GenerationState.ACTIVE,
+    **columns: Any,
+) -> Generation:
+    """A generation of rows with 4 numbers."""
+    model = ensure_model(session, "test-rows", "0" * 64, "MIT", {})
+    generation = Generation(
+        **{
+            "id": new_id(),
+            "map_id": map_id,
+            "state": state,
+            "extractor": "test-rows",
+            "spec": {"clusters": None},
+            "spec_fingerprint": "0" * 64,
+            "dimension": 4,
+            "model_id": model.id,
+            "activated_at": db_now() if state == GenerationState.ACTIVE else None,
+            **columns,
+        }
+    )
+    session.add(generation)
+    session.flush()
+    return generation
+
+
+def add_chunk(
+    catalog: Catalog,
+    store: ObjectStore,
+    generation_id: UUID,
+    photo_ids: list[UUID],
+    slot_rows: int = 1000,
+) -> UUID:
+    """A published chunk with `row_of(photo)` for each photo; its id."""
+    chunk_id = new_id()
+    written = write_chunk(
+        store,
+        generation_id=generation_id,
+        chunk_id=chunk_id,
+        rows=np.stack([row_of(photo_id) for photo_id in photo_ids]),
+        photo_ids=photo_ids,
+        spec={},
+    )
+    with catalog.write() as session:
+        generation = lock_generation(session, generation_id)
+        session.add(
+            Chunk(
+                id=chunk_id,
+                generation_id=generation_id,
+                slot=take_slot(generation, len(photo_ids), slot_rows),
+                object_key=written.object_key,
+                rows=written.rows,
+                size_bytes=written.size_bytes,
+                sha256=written.sha256,
+            )
+        )
+        session.flush()
+        for row, photo_id in enumerate(photo_ids):
+            session.add(
+                Descriptor(
+                    generation_id=generation_id, photo_id=photo_id, chunk_id=chunk_id, row=row
+                )
+            )
+        bump_version(session, generation.map_id)
+    return chunk_id
+
+
+def row_of(photo_id: UUID) -> Rows:
+    """The made-up descriptor of a photo: 4 numbers that no other photo has."""
+    row = np.random.default_rng(photo_id.int).standard_normal(4).astype(np.float32)
+    unit: Rows = row / np.linalg.norm(row)
+    return unit
+
+
+def stored_rows(catalog: Catalog, store: ObjectStore, generation_id: UUID) -> dict[UUID, Rows]:
+    """The descriptor that the generation holds of each photo, read from its chunk."""
+    found: dict[UUID, Rows] = {}
+    with catalog.read() as session:
+        pairs = session.execute(
+            select(Descriptor, Chunk)
+            .join(Chunk, Chunk.id == Descriptor.chunk_id)
+            .where(Descriptor.generation_id == generation_id)
+        ).all()
+    for descriptor, chunk in pairs:
+        rows = read_chunk(store, chunk.object_key, chunk.sha256)
+        found[descriptor.photo_id] = rows[descriptor.row]
+    return found
+
+
+def read_job(catalog: Catalog, job_id: UUID) -> Job:
+    """The job as it is now."""
+    with catalog.read() as session:
+        return session.get_one(Job, job_id)
+
+
+def states(catalog: Catalog, job_ids: list[UUID]) -> list[JobState]:
+    """The jobs' states, in the order of the ids."""
+    return [JobState(read_job(catalog, job_id).state) for job_id in job_ids]
+
+
+def set_columns(catalog: Catalog, job_id: UUID, **columns: Any) -> None:
+    """Change a job behind everyone's back."""
+    with catalog.write() as session:
+        session.execute(
+            update(Job)
+            .where(Job.id == job_id)
+            .values(**columns)
+            .execution_options(synchronize_session=False)
+        )
+
+
+def expire_lease(catalog: Catalog, *job_ids: UUID) -> None:
+    """The worker that has the jobs was last heard of too long ago."""
+    for job_id in job_ids:
+        set_columns(catalog, job_id, lease_until=db_now_plus(-1.0))
+
+
+def end_pauses(catalog: Catalog) -> None:
+    """The time of every pausing job has come."""
+    with catalog.write() as session:
+        session.execute(
+            update(Job).values(run_after=None).execution_options(synchronize_session=False)
+        )
+
+
+def take(
+    catalog: Catalog,
+    limit: int = 10,
+    worker: str = "worker",
+    lease_seconds: float = 60,
+    least_priority: int | None = None,
+) -> list[Job]:
+    """Claim in a transaction of its own."""
+    with catalog.write() as session:
+        return claim(
+            session,
+            worker=worker,
+            limit=limit,
+            lease_seconds=lease_seconds,
+            least_priority=least_priority,
+        )
