@@ -39,7 +39,7 @@ run: $(INSTALLED) ## serve the embedded Placewise on http://HOST:PORT, data unde
 	HOST=$(HOST) PORT=$(PORT) PLACEWISE_HOME=$(PLACEWISE_HOME) $(BIN)/placewise serve
 
 test: $(INSTALLED) ## every test (PLACEWISE_TEST_DATA=FOLDER adds those on real photos)
-	$(BIN)/python -m pytest tests
+	$(BIN)/python -m pytest tests --numprocesses auto --dist loadfile
 
 lint: $(INSTALLED) ## ruff, formatting and the import contracts
 	$(BIN)/ruff check .

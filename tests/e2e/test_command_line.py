@@ -1,0 +1,391 @@
+"""The `placewise` command, as people and scripts run it."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import socket
+import subprocess
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from PIL.ExifTags import GPS, IFD
+
+from tests.support.photos import photo_bytes, photo_image
+from tests.support.server import ServerProcess, environment, run_command
+
+PHOTOS = 50  # from as many on, `index` fits a vocabulary
+WIDTH = 16  # of the tiny extractor's local features
+SETTINGS = {"extractor": "test-tiny-vlad", "auto_fit_photos": 10_000}
+
+# Turin's Mole in UTM: 396878 m east, 4991561 m north in zone 32T is 45.07 N, 7.69 E.
+UTM_SHORT = "@0396877.76@4991561.25@.jpg"
+UTM_FULL = "@396877.76@4991561.25@32@T@@@pano@@123.5@@@@20260501@@.jpg"
+UTM_WITH_DEGREES = "@396877.76@4991561.25@32@T@45.5@-7.25@pano@@@@@@@@.jpg"
+
+
+@dataclass(slots=True)
+class Run:
+    """A finished command."""
+
+    process: subprocess.CompletedProcess[str]
+
+    @property
+    def code(self) -> int:
+        return self.process.returncode
+
+    @property
+    def stdout(self) -> str:
+        return self.process.stdout
+
+    @property
+    def stderr(self) -> str:
+        return self.process.stderr
+
+    def json(self, code: int = 0) -> Any:
+        """The answer of a command run with --json: all of stdout."""
+        assert self.code == code, self.stderr + self.stdout
+        assert "Traceback" not in self.stderr
+        return json.loads(self.stdout)
+
+    def refusal(self, code: str) -> str:
+        """The `detail` of a problem printed with --json."""
+        body = self.json(1)
+        assert body["code"] == code, body
+        assert body["type"] == f"urn:placewise:problem:{code}"
+        assert set(body) >= {"title", "status", "detail"}
+        detail: str = body["detail"]
+        return detail
+
+
+class CommandLine:
+    """Runs `placewise` in a folder, with the PLACEWISE_HOME of a server or of none."""
+
+    def __init__(self, folder: Path, home: Path, **settings: Any) -> None:
+        self.folder = folder
+        self.environment = environment(home, **settings)
+
+    def __call__(self, *arguments: str | Path) -> Run:
+        return Run(run_command(*arguments, env=self.environment, cwd=self.folder))
+
+
+@pytest.fixture
+def placewise(server: ServerProcess, tmp_path: Path) -> CommandLine:
+    """The command beside a running server, which it finds by PLACEWISE_HOME."""
+    return CommandLine(tmp_path, server.home)
+
+
+def with_gps(number: int) -> bytes:
+    """A photo whose EXIF says 45 30' N, 7 15' E."""
+    exif = Image.Exif()
+    exif.get_ifd(IFD.GPSInfo).update(
+        {
+            GPS.GPSLatitudeRef: "N",
+            GPS.GPSLatitude: (45.0, 30.0, 0.0),
+            GPS.GPSLongitudeRef: "E",
+            GPS.GPSLongitude: (7.0, 15.0, 0.0),
+        }
+    )
+    return photo_bytes(number, exif=exif)
+
+
+def truncated(number: int) -> bytes:
+    """A JPEG whose header is fine and whose pixels end too early."""
+    buffer = io.BytesIO()
+    photo_image(number, 640, 480).save(buffer, "JPEG", quality=95)
+    return buffer.getvalue()[: len(buffer.getvalue()) // 2]
+
+
+def coordinates(server: ServerProcess) -> dict[str, tuple[float | None, float | None]]:
+    body = server.client.get("/api/v1/search", params={"limit": 1000}).json()
+    return {
+        image["original_filename"]: (image["latitude"], image["longitude"])
+        for image in body["images"]
+    }
+
+
+@dataclass(slots=True)
+class Indexed:
+    """A folder that was indexed three times into a map without a vocabulary."""
+
+    folder: Path
+    without_fit: Run
+    with_fit: Run
+    without_the_broken: Run
+
+
+@pytest.fixture(scope="module")
+def indexed(server: ServerProcess, tmp_path_factory: pytest.TempPathFactory) -> Indexed:
+    folder = tmp_path_factory.mktemp("photos")
+    (folder / "below").mkdir()
+    (folder / "notes.txt").write_text("no photo, and not looked at")
+    (folder / "exif.jpg").write_bytes(with_gps(0))
+    (folder / UTM_FULL).write_bytes(photo_bytes(1))
+    (folder / UTM_WITH_DEGREES).write_bytes(photo_bytes(2))
+    for number in range(3, PHOTOS):
+        (folder / "below" / f"{number}.JPG").write_bytes(photo_bytes(number))
+    broken, cut_off = folder / "broken.jpg", folder / "cut-off.jpg"
+    broken.write_bytes(b"Only text, named as a photo.")
+    cut_off.write_bytes(truncated(99))
+
+    command = CommandLine(folder.parent, server.home)
+    without_fit = command("index", folder, "--no-fit", "--json")
+    with_fit = command("index", folder, "--json")
+    broken.unlink()
+    cut_off.unlink()
+    return Indexed(folder, without_fit, with_fit, command("index", folder))
+
+
+# --- index -----------------------------------------------------------------------------------
+
+
+def test_index_uploads_a_folder_and_names_what_is_refused(indexed: Indexed) -> None:
+    report = indexed.without_fit.json(code=1)
+    assert report["photos"] == PHOTOS + 2
+    assert report["already_there"] == 0
+    assert [item["path"] for item in report["refused"]] == [str(indexed.folder / "broken.jpg")]
+    assert "JPEG" in report["refused"][0]["reason"]
+    assert report["fitted"] is None
+    assert report["vocabulary"] is None, "--no-fit: they wait for one"
+    assert report["searchable"] == 0
+
+
+def test_index_fits_a_vocabulary_from_fifty_photos_on(indexed: Indexed) -> None:
+    report = indexed.with_fit.json(code=1)
+    assert report["vocabulary"] == "own"
+    assert report["fitted"]["state"] == "succeeded"
+    assert report["searchable"] == PHOTOS
+    assert [item["path"] for item in report["failed"]] == [str(indexed.folder / "cut-off.jpg")]
+    assert report["failed"][0]["reason"]
+
+
+def test_index_run_again_has_nothing_to_do(indexed: Indexed) -> None:
+    again = indexed.without_the_broken
+    assert again.code == 0, again.stderr
+    assert f"{PHOTOS} photos looked at, {PHOTOS} were there already" in again.stderr
+    assert f"{PHOTOS} searchable" in again.stderr
+
+
+def test_index_reads_places_from_exif_and_from_names(
+    server: ServerProcess, indexed: Indexed
+) -> None:
+    found = coordinates(server)
+    assert found["exif.jpg"] == pytest.approx((45.5, 7.25))
+    assert found[UTM_FULL] == pytest.approx((45.07, 7.69), abs=1e-6)
+    assert found[UTM_WITH_DEGREES] == (45.5, -7.25)
+    assert found["3.JPG"] == (None, None)
+    headed = server.client.get("/api/v1/search", params={"filename": UTM_FULL}).json()["images"]
+    assert headed[0]["heading"] == 123.5
+
+
+@pytest.mark.usefixtures("indexed")
+def test_index_reads_places_from_a_table(
+    server: ServerProcess, placewise: CommandLine, tmp_path: Path
+) -> None:
+    folder = tmp_path / "rooms"
+    (folder / "upstairs").mkdir(parents=True)
+    (folder / "hall.jpg").write_bytes(photo_bytes(101))
+    (folder / "upstairs" / "bath.jpg").write_bytes(with_gps(102))
+    (folder / "unsaid.jpg").write_bytes(photo_bytes(103))
+    table = tmp_path / "places.csv"
+    with table.open("w", newline="") as file:
+        rows = csv.writer(file)
+        rows.writerow(["filename", "latitude", "longitude", "place", "tags"])
+        rows.writerow(["hall.jpg", "45.25", "7.5", "hall", "night,rain"])
+        rows.writerow(["upstairs/bath.jpg", "", "", "bath", ""])
+    report = placewise("index", folder, "--csv", table, "--json").json()
+    assert (report["photos"], report["refused"], report["failed"]) == (3, [], [])
+    assert report["fitted"] is None, "the map has a vocabulary of its own"
+    images = server.client.get("/api/v1/search", params={"limit": 3}).json()["images"]
+    said = {
+        image["original_filename"]: (
+            image["latitude"],
+            image["longitude"],
+            image["place"],
+            image["tags"],
+        )
+        for image in images
+    }
+    assert said == {
+        "hall.jpg": (45.25, 7.5, "hall", ["night", "rain"]),
+        "bath.jpg": (45.5, 7.25, "bath", []),
+        "unsaid.jpg": (None, None, None, []),
+    }
+
+
+def test_index_refuses_what_it_can_not_place(placewise: CommandLine, tmp_path: Path) -> None:
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    assert str(empty) in placewise("index", empty, "--json").refusal("no_photos")
+
+    (empty / UTM_SHORT).write_bytes(photo_bytes(104))
+    assert "--utm-zone" in placewise("index", empty, "--json").refusal("no_utm_zone")
+
+    table = tmp_path / "places.csv"
+    table.write_text("filename,place\nmissing.jpg,nowhere\n")
+    detail = placewise("index", empty, "--csv", table, "--json").refusal("bad_table")
+    assert "missing.jpg" in detail
+    assert "line 2" in detail
+
+
+@pytest.mark.usefixtures("indexed")
+def test_index_takes_the_zone_of_short_names(
+    server: ServerProcess, placewise: CommandLine, tmp_path: Path
+) -> None:
+    (tmp_path / "short").mkdir()
+    (tmp_path / "short" / UTM_SHORT).write_bytes(photo_bytes(105))
+    placewise("index", tmp_path / "short", "--utm-zone", "32T", "--json").json()
+    assert coordinates(server)[UTM_SHORT] == pytest.approx((45.07, 7.69), abs=1e-6)
+
+
+# --- query -----------------------------------------------------------------------------------
+
+
+@pytest.mark.usefixtures("indexed")
+def test_query_finds_the_place(placewise: CommandLine, tmp_path: Path) -> None:
+    asked = tmp_path / "where.jpg"
+    asked.write_bytes(photo_bytes(2))
+    answer = placewise("query", asked, "--top-k", "2", "--json").json()
+    assert answer["query_filename"] == "where.jpg"
+    assert answer["similar_images"][0]["original_filename"] == UTM_WITH_DEGREES
+    assert answer["total_similar"] == 2
+    strict = placewise("query", asked, "--min-score", "0.999", "--json").json()
+    assert strict["total_similar"] == 1
+
+    (tmp_path / "exif.jpg").write_bytes(with_gps(0))
+    shown = placewise("query", tmp_path / "exif.jpg", "--top-k", "1")
+    assert shown.code == 0
+    for part in ("exif.jpg", "1.0000", "45.500000", "7.250000", "vocabulary: "):
+        assert part in shown.stdout, part
+
+
+def test_a_refusal_is_one_line_or_one_document(placewise: CommandLine, tmp_path: Path) -> None:
+    text = tmp_path / "text.jpg"
+    text.write_text("Only text, named as a photo.")
+    assert "JPEG" in placewise("query", text, "--json").refusal("unsupported_photo")
+    shown = placewise("query", text)
+    assert (shown.code, shown.stdout) == (1, "")
+    assert shown.stderr.startswith("unsupported_photo: ")
+    assert shown.stderr.count("\n") == 1
+    photo = tmp_path / "photo.jpg"
+    photo.write_bytes(photo_bytes(1))
+    detail = placewise("query", photo, "--map", "nowhere", "--json").refusal("map_not_found")
+    assert "nowhere" in detail
+
+    with socket.create_server(("127.0.0.1", 0)) as closed_later:
+        dead = f"http://127.0.0.1:{closed_later.getsockname()[1]}"
+    for command in (("query", photo), ("index", tmp_path)):
+        detail = placewise(*command, "--server", dead, "--json").refusal("server_unreachable")
+        assert dead in detail
+    assert placewise("query", tmp_path / "none.jpg").code == 2, "a usage error"
+
+
+# --- vocabulary ------------------------------------------------------------------------------
+
+
+def test_vocabularies_are_fitted_imported_and_listed(
+    server: ServerProcess, placewise: CommandLine, indexed: Indexed, tmp_path: Path
+) -> None:
+    fit = placewise("vocabulary", "fit", "--clusters", "5", "--seed", "3", "--json").json()
+    assert fit["state"] == "succeeded"
+    assert fit["result"]["clusters"] == 5
+
+    centres = np.random.default_rng(0).standard_normal((8, WIDTH)).astype(np.float32)
+    np.save(tmp_path / "centres.npy", centres)
+    from_npy = placewise("vocabulary", "import", tmp_path / "centres.npy", "--json").json()
+    assert from_npy["result"]["clusters"] == 8
+    torch.save(torch.from_numpy(centres[:6]).clone(), tmp_path / "c_centers.pt")
+    shown = placewise("vocabulary", "import", tmp_path / "c_centers.pt")
+    assert shown.code == 0, shown.stderr
+    assert "6 clusters, 0 failed" in shown.stdout
+
+    listed = placewise("vocabulary", "list", "--json").json()
+    assert [(v["origin"], v["clusters"], v["active"]) for v in listed[:3]] == [
+        ("imported", 6, True),
+        ("imported", 8, False),
+        ("fitted", 5, False),
+    ]
+    assert listed[0]["provenance"]["imported_from"].startswith("c_centers")
+    assert not any(v["active"] for v in listed[1:])
+
+    np.save(tmp_path / "narrow.npy", centres[:, 1:])
+    refused = placewise("vocabulary", "import", tmp_path / "narrow.npy", "--json")
+    assert f"{WIDTH - 1} dimensions" in refused.refusal("vocabulary_unfit")
+
+
+# --- without a server ------------------------------------------------------------------------
+
+
+def test_commands_work_without_a_server(tmp_path: Path) -> None:
+    alone = CommandLine(tmp_path, tmp_path / "home")
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    for number in range(3):
+        (photos / f"{number}.jpg").write_bytes(photo_bytes(number))
+    report = alone("index", photos, "--json").json()
+    assert (report["photos"], report["searchable"], report["vocabulary"]) == (3, 3, "none")
+    answer = alone("query", photos / "1.jpg", "--json").json()
+    assert answer["similar_images"][0]["original_filename"] == "1.jpg"
+    assert answer["total_similar"] == 3
+    assert not (tmp_path / "home" / "server.json").exists(), "the server ended with the command"
+
+
+def test_bench_prints_figures_and_leaves_the_folder_alone(tmp_path: Path) -> None:
+    home = tmp_path / "home"
+    bench = CommandLine(tmp_path, home)(
+        "bench", "spine", "--photos", "4", "--queries", "2", "--json"
+    )
+    figures = bench.json()
+    assert figures["photos"] == 4
+    assert figures["searchable_after_seconds"] > 0
+    assert len(figures["timings"]) == 3
+    for name, timing in figures["timings"].items():
+        assert 0 < timing["median_ms"] <= timing["p95_ms"], name
+        assert timing["per_second"] > 0, name
+    assert not home.exists()
+
+
+# --- config and doctor -----------------------------------------------------------------------
+
+
+def test_config_shows_what_is_in_force_and_no_secret(tmp_path: Path) -> None:
+    secret = "postgresql+psycopg://user:hidden-word@db.example/places"
+    command = CommandLine(tmp_path, tmp_path / "home", database_url=secret, max_file_size=12345)
+    as_json, as_table = command("config", "--json"), command("config")
+    values = as_json.json()
+    assert values["MAX_FILE_SIZE"] == 12345
+    assert values["EXTRACTOR"] == "test-tiny-avg"
+    assert values["PLACEWISE_HOME"] == str(tmp_path / "home")
+    assert values["DATABASE_URL"], "it is set, and that can be seen"
+    assert as_table.code == 0
+    assert "MAX_FILE_SIZE" in as_table.stdout
+    for run in (as_json, as_table):
+        assert "hidden-word" not in run.stdout + run.stderr
+
+
+def test_a_setting_that_can_not_be_read_is_named(tmp_path: Path) -> None:
+    command = CommandLine(tmp_path, tmp_path / "home", batch_photos="many")
+    assert "BATCH_PHOTOS" in command("config", "--json").refusal("bad_setting")
+
+
+@pytest.mark.usefixtures("indexed")
+def test_doctor_finds_the_running_server(server: ServerProcess, placewise: CommandLine) -> None:
+    findings = {finding["part"]: finding for finding in placewise("doctor", "--json").json()}
+    assert set(findings) == {"python", "folder", "server", "device", "extractor"}
+    assert all(finding["ok"] for finding in findings.values())
+    assert str(server.client.base_url).rstrip("/") in findings["server"]["detail"]
+    assert "test-tiny-avg" in findings["extractor"]["detail"]
+
+
+def test_doctor_says_what_needs_attention(tmp_path: Path) -> None:
+    command = CommandLine(tmp_path, tmp_path / "home", extractor="anylock-vitg14")
+    findings = {f["part"]: f for f in command("doctor", "--json").json(code=1)}
+    assert [part for part, finding in findings.items() if not finding["ok"]] == ["extractor"]
+    assert "anylock-vitg14" in findings["extractor"]["detail"]
+    assert "not running" in findings["server"]["detail"]

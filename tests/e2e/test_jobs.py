@@ -1,0 +1,265 @@
+"""Jobs: listed, waited for, watched, cancelled and tried again."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import itertools
+import json
+import threading
+from collections.abc import Iterator
+from typing import Any
+from uuid import uuid4
+
+import httpx2
+import pytest
+
+from tests.support.photos import photo_bytes, photo_image
+from tests.support.problems import field_refused, problem
+from tests.support.server import ServerProcess
+
+# One photo per batch, so that of several photos only the first ones are under way.
+SETTINGS = {"batch_photos": 1}
+JOBS = "/api/v1/jobs"
+fresh = itertools.count(2000)
+
+
+def undecodable() -> bytes:
+    """A JPEG whose header is fine and whose pixels end too early."""
+    buffer = io.BytesIO()
+    photo_image(next(fresh), 640, 480).save(buffer, "JPEG", quality=95)
+    return buffer.getvalue()[: len(buffer.getvalue()) // 2]
+
+
+def get(server: ServerProcess, path: str, **params: Any) -> dict[str, Any]:
+    answer = server.client.get(path, params=params)
+    assert answer.status_code == 200, answer.text
+    body: dict[str, Any] = answer.json()
+    return body
+
+
+def listed(server: ServerProcess, **params: Any) -> list[dict[str, Any]]:
+    jobs: list[dict[str, Any]] = get(server, JOBS, limit=1000, **params)["jobs"]
+    return jobs
+
+
+def failed_job(server: ServerProcess) -> str:
+    job_id: str = server.upload(undecodable()).json()["job_id"]
+    assert server.finished(job_id)["state"] == "failed"
+    return job_id
+
+
+def queued_job(server: ServerProcess) -> dict[str, Any]:
+    """The upload of a photo whose job is queued behind others; inside `no_decoding`."""
+    for _ in range(3):  # one is described, one prepared, one more for good measure
+        server.upload(photo_bytes(next(fresh)))
+    uploaded: dict[str, Any] = server.upload(photo_bytes(next(fresh))).json()
+    assert get(server, uploaded["status_url"])["state"] == "queued"
+    return uploaded
+
+
+def post(server: ServerProcess, job_id: str, verb: str) -> httpx2.Response:
+    return server.client.post(f"{JOBS}/{job_id}/{verb}")
+
+
+def test_a_job_tells_its_story(server: ServerProcess) -> None:
+    uploaded = server.upload(photo_bytes(next(fresh))).json()
+    job = server.finished(uploaded["job_id"])
+    assert job["job_id"] == uploaded["job_id"]
+    assert job["file_id"] == uploaded["file_id"]
+    assert job["status_url"] == uploaded["status_url"]
+    assert (job["kind"], job["state"]) == ("index", "succeeded")
+    assert job["progress"] == {"done": 1, "total": 1, "failed": 0}
+    assert job["error"] is None
+    assert job["waiting_for"] is None
+    assert job["created_at"] <= job["started_at"] <= job["finished_at"]
+
+
+def test_jobs_are_listed_newest_first_by_state_and_kind(server: ServerProcess) -> None:
+    indexed = server.upload(photo_bytes(next(fresh))).json()["job_id"]
+    server.finished(indexed)
+    broken = failed_job(server)
+    asked = server.client.post(
+        "/api/v1/similarity", files={"file": ("q.jpg", photo_bytes(next(fresh)))}
+    ).json()["job_id"]
+    server.finished(asked)
+
+    everything = [job["job_id"] for job in listed(server)]
+    assert everything[:3] == [asked, broken, indexed]
+    failed = listed(server, state="failed")
+    assert broken in [job["job_id"] for job in failed]
+    assert {job["state"] for job in failed} == {"failed"}
+    queries = listed(server, kind="describe")
+    assert asked in [job["job_id"] for job in queries]
+    assert {job["kind"] for job in queries} == {"describe"}
+    both = listed(server, state=["failed", "succeeded"], kind="index")
+    assert {broken, indexed} <= {job["job_id"] for job in both}
+    assert asked not in {job["job_id"] for job in both}
+
+
+def test_a_list_of_jobs_is_read_page_by_page(server: ServerProcess) -> None:
+    for _ in range(3):
+        server.finished(server.upload(photo_bytes(next(fresh))).json()["job_id"])
+    whole = [job["job_id"] for job in listed(server, kind="index")]
+    read: list[str] = []
+    page = get(server, JOBS, kind="index", limit=2)
+    while True:
+        assert 0 < len(page["jobs"]) <= 2
+        read += [job["job_id"] for job in page["jobs"]]
+        if page["next_cursor"] is None:
+            break
+        page = get(server, JOBS, kind="index", limit=2, cursor=page["next_cursor"])
+    assert read == whole
+
+
+@pytest.mark.parametrize(
+    ("params", "named"),
+    [
+        ({"state": "asleep"}, "state.0"),
+        ({"kind": "coffee"}, "kind.0"),
+        ({"limit": "0"}, "limit"),
+        ({"limit": "1001"}, "limit"),
+        ({"cursor": "page two"}, "cursor"),
+    ],
+)
+def test_a_bad_filter_is_refused_by_name(
+    server: ServerProcess, params: dict[str, str], named: str
+) -> None:
+    field_refused(server.client.get(JOBS, params=params), named)
+
+
+def test_unknown_jobs_are_not_found(server: ServerProcess) -> None:
+    for job_id in (str(uuid4()), "no-id-at-all"):
+        problem(server.client.get(f"{JOBS}/{job_id}"), 404, "job_not_found")
+        problem(server.client.get(f"{JOBS}/{job_id}/events"), 404, "job_not_found")
+        problem(post(server, job_id, "cancel"), 404, "job_not_found")
+        problem(post(server, job_id, "retry"), 404, "job_not_found")
+
+
+def test_waiting_for_a_job_ends_with_the_job(server: ServerProcess) -> None:
+    with server.no_decoding():
+        job_id = server.upload(photo_bytes(next(fresh))).json()["job_id"]
+        waited = get(server, f"{JOBS}/{job_id}", wait=0.2)
+        assert waited["state"] in ("queued", "running"), "the wait is over before the job"
+        seen: list[dict[str, Any]] = []
+        waiting = threading.Thread(
+            target=lambda: seen.append(get(server, f"{JOBS}/{job_id}", wait=60))
+        )
+        waiting.start()
+    waiting.join()
+    assert seen[0]["state"] == "succeeded"
+    field_refused(server.client.get(f"{JOBS}/{job_id}", params={"wait": -1}), "wait")
+
+
+def events(lines: Iterator[str]) -> Iterator[dict[str, str]]:
+    """Server-sent events as their fields, comments left out."""
+    event: dict[str, str] = {}
+    for line in lines:
+        if line and not line.startswith(":"):
+            name, _, value = line.partition(": ")
+            event[name] = value
+        elif event:
+            yield event
+            event = {}
+
+
+def test_a_job_is_watched_until_its_final_state(server: ServerProcess) -> None:
+    with contextlib.ExitStack() as held:
+        held.enter_context(server.no_decoding())
+        uploaded = server.upload(photo_bytes(next(fresh))).json()
+        with server.client.stream("GET", f"{uploaded['status_url']}/events") as answer:
+            assert answer.status_code == 200
+            assert answer.headers["content-type"].startswith("text/event-stream")
+            coming = events(answer.iter_lines())
+            seen = [next(coming)]
+            assert json.loads(seen[0]["data"])["state"] in ("queued", "running")
+            held.close()  # decoding goes on
+            seen += coming
+    assert {event["event"] for event in seen} == {"progress"}
+    assert [event["id"] for event in seen] == [str(n) for n in range(1, len(seen) + 1)]
+    jobs = [json.loads(event["data"]) for event in seen]
+    assert {job["job_id"] for job in jobs} == {uploaded["job_id"]}
+    assert jobs[-1] == get(server, uploaded["status_url"])
+    assert jobs[-1]["state"] == "succeeded"
+    assert all(job["state"] in ("queued", "running") for job in jobs[:-1])
+
+
+def test_a_finished_job_is_one_event(server: ServerProcess) -> None:
+    job_id = failed_job(server)
+    with server.client.stream("GET", f"{JOBS}/{job_id}/events") as answer:
+        seen = list(events(answer.iter_lines()))
+    assert [event["id"] for event in seen] == ["1"]
+    assert json.loads(seen[0]["data"])["error"]["code"] == "undecodable_photo"
+
+
+def test_a_cancelled_job_stays_undone_until_it_is_retried(server: ServerProcess) -> None:
+    with server.no_decoding():
+        uploaded = queued_job(server)
+        answer = post(server, uploaded["job_id"], "cancel")
+        assert answer.status_code == 200
+        assert answer.json()["state"] == "cancelled"
+        assert answer.json()["finished_at"]
+        last = server.upload(photo_bytes(next(fresh))).json()["job_id"]
+    # One that was queued behind it is done: it would have been, too.
+    assert server.finished(last)["state"] == "succeeded"
+    assert get(server, uploaded["status_url"])["state"] == "cancelled"
+    refused = problem(server.similar(uploaded["file_id"]), 409, "not_searchable")
+    assert refused["state"] == "cancelled"
+    problem(post(server, uploaded["job_id"], "cancel"), 409, "job_finished")
+
+    again = post(server, uploaded["job_id"], "retry")
+    assert again.status_code == 200
+    assert (again.json()["state"], again.json()["finished_at"]) == ("queued", None)
+    assert server.finished(uploaded["job_id"])["state"] == "succeeded"
+    assert server.similar(uploaded["file_id"]).status_code == 200
+
+
+def test_a_running_job_is_cancelled_and_its_work_thrown_away(server: ServerProcess) -> None:
+    with server.no_decoding():
+        uploaded = server.upload(photo_bytes(next(fresh))).json()
+        while get(server, uploaded["status_url"])["state"] != "running":
+            pass
+        assert post(server, uploaded["job_id"], "cancel").json()["state"] == "cancelled"
+    last = server.upload(photo_bytes(next(fresh))).json()["job_id"]
+    assert server.finished(last)["state"] == "succeeded"
+    assert get(server, uploaded["status_url"])["state"] == "cancelled"
+    assert not get(server, f"/api/v1/uploads/{uploaded['file_id']}")["searchable"]
+
+
+def test_a_cancelled_query_has_no_result(server: ServerProcess) -> None:
+    with server.no_decoding():
+        started = server.client.post(
+            "/api/v1/similarity", files={"file": ("q.jpg", photo_bytes(next(fresh)))}
+        ).json()
+        assert post(server, started["job_id"], "cancel").status_code == 200
+        problem(server.client.get(started["result_url"]), 409, "job_cancelled")
+
+
+def test_a_failed_job_can_be_retried(server: ServerProcess) -> None:
+    job_id = failed_job(server)
+    with server.no_decoding():
+        answer = post(server, job_id, "retry")
+        assert answer.status_code == 200
+        assert answer.json()["state"] == "queued"
+        assert answer.json()["error"] is None
+        assert answer.json()["progress"] == {"done": 0, "total": 1, "failed": 0}
+        body = problem(post(server, job_id, "retry"), 409, "job_not_retryable")
+        assert body["job_id"] == job_id
+    job = server.finished(job_id)
+    assert (job["state"], job["error"]["code"]) == ("failed", "undecodable_photo")
+
+
+def test_a_job_that_succeeded_can_be_neither_cancelled_nor_retried(server: ServerProcess) -> None:
+    job_id = server.upload(photo_bytes(next(fresh))).json()["job_id"]
+    assert server.finished(job_id)["state"] == "succeeded"
+    body = problem(post(server, job_id, "cancel"), 409, "job_finished")
+    assert (body["job_id"], body["state"]) == (job_id, "succeeded")
+    problem(post(server, job_id, "retry"), 409, "job_not_retryable")
+
+
+def test_the_job_of_a_deleted_photo_is_not_retried(server: ServerProcess) -> None:
+    with server.no_decoding():
+        uploaded = queued_job(server)
+        assert server.client.delete(f"/api/v1/uploads/{uploaded['file_id']}").status_code == 200
+        assert get(server, uploaded["status_url"])["state"] == "cancelled"
+        problem(post(server, uploaded["job_id"], "retry"), 409, "photo_deleted")

@@ -1,0 +1,330 @@
+"""Model changes: a map gets a vocabulary, and another one, while search goes on."""
+
+from __future__ import annotations
+
+import io
+import itertools
+import threading
+import time
+from dataclasses import dataclass
+from typing import Any
+from uuid import uuid4
+
+import httpx2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from tests.support.photos import photo_bytes
+from tests.support.problems import field_refused, problem
+from tests.support.server import ServerProcess
+
+# An extractor without a vocabulary of its own, in a map that never fits one by itself.
+SETTINGS = {"extractor": "test-tiny-vlad", "auto_fit_photos": 10_000}
+PHOTOS = 12
+WIDTH = 16  # of the tiny extractor's local features
+VOCABULARIES = "/api/v1/vocabularies"
+GENERATIONS = "/api/v1/generations"
+fresh = itertools.count(4000)
+
+
+def got(answer: httpx2.Response) -> Any:
+    assert answer.status_code == 200, answer.text
+    return answer.json()
+
+
+def started(answer: httpx2.Response) -> str:
+    """The job of an accepted model change."""
+    assert answer.status_code == 202, answer.text
+    body = answer.json()
+    assert set(body) >= {"job_id", "status", "status_url"}
+    assert body["status_url"] == f"/api/v1/jobs/{body['job_id']}" == answer.headers["location"]
+    assert int(answer.headers["retry-after"]) > 0
+    job_id: str = body["job_id"]
+    return job_id
+
+
+def npy(array: NDArray[Any]) -> bytes:
+    buffer = io.BytesIO()
+    np.save(buffer, array)
+    return buffer.getvalue()
+
+
+def centres(seed: int, clusters: int = 8, width: int = WIDTH) -> NDArray[np.float32]:
+    return np.random.default_rng(seed).standard_normal((clusters, width)).astype(np.float32)
+
+
+def post_import(server: ServerProcess, data: bytes, name: str = "c.npy") -> httpx2.Response:
+    return server.client.post(f"{VOCABULARIES}/import", files={"file": (name, data)})
+
+
+def done(server: ServerProcess, answer: httpx2.Response) -> dict[str, Any]:
+    """The result of a model change that succeeded."""
+    job = server.finished(started(answer))
+    assert job["state"] == "succeeded", job
+    result: dict[str, Any] = job["result"]
+    return result
+
+
+def refused(server: ServerProcess, answer: httpx2.Response) -> dict[str, Any]:
+    """The reason of a model change that failed."""
+    job = server.finished(started(answer))
+    assert job["state"] == "failed", job
+    error: dict[str, Any] = job["error"]
+    return error
+
+
+def active(server: ServerProcess) -> dict[str, Any]:
+    (found,) = (g for g in got(server.client.get(GENERATIONS)) if g["state"] == "active")
+    generation: dict[str, Any] = found
+    return generation
+
+
+def vocabulary(server: ServerProcess, vocabulary_id: str) -> dict[str, Any]:
+    (found,) = (
+        v for v in got(server.client.get(VOCABULARIES)) if v["vocabulary_id"] == vocabulary_id
+    )
+    one: dict[str, Any] = found
+    return one
+
+
+@dataclass(frozen=True, slots=True)
+class Before:
+    """What a map without a vocabulary answered."""
+
+    fit_of_nothing: httpx2.Response
+    photos: list[str]
+    jobs: list[dict[str, Any]]
+    stats: dict[str, Any]
+    by_stored: httpx2.Response
+    by_new: httpx2.Response
+    vocabularies: list[Any]
+    generations: list[Any]
+
+
+@pytest.fixture(scope="module")
+def before(server: ServerProcess) -> Before:
+    """PHOTOS photos wait for a vocabulary."""
+    fit_of_nothing = server.client.post(VOCABULARIES, json={})
+    uploads = [server.upload(photo_bytes(n), f"{n}.jpg").json() for n in range(PHOTOS)]
+    by_new = server.ask(photo_bytes(0))
+    while True:
+        jobs = [got(server.client.get(upload["status_url"])) for upload in uploads]
+        if all(job["waiting_for"] for job in jobs):
+            break
+    return Before(
+        fit_of_nothing=fit_of_nothing,
+        photos=[upload["file_id"] for upload in uploads],
+        jobs=jobs,
+        stats=got(server.client.get("/api/v1/database/stats")),
+        by_stored=server.similar(uploads[0]["file_id"]),
+        by_new=by_new,
+        vocabularies=got(server.client.get(VOCABULARIES)),
+        generations=got(server.client.get(GENERATIONS)),
+    )
+
+
+@pytest.fixture(scope="module")
+def fitted(server: ServerProcess, before: Before) -> dict[str, Any]:
+    """The result of the first fit, which every photo was waiting for."""
+    return done(server, server.client.post(VOCABULARIES, json={}))
+
+
+def test_photos_wait_until_their_map_has_a_vocabulary(before: Before) -> None:
+    assert {(job["state"], job["waiting_for"]) for job in before.jobs} == {("queued", "vocabulary")}
+    assert before.stats["total_images"] == PHOTOS
+    assert before.stats["searchable_images"] == 0
+    assert before.stats["vocabulary"] is None
+    assert before.vocabularies == before.generations == []
+    waiting = problem(before.by_stored, 409, "not_searchable")
+    assert waiting["job_id"] == before.jobs[0]["job_id"]
+    assert "vocabulary" in waiting["detail"]
+    assert "POST /api/v1/vocabularies" in problem(before.by_new, 409, "no_vocabulary")["detail"]
+
+
+def test_a_map_without_photos_has_nothing_to_fit_on(before: Before) -> None:
+    problem(before.fit_of_nothing, 409, "no_photos")
+
+
+def test_a_fit_makes_every_waiting_photo_searchable(
+    server: ServerProcess, before: Before, fitted: dict[str, Any]
+) -> None:
+    assert fitted["photos"] == PHOTOS
+    assert fitted["failed"] == 0
+    for job in before.jobs:
+        assert server.finished(job["job_id"])["state"] == "succeeded"
+    learnt = vocabulary(server, fitted["vocabulary_id"])
+    assert learnt["origin"] == "fitted"
+    assert learnt["clusters"] == fitted["clusters"] > 1
+    assert learnt["dimension"] == WIDTH
+    assert learnt["provenance"]["photos"] == PHOTOS
+    assert learnt["provenance"]["clusters_asked"] == 64
+    for generation in got(server.client.get(GENERATIONS)):
+        if generation["generation_id"] == fitted["generation_id"]:
+            assert generation["vocabulary_id"] == fitted["vocabulary_id"]
+            assert generation["dimension"] == WIDTH * fitted["clusters"]
+            assert generation["extractor"] == "test-tiny-vlad"
+
+
+def test_answers_say_whose_vocabulary_they_were_made_with(
+    server: ServerProcess, before: Before, fitted: dict[str, Any]
+) -> None:
+    imported = done(server, post_import(server, npy(centres(1))))
+    assert (imported["clusters"], imported["photos"]) == (8, active(server)["photos"])
+    assert vocabulary(server, imported["vocabulary_id"])["origin"] == "imported"
+    assert vocabulary(server, imported["vocabulary_id"])["provenance"]["imported_from"] == "c.npy"
+    for body in (got(server.ask(photo_bytes(3))), got(server.similar(before.photos[3]))):
+        assert body["vocabulary"] == "foreign"
+        assert body["generation_id"] == imported["generation_id"]
+    assert got(server.client.get("/api/v1/database/stats"))["vocabulary"] == "foreign"
+
+    own = done(server, server.client.post(VOCABULARIES, json={"clusters": 4, "seed": 7}))
+    assert own["clusters"] == 4
+    for body in (got(server.ask(photo_bytes(3))), got(server.similar(before.photos[3]))):
+        assert body["vocabulary"] == "own"
+        assert body["generation_id"] == own["generation_id"]
+    assert got(server.ask(photo_bytes(3)))["similar_images"][0]["image_id"] == before.photos[3]
+    stats = got(server.client.get("/api/v1/database/stats"))
+    assert (stats["vocabulary"], stats["feature_dimension"]) == ("own", 4 * WIDTH)
+    assert vocabulary(server, own["vocabulary_id"])["provenance"]["seed"] == 7
+
+
+def test_a_map_goes_back_to_a_vocabulary_that_it_had(
+    server: ServerProcess, before: Before, fitted: dict[str, Any]
+) -> None:
+    imported = done(server, post_import(server, npy(centres(2))))
+    body = {"vocabulary_id": fitted["vocabulary_id"]}
+    back = done(server, server.client.post(GENERATIONS, json=body))
+    assert back["vocabulary_id"] == fitted["vocabulary_id"]
+    assert back["generation_id"] not in (fitted["generation_id"], imported["generation_id"])
+    assert active(server)["generation_id"] == back["generation_id"]
+    assert active(server)["vocabulary_id"] == fitted["vocabulary_id"]
+    states = {g["generation_id"]: g["state"] for g in got(server.client.get(GENERATIONS))}
+    assert states[imported["generation_id"]] == "retired"
+    assert got(server.similar(before.photos[0]))["vocabulary"] == "own"
+
+
+@pytest.mark.usefixtures("fitted")
+def test_one_model_change_at_a_time(server: ServerProcess, before: Before) -> None:
+    answering = active(server)["generation_id"]
+    stored = {path.name for path in (server.home / "objects" / "vocabularies").iterdir()}
+    known = active(server)["vocabulary_id"]
+    with server.no_decoding():
+        running = started(server.client.post(VOCABULARIES, json={}))
+        for answer in (
+            server.client.post(VOCABULARIES, json={}),
+            server.client.post(GENERATIONS, json={"vocabulary_id": known}),
+            post_import(server, npy(centres(3))),
+        ):
+            body = problem(answer, 409, "model_change_running")
+            assert body["job_id"] == running
+            assert f"/api/v1/jobs/{running}/cancel" in body["detail"]
+        assert got(server.similar(before.photos[0]))["generation_id"] == answering
+        cancelled = server.client.post(f"/api/v1/jobs/{running}/cancel")
+        assert got(cancelled)["state"] == "cancelled"
+    left = {path.name for path in (server.home / "objects" / "vocabularies").iterdir()}
+    assert left == stored, "the refused vocabulary is not kept"
+    problem(server.client.post(f"/api/v1/jobs/{running}/retry"), 409, "job_not_retryable")
+    assert active(server)["generation_id"] == answering
+    assert got(server.similar(before.photos[0]))["generation_id"] == answering
+    done(server, post_import(server, npy(centres(4))))  # the way is free again
+
+
+@pytest.mark.usefixtures("fitted")
+@pytest.mark.parametrize(
+    "data",
+    [
+        pytest.param(npy(centres(5, width=WIDTH - 1)), id="wrong width"),
+        pytest.param(npy(np.ones((8, WIDTH), np.int64)), id="no floats"),
+        pytest.param(npy(np.ones((8, WIDTH), np.float32)), id="all the same"),
+        pytest.param(npy(np.full((8, WIDTH), np.nan, np.float32)), id="NaN"),
+        pytest.param(npy(centres(6)[0]), id="one row"),
+        pytest.param(npy(centres(7))[:-9], id="cut off"),
+        pytest.param(b"cluster centres, in words", id="text"),
+    ],
+)
+def test_an_unfit_vocabulary_fails_with_the_reason_and_changes_nothing(
+    server: ServerProcess, before: Before, data: bytes
+) -> None:
+    answering, known = active(server), got(server.client.get(VOCABULARIES))
+    error = refused(server, post_import(server, data))
+    assert (error["code"], error["status"]) == ("vocabulary_unfit", 422)
+    assert active(server) == answering
+    assert got(server.client.get(VOCABULARIES)) == known
+    assert got(server.similar(before.photos[0]))["generation_id"] == answering["generation_id"]
+
+
+@pytest.mark.usefixtures("fitted")
+def test_bad_requests_for_a_model_change_are_refused(server: ServerProcess) -> None:
+    post = server.client.post
+    field_refused(post(VOCABULARIES, json={"clusters": 0}), "clusters")
+    field_refused(post(VOCABULARIES, json={"sample": "all"}), "sample")
+    field_refused(post(VOCABULARIES, json={"seed": -1}), "seed")
+    field_refused(post(VOCABULARIES, json={"k": 64}), "k")
+    field_refused(post(GENERATIONS, json={"vocabulary_id": "the old one"}), "vocabulary_id")
+    unknown = post(GENERATIONS, json={"vocabulary_id": str(uuid4())})
+    problem(unknown, 404, "vocabulary_not_found")
+    problem(post(f"{VOCABULARIES}/import"), 400, "no_file")
+    problem(post_import(server, b""), 400, "empty_file")
+    problem(post(f"{VOCABULARIES}/import", content=npy(centres(1))), 400, "no_file")
+    for path in (VOCABULARIES, GENERATIONS):
+        problem(server.client.get(path, params={"map": "nowhere"}), 404, "map_not_found")
+        problem(post(path, json={}, params={"map": "nowhere"}), 404, "map_not_found")
+    error = refused(server, post(GENERATIONS, json={"vocabulary_id": None}))
+    assert error["code"] == "vocabulary_unfit"
+
+
+@pytest.mark.usefixtures("fitted")
+def test_search_never_fails_while_the_model_changes(server: ServerProcess, before: Before) -> None:
+    old = active(server)["generation_id"]
+    answers: list[httpx2.Response] = []
+    enough = threading.Event()
+
+    def ask_all_the_time() -> None:
+        for turn in itertools.count():
+            if enough.is_set():
+                return
+            answers.append(server.similar(before.photos[turn % PHOTOS]))
+            answers.append(server.ask(photo_bytes(turn % PHOTOS)))
+
+    asking = threading.Thread(target=ask_all_the_time)
+
+    def wait_for_four_more() -> None:
+        reached = len(answers)
+        while len(answers) < reached + 4 and asking.is_alive():
+            time.sleep(0.01)
+
+    asking.start()
+    try:
+        wait_for_four_more()
+        new = done(server, server.client.post(VOCABULARIES, json={"clusters": 3}))
+        wait_for_four_more()
+    finally:
+        enough.set()
+        asking.join()
+    assert {answer.status_code for answer in answers} == {200}, [a.text for a in answers]
+    used = [answer.json()["generation_id"] for answer in answers]
+    assert set(used) == {old, new["generation_id"]}
+    assert (used[0], used[-1]) == (old, new["generation_id"])
+    for answer in answers:
+        assert answer.json()["missing"] == []
+        assert len(answer.json()["similar_images"]) == 10
+
+
+@pytest.mark.usefixtures("fitted")
+def test_a_photo_that_arrives_during_a_model_change_is_in_the_new_generation(
+    server: ServerProcess,
+) -> None:
+    data = photo_bytes(next(fresh))
+    with server.no_decoding():
+        change = started(server.client.post(VOCABULARIES, json={"clusters": 5}))
+        uploaded = server.upload(data).json()
+    assert server.finished(uploaded["job_id"])["state"] == "succeeded"
+    job = server.finished(change)
+    assert job["state"] == "succeeded"
+    assert job["progress"]["done"] == job["progress"]["total"]
+    stats = got(server.client.get("/api/v1/database/stats"))
+    assert stats["searchable_images"] == stats["total_images"] == active(server)["photos"]
+    best = got(server.ask(data))["similar_images"][0]
+    assert best["image_id"] == uploaded["file_id"]
+    assert best["similarity_score"] == pytest.approx(1, abs=1e-4)

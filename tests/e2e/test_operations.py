@@ -1,0 +1,242 @@
+"""Running it: probes, figures, the description of the API, starts that are refused, and ends."""
+
+from __future__ import annotations
+
+import signal
+import socket
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import httpx2
+import pytest
+
+from shared.home import address_file
+from tests.support.photos import photo_bytes
+from tests.support.problems import problem
+from tests.support.server import ServerProcess, environment, run_command
+
+API = "/api/v1"
+CALLS = {
+    f"POST {API}/upload",
+    f"GET {API}/jobs",
+    f"GET {API}/jobs/{{job_id}}",
+    f"GET {API}/jobs/{{job_id}}/events",
+    f"GET {API}/jobs/{{job_id}}/result",
+    f"POST {API}/jobs/{{job_id}}/cancel",
+    f"POST {API}/jobs/{{job_id}}/retry",
+    f"POST {API}/similarity",
+    f"POST {API}/similarity/{{file_id}}",
+    f"GET {API}/search",
+    f"GET {API}/uploads/{{file_id}}",
+    f"PATCH {API}/uploads/{{file_id}}",
+    f"DELETE {API}/uploads/{{file_id}}",
+    f"GET {API}/uploads/{{file_id}}/image",
+    f"GET {API}/uploads/{{file_id}}/thumbnail",
+    f"GET {API}/vocabularies",
+    f"POST {API}/vocabularies",
+    f"POST {API}/vocabularies/import",
+    f"GET {API}/generations",
+    f"POST {API}/generations",
+    f"GET {API}/database/stats",
+    f"GET {API}/health",
+    "GET /",
+    "GET /livez",
+    "GET /readyz",
+}
+FIGURES = {
+    "total_images",
+    "searchable_images",
+    "total_chunks",
+    "total_storage_bytes",
+    "feature_dimension",
+    "max_images_per_chunk",
+    "total_searches",
+    "recent_uploads_24h",
+    "recent_searches_24h",
+    "avg_processing_time_ms",
+    "max_processing_time_ms",
+}
+
+
+def got(answer: httpx2.Response) -> dict[str, Any]:
+    assert answer.status_code == 200, answer.text
+    body: dict[str, Any] = answer.json()
+    return body
+
+
+# --- what the server tells of itself ---------------------------------------------------------
+
+
+def test_the_first_page_says_what_this_is_and_where_to_look(server: ServerProcess) -> None:
+    body = got(server.client.get("/"))
+    assert (body["service"], body["status"]) == ("Placewise", "running")
+    for link in ("docs", "redoc", "health"):
+        assert server.client.get(body[link]).status_code == 200, link
+    assert got(server.client.get(body["health"]))["version"] == body["version"]
+
+
+def test_probes_and_health_say_that_every_part_works(server: ServerProcess) -> None:
+    assert got(server.client.get("/livez")) == {"status": "alive"}
+    assert got(server.client.get("/readyz")) == {"status": "ready"}
+    body = got(server.client.get(f"{API}/health"))
+    assert body["status"] == "healthy"
+    assert body["uptime_seconds"] > 0
+    assert set(body["parts"]) == {"catalog", "object_store", "search"}
+    assert {part["status"] for part in body["parts"].values()} == {"healthy"}
+
+
+def test_every_call_is_described_once(server: ServerProcess) -> None:
+    described = got(server.client.get("/openapi.json"))
+    calls = {
+        f"{method.upper()} {path}": call
+        for path, methods in described["paths"].items()
+        for method, call in methods.items()
+    }
+    assert set(calls) >= CALLS, CALLS - set(calls)
+    names = Counter(call["operationId"] for call in calls.values())
+    assert set(names.values()) == {1}, names
+    for name, call in calls.items():
+        assert call["description"], name
+        assert "application/problem+json" in call["responses"]["4XX"]["content"], name
+    form = calls[f"POST {API}/upload"]["requestBody"]["content"]["multipart/form-data"]["schema"]
+    assert form["required"] == ["file"]
+    assert set(form["properties"]) == {
+        *("file", "latitude", "longitude", "heading"),
+        *("captured_at", "place", "tags", "metadata"),
+    }
+
+
+@pytest.mark.parametrize("path", ["/docs", "/redoc"])
+def test_the_description_can_be_read_in_a_browser(server: ServerProcess, path: str) -> None:
+    answer = server.client.get(path)
+    assert answer.status_code == 200
+    assert answer.headers["content-type"].startswith("text/html")
+    assert "/openapi.json" in answer.text
+
+
+def test_figures_follow_what_is_done(server: ServerProcess) -> None:
+    before = got(server.client.get(f"{API}/database/stats"))
+    assert set(before) >= FIGURES
+    made = server.indexed(photo_bytes(5000))
+    after = got(server.client.get(f"{API}/database/stats"))
+    for figure in ("total_images", "searchable_images", "recent_uploads_24h"):
+        assert after[figure] == before[figure] + 1
+    assert after["total_storage_bytes"] > before["total_storage_bytes"] + len(photo_bytes(5000))
+    assert after["jobs"]["succeeded"] == before["jobs"]["succeeded"] + 1
+    assert after["map_version"] > before["map_version"]
+    assert after["feature_dimension"] == 16
+    assert after["total_chunks"] >= 1
+    assert (after["map"], after["extractor"]) == ("default", "test-tiny-avg")
+    assert server.client.delete(f"{API}/uploads/{made}").status_code == 200
+    assert got(server.client.get(f"{API}/database/stats"))["total_images"] == before["total_images"]
+
+
+# --- errors of every call --------------------------------------------------------------------
+
+
+def test_unknown_paths_and_methods_are_problems_too(server: ServerProcess) -> None:
+    problem(server.client.get("/nowhere"), 404, "path_not_found")
+    problem(server.client.get(f"{API}/nowhere"), 404, "path_not_found")
+    answer = server.client.put(f"{API}/upload")
+    problem(answer, 405, "method_not_allowed")
+    assert answer.headers["allow"] == "POST"
+    problem(server.client.delete("/livez"), 405, "method_not_allowed")
+
+
+def test_a_body_that_is_no_json_is_a_problem(server: ServerProcess) -> None:
+    photo = server.upload(photo_bytes(0)).json()["file_id"]
+    headers = {"Content-Type": "application/json"}
+    for call, path in (
+        ("PATCH", f"{API}/uploads/{photo}"),
+        ("POST", f"{API}/vocabularies"),
+        ("POST", f"{API}/generations"),
+    ):
+        answer = server.client.request(call, path, content=b'{"a": ', headers=headers)
+        problem(answer, 400, "malformed_body")
+
+
+@pytest.mark.parametrize(
+    "path", ["jobs", "search", "vocabularies", "generations", "database/stats"]
+)
+def test_an_unknown_map_is_not_found(server: ServerProcess, path: str) -> None:
+    answer = server.client.get(f"{API}/{path}", params={"map": "nowhere"})
+    assert "nowhere" in problem(answer, 404, "map_not_found")["detail"]
+
+
+def test_an_extractor_without_a_vocabulary_has_nothing_to_fit(server: ServerProcess) -> None:
+    answer = server.client.post(f"{API}/vocabularies", json={})
+    job = server.finished(answer.json()["job_id"])
+    assert (job["state"], job["error"]["code"]) == ("failed", "vocabulary_unfit")
+    assert "test-tiny-avg" in job["error"]["detail"]
+
+
+# --- starts that are refused -----------------------------------------------------------------
+
+
+def refused_start(home: Path, **settings: Any) -> str:
+    """What `placewise serve` says when it can't start; a person reads it, so no traceback."""
+    ended = run_command("serve", env=environment(home, **settings), cwd=home.parent)
+    assert ended.returncode == 1, ended.stderr
+    assert "Traceback" not in ended.stderr
+    return ended.stderr
+
+
+def test_a_folder_has_one_server(server: ServerProcess, tmp_path: Path) -> None:
+    said = refused_start(server.home)
+    assert said.startswith("home_in_use: ")
+    assert str(server.client.base_url).rstrip("/") in said
+    assert str(server.home) in said
+    assert got(server.client.get("/readyz")), "the first one goes on"
+    assert address_file(server.home).exists(), "and can still be found"
+
+
+def test_an_address_has_one_server(server: ServerProcess, tmp_path: Path) -> None:
+    port = server.client.base_url.port
+    said = refused_start(tmp_path / "another", port=port)
+    assert said.startswith("address_in_use: ")
+    assert f"127.0.0.1:{port}" in said
+
+
+@pytest.mark.parametrize(
+    ("settings", "code", "named"),
+    [
+        ({"extractor": "anylock-vitg14"}, "unknown_extractor", "efficientnet-lite0-vlad"),
+        ({"allow_test_extractors": False}, "test_extractor", "test-tiny-avg"),
+        ({"port": "http"}, "bad_setting", "PORT"),
+    ],
+)
+def test_settings_that_can_not_work_are_refused_at_the_start(
+    tmp_path: Path, settings: dict[str, Any], code: str, named: str
+) -> None:
+    said = refused_start(tmp_path / "home", **settings)
+    assert said.startswith(f"{code}: ")
+    assert named in said
+
+
+# --- its end, and the next start -------------------------------------------------------------
+
+
+def test_a_stopped_server_goes_on_where_it_was(tmp_path: Path) -> None:
+    with ServerProcess(tmp_path / "home", batch_photos=1) as server:
+        first = server.indexed(photo_bytes(1))
+        with server.no_decoding():
+            uploads = [server.upload(photo_bytes(n)).json() for n in range(2, 7)]
+            server.process.send_signal(signal.SIGTERM)
+        assert server.process.wait(timeout=30) == 0, server.log()
+        assert not address_file(server.home).exists()
+
+        server.start()
+        for upload in uploads:
+            assert server.finished(upload["job_id"])["state"] == "succeeded"
+        found = got(server.similar(first, top_k=100))
+        assert {photo["image_id"] for photo in found["similar_images"]} == {
+            upload["file_id"] for upload in uploads
+        }
+
+        # Ctrl-C ends it as well, also while a client holds a connection open.
+        url = server.client.base_url
+        with socket.create_connection((url.host, url.port or 80)):
+            server.process.send_signal(signal.SIGINT)
+            assert server.process.wait(timeout=30) == 0, server.log()
+        assert "Traceback" not in server.log()

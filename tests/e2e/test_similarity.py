@@ -1,0 +1,330 @@
+"""Which known place is this? Asked with stored photos and with new ones."""
+
+from __future__ import annotations
+
+import io
+import itertools
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+from uuid import uuid4
+
+import httpx2
+import pytest
+
+from tests.support.photos import photo_bytes, photo_image
+from tests.support.problems import field_refused, problem
+from tests.support.server import ServerProcess
+
+PLACES = 8
+AT_ONCE = 25
+SIMILARITY = "/api/v1/similarity"
+ANSWER_FIELDS = {
+    "query_file_id",
+    "query_filename",
+    "processing_time_ms",
+    "total_similar",
+    "similar_images",
+    "vocabulary",
+    "certificate",
+    "rows_scanned",
+    "rows_reranked",
+    "snapshot_version",
+}
+PHOTO_FIELDS = {
+    "image_id",
+    "image_path",
+    "original_filename",
+    "similarity_score",
+    "upload_time",
+    "file_size",
+    "width",
+    "height",
+    "metadata",
+    "tags",
+    "latitude",
+    "longitude",
+    "image_url",
+    "thumbnail_url",
+}
+# Each test that changes the map takes photos of its own.
+fresh = itertools.count(1000)
+
+
+@pytest.fixture(scope="module")
+def places(server: ServerProcess) -> list[str]:
+    """PLACES photos of known places; their ids. Number 1 is the first."""
+    return [
+        server.indexed(photo_bytes(n), f"place-{n}.jpg", latitude=40 + n, longitude=7, tags="a,b")
+        for n in range(1, PLACES + 1)
+    ]
+
+
+def re_encoded(number: int) -> bytes:
+    """The photo `number` with other bytes, and as alike as the tiny extractor can bear."""
+    return photo_bytes(number, quality=50)
+
+
+def answered(answer: httpx2.Response) -> dict[str, Any]:
+    assert answer.status_code == 200, answer.text
+    body: dict[str, Any] = answer.json()
+    return body
+
+
+def ids(body: dict[str, Any]) -> list[str]:
+    return [found["image_id"] for found in body["similar_images"]]
+
+
+def scores(body: dict[str, Any]) -> list[float]:
+    return [found["similarity_score"] for found in body["similar_images"]]
+
+
+def stats(server: ServerProcess) -> dict[str, Any]:
+    return answered(server.client.get("/api/v1/database/stats"))
+
+
+def undecodable() -> bytes:
+    """A JPEG whose header is fine and whose pixels end too early."""
+    buffer = io.BytesIO()
+    photo_image(next(fresh), 640, 480).save(buffer, "JPEG", quality=95)
+    return buffer.getvalue()[: len(buffer.getvalue()) // 2]
+
+
+def test_a_near_copy_finds_its_place_first(server: ServerProcess, places: list[str]) -> None:
+    for number, place in enumerate(places, start=1):
+        body = answered(server.ask(photo_bytes(number), top_k=3))
+        assert ids(body)[0] == place
+        best = body["similar_images"][0]
+        assert best["original_filename"] == f"place-{number}.jpg"
+        assert (best["latitude"], best["longitude"]) == (40 + number, 7)
+        assert best["similarity_score"] > 0.9 > scores(body)[1]
+
+
+def test_an_answer_says_all_that_is_documented(server: ServerProcess, places: list[str]) -> None:
+    of_new = answered(server.ask(re_encoded(1)))
+    of_stored = answered(server.similar(places[0]))
+    for body in (of_new, of_stored):
+        assert set(body) >= ANSWER_FIELDS
+        assert body["total_similar"] == len(body["similar_images"])
+        assert body["processing_time_ms"] > 0
+        assert body["vocabulary"] == "none"
+        assert all(set(found) >= PHOTO_FIELDS for found in body["similar_images"])
+    assert of_new["query_file_id"] is None
+    assert of_new["query_filename"] == "query.jpg"
+    assert of_stored["query_file_id"] == places[0]
+    assert of_stored["query_filename"] == "place-1.jpg"
+
+    found = of_new["similar_images"][0]
+    assert found["tags"] == ["a", "b"]
+    assert server.client.get(found["image_url"]).content == photo_bytes(1)
+    assert server.client.get(found["image_path"]).content == photo_bytes(1)
+    assert server.client.get(found["thumbnail_url"]).headers["content-type"] == "image/jpeg"
+
+
+def test_scores_are_cosines_best_first(server: ServerProcess, places: list[str]) -> None:
+    same = answered(server.ask(photo_bytes(1), top_k=100))
+    assert ids(same)[0] == places[0]
+    assert scores(same)[0] == pytest.approx(1, abs=1e-5)
+    for body in (same, answered(server.similar(places[0], top_k=100))):
+        assert scores(body) == sorted(scores(body), reverse=True)
+        assert all(-1 <= score <= 1 for score in scores(body))
+        assert min(scores(body)) < 0, "such photos are all over the place"
+
+
+def test_a_stored_photo_never_finds_itself(server: ServerProcess, places: list[str]) -> None:
+    others = stats(server)["searchable_images"] - 1
+    for place in places:
+        body = answered(server.similar(place, top_k=100))
+        assert place not in ids(body)
+        assert len(set(ids(body))) == others
+
+
+@pytest.mark.parametrize("top_k", [1, 3, PLACES])
+def test_there_are_k_results_when_there_are_enough(
+    server: ServerProcess, places: list[str], top_k: int
+) -> None:
+    for body in (
+        answered(server.similar(places[0], top_k=top_k)),
+        answered(server.ask(photo_bytes(1), top_k=top_k)),
+    ):
+        assert len(set(ids(body))) == top_k == body["total_similar"]
+
+
+def test_a_smaller_k_gives_the_best_of_a_larger_one(
+    server: ServerProcess, places: list[str]
+) -> None:
+    larger = answered(server.similar(places[0], top_k=7))
+    assert ids(answered(server.similar(places[0], top_k=3))) == ids(larger)[:3]
+
+
+def test_min_score_leaves_out_what_is_less_similar(
+    server: ServerProcess, places: list[str]
+) -> None:
+    all_of_them = answered(server.similar(places[0], top_k=100))
+    middle = scores(all_of_them)[3]
+    wanted = [score for score in scores(all_of_them) if score >= middle - 1e-9]
+    body = answered(server.similar(places[0], top_k=100, min_score=middle - 1e-9))
+    assert scores(body) == pytest.approx(wanted)
+    nearly_same = answered(server.ask(re_encoded(2), top_k=100, min_score=0.9))
+    assert ids(nearly_same) == [places[1]]
+    assert answered(server.ask(photo_bytes(next(fresh)), min_score=1))["similar_images"] == []
+
+
+@pytest.mark.parametrize(
+    ("named", "value"),
+    [("top_k", "0"), ("top_k", "101"), ("top_k", "abc"), ("min_score", "1.5"), ("min_score", "x")],
+)
+def test_a_bad_parameter_is_refused_by_name(
+    server: ServerProcess, places: list[str], named: str, value: str
+) -> None:
+    params: dict[str, Any] = {named: value}
+    field_refused(server.similar(places[0], **params), named)
+    field_refused(server.ask(photo_bytes(1), **params), named)
+
+
+def test_unknown_photos_and_maps_are_not_found(server: ServerProcess, places: list[str]) -> None:
+    problem(server.similar(str(uuid4())), 404, "photo_not_found")
+    problem(server.similar("no-id-at-all"), 404, "photo_not_found")
+    problem(server.similar(places[0], map="nowhere"), 404, "map_not_found")
+    problem(server.ask(photo_bytes(1), map="nowhere"), 404, "map_not_found")
+
+
+def test_a_photo_that_is_not_described_yet_says_what_to_wait_for(server: ServerProcess) -> None:
+    with server.no_decoding():
+        uploaded = server.upload(photo_bytes(next(fresh))).json()
+        body = problem(server.similar(uploaded["file_id"]), 409, "not_searchable")
+        assert body["job_id"] == uploaded["job_id"]
+        assert body["status_url"] == uploaded["status_url"]
+        assert body["state"] in ("queued", "running")
+        assert uploaded["status_url"] in body["detail"]
+    server.finished(uploaded["job_id"])
+    answered(server.similar(uploaded["file_id"]))
+
+
+def test_a_photo_that_could_not_be_described_says_why(server: ServerProcess) -> None:
+    uploaded = server.upload(undecodable()).json()
+    failed = server.finished(uploaded["job_id"])
+    body = problem(server.similar(uploaded["file_id"]), 409, "not_searchable")
+    assert (body["job_id"], body["state"]) == (uploaded["job_id"], "failed")
+    assert failed["error"]["detail"] in body["detail"]
+
+
+def test_a_deleted_photo_is_not_found_any_more(server: ServerProcess, places: list[str]) -> None:
+    number = next(fresh)
+    gone = server.indexed(photo_bytes(number))
+    assert ids(answered(server.ask(photo_bytes(number))))[0] == gone
+    assert server.client.delete(f"/api/v1/uploads/{gone}").status_code == 200
+    assert gone not in ids(answered(server.ask(photo_bytes(number), top_k=100)))
+    assert gone not in ids(answered(server.similar(places[0], top_k=100)))
+    problem(server.similar(gone), 404, "photo_not_found")
+
+
+def test_a_query_is_a_job_when_nobody_waits(server: ServerProcess, places: list[str]) -> None:
+    files = {"file": ("q.jpg", re_encoded(1))}
+    with server.no_decoding():
+        answer = server.client.post(SIMILARITY, files=files, params={"top_k": 2, "min_score": 0.5})
+        started = answer.json()
+        assert answer.status_code == 202
+        assert answer.headers["location"] == started["status_url"]
+        assert int(answer.headers["retry-after"]) > 0
+        assert started["result_url"] == f"/api/v1/jobs/{started['job_id']}/result"
+        body = problem(server.client.get(started["result_url"]), 409, "job_unfinished")
+        assert body["job_id"] == started["job_id"]
+    job = server.finished(started["job_id"])
+    assert (job["state"], job["kind"]) == ("succeeded", "describe")
+    assert job["result_url"] == started["result_url"]
+    body = answered(server.client.get(started["result_url"]))
+    assert ids(body) == [places[0]], "the query's own top_k and min_score count"
+    assert body["query_filename"] == "q.jpg"
+
+
+def test_a_query_that_takes_longer_than_preferred_becomes_a_job(server: ServerProcess) -> None:
+    with server.no_decoding():
+        answer = server.ask(photo_bytes(next(fresh)), wait=1)
+        assert answer.status_code == 202
+        assert answer.headers["preference-applied"] == "wait=1"
+    assert server.finished(answer.json()["job_id"])["state"] == "succeeded"
+    answered(server.client.get(answer.json()["result_url"]))
+
+
+def test_only_queries_have_results(server: ServerProcess) -> None:
+    job_id = server.upload(photo_bytes(1)).json()["job_id"]
+    problem(server.client.get(f"/api/v1/jobs/{job_id}/result"), 409, "no_result")
+    problem(server.client.get(f"/api/v1/jobs/{uuid4()}/result"), 404, "job_not_found")
+
+
+@pytest.mark.parametrize(
+    ("request_", "status", "code"),
+    [
+        pytest.param({}, 400, "no_file", id="nothing"),
+        pytest.param({"files": {"file": ("q.jpg", b"")}}, 400, "empty_file", id="empty"),
+        pytest.param(
+            {"files": {"file": ("q.jpg", b"only text, named as a photo")}},
+            415,
+            "unsupported_photo",
+            id="text",
+        ),
+        pytest.param(
+            {"content": photo_bytes(1), "headers": {"Content-Type": "image/jpeg"}},
+            415,
+            "unsupported_body",
+            id="raw body",
+        ),
+        pytest.param(
+            {"files": {"file": ("q.jpg", b"\xff\xd8\xff\xe0" + b"no header" * 9)}},
+            422,
+            "undecodable_photo",
+            id="broken header",
+        ),
+        pytest.param(
+            {"files": {"file": ("q.jpg", undecodable())}, "headers": {"Prefer": "wait=30"}},
+            422,
+            "undecodable_photo",
+            id="broken pixels",
+        ),
+    ],
+)
+def test_a_bad_query_photo_is_refused(
+    server: ServerProcess, request_: dict[str, Any], status: int, code: str
+) -> None:
+    problem(server.client.post(SIMILARITY, **request_), status, code)
+
+
+def test_a_form_field_beside_a_query_photo_is_refused(server: ServerProcess) -> None:
+    answer = server.client.post(
+        SIMILARITY, files={"file": ("q.jpg", photo_bytes(1))}, data={"top_k": "3"}
+    )
+    field_refused(answer, "top_k")
+
+
+def test_uploads_and_searches_at_once_all_succeed(server: ServerProcess, places: list[str]) -> None:
+    numbers = [next(fresh) for _ in range(AT_ONCE)]
+
+    def do(task: int) -> httpx2.Response:
+        which, what = divmod(task, 2)
+        if what == 0:
+            return server.upload(photo_bytes(numbers[which]))
+        if which % 2:
+            return server.ask(re_encoded(1 + which % PLACES), wait=60)
+        return server.similar(places[which % PLACES])
+
+    with ThreadPoolExecutor(2 * AT_ONCE) as pool:
+        answers = list(pool.map(do, range(2 * AT_ONCE)))
+    assert [a.status_code for a in answers] == [202, 200] * AT_ONCE, [a.text for a in answers]
+    for number, answer in zip(numbers, answers[::2], strict=True):
+        assert server.finished(answer.json()["job_id"])["state"] == "succeeded"
+        assert ids(answered(server.ask(photo_bytes(number), top_k=1))) == [answer.json()["file_id"]]
+
+
+def test_every_search_counts_and_no_query_photo_is_kept(
+    server: ServerProcess, places: list[str]
+) -> None:
+    before = stats(server)
+    answered(server.similar(places[0]))
+    answered(server.ask(photo_bytes(next(fresh))))
+    problem(server.similar(str(uuid4())), 404, "photo_not_found")
+    after = stats(server)
+    for figure in ("total_searches", "recent_searches_24h"):
+        assert after[figure] == before[figure] + 2
+    for figure in ("total_images", "searchable_images", "map_version"):
+        assert after[figure] == before[figure]
+    assert after["max_processing_time_ms"] >= after["avg_processing_time_ms"] > 0

@@ -1,0 +1,468 @@
+"""Uploads: what is taken, what is refused and why, and that refusals leave nothing behind."""
+
+from __future__ import annotations
+
+import hashlib
+import http.client
+import io
+import json
+import socket
+import struct
+import time
+import zlib
+from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
+from datetime import datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import httpx2
+import pytest
+from PIL import Image
+from PIL.ExifTags import GPS, IFD
+
+from tests.support.photos import photo_bytes, photo_image
+from tests.support.problems import field_refused, problem
+from tests.support.server import ServerProcess
+
+MAX_FILE_SIZE = 100_000
+SETTINGS = {"max_file_size": MAX_FILE_SIZE}
+UPLOAD = "/api/v1/upload"
+AT_ONCE = 50
+ANSWER_FIELDS = {
+    "file_id",
+    "job_id",
+    "filename",
+    "file_size",
+    "upload_time",
+    "status",
+    "status_url",
+    "message",
+}
+
+
+def stored(server: ServerProcess) -> set[Path]:
+    """Every original in the object store."""
+    return set((server.home / "objects" / "originals").iterdir())
+
+
+def check_nothing_is_left(server: ServerProcess, before: set[Path]) -> None:
+    """The store is as it was, and what was half written is gone."""
+    assert stored(server) == before
+    deadline = time.monotonic() + 10
+    while half_written := list((server.home / "objects" / ".partial").iterdir()):
+        assert time.monotonic() < deadline, half_written  # others write there, but not for long
+        time.sleep(0.01)
+
+
+def photo(server: ServerProcess, file_id: str) -> dict[str, Any]:
+    answer = server.client.get(f"/api/v1/uploads/{file_id}")
+    assert answer.status_code == 200, answer.text
+    found: dict[str, Any] = answer.json()
+    return found
+
+
+def with_gps(number: int) -> bytes:
+    """A photo whose EXIF says 45 30' N, 7 15' W, heading 90, 2024-05-01 10:20:30 UTC."""
+    exif = Image.Exif()
+    exif.get_ifd(IFD.GPSInfo).update(
+        {
+            GPS.GPSLatitudeRef: "N",
+            GPS.GPSLatitude: (45.0, 30.0, 0.0),
+            GPS.GPSLongitudeRef: "W",
+            GPS.GPSLongitude: (7.0, 15.0, 0.0),
+            GPS.GPSImgDirection: 90.0,
+            GPS.GPSDateStamp: "2024:05:01",
+            GPS.GPSTimeStamp: (10.0, 20.0, 30.0),
+        }
+    )
+    return photo_bytes(number, exif=exif)
+
+
+def truncated(number: int) -> bytes:
+    """A JPEG whose header is fine and whose pixels end too early."""
+    buffer = io.BytesIO()
+    photo_image(number, 640, 480).save(buffer, "JPEG", quality=95)
+    return buffer.getvalue()[: len(buffer.getvalue()) // 2]
+
+
+def png_that_claims(width: int, height: int) -> bytes:
+    """A PNG of less than a hundred bytes with the header of a larger one."""
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return (
+            struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        )
+
+    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    return (
+        b"\x89PNG\r\n\x1a\n"
+        + chunk(b"IHDR", header)
+        + chunk(b"IDAT", zlib.compress(b"\0" * 64))
+        + chunk(b"IEND", b"")
+    )
+
+
+# --- what is taken ---------------------------------------------------------------------------
+
+
+def test_an_upload_is_acknowledged_with_a_job_to_poll(server: ServerProcess) -> None:
+    data = photo_bytes(1)
+    answer = server.upload(data, "street.jpg")
+    assert answer.status_code == 202
+    body = answer.json()
+    assert set(body) == ANSWER_FIELDS
+    assert body["filename"] == "street.jpg"
+    assert body["file_size"] == len(data)
+    assert body["status"] == "queued"
+    assert body["status_url"] == f"/api/v1/jobs/{body['job_id']}"
+    assert answer.headers["location"] == body["status_url"]
+    assert int(answer.headers["retry-after"]) > 0
+    assert datetime.fromisoformat(body["upload_time"]).utcoffset() == timedelta(0)
+
+    assert server.finished(body["job_id"])["state"] == "succeeded"
+    found = photo(server, body["file_id"])
+    assert found["searchable"]
+    assert found["sha256"] == hashlib.sha256(data).hexdigest()
+    assert server.client.get(body["status_url"]).json()["file_id"] == body["file_id"]
+
+
+def test_an_upload_that_prefers_to_wait_is_answered_once_it_is_searchable(
+    server: ServerProcess,
+) -> None:
+    answer = server.client.post(
+        UPLOAD, files={"file": ("p.jpg", photo_bytes(2))}, headers={"Prefer": "wait=20"}
+    )
+    assert answer.status_code == 201
+    assert set(answer.json()) == ANSWER_FIELDS
+    assert answer.json()["status"] == "succeeded"
+    assert answer.headers["preference-applied"] == "wait=20"
+    assert "retry-after" not in answer.headers
+    assert photo(server, answer.json()["file_id"])["searchable"]
+
+
+@pytest.mark.parametrize(
+    ("media", "media_type"),
+    [
+        ("JPEG", "image/jpeg"),
+        ("PNG", "image/png"),
+        ("WEBP", "image/webp"),
+        ("BMP", "image/bmp"),
+        ("TIFF", "image/tiff"),
+    ],
+)
+def test_each_accepted_format_becomes_searchable(
+    server: ServerProcess, media: str, media_type: str
+) -> None:
+    # The name lies: the content decides.
+    found = photo(server, server.indexed(photo_bytes(3, media), "photo.dat"))
+    assert found["media_type"] == media_type
+    assert (found["width"], found["height"]) == (64, 48)
+
+
+def test_the_same_bytes_again_are_the_same_photo(server: ServerProcess) -> None:
+    first = server.indexed(photo_bytes(4), "one.jpg", latitude=45.0, longitude=7.0, place="yard")
+    before = stored(server)
+    for fields in ({}, {"latitude": 45.0, "longitude": 7.0, "place": "yard"}):
+        answer = server.upload(photo_bytes(4), "another-name.jpg", **fields)
+        assert answer.status_code == 200
+        assert set(answer.json()) == ANSWER_FIELDS
+        assert answer.json()["file_id"] == first
+        assert answer.json()["filename"] == "one.jpg"
+        assert answer.json()["status"] == "succeeded"
+    assert stored(server) == before
+
+
+def test_fifty_uploads_of_the_same_bytes_at_once_make_one_photo(server: ServerProcess) -> None:
+    before = stored(server)
+    data = photo_bytes(5)
+    with ThreadPoolExecutor(AT_ONCE) as pool:
+        answers = list(pool.map(lambda _: server.upload(data, "race.jpg"), range(AT_ONCE)))
+    assert Counter(answer.status_code for answer in answers) == {202: 1, 200: AT_ONCE - 1}
+    assert len({answer.json()["file_id"] for answer in answers}) == 1
+    assert len({answer.json()["job_id"] for answer in answers}) == 1
+    assert len(stored(server) - before) == 1
+    assert server.finished(answers[0].json()["job_id"])["state"] == "succeeded"
+    found = server.client.get("/api/v1/search", params={"filename": "race.jpg"}).json()
+    assert found["total_found"] == 1
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"latitude": 45.001, "longitude": 7.0},
+        {"latitude": 45.0, "longitude": -7.0},
+        {"place": "kitchen"},
+    ],
+)
+def test_the_same_bytes_elsewhere_are_refused_and_patch_is_named(
+    server: ServerProcess, fields: dict[str, Any]
+) -> None:
+    first = server.indexed(photo_bytes(6), latitude=45.0, longitude=7.0, place="hall")
+    before = stored(server)
+    body = problem(server.upload(photo_bytes(6), **fields), 409, "photo_differs")
+    assert body["file_id"] == first
+    assert f"PATCH /api/v1/uploads/{first}" in body["detail"]
+    assert photo(server, first)["latitude"] == 45.0
+    assert photo(server, first)["place"] == "hall"
+    assert stored(server) == before
+
+
+def test_exif_fills_what_the_form_leaves_out(server: ServerProcess) -> None:
+    found = photo(server, server.indexed(with_gps(7)))
+    assert found["latitude"] == pytest.approx(45.5)
+    assert found["longitude"] == pytest.approx(-7.25)
+    assert found["heading"] == pytest.approx(90)
+    taken = datetime.fromisoformat(found["captured_at"])
+    assert taken == datetime.fromisoformat("2024-05-01T10:20:30+00:00")
+    assert taken.utcoffset() == timedelta(0)
+
+
+def test_form_fields_win_over_exif(server: ServerProcess) -> None:
+    said: dict[str, Any] = {
+        "latitude": 1.5,
+        "longitude": 2.5,
+        "heading": 360,
+        "captured_at": "2026-05-01T12:30:00+02:00",
+    }
+    found = photo(server, server.indexed(with_gps(8), **said))
+    assert (found["latitude"], found["longitude"], found["heading"]) == (1.5, 2.5, 0)
+    assert datetime.fromisoformat(found["captured_at"]) == datetime.fromisoformat(
+        "2026-05-01T10:30:00+00:00"
+    )
+
+
+def test_everything_that_is_said_of_a_photo_is_kept(server: ServerProcess) -> None:
+    found = photo(
+        server,
+        server.indexed(
+            photo_bytes(9),
+            "straße 7.jpg",
+            place=" cellar ",
+            tags="night, rain,,night",
+            metadata='{"camera": {"id": 7}, "note": "ä"}',
+        ),
+    )
+    assert found["original_filename"] == "straße 7.jpg"
+    assert found["place"] == "cellar"
+    assert found["tags"] == ["night", "rain"]
+    assert found["metadata"] == {"camera": {"id": 7}, "note": "ä"}
+    assert found["latitude"] is None
+    assert found["longitude"] is None
+
+
+@pytest.mark.parametrize("name", ["../../etc/passwd.jpg", "C:\\photos\\passwd.jpg"])
+def test_a_file_name_is_never_a_path(server: ServerProcess, name: str) -> None:
+    number = 10 if "/" in name else 11
+    answer = server.upload(photo_bytes(number), name)
+    assert answer.status_code == 202
+    assert answer.json()["filename"] == "passwd.jpg"
+
+
+# --- what is refused -------------------------------------------------------------------------
+
+
+def send(server: ServerProcess, **request: Any) -> httpx2.Response:
+    return server.client.post(UPLOAD, **request)
+
+
+JPEG = photo_bytes(50)
+GIF = photo_bytes(50, "GIF")
+BROKEN_HEADER = b"\xff\xd8\xff\xe0" + b"no header at all" * 8
+MULTIPART = {"Content-Type": "multipart/form-data; boundary=xx"}
+
+
+@pytest.mark.parametrize(
+    ("request_", "status", "code"),
+    [
+        pytest.param({}, 400, "no_file", id="nothing"),
+        pytest.param({"files": {"place": (None, "here")}}, 400, "no_file", id="no file"),
+        pytest.param({"files": {"photo": ("p.jpg", JPEG)}}, 400, "no_file", id="other field"),
+        pytest.param({"files": {"file": ("p.jpg", b"")}}, 400, "empty_file", id="empty file"),
+        pytest.param(
+            {"files": [("file", ("a.jpg", JPEG)), ("file", ("b.jpg", photo_bytes(51)))]},
+            400,
+            "several_files",
+            id="two files",
+        ),
+        pytest.param(
+            {
+                "content": b'--xx\r\nContent-Disposition: form-data; name="file"; '
+                b'filename="p.jpg"\r\n\r\n' + JPEG,
+                "headers": MULTIPART,
+            },
+            400,
+            "malformed_body",
+            id="body cut off",
+        ),
+        pytest.param(
+            {"content": b"not a form", "headers": MULTIPART}, 400, "malformed_body", id="no form"
+        ),
+        pytest.param(
+            {"content": JPEG, "headers": {"Content-Type": "image/jpeg"}},
+            415,
+            "unsupported_body",
+            id="raw body",
+        ),
+        pytest.param({"json": {"file": "p.jpg"}}, 415, "unsupported_body", id="JSON body"),
+        pytest.param({"data": {"file": "p.jpg"}}, 415, "unsupported_body", id="URL-encoded"),
+        pytest.param(
+            {"files": {"file": ("p.jpg", JPEG + b"\0" * MAX_FILE_SIZE)}},
+            413,
+            "file_too_large",
+            id="too large",
+        ),
+        pytest.param(
+            {"files": {"file": ("p.jpg", b"Only text, named as a photo.")}},
+            415,
+            "unsupported_photo",
+            id="text",
+        ),
+        pytest.param({"files": {"file": ("p.jpg", b"BM")}}, 415, "unsupported_photo", id="tiny"),
+        pytest.param({"files": {"file": ("p.gif", GIF)}}, 415, "unsupported_photo", id="GIF"),
+        pytest.param(
+            {"files": {"file": ("p.jpg", BROKEN_HEADER)}},
+            422,
+            "undecodable_photo",
+            id="broken header",
+        ),
+        pytest.param(
+            {"files": {"file": ("p.png", png_that_claims(100_000, 100_000))}},
+            422,
+            "too_many_pixels",
+            id="pixel bomb",
+        ),
+        pytest.param(
+            {"files": {"file": ("p.jpg", JPEG)}, "params": {"map": "nowhere"}},
+            404,
+            "map_not_found",
+            id="unknown map",
+        ),
+    ],
+)
+def test_a_bad_upload_is_refused_and_leaves_nothing(
+    server: ServerProcess, request_: dict[str, Any], status: int, code: str
+) -> None:
+    before = stored(server)
+    problem(send(server, **request_), status, code)
+    check_nothing_is_left(server, before)
+
+
+@pytest.mark.parametrize(
+    ("fields", "named"),
+    [
+        ({"latitude": "91", "longitude": "7"}, "latitude"),
+        ({"latitude": "nan", "longitude": "7"}, "latitude"),
+        ({"latitude": "abc", "longitude": "7"}, "latitude"),
+        ({"latitude": "45", "longitude": "180.5"}, "longitude"),
+        ({"latitude": "45", "longitude": "inf"}, "longitude"),
+        ({"latitude": "45"}, "longitude"),
+        ({"longitude": "7"}, "latitude"),
+        ({"heading": "400"}, "heading"),
+        ({"heading": "-1"}, "heading"),
+        ({"captured_at": "yesterday"}, "captured_at"),
+        ({"captured_at": "2026-13-01T00:00:00Z"}, "captured_at"),
+        ({"metadata": "[1, 2]"}, "metadata"),
+        ({"metadata": "{"}, "metadata"),
+        ({"metadata": '{"a": NaN}'}, "metadata"),
+        ({"place": "x" * 501}, "place"),
+        ({"tags": ",".join(str(tag) for tag in range(51))}, "tags"),
+        ({"lattitude": "45"}, "lattitude"),
+    ],
+)
+def test_a_bad_field_is_refused_by_name_and_leaves_nothing(
+    server: ServerProcess, fields: dict[str, str], named: str
+) -> None:
+    before = stored(server)
+    field_refused(server.upload(JPEG, **fields), named)
+    check_nothing_is_left(server, before)
+
+
+BEGIN_OF_FORM = b'--xx\r\nContent-Disposition: form-data; name="file"; filename="p.jpg"\r\n\r\n'
+
+
+def answer_to_unfinished(
+    server: ServerProcess, headers: list[str], body: list[bytes]
+) -> tuple[int, str, dict[str, Any]]:
+    """What the server answers to a request whose body never ends."""
+    url = httpx2.URL(str(server.client.base_url))
+    head = [
+        f"POST {UPLOAD} HTTP/1.1",
+        f"Host: {url.host}",
+        "Content-Type: multipart/form-data; boundary=xx",
+        *headers,
+        "",
+        "",
+    ]
+    with socket.create_connection((url.host, url.port or 80), timeout=30) as connection:
+        connection.sendall("\r\n".join(head).encode())
+        for piece in body:
+            connection.sendall(piece)
+        answer = http.client.HTTPResponse(connection)
+        answer.begin()
+        return answer.status, answer.headers.get_content_type(), json.load(answer)
+
+
+def chunk(data: bytes) -> bytes:
+    return f"{len(data):x}\r\n".encode() + data + b"\r\n"
+
+
+@pytest.mark.parametrize(
+    ("headers", "body", "status", "code"),
+    [
+        pytest.param(
+            ["Transfer-Encoding: chunked"],
+            [chunk(BEGIN_OF_FORM + b"\xff\xd8\xff\xe0"), *[chunk(b"\0" * 60_000)] * 2],
+            413,
+            "file_too_large",
+            id="too large without a declared length",
+        ),
+        pytest.param(
+            ["Content-Length: 10000000000"],
+            [],
+            413,
+            "file_too_large",
+            id="too large as declared",
+        ),
+        pytest.param(
+            ["Transfer-Encoding: chunked"],
+            [chunk(BEGIN_OF_FORM + b"no photo, whatever follows")],
+            415,
+            "unsupported_photo",
+            id="no photo by its first bytes",
+        ),
+    ],
+)
+def test_a_hopeless_body_is_refused_before_it_ends(
+    server: ServerProcess, headers: list[str], body: list[bytes], status: int, code: str
+) -> None:
+    before = stored(server)
+    answered, media_type, refusal = answer_to_unfinished(server, headers, body)
+    assert (answered, refusal["code"]) == (status, code)
+    assert media_type == "application/problem+json"
+    check_nothing_is_left(server, before)
+
+
+def test_an_undecodable_photo_fails_alone_and_may_be_tried_again(server: ServerProcess) -> None:
+    bad = truncated(60)
+    with server.no_decoding():  # so that they share a batch
+        neighbours = [server.upload(photo_bytes(61)), server.upload(photo_bytes(62))]
+        answer = server.upload(bad, "bad.jpg")
+        neighbours.append(server.upload(photo_bytes(63)))
+    assert answer.status_code == 202
+    job = server.finished(answer.json()["job_id"])
+    assert job["state"] == "failed"
+    assert job["error"]["code"] == "undecodable_photo"
+    assert job["error"]["status"] == 422
+    assert job["progress"] == {"done": 0, "total": 1, "failed": 1}
+    for neighbour in neighbours:
+        assert server.finished(neighbour.json()["job_id"])["state"] == "succeeded"
+    assert not photo(server, answer.json()["file_id"])["searchable"]
+
+    before = stored(server)
+    again = server.upload(bad, "bad.jpg")
+    assert again.status_code == 202
+    assert again.json()["status"] == "queued"
+    assert again.json()["file_id"] == answer.json()["file_id"]
+    assert server.finished(again.json()["job_id"])["state"] == "failed"
+    assert stored(server) == before
