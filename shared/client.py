@@ -11,6 +11,7 @@ its status and `code`; a server that can't be reached is Unavailable (`server_un
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -162,7 +163,8 @@ class Client:
     def _send_file(self, path: str, file: Path, **options: Any) -> Json:
         try:
             with file.open("rb") as opened:
-                return self._call("POST", path, files={"file": (file.name, opened)}, **options)
+                name = os.fsencode(file.name).decode("utf-8", "replace")
+                return self._call("POST", path, files={"file": (name, opened)}, **options)
         except OSError as error:
             raise InvalidRequest(
                 "unreadable_file", f"Can't read {file}: {error.strerror}"

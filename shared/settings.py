@@ -21,9 +21,11 @@ class Settings(BaseSettings):
     )
 
     # Where it listens and where it keeps things.
-    host: str = "127.0.0.1"
-    port: int = Field(8000, ge=0, le=65535)
-    placewise_home: Path = Path("./var")
+    host: str = Field("127.0.0.1", description="address to listen on")
+    port: int = Field(8000, ge=0, le=65535, description="0 takes a free one")
+    placewise_home: Path = Field(
+        Path("./var"), description="folder of the embedded catalog and object store"
+    )
     database_url: SecretStr | None = Field(
         None,
         description="SQLAlchemy URL of the catalog; unset: SQLite under PLACEWISE_HOME",
@@ -32,7 +34,7 @@ class Settings(BaseSettings):
     # What is accepted.
     max_file_size: int = Field(10_485_760, gt=0, description="bytes of one photo")
     max_image_pixels: int = Field(50_000_000, gt=0, description="width x height of one photo")
-    max_vocabulary_bytes: int = Field(64_000_000, gt=0)
+    max_vocabulary_bytes: int = Field(64_000_000, gt=0, description="bytes of an imported one")
     max_wait_seconds: int = Field(60, ge=0, description="longest `Prefer: wait` and `?wait=`")
 
     # How photos are described.
@@ -40,17 +42,21 @@ class Settings(BaseSettings):
     allow_test_extractors: bool = Field(
         False, description="lets a map use the tiny extractors that exist for tests"
     )
-    device: Literal["auto", "cpu", "cuda"] = "auto"
+    device: Literal["auto", "cpu", "cuda"] = Field(
+        "auto", description="where photos are described; auto takes CUDA where it is"
+    )
     batch_photos: int = Field(16, ge=1, le=1024, description="most photos in one batch")
-    decode_processes: int = Field(2, ge=1, le=64)
-    decode_memory_bytes: int = Field(2_000_000_000, ge=500_000_000)
-    decode_timeout_seconds: float = Field(30.0, gt=0)
+    decode_processes: int = Field(2, ge=1, le=64, description="photos decoded at once")
+    decode_memory_bytes: int = Field(
+        2_000_000_000, ge=500_000_000, description="memory of one decoding process"
+    )
+    decode_timeout_seconds: float = Field(30.0, gt=0, description="for one photo")
     auto_fit_photos: int = Field(
         200, ge=1, description="photos at which a map without a vocabulary fits its own"
     )
 
     # How jobs are kept alive.
-    lease_seconds: float = Field(60.0, gt=0)
+    lease_seconds: float = Field(60.0, gt=0, description="silence after which a worker is given up")
     max_attempts: int = Field(3, ge=1, description="lone crashes before a job is failed")
     query_ttl_seconds: float = Field(3600.0, gt=0, description="life of an unstored query")
 
@@ -59,12 +65,20 @@ class Settings(BaseSettings):
     compact_chunks: int = Field(
         8, ge=2, description="chunks of an open slot that are worth merging"
     )
-    superseded_grace_seconds: float = Field(600.0, ge=0)
-    retired_grace_seconds: float = Field(3600.0, ge=0)
-    orphan_age_seconds: float = Field(86_400.0, ge=0)
+    superseded_grace_seconds: float = Field(
+        600.0, ge=0, description="life of a chunk after it was merged into another"
+    )
+    retired_grace_seconds: float = Field(
+        3600.0, ge=0, description="life of a generation after it was replaced"
+    )
+    orphan_age_seconds: float = Field(
+        86_400.0, ge=0, description="age at which an object that no row knows is removed"
+    )
 
     # How search follows the catalog.
-    search_follow_seconds: float = Field(1.0, gt=0)
+    search_follow_seconds: float = Field(
+        1.0, gt=0, description="how often search looks for what is new"
+    )
     search_wait_seconds: float = Field(5.0, gt=0, description="longest wait for `min_version`")
 
     @field_validator("placewise_home")

@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import shutil
 import sys
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 
 import typer
+from sqlalchemy import func, select
+from sqlalchemy.exc import SQLAlchemyError
 
 from services.cli.configuration import read_settings
 from services.cli.output import JsonOption, answers, explained, print_json
+from shared.catalog.photos import Photo
 from shared.catalog.session import Catalog
 from shared.client import Client
-from shared.errors import PlacewiseError
+from shared.errors import Misconfigured, PlacewiseError
 from shared.home import address_of_running
-from shared.objects import FolderStore
 from shared.settings import Settings
 
 LOW_DISK_BYTES = 1_000_000_000
@@ -65,14 +69,14 @@ def _python(_settings: Settings) -> str:
 
 def _folder(settings: Settings) -> str:
     home = settings.placewise_home
-    home.mkdir(parents=True, exist_ok=True)
-    probe = home / ".doctor"
-    probe.write_bytes(b"ok")
-    probe.unlink()
-    free = shutil.disk_usage(home).free
+    there = next(folder for folder in (home, *home.parents) if folder.exists())
+    if not os.access(there, os.W_OK | os.X_OK):
+        raise OSError(errno.EACCES, "this user may not write there", str(there))
+    free = shutil.disk_usage(there).free
     if free < LOW_DISK_BYTES:
-        raise OSError(28, f"only {free / 1e9:.1f} GB are free", str(home))
-    return f"{home} is writable, {free / 1e9:.0f} GB free"
+        raise OSError(errno.ENOSPC, f"only {free / 1e9:.1f} GB are free", str(there))
+    state = "is writable" if there == home else "is not there yet and can be made"
+    return f"{home} {state}, {free / 1e9:.0f} GB free"
 
 
 def _server(settings: Settings) -> str:
@@ -84,14 +88,23 @@ def _server(settings: Settings) -> str:
             f"running on {url}: {stats['searchable_images']} of {stats['total_images']} photos "
             f"searchable, vocabulary {stats['vocabulary']}"
         )
-    # Nothing holds the folder: open it as the server would.
-    FolderStore(settings.placewise_home / "objects").check()
+    if not (settings.placewise_home / "catalog.sqlite").exists():
+        return "not running, and nothing is stored yet (start it: make run)"
     catalog = Catalog(settings.catalog_url())
     try:
-        catalog.migrate()
+        with catalog.read() as session:
+            photos = session.scalar(
+                select(func.count()).select_from(Photo).where(Photo.deleted_at.is_(None))
+            )
+    except SQLAlchemyError as error:
+        raise Misconfigured(
+            "catalog_unreadable",
+            f"The catalog in {settings.placewise_home} can't be read ({type(error).__name__}). "
+            "Check its permissions, or restore it from a backup.",
+        ) from error
     finally:
         catalog.close()
-    return "not running; its folder and catalog can be opened (start it: make run)"
+    return f"not running; {photos} photos are stored (start it: make run)"
 
 
 def _device(settings: Settings) -> str:

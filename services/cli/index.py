@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -20,6 +21,7 @@ from services.cli.output import (
     messages,
     print_json,
     progress_bar,
+    shown,
 )
 from services.cli.photo_places import FoundPhoto, find_photos
 from services.cli.vocabulary import fit_and_wait
@@ -88,7 +90,7 @@ def _index(client: Client, photos: list[FoundPhoto], fit: bool, progress: Progre
     for photo, outcome in _upload_all(client, photos):
         progress.advance(uploading)
         if isinstance(outcome, PlacewiseError):
-            refused.append({"path": str(photo.path), "reason": outcome.detail})
+            refused.append({"path": shown(photo.path), "reason": outcome.detail})
             continue
         counts[outcome["status"]] += 1
         if outcome["status"] not in FINISHED:
@@ -149,7 +151,7 @@ def _wait_all(
                 progress.advance(bar)
                 if job["state"] != "succeeded":
                     reason = (job["error"] or {}).get("detail", job["state"])
-                    failed.append({"path": str(path), "reason": reason})
+                    failed.append({"path": shown(path), "reason": reason})
                 break
             if job["waiting_for"]:
                 waiting.append((path, job_id))
@@ -164,6 +166,8 @@ def _print(report: Json) -> None:
         soft_wrap=True,
     )
     for word in ("refused", "failed"):
+        if report[word]:
+            messages.print(f"{len(report[word])} {word}:")
         for item in report[word]:
             messages.print(f"[red]{word}[/red] {item['path']}: {item['reason']}", soft_wrap=True)
-    messages.print("Ask: placewise query PHOTO")
+    messages.print(f"Ask: {sys.argv[0]} query PHOTO")

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -33,6 +35,11 @@ ServerOption = Annotated[
         help="Address of a running Placewise; left out: the one on PLACEWISE_HOME.",
     ),
 ]
+
+
+def shown(path: Path) -> str:
+    """The path as text that can be printed, also where it is not UTF-8."""
+    return os.fsencode(path).decode("utf-8", "replace")
 
 
 def print_json(value: Any) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ipaddress
 import logging
+import sys
 
 from services.cli.configuration import read_settings
 from services.cli.output import explained, messages
@@ -24,6 +25,7 @@ def serve() -> None:
 
 
 def _welcome(url: str, settings: Settings) -> str:
+    command = sys.argv[0]
     lines = [
         f"Placewise serves {settings.placewise_home} on {url}",
         f"  look:     {url}/docs   (the API)   {url}/api/v1/health",
@@ -32,7 +34,7 @@ def _welcome(url: str, settings: Settings) -> str:
             f"{url}/api/v1/upload"
         ),
         f"  ask:      curl -F file=@OTHER.jpg -H 'Prefer: wait=30' {url}/api/v1/similarity",
-        "  a folder: placewise index DIR, then placewise query PHOTO",
+        f"  a folder: {command} index DIR, then {command} query PHOTO",
     ]
     if not _is_loopback(settings.host):
         lines.append(

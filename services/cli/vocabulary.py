@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 from rich.progress import Progress
-from rich.table import Table
+from rich.table import Column, Table
 
 from services.cli.connect import connect
 from services.cli.output import (
@@ -90,7 +90,9 @@ def list_(
         if as_json:
             print_json([{**v, "active": v["vocabulary_id"] in active} for v in found])
             return
-        table = Table("", "vocabulary", "origin", "clusters", "dimension", "photos", "made")
+        # Ids are folded, never cut: they are there to be copied.
+        name = Column("vocabulary", overflow="fold", min_width=36)
+        table = Table("", name, "origin", "clusters", "dimension", "photos", "made")
         for v in found:
             table.add_row(
                 "*" if v["vocabulary_id"] in active else "",

@@ -13,6 +13,7 @@ from services.gateway import (
     similarity,
     upload,
 )
+from services.gateway.body_limit import BodyLimit
 from services.gateway.context import API, Gateway
 from services.gateway.problems import PROBLEM_RESPONSES, install_problem_handlers
 
@@ -29,6 +30,7 @@ def create_app(gateway: Gateway) -> FastAPI:
         responses=PROBLEM_RESPONSES,
     )
     app.state.gateway = gateway
+    app.add_middleware(BodyLimit)
     install_problem_handlers(app)
     for module in (upload, jobs, similarity, photos, model_changes, figures, health):
         app.include_router(module.router, prefix=API)

@@ -47,6 +47,7 @@ class HealthAnswer(Answer):
     parts: dict[str, PartAnswer]
 
 
+@probes.head("/", include_in_schema=False)
 @probes.get("/", operation_id="service", response_model=ServiceAnswer)
 def service() -> ServiceAnswer:
     """What this is and where to look."""
@@ -62,12 +63,14 @@ def service() -> ServiceAnswer:
     )
 
 
+@probes.head("/livez", include_in_schema=False)
 @probes.get("/livez", operation_id="livez", response_model=ProbeAnswer)
 def livez() -> ProbeAnswer:
     """The process answers; nothing else is looked at."""
     return ProbeAnswer(status="alive")
 
 
+@probes.head("/readyz", include_in_schema=False)
 @probes.get("/readyz", operation_id="readyz", response_model=ProbeAnswer)
 def readyz(gateway: GatewayDep, response: Response) -> ProbeAnswer:
     """503 while a part that every call needs is away."""
@@ -76,6 +79,7 @@ def readyz(gateway: GatewayDep, response: Response) -> ProbeAnswer:
     return ProbeAnswer(status="ready" if ready else "not ready")
 
 
+@router.head("/health", include_in_schema=False)
 @router.get("/health", operation_id="health", response_model=HealthAnswer)
 def health(gateway: GatewayDep, response: Response) -> HealthAnswer:
     """The state of each part; 503 when one is away."""

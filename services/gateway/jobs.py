@@ -36,7 +36,7 @@ def jobs(
     cursor: Annotated[str | None, Query()] = None,
     map_name: MapName = DEFAULT_MAP,
 ) -> JobsAnswer:
-    """Newest first. `reindex` jobs are listed only when asked for by `kind`."""
+    """Newest first. The `reindex` jobs of a model change under way are listed only by `kind`."""
     try:
         before = UUID(cursor) if cursor else None
     except ValueError:

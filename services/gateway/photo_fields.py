@@ -9,9 +9,11 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any
 
-from shared.errors import PlacewiseError, invalid_field
+from shared.errors import PlacewiseError, TooLarge, invalid_field
 
 MAX_TAGS = 50
+MAX_METADATA_CHARACTERS = 100_000
+MAX_METADATA_DEPTH = 32  # what writes answers gives up at 255 levels
 MAX_TEXT = 500  # characters of a tag or a place
 
 # A NUL as JSON writes it; after an escaped backslash the same letters are plain text.
@@ -131,9 +133,35 @@ def check_metadata(value: dict[str, Any]) -> None:
         raise invalid_field("metadata", "holds half of a surrogate pair") from None
     except ValueError:
         raise invalid_field("metadata", "holds a number that is not finite") from None
+    except RecursionError:
+        raise _too_deep() from None
+    if _depth(value) > MAX_METADATA_DEPTH:
+        raise _too_deep()
+    if len(text) > MAX_METADATA_CHARACTERS:
+        raise TooLarge(
+            "fields_too_large", f"metadata is longer than {MAX_METADATA_CHARACTERS} characters."
+        )
     if JSON_NUL.search(text):
         raise invalid_field("metadata", "holds a NUL character")
 
 
 def _no_constant(name: str) -> Any:
     raise invalid_field("metadata", f"{name} is not JSON")
+
+
+def _depth(value: Any) -> int:
+    """How many objects and lists are nested in each other; counted without recursion."""
+    deepest, open_ = 0, [(value, 1)]
+    while open_:
+        item, depth = open_.pop()
+        if isinstance(item, dict | list):
+            deepest = max(deepest, depth)
+            if depth > MAX_METADATA_DEPTH:
+                break
+            children = item.values() if isinstance(item, dict) else item
+            open_.extend((child, depth + 1) for child in children)
+    return deepest
+
+
+def _too_deep() -> PlacewiseError:
+    return invalid_field("metadata", f"is nested more than {MAX_METADATA_DEPTH} levels deep")

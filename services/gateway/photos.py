@@ -179,12 +179,16 @@ def thumbnail(gateway: GatewayDep, file_id: FileId, map_name: MapName = DEFAULT_
 @router.get("/search", operation_id="search_metadata", response_model=MetadataAnswer)
 def search(
     gateway: GatewayDep,
-    filename: Annotated[str | None, Query(description="part of the name, case ignored")] = None,
+    filename: Annotated[
+        str | None, Query(max_length=255, description="part of the name, case ignored")
+    ] = None,
     upload_after: Annotated[str | None, Query(description="ISO 8601; no offset means UTC")] = None,
     upload_before: Annotated[str | None, Query(description="ISO 8601; no offset means UTC")] = None,
     min_file_size: Annotated[int | None, Query(ge=0, le=2**62)] = None,
     max_file_size: Annotated[int | None, Query(ge=0, le=2**62)] = None,
-    tags: Annotated[str | None, Query(description="separated by commas: all are wanted")] = None,
+    tags: Annotated[
+        str | None, Query(max_length=5000, description="separated by commas: all are wanted")
+    ] = None,
     limit: Annotated[int, Query(ge=1, le=1000)] = 100,
     cursor: Annotated[str | None, Query(description="`next_cursor` of the page before")] = None,
     map_name: MapName = DEFAULT_MAP,

@@ -17,6 +17,7 @@ from shared.errors import InvalidRequest, PlacewiseError, Unavailable, Unprocess
 log = logging.getLogger(__name__)
 
 RETRY_AFTER_SECONDS = "2"
+HTTP_CODES = {400: "malformed_body", 404: "path_not_found", 405: "method_not_allowed"}
 
 
 class Problem(BaseModel):
@@ -95,7 +96,7 @@ async def _on_validation_error(request: Request, error: Exception) -> JSONRespon
 async def _on_http_exception(request: Request, error: Exception) -> JSONResponse:
     """Unknown paths and methods, as Starlette raises them."""
     assert isinstance(error, HTTPException)
-    code = {404: "path_not_found", 405: "method_not_allowed"}.get(error.status_code, "http_error")
+    code = HTTP_CODES.get(error.status_code, "http_error")
     return JSONResponse(
         {
             "type": f"urn:placewise:problem:{code}",

@@ -18,7 +18,8 @@ from services.gateway.schemas import UploadAnswer, job_url
 from services.gateway.store_photo import Incoming, Stored, store_photo
 from services.gateway.waiting import preferred_wait, wait_for_job
 from shared.errors import PlacewiseError
-from shared.jobs import JobState
+from shared.jobs import Job, JobState
+from shared.jobs.table import UNFINISHED
 from shared.objects.keys import new_original_key
 
 router = APIRouter(tags=["photos"])
@@ -68,7 +69,7 @@ async def upload(
         gateway.settings.max_file_size,
         check_photo_begin,
     )
-    stored, status = await run_in_threadpool(_store, gateway, map_name, received)
+    stored = await run_in_threadpool(_store, gateway, map_name, received)
     job = stored.job
     if stored.queued and job is not None:
         response.status_code = 202
@@ -92,11 +93,11 @@ async def upload(
         upload_time=stored.photo.uploaded_at,
         status=JobState(job.state) if job else JobState.SUCCEEDED,
         status_url=status_url,
-        message=status,
+        message=_message(stored, job),
     )
 
 
-def _store(gateway: Gateway, map_name: str, received: Received) -> tuple[Stored, str]:
+def _store(gateway: Gateway, map_name: str, received: Received) -> Stored:
     """Check what came and acknowledge it; whatever is not kept leaves no bytes behind."""
     try:
         media_type = check_photo_begin(received.begin)
@@ -109,11 +110,17 @@ def _store(gateway: Gateway, map_name: str, received: Received) -> tuple[Stored,
         # Only what is certainly refused: after a lost connection the row may be committed.
         gateway.store.delete(received.key)
         raise
-    kept = stored.photo.object_key == received.key
-    if not kept:
+    if stored.photo.object_key != received.key:
         gateway.store.delete(received.key)
-    if kept:
-        return stored, "Stored; it is described in the background."
-    if stored.queued:
-        return stored, "The map has this photo; its failed job is queued again."
-    return stored, "The map has this photo already."
+    return stored
+
+
+def _message(stored: Stored, job: Job | None) -> str:
+    if not stored.queued:
+        return "The map has this photo already."
+    if job is None or job.state in UNFINISHED:
+        return "Stored; it is described in the background."
+    if job.state == JobState.SUCCEEDED:
+        return "Stored and searchable."
+    reason = (job.error or {}).get("detail", "")
+    return f"Stored, but its job is {job.state}. {reason}".strip()

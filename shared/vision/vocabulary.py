@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import io
+import math
 import struct
 import tokenize
 import zipfile
@@ -86,15 +87,29 @@ def encode_centres(centres: Centres) -> bytes:
 def decode_centres(data: bytes, *, width: int | None = None) -> Centres:
     """The centres in the bytes of a `.npy` file, checked."""
     try:
+        _check_promise(data)
         array = np.load(io.BytesIO(data), allow_pickle=False)
     except NO_ARRAY as error:
         raise Unprocessable(
-            "vocabulary_unfit",
-            f"This is not a NumPy .npy file of cluster centres: {error}.",
+            "vocabulary_unfit", "This is not a whole NumPy .npy file of cluster centres."
         ) from error
     if not isinstance(array, np.ndarray):
         raise Unprocessable("vocabulary_unfit", "This is an .npz archive; a .npy file is needed.")
     return check_centres(array, width=width)
+
+
+def _check_promise(data: bytes) -> None:
+    """ValueError when a `.npy` header promises other bytes than follow: none are allocated."""
+    if not data.startswith(np.lib.format.MAGIC_PREFIX):
+        return  # an archive, or no array at all: np.load says which
+    buffer = io.BytesIO(data)
+    major, _ = np.lib.format.read_magic(buffer)
+    read = (
+        np.lib.format.read_array_header_1_0 if major == 1 else np.lib.format.read_array_header_2_0
+    )
+    shape, _, dtype = read(buffer)
+    if dtype.hasobject or math.prod(shape) * dtype.itemsize != len(data) - buffer.tell():
+        raise ValueError("the header does not fit the data")
 
 
 def read_centres(path: Path) -> Centres:

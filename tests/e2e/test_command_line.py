@@ -280,6 +280,8 @@ def test_a_refusal_is_one_line_or_one_document(placewise: CommandLine, tmp_path:
 
     with socket.create_server(("127.0.0.1", 0)) as closed_later:
         dead = f"http://127.0.0.1:{closed_later.getsockname()[1]}"
+    for number in range(12):  # each tried for a minute, they would take longer than a command may
+        (tmp_path / f"{number}.jpg").write_bytes(photo_bytes(number))
     for command in (("query", photo), ("index", tmp_path)):
         detail = placewise(*command, "--server", dead, "--json").refusal("server_unreachable")
         assert dead in detail

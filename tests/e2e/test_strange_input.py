@@ -1,0 +1,87 @@
+"""What a stranger once broke, and may try again."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from tests.support.photos import photo_bytes
+from tests.support.server import ServerProcess
+
+
+def nested(levels: int) -> str:
+    return '{"a":' * levels + "1" + "}" * levels
+
+
+@pytest.mark.parametrize("levels", [33, 300, 3000])
+def test_deeply_nested_metadata_is_refused_and_spoils_no_answer(
+    server: ServerProcess, levels: int
+) -> None:
+    kept = server.indexed(photo_bytes(1), metadata=nested(32))
+    refused = server.upload(photo_bytes(2), metadata=nested(levels))
+    assert refused.status_code == 422
+    assert "metadata" in refused.json()["detail"]
+    patched = server.client.patch(
+        f"/api/v1/uploads/{kept}",
+        content=f'{{"metadata": {nested(levels)}}}',
+        headers={"content-type": "application/json"},
+    )
+    assert patched.status_code in (400, 422)
+    assert patched.json()["code"] in ("malformed_body", "invalid_field")
+    assert server.client.get(f"/api/v1/uploads/{kept}").json()["metadata"] == json.loads(nested(32))
+    assert server.client.get("/api/v1/search").status_code == 200
+
+
+def test_a_large_json_body_is_refused_and_the_connection_stays_usable(
+    server: ServerProcess,
+) -> None:
+    kept = server.indexed(photo_bytes(1), metadata=nested(32))
+    for size, code in ((2_000_000, "body_too_large"), (500_000, "fields_too_large")):
+        answer = server.client.patch(
+            f"/api/v1/uploads/{kept}", json={"metadata": {"a": "x" * size}}
+        )
+        assert answer.status_code == 413
+        assert answer.json()["code"] == code
+    small = server.client.patch(f"/api/v1/uploads/{kept}", json={"place": "hall"})
+    assert small.json()["place"] == "hall"
+
+
+def test_a_photo_may_be_larger_than_a_json_body(server: ServerProcess) -> None:
+    large = photo_bytes(7, "BMP") + b"\0" * 3_000_000
+    assert server.upload(large, "large.bmp").status_code == 202
+
+
+def test_a_long_search_text_names_the_field(server: ServerProcess) -> None:
+    answer = server.client.get("/api/v1/search", params={"filename": "a" * 60_000})
+    assert answer.status_code == 422
+    assert answer.json()["errors"][0]["field"] == "filename"
+
+
+@pytest.mark.parametrize("path", ["/", "/livez", "/readyz", "/api/v1/health"])
+def test_probes_may_ask_for_the_head_alone(server: ServerProcess, path: str) -> None:
+    answer = server.client.head(path)
+    assert answer.status_code == 200
+    assert answer.content == b""
+
+
+def test_the_answer_to_a_waiting_upload_says_how_it_ended(server: ServerProcess) -> None:
+    wait = {"Prefer": "wait=30"}
+    for data, status, word in (
+        (photo_bytes(8), "succeeded", "searchable"),
+        (photo_bytes(9)[:-50], "failed", "can't be decoded"),
+    ):
+        answer = server.client.post("/api/v1/upload", files={"file": data}, headers=wait).json()
+        assert answer["status"] == status
+        assert word in answer["message"]
+
+
+def test_doctor_writes_nothing(tmp_path: Path) -> None:
+    from services.cli.doctor import _folder, _server
+    from shared.settings import Settings
+
+    settings = Settings(placewise_home=tmp_path / "not" / "there")
+    assert "can be made" in _folder(settings)
+    assert "nothing is stored" in _server(settings)
+    assert not (tmp_path / "not").exists()
