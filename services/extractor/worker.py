@@ -29,7 +29,7 @@ from shared.catalog.generations import active_generation
 from shared.catalog.maps import lock_map
 from shared.catalog.session import Catalog
 from shared.errors import Conflict, PlacewiseError, Unavailable
-from shared.jobs import Hints, Job, Priority, claim, hold_lease
+from shared.jobs import Hints, Job, Priority, begin, claim, hold_lease
 from shared.jobs.finish import fail, release
 from shared.jobs.leases import fallen, held
 from shared.jobs.model_changes import abandon_generation
@@ -164,6 +164,7 @@ class ExtractorWorker:
                 limit=settings.batch_photos,
                 lease_seconds=settings.lease_seconds,
                 least_priority=least_priority,
+                begun=False,
             )
         if not jobs:
             return None
@@ -186,6 +187,7 @@ class ExtractorWorker:
             try:
                 if work.batch is None:
                     started = time.perf_counter()
+                    self._begin(work)
                     self._changes.slice(work.jobs[0])
                     result.seconds["model change"] += time.perf_counter() - started
                 else:
@@ -193,6 +195,7 @@ class ExtractorWorker:
                     if batch is None:
                         self._wait_for_vocabulary(work)
                     else:
+                        self._begin(work)
                         outcome = self._describe(batch)
                         result.succeeded += outcome.succeeded
                         result.failed += outcome.failed
@@ -205,6 +208,11 @@ class ExtractorWorker:
             except Exception as error:
                 log.exception("a batch of %d jobs crashed", len(work.jobs))
                 self._crashed(work, error)
+
+    def _begin(self, work: Work) -> None:
+        """Decoding, in other processes, is done: a fall from here on may be the photos' fault."""
+        with self._catalog.write() as session:
+            begin(session, work.token, len(work.jobs))
 
     def _describe(self, batch: Batch) -> Published:
         target = batch.target
@@ -260,6 +268,7 @@ class ExtractorWorker:
         """As if the worker had died: what fell in a batch is tried alone, then counted."""
         with self._catalog.write() as session:
             for job in held(session, work.token, work.jobs):
+                job.claimed_together = len(work.jobs)
                 fallen(
                     session,
                     job,

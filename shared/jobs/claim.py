@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from uuid import UUID
+
 from sqlalchemy import func, select, update
 from sqlalchemy.orm import Session
 
 from shared.catalog.base import db_now, db_now_plus
 from shared.ids import new_id
-from shared.jobs.table import MODEL_CHANGES, Job, JobState, claimable
+from shared.jobs.table import MODEL_CHANGES, Job, JobState, claimable, locked_under
 
 
 def claim(
@@ -17,12 +19,14 @@ def claim(
     limit: int,
     lease_seconds: float,
     least_priority: int | None = None,
+    begun: bool = True,
 ) -> list[Job]:
     """Up to `limit` claimable jobs of one kind, map and generation, leased under one fresh token.
 
     The first by (priority, age) decides which; jobs that other workers hold are passed over
     (`FOR UPDATE SKIP LOCKED`; SQLite has one writer). A job marked `alone` and a model change come
-    as a batch of one. With `least_priority`, jobs below it are left alone.
+    as a batch of one. With `least_priority`, jobs below it are left alone. A worker that will first
+    do what can't harm it (read, decode) says so with `begun=False`, and calls `begin` after that.
     """
     order = (Job.priority.desc(), Job.id)
     wanted = [claimable()]
@@ -55,7 +59,7 @@ def claim(
         .values(
             state=JobState.RUNNING,
             worker=worker,
-            claimed_together=len(batch),
+            claimed_together=len(batch) if begun else 0,
             lease_token=new_id(),
             lease_until=db_now_plus(lease_seconds),
             run_after=None,
@@ -66,3 +70,13 @@ def claim(
     for job in batch:
         session.refresh(job)
     return batch
+
+
+def begin(session: Session, token: UUID, together: int) -> None:
+    """From here on the `together` jobs under the token may be to blame if the worker falls."""
+    session.execute(
+        update(Job)
+        .where(Job.id.in_(session.scalars(locked_under(token)).all()))
+        .values(claimed_together=together)
+        .execution_options(synchronize_session=False)
+    )

@@ -17,18 +17,16 @@ from shared.catalog.base import db_now, db_now_plus, rowcount
 from shared.catalog.session import Catalog
 from shared.jobs.finish import fail, release
 from shared.jobs.model_changes import abandon_generation
-from shared.jobs.table import MODEL_CHANGES, Job
+from shared.jobs.table import MODEL_CHANGES, Job, locked_under
 
 log = logging.getLogger(__name__)
 
 
 def extend_lease(session: Session, token: UUID, lease_seconds: float) -> bool:
     """Keep what was claimed under `token`; False when all of it has been taken over or ended."""
-    # Locked in the order of `held`: the two run at once, and else would wait for each other.
-    mine = select(Job.id).where(Job.lease_token == token).order_by(Job.id).with_for_update()
     touched = session.execute(
         update(Job)
-        .where(Job.id.in_(session.scalars(mine).all()))
+        .where(Job.id.in_(session.scalars(locked_under(token)).all()))
         .values(lease_until=db_now_plus(lease_seconds))
         .execution_options(synchronize_session=False)
     )
@@ -93,6 +91,9 @@ def fallen(session: Session, job: Job, max_attempts: int, *, cause: str | None) 
 
     What fell in a batch is tried again alone, and no attempt is counted.
     """
+    if job.claimed_together == 0:  # nothing had begun that the job could be blamed for
+        release(job)
+        return
     fell_alone = job.claimed_together == 1
     job.attempts += fell_alone
     if job.attempts >= max_attempts:

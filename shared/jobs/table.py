@@ -10,6 +10,7 @@
    │  │                 │    cancel      │
    │  └──── retry ──────┴──── FAILED     │ the lease expires: the worker died
    │                                     v
+   ├──── nothing that could harm the worker had begun: as it was
    └──── in a batch: marked `alone`, tried again one by one, no attempt counted
          alone: attempts + 1; at `max_attempts` ──────────────────────────────────> FAILED
 ```
@@ -33,6 +34,7 @@ from sqlalchemy import (
     ForeignKey,
     Index,
     Integer,
+    Select,
     String,
     Uuid,
     and_,
@@ -107,6 +109,7 @@ class Job(Base):
     error: Mapped[dict[str, Any] | None] = mapped_column(JsonValue)
     attempts: Mapped[int] = mapped_column(Integer, default=0)
     alone: Mapped[bool] = mapped_column(Boolean, default=False)
+    # How many are worked on at once; 0 until what could harm the worker has begun.
     claimed_together: Mapped[int] = mapped_column(Integer, default=0)
     worker: Mapped[str | None] = mapped_column(String(200))
     lease_token: Mapped[UUID | None] = mapped_column(Uuid)
@@ -143,6 +146,15 @@ def claimable() -> Condition:
         Job.waiting_for.is_(None),
         or_(Job.run_after.is_(None), Job.run_after <= db_now()),
     )
+
+
+def locked_under(token: UUID) -> Select[UUID]:
+    """The ids of the jobs under the token, locked in the order in which everyone locks jobs.
+
+    The lease's thread and the transaction that finishes run at once: in two orders they would
+    wait for each other.
+    """
+    return select(Job.id).where(Job.lease_token == token).order_by(Job.id).with_for_update()
 
 
 def get_job(session: Session, map_id: UUID, job_id: UUID, *, lock: bool = False) -> Job:

@@ -91,7 +91,8 @@ def decode_centres(data: bytes, *, width: int | None = None) -> Centres:
         array = np.load(io.BytesIO(data), allow_pickle=False)
     except NO_ARRAY as error:
         raise Unprocessable(
-            "vocabulary_unfit", "This is not a whole NumPy .npy file of cluster centres."
+            "vocabulary_unfit",
+            "This is not a NumPy .npy file of cluster centres, or not a whole one.",
         ) from error
     if not isinstance(array, np.ndarray):
         raise Unprocessable("vocabulary_unfit", "This is an .npz archive; a .npy file is needed.")
@@ -108,7 +109,9 @@ def _check_promise(data: bytes) -> None:
         np.lib.format.read_array_header_1_0 if major == 1 else np.lib.format.read_array_header_2_0
     )
     shape, _, dtype = read(buffer)
-    if dtype.hasobject or math.prod(shape) * dtype.itemsize != len(data) - buffer.tell():
+    if dtype.hasobject:
+        raise Unprocessable("vocabulary_unfit", "This file holds pickled objects, not numbers.")
+    if math.prod(shape) * dtype.itemsize != len(data) - buffer.tell():
         raise ValueError("the header does not fit the data")
 
 

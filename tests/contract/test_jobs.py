@@ -24,6 +24,7 @@ from shared.jobs import (
     Job,
     JobKind,
     JobState,
+    begin,
     claim,
     extend_lease,
     free_expired_leases,
@@ -853,3 +854,27 @@ def test_a_waiting_worker_wakes_with_the_hint() -> None:
 
 def test_a_wait_without_a_hint_ends() -> None:
     assert not InProcessHints().wait(0.01)
+
+
+def test_a_job_that_had_not_begun_is_not_blamed_for_the_fall(
+    catalog: Catalog, map_id: UUID
+) -> None:
+    with catalog.write() as session:
+        job_id = add_job(session, map_id).id
+    for _ in range(5):
+        with catalog.write() as session:
+            claim(session, worker="w", limit=1, lease_seconds=60, begun=False)
+            assert free_expired_leases(session, max_attempts=3, everyone=True) == 1
+    job = read_job(catalog, job_id)
+    assert (job.state, job.attempts, job.alone) == (JobState.QUEUED, 0, False)
+
+
+def test_a_job_that_has_begun_may_be_blamed(catalog: Catalog, map_id: UUID) -> None:
+    with catalog.write() as session:
+        job_id = add_job(session, map_id).id
+        (job,) = claim(session, worker="w", limit=1, lease_seconds=60, begun=False)
+        assert job.lease_token is not None
+        begin(session, job.lease_token, 1)
+    with catalog.write() as session:
+        free_expired_leases(session, max_attempts=3, everyone=True)
+    assert read_job(catalog, job_id).attempts == 1
