@@ -24,7 +24,6 @@ from shared.vision.vocabulary import Centres, decode_centres
 
 MOST_EXTRACTORS = 2  # a large backbone takes gigabytes of GPU memory
 MOST_VOCABULARIES = 16
-SPEC_DIFFERS = "spec_differs"
 
 
 class LoadedModels:
@@ -113,7 +112,7 @@ def check_spec(
     if not differing:
         return
     raise Unavailable(
-        SPEC_DIFFERS,
+        "spec_differs",
         f"This worker would describe photos otherwise than generation {generation.id} was: "
         + "; ".join(f"{k} is {spec.get(k)!r}, was {generation.spec.get(k)!r}" for k in differing)
         + ". Start a model change (POST /api/v1/generations), or run the old packages.",

@@ -260,8 +260,7 @@ class ExtractorWorker:
                     continue
                 fail(job, error.as_problem())
                 failed += 1
-                if job.kind in MODEL_CHANGES:
-                    abandon_generation(session, job)
+                abandon_generation(session, job)
         return failed
 
     def _crashed(self, work: Work, error: Exception) -> None:

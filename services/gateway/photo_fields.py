@@ -125,7 +125,9 @@ def _metadata(text: str) -> dict[str, Any]:
 
 
 def check_metadata(value: dict[str, Any]) -> None:
-    """Refuse what a JSON column can't hold."""
+    """Refuse what a JSON column can't hold, and what no answer could carry."""
+    if _is_deeper_than(MAX_METADATA_DEPTH, value):
+        raise invalid_field("metadata", f"is nested more than {MAX_METADATA_DEPTH} levels deep")
     try:
         text = json.dumps(value, ensure_ascii=False, allow_nan=False)
         text.encode()
@@ -133,10 +135,6 @@ def check_metadata(value: dict[str, Any]) -> None:
         raise invalid_field("metadata", "holds half of a surrogate pair") from None
     except ValueError:
         raise invalid_field("metadata", "holds a number that is not finite") from None
-    except RecursionError:
-        raise _too_deep() from None
-    if _depth(value) > MAX_METADATA_DEPTH:
-        raise _too_deep()
     if len(text) > MAX_METADATA_CHARACTERS:
         raise TooLarge(
             "fields_too_large", f"metadata is longer than {MAX_METADATA_CHARACTERS} characters."
@@ -149,19 +147,14 @@ def _no_constant(name: str) -> Any:
     raise invalid_field("metadata", f"{name} is not JSON")
 
 
-def _depth(value: Any) -> int:
-    """How many objects and lists are nested in each other; counted without recursion."""
-    deepest, open_ = 0, [(value, 1)]
-    while open_:
-        item, depth = open_.pop()
+def _is_deeper_than(levels: int, value: Any) -> bool:
+    """Are more than `levels` objects and lists nested in each other? Asked without recursion."""
+    left = [(value, 1)]
+    while left:
+        item, depth = left.pop()
         if isinstance(item, dict | list):
-            deepest = max(deepest, depth)
-            if depth > MAX_METADATA_DEPTH:
-                break
+            if depth > levels:
+                return True
             children = item.values() if isinstance(item, dict) else item
-            open_.extend((child, depth + 1) for child in children)
-    return deepest
-
-
-def _too_deep() -> PlacewiseError:
-    return invalid_field("metadata", f"is nested more than {MAX_METADATA_DEPTH} levels deep")
+            left.extend((child, depth + 1) for child in children)
+    return False

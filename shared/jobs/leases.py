@@ -17,7 +17,7 @@ from shared.catalog.base import db_now, db_now_plus, rowcount
 from shared.catalog.session import Catalog
 from shared.jobs.finish import fail, release
 from shared.jobs.model_changes import abandon_generation
-from shared.jobs.table import MODEL_CHANGES, Job, locked_under
+from shared.jobs.table import Job, locked_under
 
 log = logging.getLogger(__name__)
 
@@ -98,8 +98,7 @@ def fallen(session: Session, job: Job, max_attempts: int, *, cause: str | None) 
     job.attempts += fell_alone
     if job.attempts >= max_attempts:
         fail(job, _fallen_problem(job, cause))
-        if job.kind in MODEL_CHANGES:
-            abandon_generation(session, job)
+        abandon_generation(session, job)
         return
     job.alone = job.alone or not fell_alone
     release(job)

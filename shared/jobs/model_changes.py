@@ -112,8 +112,11 @@ def cancel_model_change(session: Session, job: Job) -> None:
 
 
 def abandon_generation(session: Session, job: Job) -> None:
-    """Give up the generation that an ended model change was building, with its queued photos."""
-    if job.generation_id is None:
+    """Give up the generation that an ended model change was building, with its queued photos.
+
+    Any other job, one of those photos' too, ends without touching its generation.
+    """
+    if job.kind not in MODEL_CHANGES or job.generation_id is None:
         return
     generation = lock_generation(session, job.generation_id)
     if generation.state != GenerationState.BUILDING:
