@@ -26,6 +26,7 @@ from services.extractor.worker import ExtractorWorker
 from services.gateway.app import create_app
 from services.gateway.context import Gateway
 from services.search.worker import SearchWorker
+from services.steward.evaluate import Evaluator
 from services.steward.loop import Steward
 from services.steward.queue import free_leases
 from shared.catalog.maps import ensure_default_map
@@ -90,6 +91,7 @@ def standalone(settings: Settings) -> Iterator[Standalone]:
             catalog, store, hints, settings, name=f"embedded-{os.getpid()}", only_worker=True
         )
         steward = Steward(catalog, store, hints, settings)
+        evaluator = Evaluator(catalog, search, settings, name=f"embedded-{os.getpid()}")
         gateway = Gateway(catalog, store, hints, search, settings)
         server = uvicorn.Server(
             uvicorn.Config(
@@ -107,6 +109,7 @@ def standalone(settings: Settings) -> Iterator[Standalone]:
                 ("search", search.run),
                 ("extractor", extractor.run),
                 ("steward", steward.run),
+                ("evaluator", evaluator.run),
             )
         ]
         try:

@@ -17,6 +17,7 @@ from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
+from urllib.parse import quote
 from uuid import UUID
 
 import httpx2
@@ -91,9 +92,10 @@ class Client:
         top_k: int = 10,
         min_score: float | None = None,
         wait_seconds: int = 60,
+        **filters: Any,
     ) -> Json:
-        """The photos most similar to one that is not stored."""
-        params = _given(top_k=top_k, min_score=min_score)
+        """The photos most similar to one that is not stored; `filters` as in `similar_to`."""
+        params = _given(top_k=top_k, min_score=min_score, **filters)
         answer = self._send_file(
             "/similarity",
             photo,
@@ -106,10 +108,16 @@ class Client:
         return self._call("GET", answer["result_url"].removeprefix(API))
 
     def similar_to(
-        self, file_id: UUID | str, top_k: int = 10, min_score: float | None = None
+        self,
+        file_id: UUID | str,
+        top_k: int = 10,
+        min_score: float | None = None,
+        **filters: Any,
     ) -> Json:
-        """The photos most similar to a stored one."""
-        params = _given(top_k=top_k, min_score=min_score)
+        """The photos most similar to a stored one, of those that pass the filters: `near`
+        ("LAT,LON,RADIUS_M"), `box` ("S,W,N,E"), `captured_after`, `captured_before`, `place`,
+        `tags` and `ids` (separated by commas)."""
+        params = _given(top_k=top_k, min_score=min_score, **filters)
         return self._call("POST", f"/similarity/{file_id}", params=params)
 
     def job(self, job_id: UUID | str, wait_seconds: float = 0) -> Json:
@@ -156,6 +164,34 @@ class Client:
     def generations(self) -> list[Json]:
         found: Any = self._call("GET", "/generations")
         return list(found)
+
+    def evaluate(self, **wanted: int) -> Json:
+        """Start an evaluation of the map; `sample` and `seed` may be given."""
+        return self._call("POST", "/evaluations", json=wanted)
+
+    def evaluations(self, limit: int = 50) -> list[Json]:
+        """The map's evaluations, newest first."""
+        found: list[Json] = self._call("GET", "/evaluations", params={"limit": limit})[
+            "evaluations"
+        ]
+        return found
+
+    def searches(self, limit: int = 50) -> list[Json]:
+        """What was asked, newest first."""
+        found: list[Json] = self._call("GET", "/searches", params={"limit": limit})["searches"]
+        return found
+
+    def maps(self) -> list[Json]:
+        """Every map of the server."""
+        found: Any = self._call("GET", "/maps")
+        return list(found)
+
+    def create_map(self, name: str, extractor: str | None = None) -> Json:
+        return self._call("POST", "/maps", json=_given(name=name, extractor=extractor))
+
+    def delete_map(self, name: str) -> Json:
+        """Delete a map with all its photos."""
+        return self._call("DELETE", f"/maps/{quote(name, safe='')}")
 
     def stats(self) -> Json:
         return self._call("GET", "/database/stats")

@@ -11,13 +11,16 @@ from uuid import UUID
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from shared.photo_filter import EVERYTHING, PhotoFilter
+
 
 class _Message(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
 class SearchRequest(_Message):
-    """The `k` rows of `generation_id` that are most similar to row `row` of object `object_key`.
+    """The `k` rows of `generation_id` that are most similar to row `row` of object `object_key`,
+    of those whose photos pass the filter `photos`.
 
     The worker first catches up with `min_version` of the map, so that whoever just saw a photo
     indexed or deleted sees it in the answer. `exclude` names photos that must not be answered
@@ -30,6 +33,7 @@ class SearchRequest(_Message):
     row: int = Field(ge=0)
     min_version: int = Field(ge=0)
     k: int = Field(ge=1)
+    photos: PhotoFilter = EVERYTHING
     min_score: float | None = None
     exclude: tuple[UUID, ...] = ()
 

@@ -75,6 +75,21 @@ class Settings(BaseSettings):
         86_400.0, ge=0, description="age at which an object that no row knows is removed"
     )
 
+    job_retention_days: float = Field(
+        30.0, gt=0, description="life of a finished job; failed uploads keep theirs"
+    )
+    search_history_days: float = Field(90.0, gt=0, description="life of a search in the history")
+
+    # How answers become places.
+    estimate_radius_m: float = Field(
+        25.0, gt=0, description="an estimate this near to the truth counts as right"
+    )
+    auto_evaluate_photos: int = Field(
+        20,
+        ge=0,
+        description="located photos from which a changed map is evaluated by itself; 0: never",
+    )
+
     # How search follows the catalog.
     search_follow_seconds: float = Field(
         1.0, gt=0, description="how often search looks for what is new"

@@ -17,12 +17,21 @@ from services.cli.output import (
     explained,
     print_json,
 )
+from shared.client import Json
 
 
 def query(
     photo: Annotated[Path, typer.Argument(metavar="PHOTO", exists=True, dir_okay=False)],
     top_k: Annotated[int, typer.Option(min=1, max=100, help="How many photos to answer.")] = 10,
     min_score: Annotated[float | None, typer.Option(min=-1, max=1)] = None,
+    near: Annotated[
+        str | None, typer.Option(help="LAT,LON,RADIUS_M: only photos taken there.")
+    ] = None,
+    box: Annotated[str | None, typer.Option(help="S,W,N,E in degrees.")] = None,
+    captured_after: Annotated[str | None, typer.Option(help="ISO 8601.")] = None,
+    captured_before: Annotated[str | None, typer.Option(help="ISO 8601.")] = None,
+    place: Annotated[str | None, typer.Option(help="Only photos with this label.")] = None,
+    tags: Annotated[str | None, typer.Option(help="Separated by commas: all are wanted.")] = None,
     map_name: MapOption = None,
     server: ServerOption = None,
     as_json: JsonOption = False,
@@ -30,7 +39,17 @@ def query(
     """Find the indexed photos most similar to a photo, which is not stored."""
     with explained(as_json):
         with connect(server, map_name) as client:
-            answer = client.similar_to_file(photo, top_k=top_k, min_score=min_score)
+            answer = client.similar_to_file(
+                photo,
+                top_k=top_k,
+                min_score=min_score,
+                near=near,
+                box=box,
+                captured_after=captured_after,
+                captured_before=captured_before,
+                place=place,
+                tags=tags,
+            )
         if as_json:
             print_json(answer)
             return
@@ -45,11 +64,33 @@ def query(
                 found["place"] or "",
             )
         answers.print(table)
+        answers.print(_place(answer["estimate"]), soft_wrap=True)
         answers.print(
             f"{answer['rows_scanned']} photos compared ({answer['certificate']}), "
             f"vocabulary: {answer['vocabulary']}",
             soft_wrap=True,
         )
+
+
+def _place(estimate: Json) -> str:
+    """The estimate in one line."""
+    if estimate["in_map"] is False:
+        return str(estimate["reason"])
+    where = [estimate["place"]] if estimate["place"] else []
+    if estimate["latitude"] is not None:
+        where.append(
+            f"{estimate['latitude']:.6f}, {estimate['longitude']:.6f} "
+            f"(right means within {estimate['radius_m']:g} m)"
+        )
+    if not where:
+        return f"No place: {estimate['reason']}"
+    sure = (
+        f"confidence {estimate['confidence']:.0%}"
+        if estimate["confidence"] is not None
+        else "confidence uncalibrated"
+    )
+    known = "" if estimate["in_map"] else "; whether it is in the map at all can't be told yet"
+    return f"Estimate: {'; '.join(where)}, {sure}{known}"
 
 
 def _degrees(value: float | None) -> str:

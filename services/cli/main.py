@@ -6,7 +6,7 @@ import logging
 
 import typer
 
-from services.cli import ask, bench, configuration, doctor, index, serve, vocabulary
+from services.cli import ask, bench, configuration, doctor, evaluate, index, maps, serve, vocabulary
 
 app = typer.Typer(
     name="placewise",
@@ -18,6 +18,8 @@ app = typer.Typer(
 app.command("serve")(serve.serve)
 app.command("index")(index.index)
 app.command("query")(ask.query)
+app.command("evaluate")(evaluate.evaluate)
+app.add_typer(maps.app, name="maps")
 app.add_typer(vocabulary.app, name="vocabulary")
 app.add_typer(bench.app, name="bench")
 app.command("config")(configuration.config)

@@ -20,12 +20,10 @@ from services.cli.output import (
     print_json,
     progress_bar,
 )
+from services.cli.wait import wait_with_bar
 from shared.client import Client, Json
-from shared.errors import PlacewiseError, Unprocessable
 
 app = typer.Typer(help="VLAD's cluster centres: fit them on the map's own photos, import, list.")
-
-POLL_SECONDS = 1.0  # so that the bar moves
 
 
 @app.command("fit")
@@ -74,7 +72,7 @@ def import_(
             plain = Path(folder, f"{file.stem}.npy")
             plain.write_bytes(data)
             started = client.import_vocabulary(plain)
-            job = wait_for_change(client, started["job_id"], progress)
+            job = wait_with_bar(client, started["job_id"], progress, "vocabulary")
         _print_change(job, as_json)
 
 
@@ -108,34 +106,7 @@ def list_(
 
 def fit_and_wait(client: Client, wanted: dict[str, int], progress: Progress) -> Json:
     """Fit on the map's photos and wait until the new generation answers."""
-    return wait_for_change(client, client.fit_vocabulary(**wanted)["job_id"], progress)
-
-
-def wait_for_change(client: Client, job_id: str, progress: Progress) -> Json:
-    """The model change once it has succeeded; its stored reason as an error when it has not."""
-    bar = progress.add_task("changing the model", total=None)
-
-    def show(job: Json) -> None:
-        done = job["progress"]
-        progress.update(
-            bar,
-            description=f"vocabulary: {job['stage'] or job['state']}",
-            completed=done["done"],
-            total=done["total"],
-        )
-
-    job = client.wait_for(job_id, show, poll_seconds=POLL_SECONDS)
-    if job["state"] != "succeeded":
-        error = job["error"] or {}
-        raise _refusal(error, job["state"])
-    return job
-
-
-def _refusal(error: Json, state: str) -> PlacewiseError:
-    return Unprocessable(
-        error.get("code", "model_change_ended"),
-        error.get("detail", f"The model change is {state}."),
-    )
+    return wait_with_bar(client, client.fit_vocabulary(**wanted)["job_id"], progress, "vocabulary")
 
 
 def _print_change(job: Json, as_json: bool) -> None:

@@ -21,7 +21,7 @@ from services.extractor.decoding import DecoderPool
 from services.extractor.loaded import LoadedModels, register, spec_columns
 from shared.catalog.generations import active_generation
 from shared.catalog.maps import Map
-from shared.catalog.photos import Photo, count_live, live_photos
+from shared.catalog.photos import Photo, PhotoRole, count_live, live_photos
 from shared.catalog.session import Catalog
 from shared.catalog.vocabularies import VocabularyOrigin, add_vocabulary, get_vocabulary
 from shared.errors import Conflict, NotFound, PlacewiseError, Unprocessable
@@ -84,7 +84,11 @@ class ModelChanges:
         with self._catalog.read() as session:
             photo_ids = session.scalars(
                 select(Photo.id)
-                .where(Photo.map_id == job.map_id, Photo.deleted_at.is_(None))
+                .where(
+                    Photo.map_id == job.map_id,
+                    Photo.deleted_at.is_(None),
+                    Photo.role == PhotoRole.DATABASE,
+                )
                 .order_by(Photo.id)
             ).all()
         if not photo_ids:

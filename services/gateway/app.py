@@ -5,9 +5,12 @@ from __future__ import annotations
 from fastapi import FastAPI
 
 from services.gateway import (
+    evaluations,
     figures,
     health,
+    history,
     jobs,
+    maps,
     model_changes,
     photos,
     similarity,
@@ -32,7 +35,18 @@ def create_app(gateway: Gateway) -> FastAPI:
     app.state.gateway = gateway
     app.add_middleware(BodyLimit)
     install_problem_handlers(app)
-    for module in (upload, jobs, similarity, photos, model_changes, figures, health):
+    for module in (
+        maps,
+        upload,
+        jobs,
+        similarity,
+        photos,
+        model_changes,
+        evaluations,
+        history,
+        figures,
+        health,
+    ):
         app.include_router(module.router, prefix=API)
     app.include_router(health.probes)
     return app

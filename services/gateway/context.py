@@ -12,7 +12,7 @@ from pydantic import BeforeValidator
 
 from shared.catalog.maps import DEFAULT_MAP
 from shared.catalog.session import Catalog
-from shared.errors import NotFound
+from shared.errors import NotFound, invalid_field
 from shared.jobs import Hints
 from shared.objects import ObjectStore
 from shared.search_protocol import SearchPort
@@ -49,6 +49,14 @@ def _known_shape(noun: str):  # type: ignore[no-untyped-def]
     return BeforeValidator(parse)
 
 
+def read_cursor(cursor: str | None) -> UUID | None:
+    """The id that a page ended with; 422 for a cursor that no call has given."""
+    try:
+        return UUID(cursor) if cursor else None
+    except ValueError:
+        raise invalid_field("cursor", "is not one that this call has given") from None
+
+
 GatewayDep = Annotated[Gateway, Depends(get_gateway)]
 MapName = Annotated[
     str,
@@ -72,4 +80,5 @@ __all__ = [
     "MapName",
     "MinScore",
     "TopK",
+    "read_cursor",
 ]

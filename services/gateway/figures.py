@@ -14,9 +14,9 @@ from shared.catalog.base import Condition, db_now_plus
 from shared.catalog.chunks import Chunk, count_searchable
 from shared.catalog.generations import active_generation
 from shared.catalog.maps import get_map
-from shared.catalog.photos import Photo, count_live
+from shared.catalog.photos import Photo, PhotoRole, count_live
 from shared.catalog.searches import Search
-from shared.catalog.vocabularies import Vocabulary
+from shared.catalog.vocabularies import standing_of
 from shared.jobs import Job
 
 router = APIRouter(tags=["operations"])
@@ -29,6 +29,7 @@ class StatsAnswer(Answer):
     map_version: int
     total_images: int
     searchable_images: int
+    labelled_queries: int
     total_chunks: int
     total_storage_bytes: int
     feature_dimension: int | None
@@ -57,9 +58,7 @@ def stats(gateway: GatewayDep, map_name: MapName = DEFAULT_MAP) -> StatsAnswer:
             now = (Chunk.generation_id == generation.id) & Chunk.superseded_at.is_(None)
             chunks = _number(session, func.count(Chunk.id), now)
             chunk_bytes = _number(session, func.sum(Chunk.size_bytes), now)
-            vocabulary = "none"
-            if generation.vocabulary_id is not None:
-                vocabulary = session.get_one(Vocabulary, generation.vocabulary_id).standing
+            vocabulary = standing_of(session, generation)
         week = in_map & (Search.searched_at > db_now_plus(-7 * DAY_SECONDS))
         average, longest = session.execute(
             select(func.avg(Search.processing_ms), func.max(Search.processing_ms)).where(week)
@@ -70,7 +69,8 @@ def stats(gateway: GatewayDep, map_name: MapName = DEFAULT_MAP) -> StatsAnswer:
         return StatsAnswer(
             map=map_.name,
             map_version=map_.version,
-            total_images=count_live(session, map_.id),
+            total_images=count_live(session, map_.id, PhotoRole.DATABASE),
+            labelled_queries=count_live(session, map_.id, PhotoRole.QUERY),
             searchable_images=count_searchable(session, generation.id) if generation else 0,
             total_chunks=chunks,
             total_storage_bytes=chunk_bytes + _number(session, func.sum(Photo.size_bytes), live),

@@ -11,9 +11,11 @@ from dataclasses import dataclass
 from typing import Any
 from uuid import UUID
 
+from pydantic import BaseModel, ConfigDict
 from sqlalchemy.orm import Session
 
 from services.gateway.context import Gateway
+from services.gateway.estimate import estimate
 from services.gateway.schemas import (
     PhotoAnswer,
     SimilarityAnswer,
@@ -25,9 +27,11 @@ from shared.catalog.generations import Generation, active_generation
 from shared.catalog.maps import Map, get_map
 from shared.catalog.photos import Photo, get_photo, live_photos
 from shared.catalog.searches import Search
-from shared.catalog.vocabularies import Vocabulary
+from shared.catalog.vocabularies import standing_of
 from shared.errors import Conflict, Gone
+from shared.estimate.evidence import DEPTH
 from shared.jobs import Job, JobState
+from shared.photo_filter import EVERYTHING, PhotoFilter
 from shared.search_protocol import Hit, SearchRequest, SearchResponse
 
 
@@ -45,6 +49,16 @@ class Query:
     filename: str
 
 
+class Wanted(BaseModel):
+    """What of the ranking is asked for. Kept with the job of a photo that is described first."""
+
+    model_config = ConfigDict(frozen=True)
+
+    top_k: int
+    min_score: float | None = None
+    photos: PhotoFilter = EVERYTHING
+
+
 def query_by_photo(gateway: Gateway, map_name: str, photo_id: UUID) -> Query:
     """A stored photo as a query; 404 for an unknown one, 409 while it is not searchable."""
     with gateway.catalog.read() as session:
@@ -59,7 +73,7 @@ def query_by_photo(gateway: Gateway, map_name: str, photo_id: UUID) -> Query:
             map_id=map_.id,
             min_version=map_.version,
             generation=generation,
-            vocabulary=_vocabulary_standing(session, generation),
+            vocabulary=standing_of(session, generation),
             object_key=chunk.object_key,
             row=descriptor.row,
             photo_id=photo.id,
@@ -82,7 +96,7 @@ def query_by_job(gateway: Gateway, job: Job) -> Query:
             map_id=map_.id,
             min_version=map_.version,
             generation=generation,
-            vocabulary=_vocabulary_standing(session, generation),
+            vocabulary=standing_of(session, generation),
             object_key=result["object_key"],
             row=result["row"],
             photo_id=None,
@@ -90,25 +104,32 @@ def query_by_job(gateway: Gateway, job: Job) -> Query:
         )
 
 
-def find_similar(
-    gateway: Gateway, query: Query, top_k: int, min_score: float | None
-) -> SimilarityAnswer:
-    """The `top_k` most similar live photos, without the query itself; noted in the history."""
+def find_similar(gateway: Gateway, query: Query, wanted: Wanted) -> SimilarityAnswer:
+    """The most similar live photos that are wanted, without the query itself, and the place that
+    they point to; noted in the history."""
     started = time.perf_counter()
-    hits, photos, response = _search_live(gateway, query, top_k, min_score)
+    # The estimate looks deeper than most answers, and also at what is below the least score.
+    hits, photos, response = _search_live(gateway, query, wanted, max(wanted.top_k, DEPTH))
+    found = estimate(query.generation, hits, photos, gateway.settings.estimate_radius_m)
+    shown = [
+        hit
+        for hit in hits[: wanted.top_k]
+        if wanted.min_score is None or hit.score >= wanted.min_score
+    ]
     took_ms = (time.perf_counter() - started) * 1000
     answer = SimilarityAnswer(
         query_file_id=query.photo_id,
         query_filename=query.filename,
         processing_time_ms=took_ms,
-        total_similar=len(hits),
+        total_similar=len(shown),
         similar_images=[
             SimilarPhoto(
                 similarity_score=hit.score,
                 **PhotoAnswer.fields_of(photos[hit.photo_id]),
             )
-            for hit in hits
+            for hit in shown
         ],
+        estimate=found,
         vocabulary=query.vocabulary,
         generation_id=query.generation.id,
         certificate=response.certificate,
@@ -124,18 +145,21 @@ def find_similar(
                 generation_id=query.generation.id,
                 query_photo_id=query.photo_id,
                 query_filename=query.filename,
-                top_k=top_k,
-                results=len(hits),
+                top_k=wanted.top_k,
+                results=len(shown),
                 processing_ms=took_ms,
+                best_score=hits[0].score if hits else None,
+                in_map=found.in_map,
             )
         )
     return answer
 
 
 def _search_live(
-    gateway: Gateway, query: Query, top_k: int, min_score: float | None
+    gateway: Gateway, query: Query, wanted: Wanted, depth: int
 ) -> tuple[list[Hit], dict[UUID, Photo], SearchResponse]:
-    k = top_k
+    """The first `depth` live photos, fewer when there are no more."""
+    k = depth
     while True:
         response = gateway.search.search(
             SearchRequest(
@@ -145,22 +169,16 @@ def _search_live(
                 row=query.row,
                 min_version=query.min_version,
                 k=k,
-                min_score=min_score,
+                photos=wanted.photos,
                 exclude=(query.photo_id,) if query.photo_id else (),
             )
         )
         with gateway.catalog.read() as session:
             photos = live_photos(session, [hit.photo_id for hit in response.hits])
         hits = [hit for hit in response.hits if hit.photo_id in photos]
-        if len(hits) >= top_k or len(response.hits) < k:
-            return hits[:top_k], photos, response
+        if len(hits) >= depth or len(response.hits) < k:
+            return hits[:depth], photos, response
         k *= 2
-
-
-def _vocabulary_standing(session: Session, generation: Generation) -> str:
-    if generation.vocabulary_id is None:
-        return "none"
-    return session.get_one(Vocabulary, generation.vocabulary_id).standing
 
 
 def _not_searchable(session: Session, photo: Photo) -> Conflict:

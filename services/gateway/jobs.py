@@ -12,11 +12,10 @@ from fastapi import APIRouter, Query, Request
 from fastapi.responses import StreamingResponse
 from starlette.concurrency import run_in_threadpool
 
-from services.gateway.context import DEFAULT_MAP, Gateway, GatewayDep, JobId, MapName
+from services.gateway.context import DEFAULT_MAP, Gateway, GatewayDep, JobId, MapName, read_cursor
 from services.gateway.schemas import JobAnswer, JobsAnswer
 from services.gateway.waiting import SLOWEST_LOOK_SECONDS, read_job, wait_for_job
 from shared.catalog.maps import get_map
-from shared.errors import invalid_field
 from shared.jobs import Job, JobKind, JobState
 from shared.jobs.finish import cancel, retry
 from shared.jobs.model_changes import cancel_model_change
@@ -37,10 +36,7 @@ def jobs(
     map_name: MapName = DEFAULT_MAP,
 ) -> JobsAnswer:
     """Newest first. The `reindex` jobs of a model change under way are listed only by `kind`."""
-    try:
-        before = UUID(cursor) if cursor else None
-    except ValueError:
-        raise invalid_field("cursor", "is not one that this call has given") from None
+    before = read_cursor(cursor)
     with gateway.catalog.read() as session:
         map_id = get_map(session, map_name).id
         found = list_jobs(session, map_id, state or [], kind or [], limit + 1, before)

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any
 
+from shared.catalog.photos import PhotoRole
 from shared.errors import PlacewiseError, TooLarge, invalid_field
 
 MAX_TAGS = 50
@@ -31,6 +32,7 @@ class PhotoFields:
     place: str | None = None
     tags: list[str] | None = None
     metadata: dict[str, Any] | None = None
+    role: PhotoRole | None = None
 
 
 FORM_FIELDS = tuple(PhotoFields.__slots__)
@@ -52,6 +54,7 @@ def read_form_fields(form: dict[str, str]) -> PhotoFields:
         place=_text("place", said["place"]) if "place" in said else None,
         tags=parse_tags(said["tags"].split(",")) if "tags" in said else None,
         metadata=_metadata(said["metadata"]) if "metadata" in said else None,
+        role=_role(said["role"]) if "role" in said else None,
     )
     check_pair(fields.latitude, fields.longitude)
     return fields
@@ -110,6 +113,13 @@ def _text(field: str, text: str) -> str:
     if "\0" in text:
         raise invalid_field(field, "holds a NUL character")
     return text
+
+
+def _role(text: str) -> PhotoRole:
+    try:
+        return PhotoRole(text)
+    except ValueError:
+        raise invalid_field("role", f"{text!r} is not one of {', '.join(PhotoRole)}") from None
 
 
 def _metadata(text: str) -> dict[str, Any]:

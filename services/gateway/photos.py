@@ -18,6 +18,7 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from services.gateway.context import DEFAULT_MAP, FileId, GatewayDep, MapName
+from services.gateway.filters import FilterDep
 from services.gateway.photo_fields import (
     check_metadata,
     check_pair,
@@ -36,6 +37,7 @@ from shared.catalog.maps import bump_version, get_map, lock_map
 from shared.catalog.photos import (
     MetadataFilter,
     Photo,
+    PhotoRole,
     get_photo,
     mark_deleted,
     search_metadata,
@@ -73,6 +75,7 @@ class PhotoPatch(BaseModel):
     place: Annotated[str | None, Field(max_length=500, pattern=r"^[^\x00]*$")] = None
     tags: list[Annotated[str, Field(pattern=r"^[^\x00]*$")]] | None = None
     metadata: dict[str, Any] | None = None
+    role: PhotoRole | None = None
 
     def columns(self) -> dict[str, Any]:
         """The photo's columns that are said, with their new values."""
@@ -86,6 +89,8 @@ class PhotoPatch(BaseModel):
         if "metadata" in said:
             said["attributes"] = said.pop("metadata") or {}
             check_metadata(said["attributes"])
+        if "role" in said:
+            said["role"] = said["role"] or PhotoRole.DATABASE
         return said
 
 
@@ -179,6 +184,7 @@ def thumbnail(gateway: GatewayDep, file_id: FileId, map_name: MapName = DEFAULT_
 @router.get("/search", operation_id="search_metadata", response_model=MetadataAnswer)
 def search(
     gateway: GatewayDep,
+    photos: FilterDep,
     filename: Annotated[
         str | None, Query(max_length=255, description="part of the name, case ignored")
     ] = None,
@@ -186,14 +192,12 @@ def search(
     upload_before: Annotated[str | None, Query(description="ISO 8601; no offset means UTC")] = None,
     min_file_size: Annotated[int | None, Query(ge=0, le=2**62)] = None,
     max_file_size: Annotated[int | None, Query(ge=0, le=2**62)] = None,
-    tags: Annotated[
-        str | None, Query(max_length=5000, description="separated by commas: all are wanted")
-    ] = None,
+    role: Annotated[PhotoRole | None, Query(description="left out: of both roles")] = None,
     limit: Annotated[int, Query(ge=1, le=1000)] = 100,
     cursor: Annotated[str | None, Query(description="`next_cursor` of the page before")] = None,
     map_name: MapName = DEFAULT_MAP,
 ) -> MetadataAnswer:
-    """Photos by name, time, size and tags, newest first, a page at a time."""
+    """Photos by what is known of them, newest first, a page at a time."""
     started = time.perf_counter()
     if filename is not None and "\0" in filename:
         raise invalid_field("filename", "holds a NUL character")
@@ -203,7 +207,8 @@ def search(
         upload_before=parse_time("upload_before", upload_before) if upload_before else None,
         min_file_size=min_file_size,
         max_file_size=max_file_size,
-        tags=tuple(parse_tags(tags.split(","))) if tags else (),
+        photos=photos,
+        role=role,
     )
     after = _read_cursor(cursor) if cursor else None
     with gateway.catalog.read() as session:

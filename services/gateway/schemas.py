@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from services.gateway.context import API
 from shared.catalog.generations import Generation, GenerationState
-from shared.catalog.photos import Photo
+from shared.catalog.photos import Photo, PhotoRole
 from shared.catalog.vocabularies import Vocabulary, VocabularyOrigin
 from shared.jobs import Job, JobKind, JobState
 
@@ -36,6 +36,7 @@ class PhotoAnswer(Answer):
     heading: float | None
     captured_at: datetime | None
     place: str | None
+    role: PhotoRole
     image_url: str
     thumbnail_url: str
 
@@ -57,6 +58,7 @@ class PhotoAnswer(Answer):
             "heading": photo.heading,
             "captured_at": photo.captured_at,
             "place": photo.place,
+            "role": photo.role,
             "image_url": f"{here}/image",
             "thumbnail_url": f"{here}/thumbnail",
         }
@@ -75,6 +77,23 @@ class SimilarPhoto(PhotoAnswer):
     similarity_score: float = Field(description="cosine similarity in [-1, 1]")
 
 
+class EstimateAnswer(Answer):
+    """Which place the answer points to, and how far to believe it."""
+
+    in_map: bool | None = Field(
+        None, description="false: not in this map; null: that can't be told yet"
+    )
+    latitude: float | None = None
+    longitude: float | None = None
+    radius_m: float | None = Field(None, description="right means: within so many metres")
+    place: str | None = None
+    confidence: float | None = Field(
+        None, description="P(right), learnt from labelled queries; null while uncalibrated"
+    )
+    calibration: str = Field("uncalibrated", description="`calibrated` or `uncalibrated`")
+    reason: str
+
+
 class SimilarityAnswer(Answer):
     """The most similar photos, best first, never the query itself."""
 
@@ -83,6 +102,7 @@ class SimilarityAnswer(Answer):
     processing_time_ms: float
     total_similar: int
     similar_images: list[SimilarPhoto]
+    estimate: EstimateAnswer
     vocabulary: str = Field(
         description="`own`: learnt on this map's photos; `foreign`: on photos of elsewhere; "
         "`none`: the extractor uses none"

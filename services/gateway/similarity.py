@@ -20,7 +20,8 @@ from services.gateway.context import (
     MinScore,
     TopK,
 )
-from services.gateway.find_similar import find_similar, query_by_job, query_by_photo
+from services.gateway.filters import FilterDep
+from services.gateway.find_similar import Wanted, find_similar, query_by_job, query_by_photo
 from services.gateway.photo_header import read_photo_header
 from services.gateway.receive import (
     Received,
@@ -48,12 +49,14 @@ router = APIRouter(tags=["similarity"])
 def similar_to_stored(
     gateway: GatewayDep,
     file_id: Annotated[FileId, PathParameter(description="a stored photo")],
+    photos: FilterDep,
     top_k: TopK = 10,
     min_score: MinScore = None,
     map_name: MapName = DEFAULT_MAP,
 ) -> SimilarityAnswer:
     """The photos most similar to a stored one, without itself."""
-    return find_similar(gateway, query_by_photo(gateway, map_name, file_id), top_k, min_score)
+    wanted = Wanted(top_k=top_k, min_score=min_score, photos=photos)
+    return find_similar(gateway, query_by_photo(gateway, map_name, file_id), wanted)
 
 
 @router.post(
@@ -67,6 +70,7 @@ async def similar_to_upload(
     request: Request,
     response: Response,
     gateway: GatewayDep,
+    photos: FilterDep,
     top_k: TopK = 10,
     min_score: MinScore = None,
     map_name: MapName = DEFAULT_MAP,
@@ -81,7 +85,8 @@ async def similar_to_upload(
     received = await receive_file(
         request, gateway.store, key, gateway.settings.max_file_size, check_photo_begin
     )
-    params = {"filename": received.filename, "top_k": top_k, "min_score": min_score}
+    wanted = Wanted(top_k=top_k, min_score=min_score, photos=photos)
+    params = {"filename": received.filename, "wanted": wanted.model_dump(mode="json")}
     job: Job | None = await run_in_threadpool(_queue, gateway, map_name, job_id, received, params)
     wait = preferred_wait(request, gateway.settings.max_wait_seconds)
     if wait:
@@ -153,8 +158,8 @@ def _queue(
 
 def _result(gateway: Gateway, job: Job) -> SimilarityAnswer:
     if job.state == JobState.SUCCEEDED:
-        query = query_by_job(gateway, job)
-        return find_similar(gateway, query, job.params["top_k"], job.params["min_score"])
+        wanted = Wanted.model_validate(job.params["wanted"])
+        return find_similar(gateway, query_by_job(gateway, job), wanted)
     if job.state == JobState.CANCELLED:
         raise Conflict("job_cancelled", f"The job {job.id} was cancelled.", job_id=str(job.id))
     error = job.error or {}

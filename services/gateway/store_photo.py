@@ -17,7 +17,7 @@ from services.gateway.photo_fields import PhotoFields
 from services.gateway.photo_header import PhotoHeader
 from services.gateway.receive import Received
 from shared.catalog.maps import get_map
-from shared.catalog.photos import Photo, find_live_by_sha256
+from shared.catalog.photos import Photo, PhotoRole, find_live_by_sha256
 from shared.errors import Conflict, PlacewiseError
 from shared.ids import new_id
 from shared.jobs import Job, JobKind, JobState, Priority
@@ -86,6 +86,7 @@ def _store(gateway: Gateway, map_name: str, incoming: Incoming) -> Stored:
             place=fields.place,
             tags=fields.tags or [],
             attributes=fields.metadata or {},
+            role=fields.role or PhotoRole.DATABASE,
         )
         session.add(photo)
         session.flush()
@@ -114,6 +115,8 @@ def _same_again(session: Session, photo: Photo, fields: PhotoFields) -> Stored:
 def _says_otherwise(photo: Photo, fields: PhotoFields) -> bool:
     if fields.place is not None and fields.place != photo.place:
         return True
+    if fields.role is not None and fields.role != photo.role:
+        return True
     if fields.latitude is None or fields.longitude is None:
         return False
     if photo.latitude is None or photo.longitude is None:
@@ -127,7 +130,7 @@ def _says_otherwise(photo: Photo, fields: PhotoFields) -> bool:
 def _differs(photo_id: UUID) -> PlacewiseError:
     return Conflict(
         "photo_differs",
-        "The map has a photo with the same bytes at other coordinates or with another place. "
+        "The map has a photo with the same bytes at other coordinates, with another place or role. "
         f"To change them: PATCH {API}/uploads/{photo_id}.",
         file_id=str(photo_id),
     )

@@ -17,6 +17,7 @@ from services.gateway.receive import (
 from services.gateway.schemas import UploadAnswer, job_url
 from services.gateway.store_photo import Incoming, Stored, store_photo
 from services.gateway.waiting import preferred_wait, wait_for_job
+from shared.catalog.photos import PhotoRole
 from shared.errors import PlacewiseError
 from shared.jobs import Job, JobState
 from shared.jobs.table import UNFINISHED
@@ -34,6 +35,11 @@ FORM = describe_form(
     place={**_TEXT, "description": "a label, where coordinates say little"},
     tags={**_TEXT, "description": "separated by commas"},
     metadata={**_TEXT, "description": "a JSON object"},
+    role={
+        "type": "string",
+        "enum": list(PhotoRole),
+        "description": "`query`: a labelled query, never found; evaluations ask with it",
+    },
 )
 
 

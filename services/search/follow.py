@@ -5,14 +5,13 @@ from __future__ import annotations
 import logging
 from uuid import UUID
 
-import numpy as np
 from sqlalchemy import select
 
-from services.search.snapshot import LoadedChunk, Snapshot
-from shared.catalog.chunks import Chunk, live_chunks, live_rows
+from services.search.snapshot import LoadedChunk, PhotoColumns, Snapshot
+from shared.catalog.chunks import Chunk, live_chunks, live_facts
 from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.maps import Map
-from shared.catalog.photos import deleted_since
+from shared.catalog.photos import PhotoFacts, changed_since
 from shared.catalog.session import Catalog
 from shared.chunks import read_chunk
 from shared.errors import NotFound, Unavailable
@@ -29,7 +28,7 @@ def versions(catalog: Catalog) -> dict[UUID, tuple[UUID, int]]:
         found = session.execute(
             select(Generation.id, Map.id, Map.version)
             .join(Map, Map.id == Generation.map_id)
-            .where(Generation.state.in_(FOLLOWED))
+            .where(Generation.state.in_(FOLLOWED), Map.deleted_at.is_(None))
         )
         return {generation: (map_id, version) for generation, map_id, version in found}
 
@@ -49,22 +48,19 @@ def advance(
         version = session.get_one(Map, generation.map_id).version
         chunks = live_chunks(session, generation_id)
         known = {chunk.chunk_id: chunk for chunk in old.chunks} if old else {}
-        gone = (
-            frozenset(deleted_since(session, generation.map_id, old.version))
-            if old
-            else frozenset[UUID]()
-        )
-        rows_of = {
-            chunk.id: live_rows(session, chunk.id) for chunk in chunks if chunk.id not in known
+        changed = changed_since(session, generation.map_id, old.version) if old else []
+        facts_of = {
+            chunk.id: live_facts(session, chunk.id) for chunk in chunks if chunk.id not in known
         }
+    changes = {photo.photo_id: photo for photo in changed}
     loaded: list[LoadedChunk] = []
     missing: list[str] = []
     for chunk in chunks:
         if chunk.id in known:
-            loaded.append(_without(known[chunk.id], gone))
+            loaded.append(_changed(known[chunk.id], changes))
             continue
         try:
-            loaded.append(_load(store, chunk, rows_of[chunk.id]))
+            loaded.append(_load(store, chunk, facts_of[chunk.id]))
         except (Unavailable, NotFound, ValueError, OSError) as error:
             log.error("chunk %s can't be served: %s", chunk.object_key, error)
             missing.append(chunk.object_key)
@@ -74,27 +70,19 @@ def advance(
         version=version,
         chunks=tuple(loaded),
         missing=tuple(missing),
-        live_rows=sum(int(chunk.alive.sum()) for chunk in loaded),
+        live_rows=sum(int(chunk.photos.findable.sum()) for chunk in loaded),
+        by_key={chunk.object_key: chunk for chunk in loaded},
     )
 
 
-def _load(store: ObjectStore, chunk: Chunk, live: list[tuple[int, UUID]]) -> LoadedChunk:
+def _load(store: ObjectStore, chunk: Chunk, facts: list[tuple[int, PhotoFacts]]) -> LoadedChunk:
     rows = read_chunk(store, chunk.object_key, chunk.sha256)
-    photo_ids = np.full(len(rows), None, dtype=object)
-    alive = np.zeros(len(rows), dtype=bool)
-    for row, photo_id in live:
-        photo_ids[row] = photo_id
-        alive[row] = True
-    return LoadedChunk(chunk.id, chunk.object_key, rows, photo_ids, alive)
+    return LoadedChunk(chunk.id, chunk.object_key, rows, PhotoColumns.of(len(rows), facts))
 
 
-def _without(chunk: LoadedChunk, gone: frozenset[UUID]) -> LoadedChunk:
-    """The chunk with the rows of deleted photos dead; itself when it has none of them."""
-    if not gone:
+def _changed(chunk: LoadedChunk, changes: dict[UUID, PhotoFacts]) -> LoadedChunk:
+    """The chunk with what has changed of its photos; itself when nothing has."""
+    photos = chunk.photos.changed(changes) if changes else chunk.photos
+    if photos is chunk.photos:
         return chunk
-    dead = [row for row, photo_id in enumerate(chunk.photo_ids) if photo_id in gone]
-    if not dead:
-        return chunk
-    alive = chunk.alive.copy()
-    alive[dead] = False
-    return LoadedChunk(chunk.chunk_id, chunk.object_key, chunk.rows, chunk.photo_ids, alive)
+    return LoadedChunk(chunk.chunk_id, chunk.object_key, chunk.rows, photos)

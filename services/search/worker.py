@@ -67,8 +67,9 @@ class SearchWorker:
             snapshot.chunks,
             query,
             request.k,
-            request.min_score,
-            frozenset(request.exclude),
+            min_score=request.min_score,
+            wanted=request.photos,
+            exclude=frozenset(request.exclude),
         )
         return SearchResponse(
             hits=tuple(Hit(photo_id=photo_id, score=score) for photo_id, score in hits),
@@ -120,7 +121,7 @@ class SearchWorker:
 
     def _query(self, snapshot: Snapshot, request: SearchRequest) -> NDArray[np.float32]:
         """The descriptor that the request refers to."""
-        loaded = snapshot.chunk_at(request.object_key)
+        loaded = snapshot.by_key.get(request.object_key)
         if request.object_key in snapshot.missing:
             raise _unreadable(request.object_key)
         try:

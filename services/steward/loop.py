@@ -8,10 +8,13 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+from services.steward.auto_evaluate import evaluate_changed_maps
 from services.steward.collect import collect, collect_orphans
 from services.steward.compact import compact
+from services.steward.delete_maps import delete_maps
 from services.steward.model_changes import advance_model_changes, fit_maps_that_wait
 from services.steward.queue import free_leases, resend_hints
+from services.steward.retention import forget_old_jobs, forget_old_searches
 from shared.catalog.session import Catalog
 from shared.jobs import Hints
 from shared.objects import ObjectStore
@@ -50,7 +53,23 @@ class Steward:
                 lambda: fit_maps_that_wait(catalog, hints, settings.auto_fit_photos),
             ),
             Duty("compact", 5.0, lambda: compact(catalog, store, settings.compact_chunks)),
+            Duty("delete maps", 1.0, lambda: delete_maps(catalog, store)),
             Duty("collect", 10.0, lambda: collect(catalog, store, settings)),
+            Duty(
+                "forget old jobs",
+                10.0,
+                lambda: forget_old_jobs(catalog, settings.job_retention_days),
+            ),
+            Duty(
+                "forget old searches",
+                10.0,
+                lambda: forget_old_searches(catalog, settings.search_history_days),
+            ),
+            Duty(
+                "evaluate changed maps",
+                2.0,
+                lambda: evaluate_changed_maps(catalog, settings.auto_evaluate_photos),
+            ),
             Duty(
                 "collect orphans",
                 3600.0,

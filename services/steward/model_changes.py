@@ -14,7 +14,7 @@ from sqlalchemy import delete, exists, func, insert, select, update
 from sqlalchemy.orm import Session, aliased
 
 from shared.catalog.base import Condition, db_now
-from shared.catalog.chunks import Descriptor, count_searchable
+from shared.catalog.chunks import Descriptor, count_described
 from shared.catalog.generations import (
     Generation,
     GenerationState,
@@ -93,7 +93,7 @@ def _advance(session: Session, job: Job, generation_id: UUID) -> int:
         )
     if queued or session.scalar(select(exists().where(open_jobs, Job.state.in_(UNFINISHED)))):
         sampled = int(job.params.get("sampled", 0))
-        done = count_searchable(session, generation_id)
+        done = count_described(session, generation_id)
         job.progress_done = max(0, min(sampled + done, job.progress_total - 1))
         return queued
     failed = _count(session, open_jobs & (Job.state == JobState.FAILED))
@@ -101,7 +101,7 @@ def _advance(session: Session, job: Job, generation_id: UUID) -> int:
         _switch(session, generation)
     job.progress_failed = failed
     job.progress_total = max(job.progress_total, failed)
-    photos = count_searchable(session, generation_id)
+    photos = count_described(session, generation_id)
     succeed(
         job,
         {

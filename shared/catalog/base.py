@@ -15,7 +15,11 @@ from sqlalchemy.ext.compiler import compiles
 from sqlalchemy.orm import DeclarativeBase
 from sqlalchemy.sql.elements import ColumnElement
 from sqlalchemy.sql.functions import FunctionElement
-from sqlalchemy.types import Boolean, TypeDecorator
+from sqlalchemy.types import Boolean, Float, TypeDecorator
+
+from shared.geodesy import EARTH_RADIUS_M
+
+SQLITE_DISTANCE = "placewise_distance_m"
 
 
 class UtcDateTime(TypeDecorator[datetime]):
@@ -76,6 +80,13 @@ class json_array_has(FunctionElement[bool]):
     inherit_cache = True
 
 
+class db_distance_m(FunctionElement[float]):
+    """`geodesy.distance_m` in SQL: latitude and longitude of two points, in degrees."""
+
+    type = Float()
+    inherit_cache = True
+
+
 @compiles(db_now, "postgresql")
 def _now_postgresql(element: db_now, compiler: Any, **kw: Any) -> str:
     return "clock_timestamp()"
@@ -111,6 +122,24 @@ def _json_array_has_sqlite(element: json_array_has, compiler: Any, **kw: Any) ->
     array, value = element.clauses
     array_sql, value_sql = compiler.process(array, **kw), compiler.process(value, **kw)
     return f"EXISTS (SELECT 1 FROM json_each({array_sql}) WHERE json_each.value = {value_sql})"  # noqa: S608  (compiled SQL, no text of users)
+
+
+@compiles(db_distance_m, "postgresql")
+def _distance_postgresql(element: db_distance_m, compiler: Any, **kw: Any) -> str:
+    lat_1, lon_1, lat_2, lon_2 = (
+        f"CAST({compiler.process(clause, **kw)} AS double precision)" for clause in element.clauses
+    )
+    return (
+        f"({2 * EARTH_RADIUS_M!r} * asin(least(1.0, sqrt("
+        f"power(sin(radians({lat_2} - {lat_1}) / 2), 2) + cos(radians({lat_1})) * "
+        f"cos(radians({lat_2})) * power(sin(radians({lon_2} - {lon_1}) / 2), 2)))))"
+    )
+
+
+@compiles(db_distance_m, "sqlite")
+def _distance_sqlite(element: db_distance_m, compiler: Any, **kw: Any) -> str:
+    # SQLite may be built without trigonometry: `session` brings the function to each connection.
+    return f"{SQLITE_DISTANCE}({compiler.process(element.clauses, **kw)})"
 
 
 def rowcount(result: Any) -> int:

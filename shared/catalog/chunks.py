@@ -25,7 +25,7 @@ from sqlalchemy.orm import Mapped, Session, mapped_column
 
 from shared.catalog.base import Base, UtcDateTime, db_now
 from shared.catalog.generations import Generation
-from shared.catalog.photos import Photo
+from shared.catalog.photos import Photo, PhotoFacts, PhotoRole
 from shared.ids import new_id
 
 
@@ -105,26 +105,36 @@ def live_chunks(session: Session, generation_id: UUID) -> list[Chunk]:
 
 def live_rows(session: Session, chunk_id: UUID) -> list[tuple[int, UUID]]:
     """(row, photo) of the chunk's rows that belong to live photos, by row."""
+    return [(row, facts.photo_id) for row, facts in live_facts(session, chunk_id)]
+
+
+def live_facts(session: Session, chunk_id: UUID) -> list[tuple[int, PhotoFacts]]:
+    """(row, what search knows of its photo) of the chunk's live rows, by row."""
     found = session.execute(
-        select(Descriptor.row, Descriptor.photo_id)
+        select(Descriptor.row, *PhotoFacts.COLUMNS)
         .join(Photo, Photo.id == Descriptor.photo_id)
         .where(Descriptor.chunk_id == chunk_id, Photo.deleted_at.is_(None))
         .order_by(Descriptor.row)
     )
-    return [(row, photo_id) for row, photo_id in found]
+    return [(row[0], PhotoFacts(*row[1:])) for row in found]
+
+
+def count_described(session: Session, generation_id: UUID, role: PhotoRole | None = None) -> int:
+    """How many live photos, of one role or of any, have a descriptor in the generation."""
+    counted = (
+        select(func.count())
+        .select_from(Descriptor)
+        .join(Photo, Photo.id == Descriptor.photo_id)
+        .where(Descriptor.generation_id == generation_id, Photo.deleted_at.is_(None))
+    )
+    if role is not None:
+        counted = counted.where(Photo.role == role)
+    return session.scalar(counted) or 0
 
 
 def count_searchable(session: Session, generation_id: UUID) -> int:
-    """How many live photos have a descriptor in the generation."""
-    return (
-        session.scalar(
-            select(func.count())
-            .select_from(Descriptor)
-            .join(Photo, Photo.id == Descriptor.photo_id)
-            .where(Descriptor.generation_id == generation_id, Photo.deleted_at.is_(None))
-        )
-        or 0
-    )
+    """How many photos can be found in the generation."""
+    return count_described(session, generation_id, PhotoRole.DATABASE)
 
 
 def take_slot(generation: Generation, rows: int, slot_rows: int) -> int:

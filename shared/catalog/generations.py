@@ -28,7 +28,8 @@ class GenerationState(StrEnum):
 class Generation(Base):
     """`spec` is everything that decides a descriptor's value; rows of two specs never mix.
 
-    New chunks go into `open_slot`, which holds `open_slot_rows` rows so far.
+    `calibration` is what its evaluations have learnt of its scores (`shared.estimate`). New chunks
+    go into `open_slot`, which holds `open_slot_rows` rows so far.
     """
 
     __tablename__ = "generations"
@@ -44,6 +45,7 @@ class Generation(Base):
     vocabulary_id: Mapped[UUID | None] = mapped_column(
         Uuid, ForeignKey("vocabularies.id"), index=True
     )
+    calibration: Mapped[dict[str, Any] | None] = mapped_column(JsonValue)
     open_slot: Mapped[int] = mapped_column(Integer, default=0)
     open_slot_rows: Mapped[int] = mapped_column(Integer, default=0)
     created_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())

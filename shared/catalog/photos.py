@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from datetime import datetime
-from typing import Any
+from enum import StrEnum
+from typing import Any, ClassVar
 from uuid import UUID
 
 from sqlalchemy import (
@@ -20,6 +21,7 @@ from sqlalchemy import (
     Uuid,
     func,
     literal,
+    or_,
     select,
     tuple_,
     update,
@@ -31,11 +33,19 @@ from shared.catalog.base import (
     Condition,
     JsonValue,
     UtcDateTime,
+    db_distance_m,
     db_now,
     json_array_has,
 )
 from shared.errors import NotFound
+from shared.geodesy import latitude_band
 from shared.ids import new_id
+from shared.photo_filter import EVERYTHING, Box, Circle, PhotoFilter
+
+
+class PhotoRole(StrEnum):
+    DATABASE = "database"  # indexed: it can be found
+    QUERY = "query"  # a labelled query: described, never found; evaluations ask with it
 
 
 class Photo(Base):
@@ -50,6 +60,9 @@ class Photo(Base):
     id: Mapped[UUID] = mapped_column(Uuid, primary_key=True, default=new_id)
     map_id: Mapped[UUID] = mapped_column(Uuid, ForeignKey("maps.id"))
     job_id: Mapped[UUID | None] = mapped_column(Uuid)
+    role: Mapped[PhotoRole] = mapped_column(
+        String(10), default=PhotoRole.DATABASE, server_default=PhotoRole.DATABASE
+    )
     sha256: Mapped[str] = mapped_column(String(64))
     object_key: Mapped[str] = mapped_column(Text)
     filename: Mapped[str] = mapped_column(Text)
@@ -82,6 +95,7 @@ class Photo(Base):
         ),
         Index("ix_photos_map_uploaded", "map_id", "uploaded_at", "id"),
         Index("ix_photos_map_changed", "map_id", "changed_version"),
+        Index("ix_photos_map_position", "map_id", "latitude", "longitude"),
         Index(
             "ix_photos_deleted",
             "deleted_at",
@@ -89,6 +103,36 @@ class Photo(Base):
             sqlite_where=deleted_at.is_not(None),
         ),
     )
+
+
+@dataclass(frozen=True, slots=True)
+class PhotoFacts:
+    """What search keeps of a photo, to filter by."""
+
+    COLUMNS: ClassVar = (
+        Photo.id,
+        Photo.role,
+        Photo.deleted_at,
+        Photo.latitude,
+        Photo.longitude,
+        Photo.captured_at,
+        Photo.place,
+        Photo.tags,
+    )
+
+    photo_id: UUID
+    role: PhotoRole
+    deleted_at: datetime | None
+    latitude: float | None
+    longitude: float | None
+    captured_at: datetime | None
+    place: str | None
+    tags: list[str]
+
+    @property
+    def findable(self) -> bool:
+        """Live, and not a labelled query."""
+        return self.deleted_at is None and self.role == PhotoRole.DATABASE
 
 
 def get_photo(session: Session, map_id: UUID, photo_id: UUID) -> Photo:
@@ -124,26 +168,39 @@ def live_photos(session: Session, photo_ids: Iterable[UUID]) -> dict[UUID, Photo
     return {photo.id: photo for photo in found}
 
 
-def deleted_since(session: Session, map_id: UUID, version: int) -> list[UUID]:
-    """Photos of the map that were deleted after `version`."""
-    return list(
-        session.scalars(
-            select(Photo.id).where(
-                Photo.map_id == map_id,
-                Photo.changed_version > version,
-                Photo.deleted_at.is_not(None),
-            )
-        )
+def changed_since(session: Session, map_id: UUID, version: int) -> list[PhotoFacts]:
+    """Photos of the map that were changed or deleted after `version`, as they are now."""
+    found = session.execute(
+        select(*PhotoFacts.COLUMNS).where(Photo.map_id == map_id, Photo.changed_version > version)
     )
+    return [PhotoFacts(*facts) for facts in found]
 
 
-def count_live(session: Session, map_id: UUID) -> int:
-    """How many live photos the map has."""
+def count_live(session: Session, map_id: UUID, role: PhotoRole | None = None) -> int:
+    """How many live photos the map has, of one role or of any."""
+    counted = (
+        select(func.count())
+        .select_from(Photo)
+        .where(Photo.map_id == map_id, Photo.deleted_at.is_(None))
+    )
+    if role is not None:
+        counted = counted.where(Photo.role == role)
+    return session.scalar(counted) or 0
+
+
+def count_located(session: Session, map_id: UUID) -> int:
+    """How many live database photos have coordinates or a place label."""
+    located = or_(Photo.latitude.is_not(None), Photo.place.is_not(None))
     return (
         session.scalar(
             select(func.count())
             .select_from(Photo)
-            .where(Photo.map_id == map_id, Photo.deleted_at.is_(None))
+            .where(
+                Photo.map_id == map_id,
+                Photo.deleted_at.is_(None),
+                Photo.role == PhotoRole.DATABASE,
+                located,
+            )
         )
         or 0
     )
@@ -159,8 +216,9 @@ class MetadataFilter:
     upload_before: datetime | None = None
     min_file_size: int | None = None
     max_file_size: int | None = None
-    tags: tuple[str, ...] = ()
-    """A photo must carry all of them."""
+    photos: PhotoFilter = EVERYTHING
+    """Where, when and what the photo shows."""
+    role: PhotoRole | None = None
 
     def conditions(self) -> list[Condition]:
         found: list[Condition] = []
@@ -174,8 +232,46 @@ class MetadataFilter:
             found.append(Photo.size_bytes >= self.min_file_size)
         if self.max_file_size is not None:
             found.append(Photo.size_bytes <= self.max_file_size)
-        found.extend(json_array_has(Photo.tags, tag) for tag in self.tags)
-        return found
+        if self.role is not None:
+            found.append(Photo.role == self.role)
+        return found + filter_conditions(self.photos)
+
+
+def filter_conditions(wanted: PhotoFilter) -> list[Condition]:
+    """The filter in SQL."""
+    found: list[Condition] = []
+    if wanted.near is not None:
+        found += _within(wanted.near)
+    if wanted.box is not None:
+        found += _inside(wanted.box)
+    if wanted.captured_after is not None:
+        found.append(Photo.captured_at >= wanted.captured_after)
+    if wanted.captured_before is not None:
+        found.append(Photo.captured_at <= wanted.captured_before)
+    if wanted.place is not None:
+        found.append(Photo.place == wanted.place)
+    if wanted.ids is not None:
+        found.append(Photo.id.in_(wanted.ids))
+    found.extend(json_array_has(Photo.tags, tag) for tag in wanted.tags)
+    return found
+
+
+def _within(circle: Circle) -> list[Condition]:
+    south, north = latitude_band(circle.latitude, circle.radius_m)
+    away = db_distance_m(
+        literal(circle.latitude), literal(circle.longitude), Photo.latitude, Photo.longitude
+    )
+    return [Photo.latitude.between(south, north), away <= circle.radius_m]
+
+
+def _inside(box: Box) -> list[Condition]:
+    return [
+        Photo.latitude.between(box.south, box.north),
+        or_(
+            func.abs(Photo.latitude) == 90.0,
+            *(Photo.longitude.between(west, east) for west, east in box.longitude_ranges()),
+        ),
+    ]
 
 
 def search_metadata(

@@ -1,12 +1,12 @@
-"""Searches: what was asked, for the history and the figures."""
+"""Searches: what was asked, for the history and the figures; kept for SEARCH_HISTORY_DAYS."""
 
 from __future__ import annotations
 
 from datetime import datetime
 from uuid import UUID
 
-from sqlalchemy import Float, ForeignKey, Index, Integer, Text, Uuid
-from sqlalchemy.orm import Mapped, mapped_column
+from sqlalchemy import Boolean, Float, ForeignKey, Index, Integer, Text, Uuid, select
+from sqlalchemy.orm import Mapped, Session, mapped_column
 
 from shared.catalog.base import Base, UtcDateTime, db_now
 from shared.ids import new_id
@@ -25,6 +25,21 @@ class Search(Base):
     top_k: Mapped[int] = mapped_column(Integer)
     results: Mapped[int] = mapped_column(Integer)
     processing_ms: Mapped[float] = mapped_column(Float)
+    best_score: Mapped[float | None] = mapped_column(Float)
+    in_map: Mapped[bool | None] = mapped_column(Boolean)
     searched_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())
 
-    __table_args__ = (Index("ix_searches_map_time", "map_id", "searched_at"),)
+    __table_args__ = (
+        Index("ix_searches_map_time", "map_id", "searched_at"),
+        Index("ix_searches_map_id", "map_id", "id"),
+    )
+
+
+def list_searches(
+    session: Session, map_id: UUID, limit: int, before: UUID | None = None
+) -> list[Search]:
+    """Newest first, up to `limit`, older than `before`."""
+    wanted = select(Search).where(Search.map_id == map_id)
+    if before is not None:
+        wanted = wanted.where(Search.id < before)
+    return list(session.scalars(wanted.order_by(Search.id.desc()).limit(limit)))

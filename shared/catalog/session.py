@@ -14,6 +14,9 @@ from sqlalchemy import create_engine, event
 from sqlalchemy.engine import make_url
 from sqlalchemy.orm import Session, sessionmaker
 
+from shared.catalog.base import SQLITE_DISTANCE
+from shared.geodesy import distance_m
+
 MIGRATIONS = Path(__file__).parent / "migrations"
 
 # A writer that waits this long for SQLite's single write lock has met a bug, not a queue.
@@ -95,6 +98,12 @@ def _prepare_sqlite(connection: Any, _record: Any) -> None:
     cursor.execute("PRAGMA synchronous = FULL")
     cursor.execute("PRAGMA foreign_keys = ON")
     cursor.close()
+    connection.create_function(SQLITE_DISTANCE, 4, _distance_or_null, deterministic=True)
+
+
+def _distance_or_null(*degrees: float | None) -> float | None:
+    known = [value for value in degrees if value is not None]
+    return distance_m(*known) if len(known) == len(degrees) else None
 
 
 def _begin_sqlite(connection: Any) -> None:

@@ -1,6 +1,7 @@
 """Every table, imported: what Alembic compares the database with."""
 
 from shared.catalog.chunks import Chunk, Descriptor
+from shared.catalog.evaluations import Evaluation
 from shared.catalog.generations import Generation
 from shared.catalog.maps import Map
 from shared.catalog.models import Model
@@ -12,6 +13,7 @@ from shared.jobs.table import Job
 __all__ = [
     "Chunk",
     "Descriptor",
+    "Evaluation",
     "Generation",
     "Job",
     "Map",

@@ -11,6 +11,7 @@ from sqlalchemy import ForeignKey, Integer, String, Text, Uuid, select
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
 from shared.catalog.base import Base, JsonValue, UtcDateTime, db_now
+from shared.catalog.generations import Generation
 from shared.errors import NotFound
 from shared.ids import new_id
 
@@ -40,6 +41,13 @@ class Vocabulary(Base):
     def standing(self) -> str:
         """What an answer says of it: `own` when learnt on this map's photos, else `foreign`."""
         return "own" if self.origin == VocabularyOrigin.FITTED else "foreign"
+
+
+def standing_of(session: Session, generation: Generation) -> str:
+    """The standing of the generation's vocabulary; `none` for an extractor without one."""
+    if generation.vocabulary_id is None:
+        return "none"
+    return session.get_one(Vocabulary, generation.vocabulary_id).standing
 
 
 def add_vocabulary(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from uuid import UUID
 
 from sqlalchemy import func, select, update
@@ -9,7 +10,15 @@ from sqlalchemy.orm import Session
 
 from shared.catalog.base import db_now, db_now_plus
 from shared.ids import new_id
-from shared.jobs.table import MODEL_CHANGES, Job, JobState, claimable, locked_under
+from shared.jobs.table import (
+    EXTRACTOR_JOBS,
+    MODEL_CHANGES,
+    Job,
+    JobKind,
+    JobState,
+    claimable,
+    locked_under,
+)
 
 
 def claim(
@@ -18,6 +27,7 @@ def claim(
     worker: str,
     limit: int,
     lease_seconds: float,
+    kinds: Sequence[JobKind] = EXTRACTOR_JOBS,
     least_priority: int | None = None,
     begun: bool = True,
 ) -> list[Job]:
@@ -29,7 +39,7 @@ def claim(
     do what can't harm it (read, decode) says so with `begun=False`, and calls `begin` after that.
     """
     order = (Job.priority.desc(), Job.id)
-    wanted = [claimable()]
+    wanted = [claimable(kinds)]
     if least_priority is not None:
         wanted.append(Job.priority >= least_priority)
     head = session.scalar(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from sqlalchemy import update
+from sqlalchemy import select, update
 from sqlalchemy.orm import Session
 
 from shared.catalog.base import Condition, db_now, db_now_plus
@@ -82,6 +82,28 @@ def cancel(job: Job) -> None:
     job.waiting_for = None
     job.finished_at = db_now()
     _drop_lease(job)
+
+
+def cancel_all(session: Session, condition: Condition) -> None:
+    """Cancel every unfinished job that the condition names, as `cancel` does one."""
+    unfinished = (
+        select(Job.id)
+        .where(condition, Job.state.in_(UNFINISHED))
+        .order_by(Job.id)  # as `held` locks them
+        .with_for_update()
+    )
+    session.execute(
+        update(Job)
+        .where(Job.id.in_(unfinished))
+        .values(
+            state=JobState.CANCELLED,
+            waiting_for=None,
+            finished_at=db_now(),
+            lease_token=None,
+            lease_until=None,
+        )
+        .execution_options(synchronize_session=False)
+    )
 
 
 def retry(session: Session, job: Job) -> None:

@@ -15,7 +15,7 @@ from __future__ import annotations
 from typing import Any
 from uuid import UUID
 
-from sqlalchemy import select, update
+from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from shared.catalog.base import db_now
@@ -28,13 +28,12 @@ from shared.catalog.generations import (
 from shared.catalog.maps import bump_version, lock_map
 from shared.errors import Conflict
 from shared.ids import new_id
-from shared.jobs.finish import cancel, release, release_waiting
+from shared.jobs.finish import cancel, cancel_all, release, release_waiting
 from shared.jobs.table import (
     MODEL_CHANGES,
     UNFINISHED,
     Job,
     JobKind,
-    JobState,
     Priority,
     WaitingFor,
 )
@@ -123,24 +122,4 @@ def abandon_generation(session: Session, job: Job) -> None:
         return
     generation.state = GenerationState.ABANDONED
     generation.ended_at = db_now()
-    queued = (
-        select(Job.id)
-        .where(
-            Job.generation_id == generation.id,
-            Job.kind == JobKind.REINDEX,
-            Job.state.in_(UNFINISHED),
-        )
-        .order_by(Job.id)  # as `held` locks them
-        .with_for_update()
-    )
-    session.execute(
-        update(Job)
-        .where(Job.id.in_(queued))
-        .values(
-            state=JobState.CANCELLED,
-            finished_at=db_now(),
-            lease_token=None,
-            lease_until=None,
-        )
-        .execution_options(synchronize_session=False)
-    )
+    cancel_all(session, (Job.generation_id == generation.id) & (Job.kind == JobKind.REINDEX))

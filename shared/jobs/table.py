@@ -66,9 +66,14 @@ class JobKind(StrEnum):
     FIT = "fit"  # learn a vocabulary from the map's photos and switch to it
     IMPORT = "import_vocabulary"  # check a vocabulary file and switch to it
     SWITCH = "switch"  # switch to a vocabulary that the map already has
+    EVALUATE = "evaluate"  # ask the map about photos whose place is known, and count
 
 
 MODEL_CHANGES = (JobKind.FIT, JobKind.IMPORT, JobKind.SWITCH)
+
+# Who takes what: extractors need photos and a backbone, the steward only the search tier.
+EXTRACTOR_JOBS = (JobKind.INDEX, JobKind.REINDEX, JobKind.DESCRIBE, *MODEL_CHANGES)
+STEWARD_JOBS = (JobKind.EVALUATE,)
 
 
 class Priority(IntEnum):
@@ -78,6 +83,7 @@ class Priority(IntEnum):
     UPLOAD = 50
     MODEL_CHANGE = 20
     REINDEX = 10
+    EVALUATION = 5
 
 
 class WaitingFor(StrEnum):
@@ -138,10 +144,11 @@ class Job(Base):
     )
 
 
-def claimable() -> Condition:
-    """True for jobs that a worker may take now."""
+def claimable(kinds: Sequence[JobKind] = EXTRACTOR_JOBS) -> Condition:
+    """True for jobs of these kinds that a worker may take now."""
     return and_(
         Job.state.in_(UNFINISHED),
+        Job.kind.in_(kinds),
         Job.lease_token.is_(None),
         Job.waiting_for.is_(None),
         or_(Job.run_after.is_(None), Job.run_after <= db_now()),

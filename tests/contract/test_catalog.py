@@ -29,8 +29,8 @@ from shared.catalog.models import Model, ensure_model
 from shared.catalog.photos import (
     MetadataFilter,
     Photo,
+    changed_since,
     count_live,
-    deleted_since,
     find_live_by_sha256,
     get_photo,
     live_photos,
@@ -39,6 +39,7 @@ from shared.catalog.photos import (
 from shared.catalog.session import Catalog
 from shared.errors import NotFound
 from shared.ids import new_id
+from shared.photo_filter import PhotoFilter
 from tests.support.catalog_rows import add_generation, add_job, add_map, add_photo, delete
 
 MOMENT = datetime(2024, 5, 6, 7, 8, 9, 123456, tzinfo=UTC)
@@ -319,8 +320,9 @@ def test_a_deleted_photo_shows_in_no_query(catalog: Catalog, map_id: UUID) -> No
         assert count_live(session, map_id) == 1
         page, total = search_metadata(session, map_id, MetadataFilter(), 10, None)
         assert ([photo.id for photo in page], total) == ([stays], 1)
-        assert deleted_since(session, map_id, version) == [goes]
-        assert deleted_since(session, map_id, version + 1) == []
+        changed = changed_since(session, map_id, version)
+        assert [(facts.photo_id, facts.findable) for facts in changed] == [(goes, False)]
+        assert changed_since(session, map_id, version + 1) == []
 
 
 def test_a_photo_of_another_map_is_not_found(catalog: Catalog, map_id: UUID) -> None:
@@ -336,6 +338,8 @@ def test_a_photo_of_another_map_is_not_found(catalog: Catalog, map_id: UUID) -> 
 
 def found(catalog: Catalog, map_id: UUID, **wanted: Any) -> set[str]:
     """The names of all photos that match, with the total checked against them."""
+    about = {name: wanted.pop(name) for name in PhotoFilter.model_fields if name in wanted}
+    wanted["photos"] = PhotoFilter(**about)
     with catalog.read() as session:
         page, total = search_metadata(session, map_id, MetadataFilter(**wanted), 1000, None)
     assert total == len(page)
@@ -438,7 +442,7 @@ def test_filters_work_together_and_in_one_map(catalog: Catalog, map_id: UUID) ->
         ):
             add_photo(session, map_id, **{**wanted, **wrong})
         conditions = MetadataFilter(
-            filename="x", upload_before=MOMENT, max_file_size=5, tags=("t",)
+            filename="x", upload_before=MOMENT, max_file_size=5, photos=PhotoFilter(tags=("t",))
         )
         page, total = search_metadata(session, map_id, conditions, 10, None)
     assert ([photo.id for photo in page], total) == ([right], 1)
@@ -499,10 +503,14 @@ def test_the_total_counts_what_matches_and_not_the_page(catalog: Catalog, map_id
         for number in range(7):
             add_photo(session, map_id, tags=["odd"] if number % 2 else [], uploaded_at=MOMENT)
     with catalog.read() as session:
-        first, total = search_metadata(session, map_id, MetadataFilter(tags=("odd",)), 2, None)
+        first, total = search_metadata(
+            session, map_id, MetadataFilter(photos=PhotoFilter(tags=("odd",))), 2, None
+        )
         assert (len(first), total) == (2, 3)
         after = (first[-1].uploaded_at, first[-1].id)
-        rest, total = search_metadata(session, map_id, MetadataFilter(tags=("odd",)), 2, after)
+        rest, total = search_metadata(
+            session, map_id, MetadataFilter(photos=PhotoFilter(tags=("odd",))), 2, after
+        )
         assert (len(rest), total) == (1, 3)
 
 

@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from services.search.scan import FLOAT32_MARGIN, top_k
-from services.search.snapshot import LoadedChunk
+from services.search.snapshot import LoadedChunk, PhotoColumns
 from shared.ids import new_id
+from tests.support.photo_facts import facts_of
 
 Rows = NDArray[np.float32]
 
@@ -35,10 +36,10 @@ def photo(number: int) -> UUID:
 
 
 def chunk_of(rows: Rows, numbers: list[int], dead: frozenset[int] = frozenset()) -> LoadedChunk:
-    photo_ids = np.empty(len(rows), dtype=object)
-    photo_ids[:] = [photo(number) for number in numbers]
-    alive = np.array([number not in dead for number in numbers], dtype=bool)
-    return LoadedChunk(new_id(), "chunks/test.npy", rows, photo_ids, alive)
+    live = [
+        (row, facts_of(photo(number))) for row, number in enumerate(numbers) if number not in dead
+    ]
+    return LoadedChunk(new_id(), "chunks/test.npy", rows, PhotoColumns.of(len(rows), live))
 
 
 def split(
@@ -69,7 +70,7 @@ def hits_of(
     min_score: float | None = None,
     exclude: frozenset[UUID] = frozenset(),
 ) -> list[tuple[UUID, float]]:
-    return top_k(chunks, query, k, min_score, exclude)[0]
+    return top_k(chunks, query, k, min_score=min_score, exclude=exclude)[0]
 
 
 @settings(max_examples=80, deadline=None)
@@ -107,10 +108,10 @@ def test_answers_equal_brute_force_with_order_and_ties(
         return
     chunks = split(rows, pieces, numbers, dead)
     expected = brute_force(rows, numbers, query, k, dead)
-    found, scanned, reranked = top_k(chunks, query, k, None, frozenset())
+    found, scanned, reranked = top_k(chunks, query, k)
     assert found == expected
-    assert scanned == count
-    assert len(expected) <= reranked <= count
+    assert scanned == count - len(dead)
+    assert len(expected) <= reranked <= scanned
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -163,9 +164,8 @@ def test_dead_rows_are_never_answered_even_when_they_fit_best() -> None:
 
 def test_dead_rows_need_no_photo() -> None:
     rows = unit_rows(6, 3, 8)
-    photo_ids = np.array([photo(0), None, photo(2)], dtype=object)
-    alive = np.array([True, False, True])
-    chunk = LoadedChunk(new_id(), "chunks/test.npy", rows, photo_ids, alive)
+    live = [(0, facts_of(photo(0))), (2, facts_of(photo(2)))]
+    chunk = LoadedChunk(new_id(), "chunks/test.npy", rows, PhotoColumns.of(len(rows), live))
     found = hits_of([chunk], rows[1], 3, exclude=frozenset({photo(2)}))
     assert [hit[0] for hit in found] == [photo(0)]
 
@@ -196,9 +196,9 @@ def test_fewer_rows_than_asked_are_all_answered() -> None:
 
 def test_nothing_loaded_answers_nothing() -> None:
     query = unit_rows(1, 1, 4)[0]
-    assert top_k([], query, 5, None, frozenset()) == ([], 0, 0)
+    assert top_k([], query, 5) == ([], 0, 0)
     empty = chunk_of(np.empty((0, 4), dtype=np.float32), [])
-    assert top_k([empty], query, 5, None, frozenset()) == ([], 0, 0)
+    assert top_k([empty], query, 5) == ([], 0, 0)
 
 
 def test_empty_chunk_between_others_shifts_nothing() -> None:

@@ -1,0 +1,104 @@
+"""`placewise evaluate`: how often the right place comes first, in a live map."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+from rich.table import Table
+
+from services.cli.connect import connect
+from services.cli.output import (
+    JsonOption,
+    MapOption,
+    ServerOption,
+    answers,
+    explained,
+    print_json,
+    progress_bar,
+)
+from services.cli.wait import wait_with_bar
+from shared.client import Client, Json
+
+SHOWN = 5  # evaluations before this one
+
+
+def evaluate(
+    sample: Annotated[
+        int | None, typer.Option(min=1, help="Photos of the map to ask with; default 1000.")
+    ] = None,
+    seed: Annotated[int | None, typer.Option(min=0)] = None,
+    map_name: MapOption = None,
+    server: ServerOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Ask the map about its own photos (each left out in turn) and its labelled queries."""
+    wanted = {"sample": sample, "seed": seed}
+    given = {name: value for name, value in wanted.items() if value is not None}
+    with explained(as_json):
+        with connect(server, map_name) as client, progress_bar() as progress:
+            job = wait_with_bar(client, client.evaluate(**given)["job_id"], progress, "asking")
+            earlier = client.evaluations(SHOWN + 1)
+            vocabularies = _vocabularies(client)
+        if as_json:
+            print_json(job["result"])
+            return
+        _print(earlier, vocabularies)
+
+
+def _vocabularies(client: Client) -> dict[str, str]:
+    """The origin of each generation's vocabulary, by generation."""
+    origins = {v["vocabulary_id"]: v["origin"] for v in client.vocabularies()}
+    return {
+        g["generation_id"]: origins.get(g["vocabulary_id"], "none") for g in client.generations()
+    }
+
+
+def _print(evaluations: list[Json], vocabularies: dict[str, str]) -> None:
+    table = Table(
+        "evaluated", "vocabulary", "photos", "asked with", "queries", "R@1", "R@5", "R@10"
+    )
+    for number, found in enumerate(evaluations):
+        figures = found["figures"]
+        rows = [("own photos, left out", figures["leave_one_out"])]
+        if figures["labelled_queries"]:
+            rows.append(("labelled queries", figures["labelled_queries"]))
+        for what, recall in rows:
+            table.add_row(
+                found["evaluated_at"][:19] + (" (newest)" if number == 0 else ""),
+                vocabularies.get(found["generation_id"], ""),
+                str(found["searchable"]),
+                what,
+                str(recall["queries"]),
+                *(_percent(recall[f"R@{k}"]) for k in (1, 5, 10)),
+            )
+    answers.print(table)
+    for line in _estimate_lines(evaluations[0]["figures"]):
+        answers.print(line, soft_wrap=True)
+
+
+def _estimate_lines(figures: Json) -> list[str]:
+    labelled, estimate = figures["labelled_queries"], figures["estimate"]
+    lines = [f"Right means within {figures['radius_m']:g} m, or the same label."]
+    if labelled is None:
+        lines.append(
+            "Confidence is uncalibrated: upload photos of another day, with coordinates, as "
+            "labelled queries (placewise index DIR --role query)."
+        )
+        return lines
+    lines.append(
+        f"Of {labelled['queries']} queries in the map {_percent(labelled['accepted_in_map'])} are "
+        f"accepted; of {labelled['out_of_map']} out of it {_percent(labelled['false_accepts'])}; "
+        f"of all accepted {_percent(labelled['right_of_accepted'])} are right."
+    )
+    if labelled["auroc"] is not None:
+        lines.append(
+            f"Confidence ({estimate['calibration']}, cross-validated): calibration error "
+            f"{labelled['calibration_error']:.3f}, AUROC {labelled['auroc']:.3f}, recall at 99 % "
+            f"precision {_percent(labelled['recall_at_99_precision'])}."
+        )
+    return lines
+
+
+def _percent(share: float | None) -> str:
+    return "-" if share is None else f"{100 * share:.1f} %"

@@ -1,0 +1,76 @@
+"""`placewise maps list|create|delete`."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+from rich.table import Table
+
+from services.cli.connect import connect
+from services.cli.output import JsonOption, ServerOption, answers, explained, print_json
+
+app = typer.Typer(help="Named databases of photos, each with its own extractor and vocabulary.")
+
+Name = Annotated[str, typer.Argument(metavar="NAME")]
+
+
+@app.command("list")
+def list_maps(server: ServerOption = None, as_json: JsonOption = False) -> None:
+    """Show every map."""
+    with explained(as_json):
+        with connect(server, None) as client:
+            found = client.maps()
+        if as_json:
+            print_json(found)
+            return
+        table = Table("map", "photos", "searchable", "queries", "extractor", "vocabulary")
+        for map_ in found:
+            table.add_row(
+                map_["name"],
+                str(map_["photos"]),
+                str(map_["searchable"]),
+                str(map_["labelled_queries"]),
+                map_["extractor"],
+                map_["vocabulary"] or "",
+            )
+        answers.print(table)
+
+
+@app.command("create")
+def create(
+    name: Name,
+    extractor: Annotated[
+        str | None, typer.Option(help="How its photos are described; left out: as configured.")
+    ] = None,
+    server: ServerOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Make an empty map."""
+    with explained(as_json):
+        with connect(server, None) as client:
+            made = client.create_map(name, extractor)
+        if as_json:
+            print_json(made)
+            return
+        answers.print(f"The map {name} is there, for photos described by {made['extractor']}.")
+
+
+@app.command("delete")
+def delete(
+    name: Name,
+    yes: Annotated[bool, typer.Option("--yes", help="Don't ask.")] = False,
+    server: ServerOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Delete a map with all its photos."""
+    with explained(as_json):
+        with connect(server, None) as client:
+            photos = next((m["photos"] for m in client.maps() if m["name"] == name), None)
+            if photos and not yes:
+                typer.confirm(f"Delete the map {name} with its {photos} photos?", abort=True)
+            deleted = client.delete_map(name)
+        if as_json:
+            print_json(deleted)
+            return
+        answers.print(deleted["message"])

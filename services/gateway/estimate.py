@@ -1,0 +1,67 @@
+"""From the ranking of a similarity search to the answer's estimate."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from uuid import UUID
+
+from services.gateway.schemas import EstimateAnswer
+from shared.catalog.generations import Generation
+from shared.catalog.photos import Photo
+from shared.estimate.calibration import Calibration
+from shared.estimate.evidence import Ranked, locate, weigh
+from shared.estimate.places import Spot
+from shared.search_protocol import Hit
+
+
+def estimate(
+    generation: Generation, hits: Sequence[Hit], photos: Mapping[UUID, Photo], radius_m: float
+) -> EstimateAnswer:
+    """Where the ranking points to, and what the generation's evaluations say of such a ranking."""
+    ranking = [Ranked(hit.score, _spot(photos[hit.photo_id])) for hit in hits]
+    calibration = (
+        Calibration.model_validate(generation.calibration) if generation.calibration else None
+    )
+    state = calibration.state if calibration else "uncalibrated"
+    evidence = weigh(ranking, radius_m)
+    if evidence is None:
+        reason = (
+            "No photo of the map passes the filter."
+            if not ranking
+            else "The most similar photo has neither coordinates nor a place."
+        )
+        return EstimateAnswer(calibration=state, reason=reason)
+    accepted = calibration.accepts(evidence) if calibration else None
+    confidence = (
+        calibration.confidence.probability(evidence)
+        if calibration and calibration.confidence
+        else None
+    )
+    spot = locate(ranking, radius_m) if accepted is not False else Spot(None, None, None)
+    return EstimateAnswer(
+        in_map=accepted,
+        latitude=spot.latitude,
+        longitude=spot.longitude,
+        radius_m=None if spot.latitude is None else radius_m,
+        place=spot.place,
+        confidence=confidence,
+        calibration=state,
+        reason=_reason(accepted, evidence.lead, calibration),
+    )
+
+
+def _reason(accepted: bool | None, lead: float, calibration: Calibration | None) -> str:
+    if accepted is None or calibration is None or calibration.lead_threshold is None:
+        return (
+            "Whether the place is in the map can't be told yet: first an evaluation has to see at "
+            "least 20 photos with coordinates or places (POST /api/v1/evaluations)."
+        )
+    compared = (
+        f"The best match leads every other place by {lead:.4f}; of photos that are not in the map "
+        f"one in twenty reaches {calibration.lead_threshold:.4f}."
+    )
+    return compared if accepted else f"Not in this map, as far as can be told. {compared}"
+
+
+def _spot(photo: Photo) -> Spot:
+    return Spot(photo.latitude, photo.longitude, photo.place)

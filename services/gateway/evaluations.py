@@ -1,0 +1,113 @@
+"""`/evaluations`: how often the right place comes first, measured on a live map."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Annotated, Any
+from uuid import UUID
+
+from fastapi import APIRouter, Query, Response
+from pydantic import BaseModel, ConfigDict, Field
+
+from services.gateway.context import DEFAULT_MAP, GatewayDep, MapName, read_cursor
+from services.gateway.schemas import Answer, JobStarted, job_started
+from shared.catalog.evaluations import Evaluation, list_evaluations
+from shared.catalog.generations import active_generation
+from shared.catalog.maps import get_map
+from shared.catalog.photos import count_located
+from shared.errors import Conflict
+from shared.ids import new_id
+from shared.jobs import Job, JobKind, Priority
+
+router = APIRouter(tags=["evaluations"])
+
+
+class EvaluationRequest(BaseModel):
+    """What to measure; {} is a good choice."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    sample: int = Field(
+        1000, ge=1, le=1_000_000, description="photos of the map to ask with, at most"
+    )
+    seed: int = Field(0, ge=0, le=2**31 - 1)
+
+
+class EvaluationAnswer(Answer):
+    evaluation_id: UUID
+    generation_id: UUID
+    automatic: bool = Field(description="made because the map had changed")
+    searchable: int = Field(description="photos that could be found then")
+    figures: dict[str, Any] = Field(
+        description="`leave_one_out`: the map's own photos asked, themselves left out; "
+        "`labelled_queries`: photos of role `query`; R@k is the share, of those that the map has "
+        "another photo of, with a right one among the first k"
+    )
+    evaluated_at: datetime
+
+    @classmethod
+    def of(cls, evaluation: Evaluation) -> EvaluationAnswer:
+        return cls(
+            evaluation_id=evaluation.id,
+            generation_id=evaluation.generation_id,
+            automatic=evaluation.automatic,
+            searchable=evaluation.searchable,
+            figures=evaluation.figures,
+            evaluated_at=evaluation.evaluated_at,
+        )
+
+
+class EvaluationsAnswer(Answer):
+    evaluations: list[EvaluationAnswer]
+    next_cursor: str | None
+
+
+@router.post("/evaluations", operation_id="evaluate", status_code=202, response_model=JobStarted)
+def evaluate(
+    gateway: GatewayDep,
+    response: Response,
+    wanted: EvaluationRequest | None = None,
+    map_name: MapName = DEFAULT_MAP,
+) -> JobStarted:
+    """Measure the active generation: leave-one-out on the map's own photos whose place is known,
+    and recall on its labelled queries. The job's `result` has the figures."""
+    params = (wanted or EvaluationRequest.model_validate({})).model_dump()
+    with gateway.catalog.write() as session:
+        map_ = get_map(session, map_name)
+        if active_generation(session, map_.id) is None or not count_located(session, map_.id):
+            raise Conflict(
+                "nothing_to_evaluate",
+                "The map has no described photo with coordinates or a place. Upload some, and wait "
+                "for their jobs.",
+            )
+        job = Job(
+            id=new_id(),
+            map_id=map_.id,
+            kind=JobKind.EVALUATE,
+            priority=Priority.EVALUATION,
+            params={**params, "automatic": False},
+        )
+        session.add(job)
+        session.flush()
+    answer = job_started(job)
+    response.headers["Location"] = answer.status_url
+    response.headers["Retry-After"] = "1"
+    return answer
+
+
+@router.get("/evaluations", operation_id="list_evaluations", response_model=EvaluationsAnswer)
+def evaluations(
+    gateway: GatewayDep,
+    limit: Annotated[int, Query(ge=1, le=1000)] = 50,
+    cursor: Annotated[str | None, Query()] = None,
+    map_name: MapName = DEFAULT_MAP,
+) -> EvaluationsAnswer:
+    """Newest first, those made by themselves as well: before and after a vocabulary, in numbers."""
+    before = read_cursor(cursor)
+    with gateway.catalog.read() as session:
+        found = list_evaluations(session, get_map(session, map_name).id, limit + 1, before)
+    page = found[:limit]
+    return EvaluationsAnswer(
+        evaluations=[EvaluationAnswer.of(evaluation) for evaluation in page],
+        next_cursor=str(page[-1].id) if len(found) > limit else None,
+    )

@@ -1,0 +1,109 @@
+"""`/maps`: named databases of photos, each with its own extractor, vocabulary and generation."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Annotated
+from uuid import UUID
+
+from fastapi import APIRouter, Path
+from pydantic import BaseModel, ConfigDict, Field
+from sqlalchemy.orm import Session
+
+from services.gateway.context import DEFAULT_MAP, GatewayDep
+from services.gateway.schemas import Answer
+from shared.catalog.chunks import count_searchable
+from shared.catalog.generations import active_generation
+from shared.catalog.maps import (
+    MAP_NAME,
+    Map,
+    create_map,
+    ensure_default_map,
+    get_map,
+    list_maps,
+    lock_map,
+    mark_map_deleted,
+)
+from shared.catalog.photos import PhotoRole, count_live
+from shared.catalog.vocabularies import standing_of
+from shared.jobs import Job
+from shared.jobs.finish import cancel_all
+
+router = APIRouter(tags=["maps"])
+
+MapPath = Annotated[str, Path(description="the map's name", min_length=1, max_length=100)]
+
+
+class NewMap(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+    name: str = Field(pattern=MAP_NAME, description="letters, digits, `.`, `_`, `-`; at most 100")
+    extractor: str | None = Field(None, max_length=200, description="left out: the configured one")
+
+
+class MapAnswer(Answer):
+    name: str
+    extractor: str
+    version: int = Field(description="grows with every change of what can be found")
+    photos: int
+    searchable: int
+    labelled_queries: int
+    generation_id: UUID | None
+    vocabulary: str | None = Field(description="own, foreign, none; null before the first photo")
+    created_at: datetime
+
+
+class MapDeleted(Answer):
+    success: bool
+    message: str
+    deleted_map: str
+
+
+@router.get("/maps", operation_id="list_maps", response_model=list[MapAnswer])
+def maps(gateway: GatewayDep) -> list[MapAnswer]:
+    """Every map, by name."""
+    with gateway.catalog.read() as session:
+        return [_answer(session, map_) for map_ in list_maps(session)]
+
+
+@router.post("/maps", operation_id="create_map", status_code=201, response_model=MapAnswer)
+def new_map(gateway: GatewayDep, wanted: NewMap) -> MapAnswer:
+    """Make an empty map; 409 when the name is taken."""
+    settings = gateway.settings
+    extractor = wanted.extractor or settings.extractor
+    with gateway.catalog.write() as session:
+        return _answer(session, create_map(session, wanted.name, extractor))
+
+
+@router.get("/maps/{name}", operation_id="get_map", response_model=MapAnswer)
+def one_map(gateway: GatewayDep, name: MapPath) -> MapAnswer:
+    """One map."""
+    with gateway.catalog.read() as session:
+        return _answer(session, get_map(session, name))
+
+
+@router.delete("/maps/{name}", operation_id="delete_map", response_model=MapDeleted)
+def delete_map(gateway: GatewayDep, name: MapPath) -> MapDeleted:
+    """Gone with all its photos at once; its bytes follow. `default` is made anew, empty."""
+    with gateway.catalog.write() as session:
+        map_ = lock_map(session, get_map(session, name).id)
+        cancel_all(session, Job.map_id == map_.id)
+        mark_map_deleted(session, map_)
+        if name == DEFAULT_MAP:
+            ensure_default_map(session, gateway.settings.extractor)
+    return MapDeleted(success=True, message=f"The map {name} is deleted.", deleted_map=name)
+
+
+def _answer(session: Session, map_: Map) -> MapAnswer:
+    generation = active_generation(session, map_.id)
+    return MapAnswer(
+        name=map_.name,
+        extractor=map_.extractor,
+        version=map_.version,
+        photos=count_live(session, map_.id, PhotoRole.DATABASE),
+        searchable=count_searchable(session, generation.id) if generation else 0,
+        labelled_queries=count_live(session, map_.id, PhotoRole.QUERY),
+        generation_id=generation.id if generation else None,
+        vocabulary=standing_of(session, generation) if generation else None,
+        created_at=map_.created_at,
+    )

@@ -1,0 +1,124 @@
+"""Removing what belonged to deleted maps: objects before the rows that remember them.
+
+A little at a time, from whatever is left: a crash repeats at most what is harmless. What a request
+that was under way still wrote into the map is found by the next round; the map's own row goes last.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from uuid import UUID
+
+from sqlalchemy import delete, select
+
+from shared.catalog.chunks import Chunk, Descriptor
+from shared.catalog.evaluations import Evaluation
+from shared.catalog.generations import Generation
+from shared.catalog.maps import Map
+from shared.catalog.photos import Photo
+from shared.catalog.searches import Search
+from shared.catalog.session import Catalog
+from shared.catalog.vocabularies import Vocabulary
+from shared.chunks import delete_chunk
+from shared.jobs.finish import cancel_all
+from shared.jobs.table import Job, JobKind
+from shared.objects import ObjectStore
+from shared.objects.keys import query_key, query_vector_key, thumbnail_key
+
+log = logging.getLogger(__name__)
+
+AT_ONCE = 500  # rows removed in one transaction
+SLICE_SECONDS = 2.0  # then the steward's other duties have their turn
+
+
+def delete_maps(catalog: Catalog, store: ObjectStore) -> None:
+    """Go on removing every deleted map, for a few seconds."""
+    with catalog.read() as session:
+        gone = session.scalars(select(Map.id).where(Map.deleted_at.is_not(None))).all()
+    until = time.monotonic() + SLICE_SECONDS
+    for map_id in gone:
+        while not _step(catalog, store, map_id):
+            if time.monotonic() > until:
+                return
+
+
+def _step(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
+    """Remove the next rows of the map with their objects; True when the map is gone."""
+    with catalog.write() as session:
+        cancel_all(session, Job.map_id == map_id)
+    for some_were_left in (_chunks, _queries, _photos):
+        if some_were_left(catalog, store, map_id):
+            return False
+    _vocabularies(catalog, store, map_id)
+    with catalog.write() as session:
+        session.execute(delete(Evaluation).where(Evaluation.map_id == map_id))
+        session.execute(delete(Search).where(Search.map_id == map_id))
+        session.execute(delete(Job).where(Job.map_id == map_id))
+        session.execute(delete(Generation).where(Generation.map_id == map_id))
+        session.execute(delete(Vocabulary).where(Vocabulary.map_id == map_id))
+        session.execute(delete(Map).where(Map.id == map_id))
+    log.info("the deleted map %s is gone", map_id)
+    return True
+
+
+def _chunks(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
+    with catalog.read() as session:
+        chunks = session.scalars(
+            select(Chunk)
+            .join(Generation, Generation.id == Chunk.generation_id)
+            .where(Generation.map_id == map_id)
+            .limit(AT_ONCE // 10)
+        ).all()
+    for chunk in chunks:
+        delete_chunk(store, chunk.object_key)
+    ids = [chunk.id for chunk in chunks]
+    if ids:
+        with catalog.write() as session:
+            session.execute(delete(Descriptor).where(Descriptor.chunk_id.in_(ids)))
+            session.execute(delete(Chunk).where(Chunk.id.in_(ids)))
+    return bool(ids)
+
+
+def _queries(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
+    with catalog.read() as session:
+        ids = session.scalars(
+            select(Job.id).where(Job.map_id == map_id, Job.kind == JobKind.DESCRIBE).limit(AT_ONCE)
+        ).all()
+    for job_id in ids:
+        store.delete(query_key(job_id))
+        store.delete(query_vector_key(job_id))
+    if ids:
+        with catalog.write() as session:
+            session.execute(delete(Job).where(Job.id.in_(ids)))
+    return bool(ids)
+
+
+def _photos(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
+    with catalog.read() as session:
+        photos = session.scalars(select(Photo).where(Photo.map_id == map_id).limit(AT_ONCE)).all()
+    for photo in photos:
+        if photo.object_key:  # empty: its bytes went when it was deleted
+            store.delete(photo.object_key)
+        store.delete(thumbnail_key(photo.id))
+    ids = [photo.id for photo in photos]
+    if ids:
+        with catalog.write() as session:
+            session.execute(delete(Descriptor).where(Descriptor.photo_id.in_(ids)))
+            session.execute(delete(Job).where(Job.photo_id.in_(ids)))
+            session.execute(delete(Photo).where(Photo.id.in_(ids)))
+    return bool(ids)
+
+
+def _vocabularies(catalog: Catalog, store: ObjectStore, map_id: UUID) -> None:
+    """Only the objects, and those of imports that never came to a row: the rows are few."""
+    with catalog.read() as session:
+        keys = list(
+            session.scalars(select(Vocabulary.object_key).where(Vocabulary.map_id == map_id))
+        )
+        imports = session.scalars(
+            select(Job.params).where(Job.map_id == map_id, Job.kind == JobKind.IMPORT)
+        )
+        keys += [params["object_key"] for params in imports]
+    for key in keys:
+        store.delete(key)

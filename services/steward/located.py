@@ -1,0 +1,71 @@
+"""The photos of a map whose place is known, and which of them show a given place."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from uuid import UUID
+
+import numpy as np
+from sqlalchemy import or_, select
+from sqlalchemy.orm import Session
+
+from shared.catalog.chunks import Descriptor
+from shared.catalog.photos import Photo, PhotoRole
+from shared.estimate.places import Spot
+from shared.geodesy import distances_m, latitude_band
+
+
+@dataclass(frozen=True, slots=True)
+class Located:
+    """A described photo whose place is known."""
+
+    photo_id: UUID
+    spot: Spot
+    captured_at: datetime | None
+
+
+class LocatedPhotos:
+    """Database photos by place: how many of them show one."""
+
+    def __init__(self, photos: Sequence[Located]) -> None:
+        self.photos = photos
+        self._labels = Counter(p.spot.place for p in photos if p.spot.place is not None)
+        spots = np.array(
+            [(p.spot.latitude, p.spot.longitude) for p in photos if p.spot.latitude is not None],
+            dtype=np.float64,
+        ).reshape(-1, 2)
+        self._spots = spots[np.argsort(spots[:, 0], kind="stable")]
+
+    def showing(self, spot: Spot, radius_m: float) -> int:
+        """How many photos lie within `radius_m` of the spot, or bear its label: the larger count,
+        so that one that does both counts once."""
+        labelled = self._labels[spot.place] if spot.place is not None else 0
+        if spot.latitude is None or spot.longitude is None:
+            return labelled
+        south, north = latitude_band(spot.latitude, radius_m)
+        first, last = np.searchsorted(self._spots[:, 0], [south, north])
+        near = self._spots[first : last + 1]
+        away = distances_m(spot.latitude, spot.longitude, near[:, 0], near[:, 1])
+        return max(labelled, int((away <= radius_m).sum()))
+
+
+def read_located(
+    session: Session, map_id: UUID, generation_id: UUID, role: PhotoRole
+) -> list[Located]:
+    """The live photos of a role that have a descriptor in the generation and a place, by id."""
+    found = session.execute(
+        select(Photo.id, Photo.latitude, Photo.longitude, Photo.place, Photo.captured_at)
+        .join(Descriptor, Descriptor.photo_id == Photo.id)
+        .where(
+            Photo.map_id == map_id,
+            Descriptor.generation_id == generation_id,
+            Photo.deleted_at.is_(None),
+            Photo.role == role,
+            or_(Photo.latitude.is_not(None), Photo.place.is_not(None)),
+        )
+        .order_by(Photo.id)
+    )
+    return [Located(row[0], Spot(*row[1:4]), row[4]) for row in found]

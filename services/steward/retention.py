@@ -1,0 +1,43 @@
+"""What is kept for a while only: finished jobs and the history of searches."""
+
+from __future__ import annotations
+
+from sqlalchemy import delete, exists, or_, select
+
+from shared.catalog.base import db_now_plus
+from shared.catalog.photos import Photo
+from shared.catalog.searches import Search
+from shared.catalog.session import Catalog
+from shared.jobs.table import Job, JobState
+
+AT_ONCE = 1000  # rows removed in one transaction
+DAY_SECONDS = 86_400.0
+
+
+def forget_old_jobs(catalog: Catalog, retention_days: float) -> None:
+    """Jobs that ended long ago. A photo's failed job stays: it holds the reason."""
+    reason_of_a_photo = exists().where(Photo.job_id == Job.id)
+    old = (
+        select(Job.id)
+        .where(
+            Job.finished_at < db_now_plus(-retention_days * DAY_SECONDS),
+            or_(
+                Job.state.in_((JobState.SUCCEEDED, JobState.CANCELLED)),
+                (Job.state == JobState.FAILED) & ~reason_of_a_photo,
+            ),
+        )
+        .limit(AT_ONCE)
+    )
+    with catalog.write() as session:
+        session.execute(delete(Job).where(Job.id.in_(session.scalars(old).all())))
+
+
+def forget_old_searches(catalog: Catalog, history_days: float) -> None:
+    """Searches that were asked long ago."""
+    old = (
+        select(Search.id)
+        .where(Search.searched_at < db_now_plus(-history_days * DAY_SECONDS))
+        .limit(AT_ONCE)
+    )
+    with catalog.write() as session:
+        session.execute(delete(Search).where(Search.id.in_(session.scalars(old).all())))

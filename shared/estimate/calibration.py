@@ -1,0 +1,137 @@
+"""What a generation's scores mean: a threshold learnt from impostors, a confidence from labels.
+
+*Impostors* are the map's own photos asked without their place: whatever comes first then is wrong.
+Their evidence is what a photo from outside the map would show, so a threshold that 95 % of them
+stay under accepts about one outsider in twenty. It needs no labels.
+
+A *confidence*, P(the estimate is right), needs queries whose place is known and that were taken on
+another day than the photos they match: within one session the right photo always scores high, and
+a confidence learnt there would be overconfident ever after. It is a logistic regression on the
+evidence (Platt 1999), fitted by Newton's method with a small ridge.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict
+
+from shared.estimate.evidence import Evidence
+
+FALSE_ACCEPTS = 0.05  # of impostors
+LEAST_IMPOSTORS = 20  # fewer, and one in twenty can't be told
+LEAST_LABELLED = 40
+LEAST_OF_A_KIND = 8  # right ones and wrong ones: with fewer the slope is a guess
+RIDGE = 0.1  # in units of standardised evidence: keeps separable data finite
+NEWTON_STEPS = 50
+FOLDS = 5
+
+
+class Logistic(BaseModel):
+    """P = 1 / (1 + exp(-(intercept + sum of weight * (evidence - mean) / scale)))."""
+
+    model_config = ConfigDict(frozen=True)
+
+    intercept: float
+    weights: tuple[float, ...]
+    means: tuple[float, ...]
+    scales: tuple[float, ...]
+
+    def probability(self, evidence: Evidence) -> float:
+        """P(right) of one piece of evidence, in (0, 1)."""
+        return float(self.probabilities(_matrix([evidence]))[0])
+
+    def probabilities(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(n, 3) evidence -> (n,) probabilities."""
+        standard = (rows - np.array(self.means)) / np.array(self.scales)
+        return _sigmoid(self.intercept + standard @ np.array(self.weights))
+
+
+class Calibration(BaseModel):
+    """Stored with the generation that it was learnt on; says nothing about any other."""
+
+    model_config = ConfigDict(frozen=True)
+
+    radius_m: float
+    lead_threshold: float | None
+    """Evidence with a smaller lead is "not in this map"; None with too few impostors."""
+    impostors: int
+    labelled_queries: int
+    confidence: Logistic | None
+    """None: uncalibrated."""
+
+    @property
+    def state(self) -> str:
+        """`calibrated` or `uncalibrated`: whether answers carry a confidence."""
+        return "uncalibrated" if self.confidence is None else "calibrated"
+
+    def accepts(self, evidence: Evidence) -> bool | None:
+        """Whether the ranking shows a place of the map; None where that can't be told yet."""
+        return None if self.lead_threshold is None else evidence.lead > self.lead_threshold
+
+
+def learn_threshold(impostors: Sequence[Evidence]) -> float | None:
+    """The lead that FALSE_ACCEPTS of the impostors exceed; None for fewer than LEAST_IMPOSTORS.
+
+    The smallest order statistic whose rank is high enough: on average at most that share of new
+    impostors exceeds it, whatever their distribution (conformal bound, Vovk et al. 2005).
+    """
+    if len(impostors) < LEAST_IMPOSTORS:
+        return None
+    leads = np.sort([evidence.lead for evidence in impostors])
+    rank = int(np.ceil((1 - FALSE_ACCEPTS) * (len(leads) + 1)))
+    return float(leads[min(rank, len(leads)) - 1])
+
+
+def learn_confidence(labelled: Sequence[tuple[Evidence, bool]]) -> Logistic | None:
+    """P(right) from (evidence, was it right); None with too few of them, or of one kind."""
+    right = sum(ok for _, ok in labelled)
+    if len(labelled) < LEAST_LABELLED or min(right, len(labelled) - right) < LEAST_OF_A_KIND:
+        return None
+    rows = _matrix([evidence for evidence, _ in labelled])
+    truth = np.array([ok for _, ok in labelled], dtype=np.float64)
+    means, scales = rows.mean(axis=0), rows.std(axis=0)
+    scales = np.where(scales > 1e-9, scales, 1.0)
+    design = np.column_stack([np.ones(len(rows)), (rows - means) / scales])
+    ridge = np.diag([0.0, *[RIDGE] * rows.shape[1]])
+    beta = np.zeros(design.shape[1])
+    for _ in range(NEWTON_STEPS):
+        probability = _sigmoid(design @ beta)
+        gradient = design.T @ (truth - probability) - ridge @ beta
+        spread = np.maximum(probability * (1 - probability), 1e-6)
+        step = np.linalg.solve((design.T * spread) @ design + ridge, gradient)
+        beta += step
+        if float(np.abs(step).max()) < 1e-8:
+            break
+    return Logistic(
+        intercept=float(beta[0]),
+        weights=tuple(beta[1:].tolist()),
+        means=tuple(means.tolist()),
+        scales=tuple(scales.tolist()),
+    )
+
+
+def cross_validated(labelled: Sequence[tuple[Evidence, bool]]) -> list[float] | None:
+    """P(right) of each, learnt from the other folds: what the confidence is worth on new queries.
+
+    None where there are too few to learn from.
+    """
+    predicted = [0.0] * len(labelled)
+    for fold in range(FOLDS):
+        learnt = learn_confidence([pair for i, pair in enumerate(labelled) if i % FOLDS != fold])
+        if learnt is None:
+            return None
+        for index in range(fold, len(labelled), FOLDS):
+            predicted[index] = learnt.probability(labelled[index][0])
+    return predicted
+
+
+def _matrix(evidence: Sequence[Evidence]) -> NDArray[np.float64]:
+    return np.array([(e.score, e.lead, e.agreement) for e in evidence], dtype=np.float64)
+
+
+def _sigmoid(x: NDArray[np.float64]) -> NDArray[np.float64]:
+    bounded: NDArray[np.float64] = 1.0 / (1.0 + np.exp(-np.clip(x, -30, 30)))
+    return bounded
