@@ -25,10 +25,12 @@ import uvicorn
 from services.extractor.worker import ExtractorWorker
 from services.gateway.app import create_app
 from services.gateway.context import Gateway
+from services.gateway.keys import Keys, KnownKeys, NoKeys
 from services.search.worker import SearchWorker
 from services.steward.evaluate import Evaluator
 from services.steward.loop import Steward
 from services.steward.queue import free_leases
+from shared.admin_key import AdminKey, admin_key, hash_key, is_loopback, new_local_key
 from shared.catalog.maps import ensure_default_map
 from shared.catalog.session import Catalog
 from shared.errors import Misconfigured
@@ -49,8 +51,13 @@ class Standalone:
     """A running embedded Placewise."""
 
     url: str
+    """An address of it that this machine reaches."""
     server: uvicorn.Server
     listener: socket.socket
+    key: AdminKey | None
+    """What every call needs; None on loopback, where none is needed unless ADMIN_KEY is set."""
+    local_key: str | None
+    """Another one, for the commands of this user."""
     failed: threading.Event
     """Set when one of the parts has died: the process should end and say so."""
 
@@ -63,11 +70,13 @@ class Standalone:
 
 
 @contextlib.contextmanager
-def standalone(settings: Settings) -> Iterator[Standalone]:
+def standalone(settings: Settings, *, new_key: bool = False) -> Iterator[Standalone]:
     """Lock the folder, recover what a killed process left, and start every part.
 
-    Raises Misconfigured: `home_in_use` for a folder that another server has, `address_in_use`,
-    and for an extractor of new maps that is unknown: no photo could ever be described.
+    Beyond loopback, or with an ADMIN_KEY, every call needs a key; `new_key` replaces the one that
+    an earlier start has made. Raises Misconfigured: `home_in_use` for a folder that another server
+    has, `address_in_use`, `no_key_needed` for a new key on loopback, and for an extractor of new
+    maps that is unknown: no photo could ever be described.
     """
     get_recipe(settings.extractor, allow_test_extractors=settings.allow_test_extractors)
     home = settings.placewise_home
@@ -75,8 +84,20 @@ def standalone(settings: Settings) -> Iterator[Standalone]:
         held.enter_context(lock_home(home))
         listener = held.enter_context(_listener(settings))
         host, port = listener.getsockname()[:2]
-        url = f"http://{f'[{host}]' if ':' in host else host}:{port}"
-        held.enter_context(announced(home, url))
+        keys: Keys = NoKeys()
+        key = local_key = None
+        # The name as well as what it means today: what a name leads to can change.
+        if settings.admin_key or not (is_loopback(settings.host) and is_loopback(host)):
+            key, local_key = admin_key(home, settings.admin_key, new_key), new_local_key()
+            keys = KnownKeys(key.sha256, hash_key(local_key))
+        elif new_key:
+            raise Misconfigured(
+                "no_key_needed",
+                f"On {settings.host} no key is needed, because only this machine reaches it. "
+                "Give --new-key with the HOST that needs one.",
+            )
+        url = _url(host, port)
+        held.enter_context(announced(home, url, local_key))
         catalog = Catalog(settings.catalog_url())
         store = FolderStore(home / "objects")
         hints = InProcessHints()
@@ -92,7 +113,7 @@ def standalone(settings: Settings) -> Iterator[Standalone]:
         )
         steward = Steward(catalog, store, hints, settings)
         evaluator = Evaluator(catalog, search, settings, name=f"embedded-{os.getpid()}")
-        gateway = Gateway(catalog, store, hints, search, settings)
+        gateway = Gateway(catalog, store, hints, search, settings, keys)
         server = uvicorn.Server(
             uvicorn.Config(
                 create_app(gateway),
@@ -101,7 +122,7 @@ def standalone(settings: Settings) -> Iterator[Standalone]:
                 timeout_graceful_shutdown=GRACEFUL_SECONDS,
             )
         )
-        running = Standalone(url, server, listener, threading.Event())
+        running = Standalone(url, server, listener, key, local_key, threading.Event())
         stop = threading.Event()
         parts = [
             _start(name, part, stop, running)
@@ -167,6 +188,12 @@ def _listener(settings: Settings) -> Iterator[socket.socket]:
         ) from error
     with listener:
         yield listener
+
+
+def _url(host: str, port: int) -> str:
+    """An address that this machine reaches; "every address" is none that can be called."""
+    host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)  # noqa: S104
+    return f"http://{f'[{host}]' if ':' in host else host}:{port}"
 
 
 def _start(

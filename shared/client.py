@@ -1,6 +1,6 @@
 """A client of the HTTP API.
 
-    with Client("http://127.0.0.1:8000") as places:
+    with Client("http://127.0.0.1:8000") as places:  # beyond loopback: Client(url, key="pw_...")
         uploaded = places.upload(Path("street.jpg"), latitude=45.07, longitude=7.69)
         places.wait_for(uploaded["job_id"])
         answer = places.similar_to_file(Path("where.jpg"), top_k=5)
@@ -29,6 +29,7 @@ from shared.errors import (
     NotFound,
     PlacewiseError,
     TooLarge,
+    Unauthorized,
     Unavailable,
     Unprocessable,
     UnsupportedMedia,
@@ -43,6 +44,7 @@ _BY_STATUS: dict[int, type[PlacewiseError]] = {
     kind.status: kind
     for kind in (
         InvalidRequest,
+        Unauthorized,
         NotFound,
         Conflict,
         Gone,
@@ -59,12 +61,19 @@ Json = dict[str, Any]
 class Client:
     """One server and one map. Thread-safe; close it, or use it as a context manager."""
 
-    def __init__(self, url: str, map_name: str | None = None) -> None:
+    def __init__(self, url: str, map_name: str | None = None, key: str | None = None) -> None:
+        """`key` is what a server beyond loopback wants; others don't look at it.
+
+        Raises InvalidRequest (`bad_key`) for a key that no header can carry.
+        """
+        if key is not None and not (key.isascii() and key.isprintable()):
+            raise InvalidRequest("bad_key", "A key is made of printable ASCII characters.")
         self.url = url.rstrip("/")
         self._http = httpx2.Client(
             base_url=self.url,
             timeout=TIMEOUT_SECONDS,
             params={"map": map_name} if map_name else None,
+            headers={"Authorization": f"Bearer {key}"} if key else None,
         )
 
     def __enter__(self) -> Self:

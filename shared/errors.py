@@ -2,6 +2,7 @@
 
 PlacewiseError
 ├── InvalidRequest 400          no_file, empty_file, malformed_body
+├── Unauthorized 401            key_missing, key_unknown
 ├── NotFound 404                photo_not_found, job_not_found, map_not_found, ...
 ├── Conflict 409                not_searchable, coordinates_differ, model_change_running, ...
 ├── Gone 410                    query_expired
@@ -61,6 +62,13 @@ def _rebuild(
 class InvalidRequest(PlacewiseError):
     status = 400
     title = "The request can't be read"
+
+
+class Unauthorized(PlacewiseError):
+    """The gateway adds `WWW-Authenticate`."""
+
+    status = 401
+    title = "A key is needed"
 
 
 class NotFound(PlacewiseError):

@@ -6,6 +6,7 @@ import contextlib
 import json
 import os
 from collections.abc import Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from filelock import FileLock, Timeout
@@ -13,21 +14,36 @@ from filelock import FileLock, Timeout
 from shared.errors import Misconfigured
 
 
+@dataclass(frozen=True, slots=True)
+class RunningServer:
+    """A server as whoever may read its folder finds it."""
+
+    url: str
+    key: str | None = field(default=None, repr=False)
+    """Good until that server ends; None where no key is needed."""
+
+
 def address_file(home: Path) -> Path:
-    """Says where the server that holds the lock listens."""
+    """Says where the server that holds the lock listens, and a key for this user's commands."""
     return home / "server.json"
 
 
-def address_of_running(home: Path) -> str | None:
-    """The address of the server that serves the folder now, or None."""
+def running_server(home: Path) -> RunningServer | None:
+    """The server that serves the folder now, or None."""
     if not _lock_file(home).exists():
         return None
     with contextlib.suppress(Timeout), FileLock(_lock_file(home), timeout=0):
         return None
     with contextlib.suppress(FileNotFoundError, ValueError, KeyError):
-        url: str = json.loads(address_file(home).read_text())["url"]
-        return url
+        said = json.loads(address_file(home).read_text())
+        return RunningServer(said["url"], said.get("key"))
     return None
+
+
+def address_of_running(home: Path) -> str | None:
+    """The address of the server that serves the folder now, or None."""
+    running = running_server(home)
+    return running.url if running else None
 
 
 @contextlib.contextmanager
@@ -57,13 +73,26 @@ def lock_home(home: Path) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def announced(home: Path, url: str) -> Iterator[None]:
-    """While the block runs, others find the server at `url` through its folder."""
-    address_file(home).write_text(json.dumps({"url": url, "pid": os.getpid()}))
+def announced(home: Path, url: str, key: str | None = None) -> Iterator[None]:
+    """While the block runs, this user's commands find the server at `url` through its folder."""
+    said = {"url": url, "pid": os.getpid()} | ({"key": key} if key else {})
+    write_private(address_file(home), json.dumps(said))
     try:
         yield
     finally:
         address_file(home).unlink(missing_ok=True)
+
+
+def write_private(file: Path, text: str) -> None:
+    """The whole file at once, durable, and from its first byte readable by this user alone."""
+    partial = file.with_name(f".{file.name}.partial")
+    partial.unlink(missing_ok=True)  # a killed process's; its mode is not to be trusted
+    descriptor = os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+    with os.fdopen(descriptor, "w") as opened:
+        opened.write(text)
+        opened.flush()
+        os.fsync(opened.fileno())
+    partial.replace(file)
 
 
 def _lock_file(home: Path) -> Path:

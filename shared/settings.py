@@ -6,11 +6,14 @@ Durations end in `_seconds`, sizes in `_bytes` unless the predecessor's name is 
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Literal, Self
 
 from pydantic import Field, SecretStr, field_validator, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
+
+LEAST_KEY_CHARACTERS = 16
 
 
 class Settings(BaseSettings):
@@ -23,6 +26,11 @@ class Settings(BaseSettings):
     # Where it listens and where it keeps things.
     host: str = Field("127.0.0.1", description="address to listen on")
     port: int = Field(8000, ge=0, le=65535, description="0 takes a free one")
+    admin_key: SecretStr | None = Field(
+        None,
+        description="the key that every call needs; unset: made and shown at the first start "
+        "beyond loopback, and none is needed on loopback",
+    )
     placewise_home: Path = Field(
         Path("./var"), description="folder of the embedded catalog and object store"
     )
@@ -95,6 +103,19 @@ class Settings(BaseSettings):
         1.0, gt=0, description="how often search looks for what is new"
     )
     search_wait_seconds: float = Field(5.0, gt=0, description="longest wait for `min_version`")
+
+    @field_validator("admin_key")
+    @classmethod
+    def _can_be_sent_and_not_guessed(cls, value: SecretStr | None) -> SecretStr | None:
+        if value is None or not value.get_secret_value():
+            return None  # `ADMIN_KEY=` is how a compose file says that it is not set
+        key = value.get_secret_value()
+        if len(key) < LEAST_KEY_CHARACTERS or not re.fullmatch(r"[!-~]+", key):
+            raise ValueError(
+                f"a key has at least {LEAST_KEY_CHARACTERS} printable ASCII characters and no "
+                "blanks; this makes one: openssl rand -hex 24"
+            )
+        return value
 
     @field_validator("placewise_home")
     @classmethod

@@ -11,6 +11,7 @@ from rich.table import Table
 from services.cli.connect import connect
 from services.cli.output import (
     JsonOption,
+    KeyOption,
     MapOption,
     ServerOption,
     answers,
@@ -34,11 +35,12 @@ def query(
     tags: Annotated[str | None, typer.Option(help="Separated by commas: all are wanted.")] = None,
     map_name: MapOption = None,
     server: ServerOption = None,
+    key: KeyOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Find the indexed photos most similar to a photo, which is not stored."""
     with explained(as_json):
-        with connect(server, map_name) as client:
+        with connect(server, map_name, key) as client:
             answer = client.similar_to_file(
                 photo,
                 top_k=top_k,

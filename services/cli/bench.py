@@ -23,7 +23,7 @@ from rich.table import Table
 from services.cli.output import JsonOption, answers, explained, print_json, progress_bar
 from shared.client import Client, Json, retry_while_away
 from shared.errors import Unavailable
-from shared.home import address_of_running
+from shared.home import RunningServer, running_server
 
 START_SECONDS = 60.0
 
@@ -47,7 +47,10 @@ def spine(
     """
     with explained(as_json), tempfile.TemporaryDirectory() as folder, progress_bar() as progress:
         made = _make_photos(Path(folder, "photos"), photos)
-        with _server(Path(folder, "home")) as url, Client(url) as client:
+        with (
+            _server(Path(folder, "home")) as running,
+            Client(running.url, key=running.key) as client,
+        ):
             figures = _measure(client, made, queries, progress)
     if as_json:
         print_json(figures)
@@ -65,19 +68,19 @@ def spine(
 
 
 @contextlib.contextmanager
-def _server(home: Path) -> Iterator[str]:
+def _server(home: Path) -> Iterator[RunningServer]:
     """A server in a process of its own: in ours it would share the interpreter with the client."""
     command = [str(Path(sys.executable).with_name("placewise")), "serve"]
     environment = {**os.environ, "PLACEWISE_HOME": str(home), "HOST": "127.0.0.1", "PORT": "0"}
     with subprocess.Popen(command, env=environment, stderr=subprocess.DEVNULL) as server:  # noqa: S603
         try:
             deadline = time.monotonic() + START_SECONDS
-            while (url := address_of_running(home)) is None:
+            while (running := running_server(home)) is None:
                 if server.poll() is not None or time.monotonic() > deadline:
                     raise Unavailable("server_unreachable", "The server did not start.")
                 time.sleep(0.1)
-            retry_while_away(lambda: Client(url).stats(), START_SECONDS)
-            yield url
+            retry_while_away(lambda: Client(running.url, key=running.key).stats(), START_SECONDS)
+            yield running
         finally:
             server.terminate()
 

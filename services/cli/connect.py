@@ -10,18 +10,21 @@ from collections.abc import Iterator
 from services.cli.configuration import read_settings
 from shared.client import Client
 from shared.errors import Unavailable
-from shared.home import address_of_running
+from shared.home import RunningServer, running_server
 
 START_SECONDS = 30.0
 
 
 @contextlib.contextmanager
-def connect(server: str | None, map_name: str | None) -> Iterator[Client]:
-    """A client of `server`, else of the server on PLACEWISE_HOME, else of one started for it."""
+def connect(server: str | None, map_name: str | None, key: str | None = None) -> Iterator[Client]:
+    """A client of `server`, else of the server on PLACEWISE_HOME, else of one started for it.
+
+    `key` is what `server` wants. The server on PLACEWISE_HOME leaves one there for its own user.
+    """
     settings = read_settings()
-    url = server or address_of_running(settings.placewise_home)
-    if url is not None:
-        with Client(url, map_name) as client:
+    found = RunningServer(server) if server else running_server(settings.placewise_home)
+    if found is not None:
+        with Client(found.url, map_name, key or found.key) as client:
             yield client
         return
     # Imported only here: torch takes seconds, and a client of a running server needs none of it.
@@ -38,7 +41,7 @@ def connect(server: str | None, map_name: str | None) -> Iterator[Client]:
                 if time.monotonic() > deadline or not serving.is_alive():
                     raise Unavailable("server_unreachable", "The embedded server did not start.")
                 time.sleep(0.01)
-            with Client(running.url, map_name) as client:
+            with Client(running.url, map_name, running.local_key) as client:
                 yield client
         finally:
             running.server.should_exit = True

@@ -19,7 +19,7 @@ from shared.catalog.photos import Photo
 from shared.catalog.session import Catalog
 from shared.client import Client
 from shared.errors import Misconfigured, PlacewiseError
-from shared.home import address_of_running
+from shared.home import running_server
 from shared.settings import Settings
 
 LOW_DISK_BYTES = 1_000_000_000
@@ -80,13 +80,13 @@ def _folder(settings: Settings) -> str:
 
 
 def _server(settings: Settings) -> str:
-    url = address_of_running(settings.placewise_home)
-    if url is not None:
-        with Client(url) as client:
+    running = running_server(settings.placewise_home)
+    if running is not None:
+        with Client(running.url, key=running.key) as client:
             stats = client.stats()
         return (
-            f"running on {url}: {stats['searchable_images']} of {stats['total_images']} photos "
-            f"searchable, vocabulary {stats['vocabulary']}"
+            f"running on {running.url}: {stats['searchable_images']} of {stats['total_images']} "
+            f"photos searchable, vocabulary {stats['vocabulary']}"
         )
     if not (settings.placewise_home / "catalog.sqlite").exists():
         return "not running, and nothing is stored yet (start it: make run)"

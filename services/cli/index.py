@@ -15,6 +15,7 @@ from rich.progress import Progress
 from services.cli.connect import connect
 from services.cli.output import (
     JsonOption,
+    KeyOption,
     MapOption,
     ServerOption,
     explained,
@@ -61,6 +62,7 @@ def index(
     ] = True,
     map_name: MapOption = None,
     server: ServerOption = None,
+    key: KeyOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Upload every photo of a folder and wait until all are searchable.
@@ -70,7 +72,7 @@ def index(
     """
     with explained(as_json):
         photos = find_photos(folder, table, utm_zone)
-        with connect(server, map_name) as client, progress_bar() as progress:
+        with connect(server, map_name, key) as client, progress_bar() as progress:
             report = _index(client, photos, fit, progress)
         if as_json:
             print_json(report)

@@ -36,6 +36,16 @@ ServerOption = Annotated[
     ),
 ]
 
+KeyOption = Annotated[
+    str | None,
+    typer.Option(
+        "--key",
+        envvar="PLACEWISE_KEY",
+        help="The key that the server wants. Better in the variable: others on this machine can "
+        "see a command's options. Not needed for the server on PLACEWISE_HOME.",
+    ),
+]
+
 
 def shown(path: Path) -> str:
     """The path as text that can be printed, also where it is not UTF-8."""

@@ -2,49 +2,76 @@
 
 from __future__ import annotations
 
-import ipaddress
 import logging
 import sys
+from typing import Annotated
+
+import typer
 
 from services.cli.configuration import read_settings
 from services.cli.output import explained, messages
+from shared.admin_key import AdminKey, admin_key_file, is_loopback
 from shared.settings import Settings
 
 
-def serve() -> None:
-    """Serve the embedded Placewise (HOST, PORT, PLACEWISE_HOME) until Ctrl-C."""
+def serve(
+    new_key: Annotated[
+        bool,
+        typer.Option(
+            "--new-key", help="Make and print a new admin key; the old one is no longer good."
+        ),
+    ] = False,
+) -> None:
+    """Serve the embedded Placewise (HOST, PORT, PLACEWISE_HOME) until Ctrl-C.
+
+    Where HOST is not loopback, every call needs the admin key, which the first start prints.
+    """
     with explained(as_json=False):
         settings = read_settings()
         from services.standalone import standalone  # brings torch, as `connect` says
 
         logging.getLogger().setLevel(logging.INFO)
         logging.getLogger("alembic").setLevel(logging.WARNING)
-        with standalone(settings) as running:
-            messages.print(_welcome(running.url, settings), soft_wrap=True)
+        with standalone(settings, new_key=new_key) as running:
+            messages.print(_welcome(running.url, running.key, settings), soft_wrap=True)
             running.serve()
 
 
-def _welcome(url: str, settings: Settings) -> str:
+def _welcome(url: str, key: AdminKey | None, settings: Settings) -> str:
     command = sys.argv[0]
+    header = '-H "Authorization: Bearer $PLACEWISE_KEY" ' if key else ""
     lines = [
         f"Placewise serves {settings.placewise_home} on {url}",
+        *_about_the_key(key, settings, command),
         f"  look:     {url}/docs   (the API)   {url}/api/v1/health",
         (
-            f"  put in:   curl -F file=@PHOTO.jpg -F latitude=45.07 -F longitude=7.69 "
+            f"  put in:   curl {header}-F file=@PHOTO.jpg -F latitude=45.07 -F longitude=7.69 "
             f"{url}/api/v1/upload"
         ),
-        f"  ask:      curl -F file=@OTHER.jpg -H 'Prefer: wait=30' {url}/api/v1/similarity",
+        (
+            f"  ask:      curl {header}-F file=@OTHER.jpg -H 'Prefer: wait=30' "
+            f"{url}/api/v1/similarity"
+        ),
         f"  a folder: {command} index DIR, then {command} query PHOTO",
     ]
-    if not _is_loopback(settings.host):
-        lines.append(
-            "  careful:  there are no keys yet; whoever reaches this address can read and delete."
-        )
     return "\n".join(lines)
 
 
-def _is_loopback(host: str) -> bool:
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"
+def _about_the_key(key: AdminKey | None, settings: Settings, command: str) -> list[str]:
+    if key is None:
+        return []
+    lines = []
+    if not is_loopback(settings.host):
+        lines.append(f"  open to:  whoever reaches {settings.host} and has the key")
+    if key.made is not None:
+        lines.append(f"  key:      export PLACEWISE_KEY={key.made}")
+        lines.append("            It is shown this once; every call needs it.")
+    elif settings.admin_key is not None:
+        lines.append("  key:      the one in ADMIN_KEY; every call needs it")
+    else:
+        lines.append("  key:      the one that was shown when it was made; every call needs it")
+        lines.append(f"            Lost it? {command} serve --new-key makes another one;")
+        lines.append(
+            f"            so does a start without {admin_key_file(settings.placewise_home)}"
+        )
+    return lines

@@ -13,6 +13,7 @@ from rich.table import Column, Table
 from services.cli.connect import connect
 from services.cli.output import (
     JsonOption,
+    KeyOption,
     MapOption,
     ServerOption,
     answers,
@@ -35,13 +36,14 @@ def fit(
     seed: Annotated[int | None, typer.Option(min=0)] = None,
     map_name: MapOption = None,
     server: ServerOption = None,
+    key: KeyOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Learn a vocabulary from the map's photos, describe all of them anew, switch."""
     wanted = {"clusters": clusters, "sample": sample, "seed": seed}
     given = {name: value for name, value in wanted.items() if value is not None}
     with explained(as_json):
-        with connect(server, map_name) as client, progress_bar() as progress:
+        with connect(server, map_name, key) as client, progress_bar() as progress:
             job = fit_and_wait(client, given, progress)
         _print_change(job, as_json)
 
@@ -54,6 +56,7 @@ def import_(
     ],
     map_name: MapOption = None,
     server: ServerOption = None,
+    key: KeyOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Bring a vocabulary, describe all photos with it, switch."""
@@ -66,7 +69,7 @@ def import_(
         data = encode_centres(read_centres(file))
         with (
             tempfile.TemporaryDirectory() as folder,
-            connect(server, map_name) as client,
+            connect(server, map_name, key) as client,
             progress_bar() as progress,
         ):
             plain = Path(folder, f"{file.stem}.npy")
@@ -78,11 +81,14 @@ def import_(
 
 @app.command("list")
 def list_(
-    map_name: MapOption = None, server: ServerOption = None, as_json: JsonOption = False
+    map_name: MapOption = None,
+    server: ServerOption = None,
+    key: KeyOption = None,
+    as_json: JsonOption = False,
 ) -> None:
     """The map's vocabularies, newest first; the one that answers is marked."""
     with explained(as_json):
-        with connect(server, map_name) as client:
+        with connect(server, map_name, key) as client:
             found = client.vocabularies()
             active = {g["vocabulary_id"] for g in client.generations() if g["state"] == "active"}
         if as_json:

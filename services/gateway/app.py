@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from fastapi import FastAPI
+from fastapi import FastAPI, Security
+from fastapi.security import HTTPBearer
 
 from services.gateway import (
     evaluations,
@@ -18,10 +19,18 @@ from services.gateway import (
 )
 from services.gateway.body_limit import BodyLimit
 from services.gateway.context import API, Gateway
+from services.gateway.key_check import KeyCheck
 from services.gateway.problems import PROBLEM_RESPONSES, install_problem_handlers
 
 DESCRIPTION = """Photo in, place out. Upload geotagged photos, poll their jobs, and ask which known
 place a photo shows. Every error is an RFC 9457 problem with a stable `code`."""
+
+# Only describes: `KeyCheck` is what asks for the key, before a route is looked for.
+BEARER = HTTPBearer(
+    auto_error=False,
+    scheme_name="key",
+    description="The admin key. A server on loopback without an ADMIN_KEY needs none.",
+)
 
 
 def create_app(gateway: Gateway) -> FastAPI:
@@ -34,6 +43,7 @@ def create_app(gateway: Gateway) -> FastAPI:
     )
     app.state.gateway = gateway
     app.add_middleware(BodyLimit)
+    app.add_middleware(KeyCheck, keys=gateway.keys)  # the last one added is the first one asked
     install_problem_handlers(app)
     for module in (
         maps,
@@ -47,6 +57,6 @@ def create_app(gateway: Gateway) -> FastAPI:
         figures,
         health,
     ):
-        app.include_router(module.router, prefix=API)
+        app.include_router(module.router, prefix=API, dependencies=[Security(BEARER)])
     app.include_router(health.probes)
     return app

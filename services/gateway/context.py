@@ -10,6 +10,7 @@ from uuid import UUID
 from fastapi import Depends, Query, Request
 from pydantic import BeforeValidator
 
+from services.gateway.keys import Keys
 from shared.catalog.maps import DEFAULT_MAP
 from shared.catalog.session import Catalog
 from shared.errors import NotFound, invalid_field
@@ -30,6 +31,7 @@ class Gateway:
     hints: Hints
     search: SearchPort
     settings: Settings
+    keys: Keys
     started: float = field(default_factory=time.monotonic)
 
 

@@ -56,6 +56,8 @@ def install_problem_handlers(app: FastAPI) -> None:
 
 def problem_response(error: PlacewiseError, request: Request) -> JSONResponse:
     headers = {}
+    if error.status == 401:
+        headers["WWW-Authenticate"] = "Bearer"
     if error.status == 503:
         headers["Retry-After"] = RETRY_AFTER_SECONDS
     if error.status == 413:

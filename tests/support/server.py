@@ -41,7 +41,7 @@ def _bytecode() -> dict[str, str]:
 
 def environment(home: Path, **settings: Any) -> dict[str, str]:
     """For a process on `home`: the tiny extractor, and none of the developer's own settings."""
-    own = {name.upper() for name in Settings.model_fields} | {"PLACEWISE_SERVER"}
+    own = {name.upper() for name in Settings.model_fields} | {"PLACEWISE_SERVER", "PLACEWISE_KEY"}
     return {
         **{name: value for name, value in os.environ.items() if name not in own},
         **_bytecode(),
@@ -72,7 +72,10 @@ def run_command(
 
 
 class ServerProcess:
-    """Starts on a free port; `client` speaks to it. Settings come from keyword arguments."""
+    """Starts on a free port; `client` speaks to it. Settings come from keyword arguments.
+
+    Where the server wants a key, `client` sends the one that it leaves for its own user.
+    """
 
     def __init__(self, home: Path, **settings: Any) -> None:
         self.home = home
@@ -99,12 +102,12 @@ class ServerProcess:
         assert self._process is not None, "the server was not started"
         return self._process
 
-    def start(self) -> None:
-        """Start and wait until it answers."""
+    def start(self, *options: str) -> None:
+        """Start and wait until it answers; `options` are those of `placewise serve`."""
         address_file(self.home).unlink(missing_ok=True)
         with self.log_path.open("ab") as log:
             self._process = subprocess.Popen(
-                [PLACEWISE, "serve"],
+                [PLACEWISE, "serve", *options],
                 env=self._environment,
                 cwd=self.home.parent,  # the repository may hold a developer's .env
                 stdin=subprocess.DEVNULL,
@@ -115,11 +118,14 @@ class ServerProcess:
         while time.monotonic() < deadline:
             if self._process.poll() is not None:
                 raise AssertionError(f"the server ended: {self.log()}")
-            url = self._address()
-            if url is not None:
+            said = self._announced()
+            if said is not None:
                 self.client.close()
                 self.client = httpx2.Client(
-                    base_url=url, timeout=90, event_hooks={"response": [self._check_discreet]}
+                    base_url=said["url"],
+                    headers={"Authorization": f"Bearer {said['key']}"} if "key" in said else None,
+                    timeout=90,
+                    event_hooks={"response": [self._check_discreet]},
                 )
                 try:
                     if self.client.get("/livez").is_success:
@@ -137,12 +143,12 @@ class ServerProcess:
         for secret in (str(self.home).encode(), b"Traceback"):
             assert secret not in answer.content, f"{answer.request.url} tells of {secret!r}"
 
-    def _address(self) -> str | None:
+    def _announced(self) -> dict[str, str] | None:
         try:
-            url: str = json.loads(address_file(self.home).read_text())["url"]
+            said: dict[str, str] = json.loads(address_file(self.home).read_text())
         except (FileNotFoundError, ValueError):
             return None
-        return url
+        return said
 
     def kill(self) -> None:
         """SIGKILL: nothing can be tidied up."""

@@ -1,0 +1,41 @@
+"""The key is asked for before anything else: before the route, and before the body is read."""
+
+from __future__ import annotations
+
+from fastapi import Request
+from starlette.types import ASGIApp, Receive, Scope, Send
+
+from services.gateway.keys import Keys
+from services.gateway.problems import problem_response
+from shared.errors import Unauthorized
+
+# Probes, and descriptions of the service: none of them tells what is stored.
+OPEN_PATHS = frozenset(
+    {
+        "/",
+        "/livez",
+        "/readyz",
+        "/docs",
+        "/docs/oauth2-redirect",
+        "/redoc",
+        "/openapi.json",
+    }
+)
+
+
+class KeyCheck:
+    """Answers 401 to a call without a key, whatever it asks for: not even which paths exist."""
+
+    def __init__(self, app: ASGIApp, keys: Keys) -> None:
+        self._app = app
+        self._keys = keys
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] == "http" and scope["path"] not in OPEN_PATHS:
+            request = Request(scope)
+            try:
+                self._keys.check(request.headers.get("authorization"))
+            except Unauthorized as error:
+                await problem_response(error, request)(scope, receive, send)
+                return
+        await self._app(scope, receive, send)

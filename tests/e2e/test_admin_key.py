@@ -1,0 +1,236 @@
+"""Beyond loopback every call needs the admin key; on loopback none does."""
+
+from __future__ import annotations
+
+import json
+import re
+import socket
+import stat
+from collections.abc import Iterator
+from pathlib import Path
+
+import httpx2
+import pytest
+
+from shared.client import Client
+from shared.errors import Unauthorized
+from shared.home import address_file
+from tests.support.photos import photo_bytes
+from tests.support.problems import problem
+from tests.support.server import ServerProcess, environment, run_command
+
+API = "/api/v1"
+SETTINGS = {"host": "0.0.0.0"}
+CHOSEN = "a-key-of-ones-own-0123456789"
+
+
+def shown_key(server: ServerProcess) -> str:
+    """The key as the last start has printed it."""
+    found = re.findall(r"export PLACEWISE_KEY=(pw_\S+)", server.log())
+    assert found, server.log()
+    key: str = found[-1]
+    return key
+
+
+@pytest.fixture(scope="module")
+def key(server: ServerProcess) -> str:
+    return shown_key(server)
+
+
+@pytest.fixture
+def stranger(server: ServerProcess) -> Iterator[httpx2.Client]:
+    """Somebody who reaches the server and has no key."""
+    with httpx2.Client(base_url=server.client.base_url, timeout=30) as client:
+        yield client
+
+
+def bearer(key: str) -> dict[str, str]:
+    return {"Authorization": f"Bearer {key}"}
+
+
+def objects(server: ServerProcess) -> set[Path]:
+    return {path for path in (server.home / "objects").rglob("*") if path.is_file()}
+
+
+# --- calls -----------------------------------------------------------------------------------
+
+
+def test_probes_and_descriptions_are_open(stranger: httpx2.Client) -> None:
+    for path in ("/", "/livez", "/readyz", "/docs", "/redoc", "/openapi.json"):
+        assert stranger.get(path).status_code == 200, path
+
+
+def test_every_described_call_needs_the_key(stranger: httpx2.Client, key: str) -> None:
+    described = stranger.get("/openapi.json").json()
+    assert described["components"]["securitySchemes"]["key"]["scheme"] == "bearer"
+    asked = 0
+    for path, methods in described["paths"].items():
+        for method, call in methods.items():
+            if not path.startswith(API):
+                assert "security" not in call, path
+                continue
+            assert call["security"] == [{"key": []}], path
+            real = re.sub(r"\{.*?\}", "0190a8c2-0000-7000-8000-000000000000", path)
+            for headers, code in (({}, "key_missing"), (bearer(key + "x"), "key_unknown")):
+                answer = stranger.request(method.upper(), real, headers=headers)
+                problem(answer, 401, code)
+                assert answer.headers["www-authenticate"] == "Bearer"
+                asked += 1
+    assert asked > 40
+
+
+@pytest.mark.parametrize(
+    "path", ["/nowhere", f"{API}/nowhere", "/livez/", "/docs/x", f"/docs%2F..{API}/jobs"]
+)
+def test_a_stranger_does_not_learn_which_paths_exist(stranger: httpx2.Client, path: str) -> None:
+    problem(stranger.get(path), 401, "key_missing")
+
+
+def test_the_shown_key_opens_every_call(
+    server: ServerProcess, stranger: httpx2.Client, key: str
+) -> None:
+    photo = {"file": ("mine.jpg", photo_bytes(1))}
+    stored = stranger.post(f"{API}/upload", files=photo, headers=bearer(key))
+    assert stored.status_code == 202
+    job = stored.json()["status_url"]
+    ended = stranger.get(job, params={"wait": 30}, headers=bearer(key)).json()
+    assert ended["state"] == "succeeded", "long polls, too"
+    events = stranger.get(f"{job}/events", headers=bearer(key))
+    assert events.text.startswith("id: 1\nevent: progress\n"), "and event streams"
+    problem(stranger.get(f"{job}/events"), 401, "key_missing")
+    image = f"{API}/uploads/{stored.json()['file_id']}/image"
+    assert stranger.get(image, headers=bearer(key)).content == photo_bytes(1)
+    problem(stranger.get(image), 401, "key_missing")
+    problem(stranger.get(image, params={"key": key}), 401, "key_missing")
+
+
+def test_an_upload_without_the_key_stores_nothing(
+    server: ServerProcess, stranger: httpx2.Client
+) -> None:
+    before = objects(server)
+    for headers in ({}, bearer("pw_guessed")):
+        for call in ("upload", "similarity", "vocabularies/import"):
+            photo = {"file": ("theirs.jpg", photo_bytes(99))}
+            assert stranger.post(f"{API}/{call}", files=photo, headers=headers).status_code == 401
+    assert objects(server) == before
+    found = server.client.get(f"{API}/search", params={"filename": "theirs"}).json()
+    assert found["total_found"] == 0
+
+
+def test_a_stranger_is_refused_before_the_body_is_sent(server: ServerProcess) -> None:
+    url = server.client.base_url
+    head = (
+        f"POST {API}/upload HTTP/1.1\r\nHost: {url.host}\r\nContent-Length: 5000000\r\n"
+        "Content-Type: multipart/form-data; boundary=x\r\n\r\n"
+    )
+    with socket.create_connection((url.host, url.port or 80), timeout=10) as connection:
+        connection.sendall(head.encode())  # and not one byte of the body
+        assert connection.recv(4096).startswith(b"HTTP/1.1 401 ")
+
+
+def test_the_client_sends_its_key_and_raises_what_is_refused(
+    server: ServerProcess, key: str
+) -> None:
+    url = str(server.client.base_url)
+    with Client(url, key=key) as places:
+        assert places.stats()["map"] == "default"
+    for wrong, code in ((None, "key_missing"), ("pw_wrong", "key_unknown")):
+        with Client(url, key=wrong) as places, pytest.raises(Unauthorized) as caught:
+            places.stats()
+        assert caught.value.code == code
+
+
+# --- commands --------------------------------------------------------------------------------
+
+
+def test_commands_of_the_same_user_need_no_key(server: ServerProcess, tmp_path: Path) -> None:
+    env = environment(server.home)
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos" / "one.jpg").write_bytes(photo_bytes(2))
+    for command in (
+        ("index", tmp_path / "photos", "--json"),
+        ("query", tmp_path / "photos" / "one.jpg", "--json"),
+        ("vocabulary", "list", "--json"),
+        ("doctor", "--json"),
+    ):
+        ended = run_command(*command, env=env, cwd=tmp_path)
+        assert ended.returncode == 0, ended.stdout + ended.stderr
+    assert stat.S_IMODE(address_file(server.home).stat().st_mode) == 0o600
+
+
+def test_commands_with_a_servers_address_need_its_key(
+    server: ServerProcess, key: str, tmp_path: Path
+) -> None:
+    photo = tmp_path / "one.jpg"
+    photo.write_bytes(photo_bytes(2))
+    env = environment(tmp_path / "elsewhere", placewise_server=server.client.base_url)
+    command = ("query", photo, "--json")
+    refused = run_command(*command, env=env, cwd=tmp_path)
+    assert refused.returncode == 1
+    assert json.loads(refused.stdout)["code"] == "key_missing"
+    assert "PLACEWISE_KEY" in json.loads(refused.stdout)["detail"]
+    given = {**env, "PLACEWISE_KEY": key}
+    assert run_command(*command, env=given, cwd=tmp_path).returncode == 0
+    assert run_command(*command, "--key", key, env=env, cwd=tmp_path).returncode == 0
+    wrong = run_command(*command, "--key", "pw_wrong", env=given, cwd=tmp_path)
+    assert json.loads(wrong.stdout)["code"] == "key_unknown"
+
+
+# --- starts ----------------------------------------------------------------------------------
+
+
+def test_a_restart_keeps_the_key_and_a_new_one_replaces_it(tmp_path: Path) -> None:
+    with ServerProcess(tmp_path / "home", host="0.0.0.0", debug=True) as server:
+        first = shown_key(server)
+
+        def opens(key: str) -> bool:
+            answer = server.client.get(f"{API}/jobs", headers=bearer(key))
+            return answer.status_code == 200
+
+        assert opens(first)
+        local = json.loads(address_file(server.home).read_text())["key"]
+        assert opens(local)
+        assert server.stop() == 0
+        server.log_path.unlink()
+
+        server.start()
+        assert first not in server.log()
+        assert "serve --new-key" in server.log()
+        assert opens(first)
+        assert not opens(local), "good until that server ended"
+        assert server.stop() == 0
+
+        server.start("--new-key")
+        second = shown_key(server)
+        assert second != first
+        assert opens(second)
+        assert not opens(first)
+        written = [path.read_bytes() for path in server.home.rglob("*") if path.is_file()]
+        assert not any(key.encode() in data for key in (first, second) for data in written)
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "127.0.0.1"])
+def test_a_chosen_key_is_the_key_also_on_loopback(tmp_path: Path, host: str) -> None:
+    with ServerProcess(tmp_path / "home", host=host, admin_key=CHOSEN) as server:
+        url = f"{str(server.client.base_url).rstrip('/')}{API}/jobs"
+        problem(httpx2.get(url), 401, "key_missing")
+        assert httpx2.get(url, headers=bearer(CHOSEN)).status_code == 200
+        assert CHOSEN not in server.log()
+        assert not list(server.home.glob("admin-key*"))
+        shown = run_command("config", env=environment(server.home, admin_key=CHOSEN), cwd=tmp_path)
+        assert CHOSEN not in shown.stdout + shown.stderr
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "::1", "localhost"])
+def test_loopback_needs_no_key(tmp_path: Path, host: str) -> None:
+    with ServerProcess(tmp_path / "home", host=host) as server:
+        assert "authorization" not in server.client.headers
+        assert server.client.get(f"{API}/jobs").status_code == 200
+        assert "PLACEWISE_KEY" not in server.log()
+        assert not list(server.home.glob("admin-key*"))
+
+
+def test_a_new_key_where_none_is_needed_is_refused(tmp_path: Path) -> None:
+    ended = run_command("serve", "--new-key", env=environment(tmp_path / "home"), cwd=tmp_path)
+    assert ended.returncode == 1
+    assert ended.stderr.startswith("no_key_needed: ")
