@@ -90,10 +90,13 @@ class Client:
     def close(self) -> None:
         self._http.close()
 
-    def upload(self, photo: Path, **fields: Any) -> Json:
-        """Store a photo; `fields` are the form's (`latitude`, `longitude`, `place`, ...)."""
+    def upload(self, photo: Path, filename: str | None = None, **fields: Any) -> Json:
+        """Store a photo; `fields` are the form's (`latitude`, `longitude`, `place`, ...).
+
+        It is called `filename`, or as its file is.
+        """
         said = {name: str(value) for name, value in fields.items() if value is not None}
-        return self._send_file("/upload", photo, data=said)
+        return self._send_file("/upload", photo, filename, data=said)
 
     def similar_to_file(
         self,
@@ -205,10 +208,10 @@ class Client:
     def stats(self) -> Json:
         return self._call("GET", "/database/stats")
 
-    def _send_file(self, path: str, file: Path, **options: Any) -> Json:
+    def _send_file(self, path: str, file: Path, called: str | None = None, **options: Any) -> Json:
         try:
             with file.open("rb") as opened:
-                name = os.fsencode(file.name).decode("utf-8", "replace")
+                name = called or os.fsencode(file.name).decode("utf-8", "replace")
                 return self._call("POST", path, files={"file": (name, opened)}, **options)
         except OSError as error:
             raise InvalidRequest(

@@ -28,6 +28,8 @@ class FoundPhoto:
     path: Path
     fields: dict[str, str]
     """What is said of it, in the upload form's names."""
+    name: str | None = None
+    """What it is called, where that is not its file's name."""
 
 
 def find_photos(folder: Path, table: Path | None, utm_zone: str | None) -> list[FoundPhoto]:

@@ -193,6 +193,7 @@ class UploadAnswer(Answer):
     upload_time: datetime
     status: JobState
     status_url: str
+    already_there: bool = Field(description="the map has these bytes; none were stored")
     message: str
 
 

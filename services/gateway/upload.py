@@ -99,6 +99,7 @@ async def upload(
         upload_time=stored.photo.uploaded_at,
         status=JobState(job.state) if job else JobState.SUCCEEDED,
         status_url=status_url,
+        already_there=stored.photo.object_key != received.key,
         message=_message(stored, job),
     )
 

@@ -37,6 +37,7 @@ ANSWER_FIELDS = {
     "upload_time",
     "status",
     "status_url",
+    "already_there",
     "message",
 }
 
@@ -112,6 +113,7 @@ def test_an_upload_is_acknowledged_with_a_job_to_poll(server: ServerProcess) -> 
     assert answer.status_code == 202
     body = answer.json()
     assert set(body) == ANSWER_FIELDS
+    assert body["already_there"] is False
     assert body["filename"] == "street.jpg"
     assert body["file_size"] == len(data)
     assert body["status"] == "queued"
@@ -168,6 +170,7 @@ def test_the_same_bytes_again_are_the_same_photo(server: ServerProcess) -> None:
         assert answer.status_code == 200
         assert set(answer.json()) == ANSWER_FIELDS
         assert answer.json()["file_id"] == first
+        assert answer.json()["already_there"] is True
         assert answer.json()["filename"] == "one.jpg"
         assert answer.json()["status"] == "succeeded"
     assert stored(server) == before

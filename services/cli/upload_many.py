@@ -1,0 +1,136 @@
+"""Many photos into a map: uploaded in parallel, then waited for until all are searchable."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from typing import Annotated, Any
+
+import typer
+from rich.markup import escape
+from rich.progress import Progress, TaskID
+
+from services.cli.output import messages, shown
+from services.cli.photo_places import FoundPhoto
+from services.cli.vocabulary import fit_and_wait
+from shared.client import FINISHED, Client, Json, retry_while_away
+from shared.errors import PlacewiseError
+
+FIT_FROM_PHOTOS = 50
+UPLOADS_AT_ONCE = 4
+AWAY_SECONDS = 60.0
+LOOK_SECONDS = 1.0  # a job that begins to wait for a vocabulary is not seen by a longer poll
+
+FitOption = Annotated[
+    bool,
+    typer.Option(
+        "--fit/--no-fit",
+        help=f"Fit a vocabulary at the end, from {FIT_FROM_PHOTOS} photos up, if the map has none "
+        "of its own.",
+    ),
+]
+Pending = list[tuple[FoundPhoto, str]]
+"""Photos with the ids of the jobs that describe them."""
+
+
+def upload_many(client: Client, photos: list[FoundPhoto], fit: bool, progress: Progress) -> Json:
+    """Upload, describe, and fit a vocabulary where the map needs one. Running it again uploads
+    the same bytes again and describes nothing twice.
+
+    Returns counts (`photos`, `uploaded`, `already_there`, `searchable` in the whole map), what is
+    `refused` and `failed` with the reasons, and the map's `vocabulary`.
+    """
+    client.stats()  # a wrong address, key or map is said once and now, not after each photo
+    counts: Counter[str] = Counter()
+    refused: list[Json] = []
+    failed: list[Json] = []
+    pending: Pending = []
+    uploading = progress.add_task("uploading", total=len(photos))
+    for photo, outcome in _upload_all(client, photos):
+        progress.advance(uploading)
+        if isinstance(outcome, PlacewiseError):
+            refused.append(_fault(photo, outcome.detail))
+            continue
+        counts["already_there" if outcome["already_there"] else "uploaded"] += 1
+        if outcome["status"] not in FINISHED:
+            pending.append((photo, outcome["job_id"]))
+    describing = progress.add_task("describing", total=len(pending))
+    pending = _wait_all(client, pending, failed, progress, describing)
+
+    stats = client.stats()
+    vocabulary: Json | None = None
+    if (
+        fit
+        and stats["vocabulary"] in ("foreign", None)
+        and stats["total_images"] >= FIT_FROM_PHOTOS
+    ):
+        vocabulary = fit_and_wait(client, {}, progress)
+        stats = client.stats()
+    _wait_all(client, pending, failed, progress, describing)
+    return {
+        "photos": len(photos),
+        "uploaded": counts["uploaded"],
+        "already_there": counts["already_there"],
+        "searchable": stats["searchable_images"],
+        "refused": refused,
+        "failed": failed,
+        "vocabulary": stats["vocabulary"],
+        "fitted": vocabulary,
+    }
+
+
+def print_faults(report: Json, *words: str) -> None:
+    """What is listed under each of the words, with its reason."""
+    for word in words:
+        if report[word]:
+            messages.print(f"{len(report[word])} {word}:")
+        for item in report[word]:
+            name = f" ({item['filename']})" if "filename" in item else ""
+            messages.print(
+                f"[red]{word}[/red] {escape(item['path'] + name)}: {escape(item['reason'])}",
+                soft_wrap=True,
+            )
+
+
+def _upload_all(
+    client: Client, photos: list[FoundPhoto]
+) -> Iterator[tuple[FoundPhoto, Json | PlacewiseError]]:
+    def upload(photo: FoundPhoto) -> Json | PlacewiseError:
+        fields: dict[str, Any] = dict(photo.fields)
+        try:
+            return retry_while_away(
+                lambda: client.upload(photo.path, filename=photo.name, **fields), AWAY_SECONDS
+            )
+        except PlacewiseError as error:
+            return error
+
+    with ThreadPoolExecutor(UPLOADS_AT_ONCE) as pool:
+        yield from zip(photos, pool.map(upload, photos), strict=True)
+
+
+def _wait_all(
+    client: Client, pending: Pending, failed: list[Json], progress: Progress, bar: TaskID
+) -> Pending:
+    """Wait for the jobs; returns those that wait for a vocabulary and can't end before it."""
+    waiting: Pending = []
+    for photo, job_id in pending:
+        wait_seconds = 0.0
+        while True:
+            job = client.job(job_id, wait_seconds)
+            wait_seconds = LOOK_SECONDS
+            if job["state"] in FINISHED:
+                progress.advance(bar)
+                if job["state"] != "succeeded":
+                    error: Json = job["error"] or {}
+                    failed.append(_fault(photo, error.get("detail", job["state"])))
+                break
+            if job["waiting_for"]:
+                waiting.append((photo, job_id))
+                break
+    return waiting
+
+
+def _fault(photo: FoundPhoto, reason: str) -> Json:
+    named = {"filename": photo.name} if photo.name else {}
+    return {"path": shown(photo.path), **named, "reason": reason}
