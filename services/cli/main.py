@@ -6,7 +6,18 @@ import logging
 
 import typer
 
-from services.cli import ask, bench, configuration, doctor, evaluate, index, maps, serve, vocabulary
+from services.cli import (
+    ask,
+    bench,
+    configuration,
+    doctor,
+    evaluate,
+    import_anyloc,
+    index,
+    maps,
+    serve,
+    vocabulary,
+)
 
 app = typer.Typer(
     name="placewise",
@@ -17,6 +28,7 @@ app = typer.Typer(
 )
 app.command("serve")(serve.serve)
 app.command("index")(index.index)
+app.command("import-anyloc")(import_anyloc.import_anyloc)
 app.command("query")(ask.query)
 app.command("evaluate")(evaluate.evaluate)
 app.add_typer(maps.app, name="maps")

@@ -1,0 +1,208 @@
+"""The predecessor's folder: its rows and its photos brought together.
+
+A row's `image_path` is one of another machine or container, and the file's name is not the row's
+id: what joins them is the path's last part, below a folder called `uploads`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections import defaultdict
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from itertools import takewhile
+from pathlib import Path, PureWindowsPath
+from typing import Any
+
+from services.cli.anyloc_database import DATABASE_NAME, AnylocRow, read_rows
+from services.cli.output import shown
+from services.cli.photo_places import SUFFIXES, FoundPhoto
+from shared.client import Json
+from shared.errors import InvalidRequest
+
+UPLOADS = "uploads"
+VOCABULARY = "c_centers.pt"
+
+
+@dataclass(slots=True)
+class AnylocPhoto:
+    path: Path
+    name: str
+    tags: list[str] = field(default_factory=list)
+    metadata: dict[str, Any] = field(default_factory=dict)
+
+    def as_found(self) -> FoundPhoto:
+        """As the upload form says it."""
+        fields = {"tags": ",".join(self.tags), "metadata": json.dumps(self.metadata)}
+        return FoundPhoto(
+            self.path, {k: v for k, v in fields.items() if v not in ("", "{}")}, self.name
+        )
+
+
+@dataclass(slots=True)
+class AnylocFolder:
+    """What there is to import, and what is not imported."""
+
+    database: Path
+    rows: int
+    photos: list[FoundPhoto]
+    unlisted: int
+    """How many of the photos no row names."""
+    missing: list[Json]
+    """Rows without a file."""
+    duplicates: list[Json]
+    """Photos whose bytes are those of another one, which is imported."""
+    vocabularies: list[Path]
+
+
+def read_folder(folder: Path, database: Path | None, uploads: Path | None) -> AnylocFolder:
+    """Look through the folder; `database` and `uploads` say where those lie if not below it.
+
+    Raises InvalidRequest: `no_anyloc_database`, `several_anyloc_databases`, `no_anyloc_uploads`,
+    `bad_anyloc_database`.
+    """
+    below = list(_walk(folder))
+    database = database or _only_database(folder, below)
+    files = _uploaded_files(folder, below, uploads)
+    rows = read_rows(database)
+    listed, missing = _join(rows, files)
+    named = {photo.path for photo in listed}
+    unlisted = [
+        AnylocPhoto(path, shown(Path(path.name)))
+        for path in sorted(set().union(*files.values()) - named)
+        if path.suffix.lower() in SUFFIXES
+    ]
+    kept, duplicates = _without_doubles(listed + unlisted)
+    return AnylocFolder(
+        database=database,
+        rows=len(rows),
+        photos=[photo.as_found() for photo in kept],
+        unlisted=len(unlisted),
+        missing=missing,
+        duplicates=duplicates,
+        vocabularies=sorted(path for path in below if path.name == VOCABULARY),
+    )
+
+
+def _walk(folder: Path) -> Iterator[Path]:
+    """Every file below the folder, but for hidden ones (`.git`, `.venv`, `.gitkeep`)."""
+    for directory, folders, names in os.walk(folder):
+        folders[:] = [name for name in folders if not name.startswith(".")]
+        yield from (Path(directory, name) for name in names if not name.startswith("."))
+
+
+def _only_database(folder: Path, below: list[Path]) -> Path:
+    found = sorted(path for path in below if path.name == DATABASE_NAME)
+    if not found:
+        raise InvalidRequest(
+            "no_anyloc_database",
+            f"There is no {DATABASE_NAME} below {folder}. Name it: --database FILE; or, for photos "
+            "without a database: placewise index DIR.",
+        )
+    if len(found) > 1:
+        raise InvalidRequest(
+            "several_anyloc_databases",
+            f"There are several databases: {', '.join(map(str, found))}. Say which one is meant: "
+            "--database FILE.",
+        )
+    return found[0]
+
+
+def _uploaded_files(folder: Path, below: list[Path], uploads: Path | None) -> dict[str, set[Path]]:
+    """The files below the folders called `uploads`, by name."""
+    if uploads is not None:
+        paths = list(_walk(uploads))
+    elif folder.resolve().name == UPLOADS:
+        paths = below
+    else:
+        paths = [path for path in below if UPLOADS in path.relative_to(folder).parts[:-1]]
+    if not paths:
+        raise InvalidRequest(
+            "no_anyloc_uploads",
+            f"No photo lies in a folder called {UPLOADS} below {folder}. If they lie elsewhere: "
+            "--uploads FOLDER.",
+        )
+    files: dict[str, set[Path]] = defaultdict(set)
+    for path in paths:
+        files[path.name].add(path)
+    return files
+
+
+def _join(
+    rows: list[AnylocRow], files: dict[str, set[Path]]
+) -> tuple[list[AnylocPhoto], list[Json]]:
+    listed: list[AnylocPhoto] = []
+    missing: list[Json] = []
+    for row in rows:
+        path = PureWindowsPath(row.image_path)  # takes both kinds of slashes
+        # Of several with this name, one whose folders are called most like the row's.
+        there = sorted(files.get(path.name, ()), key=lambda file: (-_same_end(file, path), file))
+        if there:
+            listed.append(AnylocPhoto(there[0], row.name or path.name, row.tags, row.metadata))
+        else:
+            missing.append(
+                {
+                    "path": row.image_path,
+                    "filename": row.name,
+                    "reason": "the file is not there; its row says only what it was called",
+                }
+            )
+    return listed, missing
+
+
+def _same_end(file: Path, path: PureWindowsPath) -> int:
+    """How many parts the two paths have in common, from the end."""
+    pairs = zip(reversed(file.parts), reversed(path.parts), strict=False)
+    return len(list(takewhile(lambda pair: pair[0] == pair[1], pairs)))
+
+
+def _without_doubles(photos: list[AnylocPhoto]) -> tuple[list[AnylocPhoto], list[Json]]:
+    """A map keeps the same bytes once: the first one stays and remembers the others."""
+    first: dict[object, AnylocPhoto] = {}
+    duplicates: list[Json] = []
+    for key, photo in zip(_contents(photos), photos, strict=True):
+        kept = first.setdefault(key, photo)
+        if kept is photo:
+            continue
+        kept.tags = list(dict.fromkeys(kept.tags + photo.tags))
+        other = {"filename": photo.name, **photo.metadata}
+        kept.metadata.setdefault("anyloc_same_photo", []).append(other)
+        duplicates.append(
+            {
+                "path": shown(photo.path),
+                "filename": photo.name,
+                "reason": f"the same photo as {kept.name}",
+            }
+        )
+    return list(first.values()), duplicates
+
+
+def _contents(photos: list[AnylocPhoto]) -> Iterator[object]:
+    """For each photo a value that it shares with those of the same bytes.
+
+    Only files of the same size are read. One that can't be read shares its value with none: the
+    upload says why it is refused.
+    """
+    sizes: dict[int, set[Path]] = defaultdict(set)
+    for photo in photos:
+        sizes[_size(photo.path)].add(photo.path)
+    for photo in photos:
+        size = _size(photo.path)
+        try:
+            yield photo.path if len(sizes[size]) == 1 else _sha256(photo.path)
+        except OSError:
+            yield photo.path
+
+
+def _size(path: Path) -> int:
+    try:
+        return path.stat().st_size
+    except OSError:
+        return -1
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,0 +1,106 @@
+"""`placewise import-anyloc`: the predecessor's photos in a map, found by their own names."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.support.anyloc import AnylocHouse
+from tests.support.photos import photo_bytes
+from tests.support.server import ServerProcess, environment, run_command
+
+
+@pytest.fixture(scope="module")
+def house(tmp_path_factory: pytest.TempPathFactory) -> AnylocHouse:
+    """Four photos in rows, one of them twice and one without its file; one that no row names."""
+    made = AnylocHouse(tmp_path_factory.mktemp("anyloc"))
+    made.add(
+        "5f0e.jpg",
+        photo_bytes(10),
+        original_filename="Piazza Castello.jpg",
+        tags='["night", "rain"]',
+        metadata_json='{"camera": "left"}',
+    )
+    made.add("7a31.png", photo_bytes(11, "PNG"), original_filename="hall.png")
+    made.add("99b2.jpg", photo_bytes(10), original_filename="castle-again.jpg")
+    made.add("c4d5.jpg", None, original_filename="lost.jpg")
+    (made.uploads / "unlisted.jpg").write_bytes(photo_bytes(12))
+    return made  # still open: the last rows lie in the write-ahead log
+
+
+def import_it(
+    server: ServerProcess, house: AnylocHouse, cwd: Path, code: int = 0
+) -> dict[str, Any]:
+    ended = run_command(
+        "import-anyloc", house.root, "--json", env=environment(server.home), cwd=cwd
+    )
+    assert ended.returncode == code, ended.stdout + ended.stderr
+    report: dict[str, Any] = json.loads(ended.stdout)
+    return report
+
+
+def images(server: ServerProcess, **filters: str) -> list[dict[str, Any]]:
+    found: list[dict[str, Any]] = server.client.get("/api/v1/search", params=filters).json()[
+        "images"
+    ]
+    return found
+
+
+def test_photos_are_imported_and_found_by_their_original_names(
+    server: ServerProcess, house: AnylocHouse, tmp_path: Path
+) -> None:
+    report = import_it(server, house, tmp_path)
+    assert (report["rows"], report["photos"], report["unlisted"]) == (4, 3, 1)
+    assert (report["imported"], report["already_there"]) == (3, 0)
+    assert [item["filename"] for item in report["missing"]] == ["lost.jpg"]
+    assert [item["filename"] for item in report["duplicates"]] == ["castle-again.jpg"]
+    assert report["refused"] == report["failed"] == []
+    assert "made anew" in report["notes"][0]
+    assert "c_centers.pt" in report["notes"][1]
+
+    [castle] = images(server, filename="piazza castello")
+    assert castle["original_filename"] == "Piazza Castello.jpg"
+    assert castle["tags"] == ["night", "rain"]
+    assert castle["metadata"]["camera"] == "left"
+    assert castle["metadata"]["anyloc_image_id"] == "id-of-5f0e.jpg"
+    assert castle["metadata"]["anyloc_upload_time"] == "2026-05-01T10:20:30+00:00"
+    assert castle["metadata"]["anyloc_same_photo"][0]["filename"] == "castle-again.jpg"
+    assert len(images(server, filename="hall.png")) == 1
+    assert len(images(server, filename="unlisted.jpg")) == 1
+    assert [photo["original_filename"] for photo in images(server, tags="rain,night")] == [
+        "Piazza Castello.jpg"
+    ]
+    similar = server.ask(photo_bytes(10), top_k=1).json()["similar_images"]
+    assert similar[0]["original_filename"] == "Piazza Castello.jpg"
+
+    again = import_it(server, house, tmp_path)
+    assert (again["imported"], again["already_there"]) == (0, 3)
+    assert again["searchable"] == report["searchable"]
+
+
+def test_what_is_refused_is_named_and_ends_with_exit_code_1(
+    server: ServerProcess, house: AnylocHouse, tmp_path: Path
+) -> None:
+    house.add("text.jpg", b"Only text, named as a photo.", original_filename="[odd] name.jpg")
+    report = import_it(server, house, tmp_path, code=1)
+    assert [item["filename"] for item in report["refused"]] == ["[odd] name.jpg"]
+    assert "JPEG" in report["refused"][0]["reason"]
+    shown = run_command("import-anyloc", house.root, env=environment(server.home), cwd=tmp_path)
+    assert shown.returncode == 1
+    assert "4 rows" not in shown.stderr
+    assert "0 photos imported, 3 were there already" in shown.stderr
+    assert "1 missing, 1 refused" in shown.stderr
+    assert "[odd] name.jpg" in shown.stderr
+
+
+def test_a_broken_database_is_one_line(server: ServerProcess, tmp_path: Path) -> None:
+    (tmp_path / "uploads").mkdir()
+    (tmp_path / "uploads" / "a.jpg").write_bytes(photo_bytes(13))
+    (tmp_path / "similarity.db").write_text("no database")
+    ended = run_command("import-anyloc", tmp_path, env=environment(server.home), cwd=tmp_path)
+    assert ended.returncode == 1
+    assert ended.stderr.startswith("bad_anyloc_database: ")
+    assert ended.stderr.count("\n") == 1
