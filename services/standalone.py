@@ -37,6 +37,7 @@ from shared.errors import Misconfigured
 from shared.home import announced, lock_home
 from shared.jobs import InProcessHints
 from shared.objects import FolderStore
+from shared.objects.upload_dir import place_originals
 from shared.settings import Settings
 from shared.vision.extractors import get_recipe
 
@@ -75,11 +76,13 @@ def standalone(settings: Settings, *, new_key: bool = False) -> Iterator[Standal
 
     Beyond loopback, or with an ADMIN_KEY, every call needs a key; `new_key` replaces the one that
     an earlier start has made. Raises Misconfigured: `home_in_use` for a folder that another server
-    has, `address_in_use`, `no_key_needed` for a new key on loopback, and for an extractor of new
-    maps that is unknown: no photo could ever be described.
+    has, `address_in_use`, `no_key_needed` for a new key on loopback, those of `admin_key` and
+    `place_originals`, and for an extractor of new maps that is unknown: no photo could ever be
+    described.
     """
     get_recipe(settings.extractor, allow_test_extractors=settings.allow_test_extractors)
     home = settings.placewise_home
+    objects = home / "objects"
     with contextlib.ExitStack() as held:
         held.enter_context(lock_home(home))
         listener = held.enter_context(_listener(settings))
@@ -99,7 +102,7 @@ def standalone(settings: Settings, *, new_key: bool = False) -> Iterator[Standal
         url = _url(host, port)
         held.enter_context(announced(home, url, local_key))
         catalog = Catalog(settings.catalog_url())
-        store = FolderStore(home / "objects")
+        store = FolderStore(objects, place_originals(home, objects, settings.upload_dir))
         hints = InProcessHints()
         catalog.migrate()
         with catalog.write() as session:
@@ -118,7 +121,7 @@ def standalone(settings: Settings, *, new_key: bool = False) -> Iterator[Standal
             uvicorn.Config(
                 create_app(gateway),
                 log_config=None,
-                access_log=False,
+                access_log=settings.debug,
                 timeout_graceful_shutdown=GRACEFUL_SECONDS,
             )
         )

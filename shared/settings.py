@@ -34,9 +34,16 @@ class Settings(BaseSettings):
     placewise_home: Path = Field(
         Path("./var"), description="folder of the embedded catalog and object store"
     )
+    upload_dir: Path | None = Field(
+        None, description="folder of the original photos; unset: PLACEWISE_HOME/objects/originals"
+    )
     database_url: SecretStr | None = Field(
         None,
         description="SQLAlchemy URL of the catalog; unset: SQLite under PLACEWISE_HOME",
+    )
+
+    debug: bool = Field(
+        False, description="log every call and every refusal; answers stay the same"
     )
 
     # What is accepted.
@@ -117,10 +124,15 @@ class Settings(BaseSettings):
             )
         return value
 
-    @field_validator("placewise_home")
+    @field_validator("upload_dir", mode="before")
     @classmethod
-    def _absolute(cls, value: Path) -> Path:
-        return value.expanduser().resolve()
+    def _empty_is_unset(cls, value: object) -> object:
+        return value or None
+
+    @field_validator("placewise_home", "upload_dir")
+    @classmethod
+    def _absolute(cls, value: Path | None) -> Path | None:
+        return value and value.expanduser().resolve()
 
     @model_validator(mode="after")
     def _a_batch_fits_into_a_slot(self) -> Self:

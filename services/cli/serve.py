@@ -30,11 +30,19 @@ def serve(
         settings = read_settings()
         from services.standalone import standalone  # brings torch, as `connect` says
 
-        logging.getLogger().setLevel(logging.INFO)
-        logging.getLogger("alembic").setLevel(logging.WARNING)
+        _set_log_levels(settings.debug)
         with standalone(settings, new_key=new_key) as running:
             messages.print(_welcome(running.url, running.key, settings), soft_wrap=True)
             running.serve()
+
+
+def _set_log_levels(debug: bool) -> None:
+    """What Placewise itself says, in detail with DEBUG; of others, never each statement."""
+    logging.getLogger().setLevel(logging.INFO)
+    for ours in ("services", "shared"):
+        logging.getLogger(ours).setLevel(logging.DEBUG if debug else logging.INFO)
+    for others in ("alembic", "sqlalchemy"):
+        logging.getLogger(others).setLevel(logging.WARNING)
 
 
 def _welcome(url: str, key: AdminKey | None, settings: Settings) -> str:

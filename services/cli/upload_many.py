@@ -123,7 +123,7 @@ def _wait_all(
                 progress.advance(bar)
                 if job["state"] != "succeeded":
                     error: Json = job["error"] or {}
-                    failed.append(_fault(photo, error.get("detail", job["state"])))
+                    failed.append(_fault(photo, str(error.get("detail", job["state"]))))
                 break
             if job["waiting_for"]:
                 waiting.append((photo, job_id))

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import logging
+
 from fastapi import Request
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from services.gateway.keys import Keys
 from services.gateway.problems import problem_response
 from shared.errors import Unauthorized
+
+log = logging.getLogger(__name__)
 
 # Probes, and descriptions of the service: none of them tells what is stored.
 OPEN_PATHS = frozenset(
@@ -36,6 +40,7 @@ class KeyCheck:
             try:
                 self._keys.check(request.headers.get("authorization"))
             except Unauthorized as error:
+                log.debug("%s %s: %s", request.method, request.url.path, error.code)
                 await problem_response(error, request)(scope, receive, send)
                 return
         await self._app(scope, receive, send)

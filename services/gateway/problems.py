@@ -74,6 +74,8 @@ async def _on_placewise_error(request: Request, error: Exception) -> JSONRespons
     assert isinstance(error, PlacewiseError)
     if error.status >= 500:
         log.error("%s %s: %s", request.method, request.url.path, error.detail)
+    else:
+        log.debug("%s %s: %s", request.method, request.url.path, error.detail)
     return problem_response(error, request)
 
 

@@ -31,6 +31,7 @@ from shared.objects.keys import (
     THUMBNAILS,
     VOCABULARIES,
     WORK,
+    is_original_key,
     query_key,
     query_vector_key,
     thumbnail_key,
@@ -194,7 +195,9 @@ def collect(catalog: Catalog, store: ObjectStore, settings: Settings) -> None:
 
 
 def _known_originals(session: Session, keys: list[str]) -> Iterable[str]:
-    return session.scalars(select(Photo.object_key).where(Photo.object_key.in_(keys)))
+    """Those of photos, and whatever Placewise has not put there: that is not ours to remove."""
+    stored = session.scalars(select(Photo.object_key).where(Photo.object_key.in_(keys)))
+    return [*stored, *(key for key in keys if not is_original_key(key))]
 
 
 def _known_thumbnails(session: Session, keys: list[str]) -> Iterable[str]:

@@ -1,11 +1,15 @@
-"""Objects as files below one folder, written whole: temporary file, fsync, rename."""
+"""Objects as files below one folder, written whole: temporary file, fsync, rename.
+
+One kind of object may lie elsewhere: the files of `originals/...` in a folder of their own, which
+may be on another disk.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import os
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path, PurePosixPath
 from typing import BinaryIO
@@ -17,29 +21,32 @@ from shared.objects.port import ObjectInfo
 # No file there, or a folder on the way or at the end: to a store of keys it is all the same.
 MISSING = (FileNotFoundError, NotADirectoryError, IsADirectoryError)
 PARTIAL = ".partial"  # the folder of files being written: same file system, so rename is atomic
+MARK = ".placewise"  # the file that says whose folder it is (`shared.objects.upload_dir`)
+RESERVED = (PARTIAL, MARK)
 
 
 class FolderStore:
     """An object store in a local folder. What killed writers left half written goes at start."""
 
-    def __init__(self, root: Path) -> None:
+    def __init__(self, root: Path, elsewhere: Mapping[str, Path] | None = None) -> None:
+        """`elsewhere` says in which other folder the keys lie that begin with a name and a slash:
+        `{"originals": Path("/photos")}` keeps `originals/a` as `/photos/a`.
+        """
         self.root = root
-        self._partial = root / PARTIAL
-        self._partial.mkdir(parents=True, exist_ok=True)
-        for left_over in self._partial.iterdir():
-            left_over.unlink()
+        self._elsewhere = dict(elsewhere or {})
+        for folder in self._folders():
+            (folder / PARTIAL).mkdir(parents=True, exist_ok=True)
+            for left_over in (folder / PARTIAL).iterdir():
+                left_over.unlink()
 
     def path(self, key: str) -> Path:
         """The file of a key. Keys are names joined by single slashes, none of them `.` or `..`."""
-        parts = key.split("/")
-        if any(part in ("", ".", "..") for part in parts):
-            raise ValueError(f"not an object key: {key!r}")
-        if parts[0] == PARTIAL:
-            raise ValueError(f"the name {PARTIAL} is the store's own: {key!r}")
-        return self.root.joinpath(*parts)
+        folder, parts = self._place(key)
+        return folder.joinpath(*parts)
 
     def writer(self, key: str) -> FolderWriter:
-        return FolderWriter(self.path(key), self._partial / str(new_id()))
+        folder, parts = self._place(key)
+        return FolderWriter(folder.joinpath(*parts), folder / PARTIAL / str(new_id()))
 
     def put(self, key: str, data: bytes) -> None:
         writer = self.writer(key)
@@ -73,27 +80,55 @@ class FolderStore:
             self.path(key).unlink()
 
     def list(self, prefix: str) -> Iterator[ObjectInfo]:
-        folder = self.root.joinpath(*PurePosixPath(prefix).parts[: prefix.count("/")])
-        for directory, _, names in os.walk(folder):
-            for name in names:
-                path = Path(directory, name)
-                key = path.relative_to(self.root).as_posix()
-                if key.startswith(f"{PARTIAL}/") or not key.startswith(prefix):
-                    continue
-                with contextlib.suppress(FileNotFoundError):  # deleted since it was listed
-                    yield _info(key, path.stat())
+        yield from self._list_folder(self.root, "", prefix)
+        for name, folder in self._elsewhere.items():
+            yield from self._list_folder(folder, f"{name}/", prefix)
 
     def check(self) -> None:
-        probe = self._partial / str(new_id())
-        try:
-            probe.write_bytes(b"ok")
-            probe.unlink()
-        except OSError as error:
-            raise Unavailable(
-                "object_store_unavailable",
-                f"Can't write below {self.root.name}: {error.strerror}. "
-                "Check the disk's free space and the folder's permissions.",
-            ) from error
+        for folder in self._folders():
+            probe = folder / PARTIAL / str(new_id())
+            try:
+                probe.write_bytes(b"ok")
+                probe.unlink()
+            except OSError as error:
+                raise Unavailable(
+                    "object_store_unavailable",
+                    f"Can't write below {folder.name}: {error.strerror}. "
+                    "Check the disk's free space and the folder's permissions.",
+                ) from error
+
+    def _folders(self) -> Iterator[Path]:
+        yield self.root
+        yield from self._elsewhere.values()
+
+    def _place(self, key: str) -> tuple[Path, Sequence[str]]:
+        """The folder that a key lies in, and the names that lead to it from there."""
+        folder, parts = self.root, key.split("/")
+        if any(part in ("", ".", "..") for part in parts):
+            raise ValueError(f"not an object key: {key!r}")
+        if parts[0] in self._elsewhere and len(parts) > 1:
+            folder, parts = self._elsewhere[parts[0]], parts[1:]
+        if parts[0] in RESERVED:
+            raise ValueError(f"the name {parts[0]} is the store's own: {key!r}")
+        return folder, parts
+
+    def _list_folder(self, folder: Path, begin: str, prefix: str) -> Iterator[ObjectInfo]:
+        """The objects in one of the folders, whose keys begin with `begin`."""
+        if not (prefix.startswith(begin) or begin.startswith(prefix)):
+            return
+        below = prefix.removeprefix(begin) if prefix.startswith(begin) else ""
+        start = folder.joinpath(*PurePosixPath(below).parts[: below.count("/")])
+        for directory, _, names in os.walk(start):
+            for name in names:
+                path = Path(directory, name)
+                inside = path.relative_to(folder)
+                key = begin + inside.as_posix()
+                if inside.parts[0] in RESERVED or not key.startswith(prefix):
+                    continue
+                if self.path(key) != path:
+                    continue  # in the root's own folder of a name that lies elsewhere
+                with contextlib.suppress(FileNotFoundError):  # deleted since it was listed
+                    yield _info(key, path.stat())
 
 
 class FolderWriter:

@@ -18,6 +18,14 @@ def new_original_key() -> str:
     return f"{ORIGINALS}{new_id()}"
 
 
+def is_original_key(key: str) -> bool:
+    """Was it made by `new_original_key`? UPLOAD_DIR is a folder into which people may put files."""
+    try:
+        return key == f"{ORIGINALS}{UUID(key.removeprefix(ORIGINALS))}"
+    except ValueError:
+        return False
+
+
 def thumbnail_key(photo_id: UUID) -> str:
     return f"{THUMBNAILS}{photo_id}.jpg"
 

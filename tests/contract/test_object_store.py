@@ -354,3 +354,61 @@ class TestFolderStore(ObjectStoreContract):
         with pytest.raises(Unavailable) as caught:
             store.check()
         assert caught.value.code == "object_store_unavailable"
+
+
+class TestFolderStoreWithOriginalsElsewhere(ObjectStoreContract):
+    """The same promises where some of the keys lie in other folders."""
+
+    @pytest.fixture
+    def store(self, tmp_path: Path) -> FolderStore:
+        elsewhere = {"originals": tmp_path / "photos", "a": tmp_path / "deep" / "down"}
+        return FolderStore(tmp_path / "objects", elsewhere)
+
+    def test_each_key_lies_in_its_folder_and_nowhere_else(
+        self, store: FolderStore, tmp_path: Path
+    ) -> None:
+        for key in ("originals/1", "originals/deep/2", "chunks/3", "originals-too/4"):
+            store.put(key, key.encode())
+        files = {
+            path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*") if path.is_file()
+        }
+        assert files == {
+            "photos/1",
+            "photos/deep/2",
+            "objects/chunks/3",
+            "objects/originals-too/4",
+        }
+        assert keys_of(store, "orig") == ["originals-too/4", "originals/1", "originals/deep/2"]
+        assert keys_of(store, "originals/d") == ["originals/deep/2"]
+
+    def test_files_are_half_written_on_the_disk_that_they_are_for(
+        self, store: FolderStore, tmp_path: Path
+    ) -> None:
+        killed = store.writer("originals/half")
+        killed.write(b"half")
+        partial = tmp_path / "photos" / ".partial"
+        assert len(list(partial.iterdir())) == 1
+        assert keys_of(store) == []
+        FolderStore(store.root, {"originals": tmp_path / "photos"})
+        assert list(partial.iterdir()) == []
+        killed.abort()
+
+    def test_the_folders_own_names_are_no_keys(self, store: FolderStore, tmp_path: Path) -> None:
+        (tmp_path / "photos" / ".placewise").write_text("whose it is")
+        assert keys_of(store, "originals/") == []
+        for key in ("originals/.partial/a", "originals/.placewise", "originals/../b"):
+            with pytest.raises(ValueError):
+                store.head(key)
+
+    def test_what_lies_where_its_key_does_not_lead_is_not_listed(self, store: FolderStore) -> None:
+        (store.root / "originals").mkdir()
+        (store.root / "originals" / "old").write_bytes(b"from before")
+        assert keys_of(store) == []
+        assert store.head("originals/old") is None
+
+    def test_one_folder_that_cannot_be_written_makes_the_store_unavailable(
+        self, store: FolderStore, tmp_path: Path
+    ) -> None:
+        (tmp_path / "photos" / ".partial").rmdir()
+        with pytest.raises(Unavailable, match="photos"):
+            store.check()

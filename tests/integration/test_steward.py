@@ -510,12 +510,21 @@ def test_an_orphan_goes_once_no_row_refers_to_it_any_more(house: House) -> None:
     assert house.objects("thumbnails/") == set()  # left by a batch that met the deletion
 
 
+def test_files_that_people_put_beside_the_originals_are_not_removed(house: House) -> None:
+    theirs = {"originals/.DS_Store", "originals/holiday.jpg", f"originals/{new_id()}.jpg"}
+    for key in theirs:
+        house.store.put(key, b"not ours")
+    house.age(theirs, 2 * DAY_SECONDS)
+    assert collect_orphans(house.catalog, house.store, DAY_SECONDS) == 0
+    assert house.objects() == theirs
+
+
 def test_stray_files_stop_no_collection_and_go_with_the_orphans(house: House) -> None:
     live = _live_objects(house)
     with house.catalog.read() as session:
         photo_id = session.scalars(select(Photo.id)).one()
     stray = {
-        "originals/.DS_Store",
+        "thumbnails/.DS_Store",
         "thumbnails/Thumbs.db",
         f"thumbnails/{photo_id.hex}.jpg",  # nearly a live one
         "chunks/notes.txt",

@@ -1,0 +1,93 @@
+"""UPLOAD_DIR: original photos in a folder of their own, which belongs to one PLACEWISE_HOME.
+
+The folder and the home carry the same mark. A folder that another home uses as well would lose
+its photos: each home removes the originals that its own catalog does not know. And a folder that
+is not the one of before, such as a disk that is not mounted, holds none of the photos.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+
+from shared.errors import Misconfigured
+from shared.home import write_private
+from shared.ids import new_id
+from shared.objects.folder import MARK
+from shared.objects.keys import ORIGINALS
+
+NAME = ORIGINALS.rstrip("/")
+
+
+def place_originals(home: Path, objects: Path, upload_dir: Path | None) -> Mapping[str, Path]:
+    """What lies outside of `objects`, as FolderStore wants it: {} or the originals.
+
+    Marks a folder that is used for the first time. Raises Misconfigured: `upload_dir_overlaps`,
+    `upload_dir_unwritable`, `upload_dir_taken` for another home's, and `upload_dir_changed` where
+    the photos that the home has would be out of reach.
+    """
+    note = home / "upload-dir.json"
+    before: dict[str, str] = json.loads(note.read_text()) if note.exists() else {}
+    if upload_dir is None:
+        if before:
+            raise Misconfigured(
+                "upload_dir_changed",
+                f"The photos lie in {before['folder']}, and UPLOAD_DIR is not set. Set it; or move "
+                f"what is in that folder to {objects / NAME} and delete {note}.",
+            )
+        return {}
+    _check_apart(objects, upload_dir)
+    mark = upload_dir / MARK
+    try:
+        upload_dir.mkdir(parents=True, exist_ok=True)
+        found = mark.read_text().strip() if mark.exists() else None
+        if not os.access(upload_dir, os.W_OK | os.X_OK):
+            raise PermissionError(0, "this user may not write there")
+        if found is None:
+            if before:
+                raise Misconfigured(
+                    "upload_dir_changed",
+                    f"The photos lie in {before['folder']}, and UPLOAD_DIR is {upload_dir}, which "
+                    f"has no {MARK} of that folder. Is its disk mounted? To move the photos: all "
+                    f"that is in {before['folder']}, {MARK} too.",
+                )
+            _check_none_stored(objects / NAME, upload_dir)
+            found = str(new_id())
+            mark.write_text(f"{found}\n")
+        elif found != before.get("id"):
+            raise Misconfigured(
+                "upload_dir_taken",
+                f"The folder {upload_dir} (UPLOAD_DIR) belongs to another PLACEWISE_HOME than "
+                f"{home}. Give this one a folder of its own; or, if the other one is gone, delete "
+                f"{mark}.",
+            )
+    except OSError as error:
+        raise Misconfigured(
+            "upload_dir_unwritable",
+            f"Can't write into the folder {upload_dir} (UPLOAD_DIR): {error.strerror}. Check its "
+            "permissions, or choose another one.",
+        ) from error
+    now = {"folder": str(upload_dir), "id": found}
+    if now != before:
+        write_private(note, json.dumps(now))
+    return {NAME: upload_dir}
+
+
+def _check_apart(objects: Path, upload_dir: Path) -> None:
+    if upload_dir.is_relative_to(objects) or objects.is_relative_to(upload_dir):
+        raise Misconfigured(
+            "upload_dir_overlaps",
+            f"UPLOAD_DIR is {upload_dir}, and the other objects lie in {objects}: neither may lie "
+            "inside the other. Choose another UPLOAD_DIR, or unset it.",
+        )
+
+
+def _check_none_stored(originals: Path, upload_dir: Path) -> None:
+    if originals.is_dir() and any(originals.iterdir()):
+        raise Misconfigured(
+            "upload_dir_changed",
+            f"Photos lie in {originals} already, and would be out of reach. Unset UPLOAD_DIR, or "
+            f"move them first, for example: mv {originals}/* {upload_dir}/",
+        )
