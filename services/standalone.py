@@ -86,21 +86,6 @@ def standalone(settings: Settings, *, new_key: bool = False) -> Iterator[Standal
     with contextlib.ExitStack() as held:
         held.enter_context(lock_home(home))
         listener = held.enter_context(_listener(settings))
-        host, port = listener.getsockname()[:2]
-        keys: Keys = NoKeys()
-        key = local_key = None
-        # The name as well as what it means today: what a name leads to can change.
-        if settings.admin_key or not (is_loopback(settings.host) and is_loopback(host)):
-            key, local_key = admin_key(home, settings.admin_key, new_key), new_local_key()
-            keys = KnownKeys(key.sha256, hash_key(local_key))
-        elif new_key:
-            raise Misconfigured(
-                "no_key_needed",
-                f"On {settings.host} no key is needed, because only this machine reaches it. "
-                "Give --new-key with the HOST that needs one.",
-            )
-        url = _url(host, port)
-        held.enter_context(announced(home, url, local_key))
         catalog = Catalog(settings.catalog_url())
         store = FolderStore(objects, place_originals(home, objects, settings.upload_dir))
         hints = InProcessHints()
@@ -109,6 +94,12 @@ def standalone(settings: Settings, *, new_key: bool = False) -> Iterator[Standal
             ensure_default_map(session, settings.extractor)
         # The lock says that no other worker lives: what was leased belongs to a killed process.
         free_leases(catalog, settings.max_attempts, everyone=True)
+
+        # After all that can be refused: a key that no start gets to show would be lost.
+        host, port = listener.getsockname()[:2]
+        keys, key, local_key = _make_keys(settings, host, new_key)
+        url = _url(host, port)
+        held.enter_context(announced(home, url, local_key))
 
         search = SearchWorker(catalog, store, settings)
         extractor = ExtractorWorker(
@@ -191,6 +182,24 @@ def _listener(settings: Settings) -> Iterator[socket.socket]:
         ) from error
     with listener:
         yield listener
+
+
+def _make_keys(
+    settings: Settings, host: str, new_key: bool
+) -> tuple[Keys, AdminKey | None, str | None]:
+    """What the gateway asks, the admin key, and a key for this user's commands."""
+    # The name as well as what it means today: what a name leads to can change.
+    if settings.admin_key or not (is_loopback(settings.host) and is_loopback(host)):
+        key = admin_key(settings.placewise_home, settings.admin_key, new_key)
+        local_key = new_local_key()
+        return KnownKeys(key.sha256, hash_key(local_key)), key, local_key
+    if new_key:
+        raise Misconfigured(
+            "no_key_needed",
+            f"On {settings.host} no key is needed, because only this machine reaches it. "
+            "Give --new-key with the HOST that needs one.",
+        )
+    return NoKeys(), None, None
 
 
 def _url(host: str, port: int) -> str:

@@ -36,10 +36,12 @@ def test_original_photos_lie_in_the_upload_dir(tmp_path: Path) -> None:
 def test_an_upload_dir_that_can_not_work_is_refused_at_the_start(tmp_path: Path) -> None:
     home = tmp_path / "home"
     inside = home / "objects" / "photos"
-    ended = run_command("serve", env=environment(home, upload_dir=inside), cwd=tmp_path)
+    env = environment(home, upload_dir=inside, host="0.0.0.0")
+    ended = run_command("serve", env=env, cwd=tmp_path)
     assert ended.returncode == 1
     assert ended.stderr.startswith("upload_dir_overlaps: ")
     assert "Traceback" not in ended.stderr
+    assert not list(home.glob("admin-key*")), "a start that shows no key makes none"
 
 
 @pytest.mark.parametrize("debug", [True, False])
