@@ -20,6 +20,7 @@ from shared.errors import (
     NotFound,
     PlacewiseError,
     TooLarge,
+    Unauthorized,
     Unavailable,
     Unprocessable,
     UnsupportedMedia,
@@ -81,6 +82,7 @@ def client(server: FakeServer) -> Iterator[Client]:
     ("status", "kind"),
     [
         (400, InvalidRequest),
+        (401, Unauthorized),
         (404, NotFound),
         (409, Conflict),
         (410, Gone),
@@ -138,6 +140,23 @@ def test_upload_sends_the_file_and_only_the_fields_that_are_said(
     assert b"the photo's bytes" in body
     assert b"45.5" in body
     assert b"place" not in body
+
+
+def test_upload_may_be_called_otherwise_than_its_file(
+    server: FakeServer, client: Client, tmp_path: Path
+) -> None:
+    (tmp_path / "5f0e.jpg").write_bytes(b"bytes")
+    server.will_answer(202, {})
+    client.upload(tmp_path / "5f0e.jpg", filename="Piazza Castello.jpg")
+    assert b'filename="Piazza Castello.jpg"' in server.asked[0][2]
+
+
+def test_key_that_no_header_can_carry_is_refused(server: FakeServer) -> None:
+    for key in ("schlüssel", "two\nlines"):
+        with pytest.raises(InvalidRequest) as caught:
+            Client(server.url, key=key)
+        assert caught.value.code == "bad_key"
+        assert key not in caught.value.detail
 
 
 def test_file_that_cannot_be_read_is_an_error_before_anything_is_sent(
