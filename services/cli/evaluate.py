@@ -10,6 +10,7 @@ from rich.table import Table
 from services.cli.connect import connect
 from services.cli.output import (
     JsonOption,
+    KeyOption,
     MapOption,
     ServerOption,
     answers,
@@ -30,13 +31,14 @@ def evaluate(
     seed: Annotated[int | None, typer.Option(min=0)] = None,
     map_name: MapOption = None,
     server: ServerOption = None,
+    key: KeyOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Ask the map about its own photos (each left out in turn) and its labelled queries."""
     wanted = {"sample": sample, "seed": seed}
     given = {name: value for name, value in wanted.items() if value is not None}
     with explained(as_json):
-        with connect(server, map_name) as client, progress_bar() as progress:
+        with connect(server, map_name, key) as client, progress_bar() as progress:
             job = wait_with_bar(client, client.evaluate(**given)["job_id"], progress, "asking")
             earlier = client.evaluations(SHOWN + 1)
             vocabularies = _vocabularies(client)

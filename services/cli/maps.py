@@ -8,7 +8,7 @@ import typer
 from rich.table import Table
 
 from services.cli.connect import connect
-from services.cli.output import JsonOption, ServerOption, answers, explained, print_json
+from services.cli.output import JsonOption, KeyOption, ServerOption, answers, explained, print_json
 
 app = typer.Typer(help="Named databases of photos, each with its own extractor and vocabulary.")
 
@@ -16,10 +16,12 @@ Name = Annotated[str, typer.Argument(metavar="NAME")]
 
 
 @app.command("list")
-def list_maps(server: ServerOption = None, as_json: JsonOption = False) -> None:
+def list_maps(
+    server: ServerOption = None, key: KeyOption = None, as_json: JsonOption = False
+) -> None:
     """Show every map."""
     with explained(as_json):
-        with connect(server, None) as client:
+        with connect(server, None, key) as client:
             found = client.maps()
         if as_json:
             print_json(found)
@@ -44,11 +46,12 @@ def create(
         str | None, typer.Option(help="How its photos are described; left out: as configured.")
     ] = None,
     server: ServerOption = None,
+    key: KeyOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Make an empty map."""
     with explained(as_json):
-        with connect(server, None) as client:
+        with connect(server, None, key) as client:
             made = client.create_map(name, extractor)
         if as_json:
             print_json(made)
@@ -61,11 +64,12 @@ def delete(
     name: Name,
     yes: Annotated[bool, typer.Option("--yes", help="Don't ask.")] = False,
     server: ServerOption = None,
+    key: KeyOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Delete a map with all its photos."""
     with explained(as_json):
-        with connect(server, None) as client:
+        with connect(server, None, key) as client:
             photos = next((m["photos"] for m in client.maps() if m["name"] == name), None)
             if photos and not yes:
                 typer.confirm(f"Delete the map {name} with its {photos} photos?", abort=True)
