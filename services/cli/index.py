@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -21,6 +22,7 @@ from services.cli.output import (
 )
 from services.cli.photo_places import find_photos
 from services.cli.upload_many import FitOption, print_faults, upload_many
+from shared.catalog.photos import PhotoRole
 from shared.client import Json
 
 
@@ -41,6 +43,17 @@ def index(
         str | None,
         typer.Option(help="Zone of @UTM@ names that don't say it, such as 32T."),
     ] = None,
+    places: Annotated[
+        bool,
+        typer.Option(
+            "--places-by-folder",
+            help="The name of a photo's folder is its place label: for rooms, shelves, trails.",
+        ),
+    ] = False,
+    role: Annotated[
+        PhotoRole,
+        typer.Option(help="`query`: labelled queries, which `placewise evaluate` asks with."),
+    ] = PhotoRole.DATABASE,
     fit: FitOption = True,
     map_name: MapOption = None,
     server: ServerOption = None,
@@ -53,7 +66,9 @@ def index(
     interruption: what is there already is not described twice.
     """
     with explained(as_json):
-        photos = find_photos(folder, table, utm_zone)
+        photos = find_photos(folder, table, utm_zone, places_by_folder=places)
+        if role != PhotoRole.DATABASE:
+            photos = [replace(p, fields={**p.fields, "role": role}) for p in photos]
         with connect(server, map_name, key) as client, progress_bar() as progress:
             report = upload_many(client, photos, fit, progress)
         if as_json:

@@ -32,8 +32,13 @@ class FoundPhoto:
     """What it is called, where that is not its file's name."""
 
 
-def find_photos(folder: Path, table: Path | None, utm_zone: str | None) -> list[FoundPhoto]:
+def find_photos(
+    folder: Path, table: Path | None, utm_zone: str | None, *, places_by_folder: bool = False
+) -> list[FoundPhoto]:
     """Every photo below the folder, in the order of the paths, with what is said of it.
+
+    With `places_by_folder`, the name of the folder that a photo lies in is its place, unless the
+    table says another; photos directly in `folder` have none.
 
     Raises InvalidRequest for a table that names a photo that is not there, and for coordinates
     that can't be read.
@@ -49,10 +54,13 @@ def find_photos(folder: Path, table: Path | None, utm_zone: str | None) -> list[
             f"There is no photo ({', '.join(sorted(SUFFIXES))}) below {folder}.",
         )
     said = _read_table(folder, table, set(paths)) if table else {}
-    return [
-        FoundPhoto(path, {**fields_of_name(path.name, utm_zone), **said.get(path, {})})
-        for path in paths
-    ]
+    found = []
+    for path in paths:
+        fields = fields_of_name(path.name, utm_zone)
+        if places_by_folder and path.parent != folder:
+            fields["place"] = path.parent.name
+        found.append(FoundPhoto(path, {**fields, **said.get(path, {})}))
+    return found
 
 
 def fields_of_name(name: str, utm_zone: str | None) -> dict[str, str]:
