@@ -46,19 +46,19 @@ def estimate(
         place=spot.place,
         confidence=confidence,
         calibration=state,
-        reason=_reason(accepted, evidence.lead, calibration),
+        reason=_reason(accepted, evidence.support, calibration),
     )
 
 
-def _reason(accepted: bool | None, lead: float, calibration: Calibration | None) -> str:
-    if accepted is None or calibration is None or calibration.lead_threshold is None:
+def _reason(accepted: bool | None, support: float, calibration: Calibration | None) -> str:
+    if accepted is None or calibration is None or calibration.support_threshold is None:
         return (
             "Whether the place is in the map can't be told yet: first an evaluation has to see at "
             "least 20 photos with coordinates or places (POST /api/v1/evaluations)."
         )
     compared = (
-        f"The best match leads every other place by {lead:.4f}; of photos that are not in the map "
-        f"one in twenty reaches {calibration.lead_threshold:.4f}."
+        f"The first ten photos support the place by {support:.4f}; of photos that are not in the "
+        f"map one in twenty reaches {calibration.support_threshold:.4f}."
     )
     return compared if accepted else f"Not in this map, as far as can be told. {compared}"
 

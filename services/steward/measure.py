@@ -80,7 +80,7 @@ class Measure:
         threshold = learn_threshold(impostors)
         provisional = Calibration(
             radius_m=self._radius_m,
-            lead_threshold=threshold,
+            support_threshold=threshold,
             impostors=len(impostors),
             labelled_queries=0,
             confidence=None,
@@ -95,7 +95,7 @@ class Measure:
             "leave_one_out": {**recall.figures(), "without_positive": alone},
             "labelled_queries": labelled.figures() if self.queries else None,
             "estimate": {
-                "lead_threshold": threshold,
+                "support_threshold": threshold,
                 "impostors": len(impostors),
                 "calibration": calibration.state,
             },

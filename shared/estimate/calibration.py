@@ -44,7 +44,7 @@ class Logistic(BaseModel):
         return float(self.probabilities(_matrix([evidence]))[0])
 
     def probabilities(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(n, 3) evidence -> (n,) probabilities."""
+        """(n, 2) evidence -> (n,) probabilities."""
         standard = (rows - np.array(self.means)) / np.array(self.scales)
         return _sigmoid(self.intercept + standard @ np.array(self.weights))
 
@@ -55,8 +55,8 @@ class Calibration(BaseModel):
     model_config = ConfigDict(frozen=True)
 
     radius_m: float
-    lead_threshold: float | None
-    """Evidence with a smaller lead is "not in this map"; None with too few impostors."""
+    support_threshold: float | None
+    """Evidence with less support is "not in this map"; None with too few impostors."""
     impostors: int
     labelled_queries: int
     confidence: Logistic | None
@@ -69,20 +69,20 @@ class Calibration(BaseModel):
 
     def accepts(self, evidence: Evidence) -> bool | None:
         """Whether the ranking shows a place of the map; None where that can't be told yet."""
-        return None if self.lead_threshold is None else evidence.lead > self.lead_threshold
+        return None if self.support_threshold is None else evidence.support > self.support_threshold
 
 
 def learn_threshold(impostors: Sequence[Evidence]) -> float | None:
-    """The lead that FALSE_ACCEPTS of the impostors exceed; None for fewer than LEAST_IMPOSTORS.
+    """The support that FALSE_ACCEPTS of the impostors exceed; None for fewer than LEAST_IMPOSTORS.
 
     The smallest order statistic whose rank is high enough: on average at most that share of new
     impostors exceeds it, whatever their distribution (conformal bound, Vovk et al. 2005).
     """
     if len(impostors) < LEAST_IMPOSTORS:
         return None
-    leads = np.sort([evidence.lead for evidence in impostors])
-    rank = int(np.ceil((1 - FALSE_ACCEPTS) * (len(leads) + 1)))
-    return float(leads[min(rank, len(leads)) - 1])
+    supports = np.sort([evidence.support for evidence in impostors])
+    rank = int(np.ceil((1 - FALSE_ACCEPTS) * (len(supports) + 1)))
+    return float(supports[min(rank, len(supports)) - 1])
 
 
 def learn_confidence(labelled: Sequence[tuple[Evidence, bool]]) -> Logistic | None:
@@ -129,7 +129,7 @@ def cross_validated(labelled: Sequence[tuple[Evidence, bool]]) -> list[float] | 
 
 
 def _matrix(evidence: Sequence[Evidence]) -> NDArray[np.float64]:
-    return np.array([(e.score, e.lead, e.agreement) for e in evidence], dtype=np.float64)
+    return np.array([(e.support, e.agreement) for e in evidence], dtype=np.float64)
 
 
 def _sigmoid(x: NDArray[np.float64]) -> NDArray[np.float64]:

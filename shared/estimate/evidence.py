@@ -1,4 +1,4 @@
-"""What a ranking tells of the place: the best score, its lead over other places, agreement."""
+"""What a ranking tells of the place: by how much it leads, and how many photos agree."""
 
 from __future__ import annotations
 
@@ -24,11 +24,16 @@ class Ranked:
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """`score`: the best cosine. `lead`: how much higher it is than the best one of another place.
-    `agreement`: share of the first ten that show the best one's place."""
+    """How the first ten photos speak for the place of the best one.
 
-    score: float
-    lead: float
+    `support`: the sum, over those of them that show that place, of how much higher their cosine is
+    than the best one of any other place. `agreement`: their share. Of the statistics that were
+    tried on generated places (best score, lead, z-score of the lead, softmax share of the place)
+    these two told right from wrong best, and carry over to photos of other days, which lower all
+    scores alike.
+    """
+
+    support: float
     agreement: float
 
 
@@ -36,11 +41,12 @@ def weigh(ranking: Sequence[Ranked], radius_m: float) -> Evidence | None:
     """The evidence of a ranking, best first; None when it is empty or its first has no place."""
     if not ranking or not ranking[0].spot.is_known:
         return None
-    first = ranking[0]
-    rival = next((r.score for r in ranking if elsewhere(first.spot, r.spot)), ranking[-1].score)
+    first = ranking[0].spot
+    rival = next((r.score for r in ranking if elsewhere(first, r.spot)), ranking[-1].score)
     voters = ranking[:VOTERS]
-    agreeing = sum(same_place(first.spot, r.spot, radius_m) for r in voters)
-    return Evidence(first.score, first.score - rival, agreeing / len(voters))
+    agreeing = [r.score for r in voters if same_place(first, r.spot, radius_m)]
+    support = sum(max(0.0, score - rival) for score in agreeing)
+    return Evidence(support, len(agreeing) / len(voters))
 
 
 def locate(ranking: Sequence[Ranked], radius_m: float) -> Spot:
