@@ -38,8 +38,8 @@ from shared.home import announced, lock_home
 from shared.jobs import InProcessHints
 from shared.objects import FolderStore
 from shared.objects.upload_dir import place_originals
+from shared.recipes import get_recipe
 from shared.settings import Settings
-from shared.vision.extractors import get_recipe
 
 log = logging.getLogger(__name__)
 

@@ -20,6 +20,7 @@ from shared.catalog.session import Catalog
 from shared.client import Client
 from shared.errors import Misconfigured, PlacewiseError
 from shared.home import running_server
+from shared.recipes import get_recipe
 from shared.settings import Settings
 
 LOW_DISK_BYTES = 1_000_000_000
@@ -119,7 +120,7 @@ def _device(settings: Settings) -> str:
 
 
 def _extractor(settings: Settings) -> str:
-    from shared.vision.extractors import Extractor, choose_device, get_recipe
+    from shared.vision.extractors import Extractor, choose_device
 
     recipe = get_recipe(settings.extractor, allow_test_extractors=settings.allow_test_extractors)
     extractor = Extractor(recipe, choose_device(settings.device))

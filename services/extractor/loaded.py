@@ -13,13 +13,9 @@ from shared.catalog.models import Model, ensure_model
 from shared.catalog.vocabularies import Vocabulary
 from shared.errors import Unavailable
 from shared.objects import ObjectStore
+from shared.recipes import Recipe, get_recipe
 from shared.settings import Settings
-from shared.vision.extractors import (
-    Extractor,
-    choose_device,
-    get_recipe,
-    spec_fingerprint,
-)
+from shared.vision.extractors import Extractor, choose_device, spec_fingerprint
 from shared.vision.vocabulary import Centres, decode_centres
 
 MOST_EXTRACTORS = 2  # a large backbone takes gigabytes of GPU memory
@@ -39,16 +35,21 @@ class LoadedModels:
 
     def extractor(self, name: str) -> Extractor:
         """The extractor called `name`, its weights loaded."""
-        allow_test_extractors = self._settings.allow_test_extractors
+        recipe = get_recipe(name, allow_test_extractors=self._settings.allow_test_extractors)
         with self._lock:
-            found = self._extractors.get(name)
+            found = self._extractors.get(recipe.name)
             if found is None:
-                recipe = get_recipe(name, allow_test_extractors=allow_test_extractors)
-                found = self._extractors[name] = Extractor(recipe, self._device)
-            self._extractors.move_to_end(name)
+                found = self._extractors[recipe.name] = self._load(recipe)
+            self._extractors.move_to_end(recipe.name)
             while len(self._extractors) > MOST_EXTRACTORS:
                 self._extractors.popitem(last=False)
             return found
+
+    def _load(self, recipe: Recipe) -> Extractor:
+        for loaded in self._extractors.values():
+            if loaded.recipe.local_features == recipe.local_features:
+                return Extractor(recipe, self._device, backbone=loaded.backbone)
+        return Extractor(recipe, self._device)
 
     def centres(self, vocabulary: Vocabulary) -> Centres:
         """The vocabulary's centres, checked against the catalog's hash."""

@@ -1,11 +1,10 @@
-"""Extractors by name: which backbone, preprocessing and aggregator make a descriptor."""
+"""Extractors: recipes (`shared.recipes`) with their weights loaded, at work on pixels."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 from torch.nn.functional import normalize
 
 from shared.errors import Misconfigured
+from shared.recipes import Recipe
 from shared.vision.backbones import Backbone
 from shared.vision.backbones.efficientnet_lite0 import EfficientNetLite0
 from shared.vision.backbones.tiny import TinyBackbone
@@ -26,70 +26,10 @@ from shared.vision.vocabulary import Centres, decode_centres
 SHIPPED = Path(__file__).parent / "vocabularies"
 
 
-@dataclass(frozen=True, slots=True)
-class Recipe:
-    """How the extractor `name` is put together."""
-
-    name: str
-    backbone: Callable[[torch.device], Backbone]
-    preprocessing: str
-    aggregator: str
-    """`vlad` needs a vocabulary; `avg` is the mean of the local features."""
-    clusters: int = 64
-    shipped_vocabulary: str | None = None
-    """File below `vocabularies/`: learnt on photographs of elsewhere, so that a new map answers."""
-    for_tests: bool = False
-
-    @property
-    def needs_vocabulary(self) -> bool:
-        return self.aggregator == "vlad"
-
-
-RECIPES = {
-    recipe.name: recipe
-    for recipe in (
-        Recipe(
-            name="efficientnet-lite0-vlad",
-            backbone=EfficientNetLite0,
-            preprocessing="square224",
-            aggregator="vlad",
-            shipped_vocabulary="efficientnet-lite0.npy",
-        ),
-        Recipe(
-            name="test-tiny-avg",
-            backbone=TinyBackbone,
-            preprocessing="square32",
-            aggregator="avg",
-            for_tests=True,
-        ),
-        Recipe(
-            name="test-tiny-vlad",
-            backbone=TinyBackbone,
-            preprocessing="square32",
-            aggregator="vlad",
-            clusters=8,
-            for_tests=True,
-        ),
-    )
+BACKBONES: dict[str, Callable[[Recipe, torch.device], Backbone]] = {
+    "efficientnet-lite0": lambda _recipe, device: EfficientNetLite0(device),
+    "test-tiny": lambda _recipe, device: TinyBackbone(device),
 }
-
-
-def get_recipe(name: str, *, allow_test_extractors: bool) -> Recipe:
-    """The recipe called `name`; Misconfigured when unknown, or for tests and not allowed."""
-    recipe = RECIPES.get(name)
-    if recipe is None:
-        known = ", ".join(sorted(r.name for r in RECIPES.values() if not r.for_tests))
-        raise Misconfigured(
-            "unknown_extractor",
-            f"There is no extractor {name!r}. Known: {known} (EXTRACTOR).",
-        )
-    if recipe.for_tests and not allow_test_extractors:
-        raise Misconfigured(
-            "test_extractor",
-            f"The extractor {name!r} exists for tests and knows nothing of places. "
-            "Tests set ALLOW_TEST_EXTRACTORS=true.",
-        )
-    return recipe
 
 
 def choose_device(device: str) -> torch.device:
@@ -108,10 +48,14 @@ def choose_device(device: str) -> torch.device:
 class Extractor:
     """A recipe with its weights loaded: the backbone is shared by all its vocabularies."""
 
-    def __init__(self, recipe: Recipe, device: torch.device) -> None:
+    def __init__(
+        self, recipe: Recipe, device: torch.device, *, backbone: Backbone | None = None
+    ) -> None:
+        """`backbone`: one that is loaded already, of the same `recipe.local_features`."""
         self.recipe = recipe
         self.preprocessing: Preprocessing = get_preprocessing(recipe.preprocessing)
-        self.backbone = recipe.backbone(device)
+        self.backbone = backbone or BACKBONES[recipe.backbone](recipe, device)
+        assert self.backbone.width == recipe.width, "the recipe tells others the width"
 
     def shipped_vocabulary(self) -> tuple[Centres, dict[str, Any]] | None:
         """The vocabulary that comes with the extractor, with its provenance; None without one."""

@@ -19,7 +19,8 @@ import numpy as np
 import torch
 from PIL import Image
 
-from shared.vision.extractors import RECIPES, SHIPPED, Extractor, choose_device
+from shared.recipes import RECIPES
+from shared.vision.extractors import SHIPPED, Extractor, choose_device
 from shared.vision.kmeans import MAX_ITERATIONS, TOLERANCE, iterate, seed_centres
 from shared.vision.vocabulary import check_centres, encode_centres
 

@@ -24,9 +24,10 @@ from shared.jobs import InProcessHints, Job, JobKind, free_expired_leases
 from shared.jobs.model_changes import cancel_model_change, start_model_change
 from shared.jobs.table import UNFINISHED, get_job
 from shared.objects import FolderStore
+from shared.recipes import get_recipe
 from shared.settings import Settings
 from shared.vision.decode import decode
-from shared.vision.extractors import Extractor, get_recipe
+from shared.vision.extractors import Extractor
 from shared.vision.vocabulary import Centres
 from tests.support.catalog_rows import ask, delete, read_job, set_columns, stored_rows, upload
 from tests.support.photos import photo_bytes

@@ -14,14 +14,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from shared.errors import Misconfigured
-from shared.vision.extractors import (
-    RECIPES,
-    SHIPPED,
-    Extractor,
-    choose_device,
-    get_recipe,
-    spec_fingerprint,
-)
+from shared.recipes import RECIPES
+from shared.vision.extractors import SHIPPED, Extractor, choose_device, spec_fingerprint
 from shared.vision.vocabulary import check_centres, decode_centres
 
 CPU = torch.device("cpu")
@@ -54,22 +48,6 @@ def views(photo: Image.Image) -> list[Image.Image]:
     width, height = photo.size
     side = int(0.8 * min(width, height))
     return [photo.crop((left, 20, left + side, 20 + side)) for left in (60, 110, 160)]
-
-
-@pytest.mark.parametrize("name", ["test-tiny-avg", "test-tiny-vlad"])
-def test_test_extractors_are_refused_unless_allowed(name: str) -> None:
-    with pytest.raises(Misconfigured) as caught:
-        get_recipe(name, allow_test_extractors=False)
-    assert caught.value.code == "test_extractor"
-    assert get_recipe(name, allow_test_extractors=True).name == name
-
-
-def test_unknown_extractor_names_the_known_but_not_those_for_tests() -> None:
-    with pytest.raises(Misconfigured) as caught:
-        get_recipe("anyloc", allow_test_extractors=True)
-    assert caught.value.code == "unknown_extractor"
-    assert "efficientnet-lite0-vlad" in caught.value.detail
-    assert "test-" not in caught.value.detail
 
 
 def test_missing_cuda_is_an_error_and_not_a_slow_fallback(

@@ -1,0 +1,208 @@
+"""Extractors by name: which backbone, preprocessing and aggregator make a descriptor.
+
+    get_recipe("anyloc-vitb14", allow_test_extractors=False)
+    get_recipe("anyloc-vitb14:clusters=32,facet=key,layer=9", allow_test_extractors=False)
+
+A name may carry options. Their canonical order is the alphabet's and what equals the extractor's
+own default is left out, so that one extractor has one name wherever it is stored or compared.
+
+Imports no torch: the settings and the gateway choose extractors without loading one.
+`shared.vision.extractors` turns a recipe into descriptors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+from shared.errors import Misconfigured
+
+FACETS = ("query", "key", "value", "token")
+MOST_CLUSTERS = 4096
+
+
+@dataclass(frozen=True, slots=True)
+class Recipe:
+    """How the extractor `name` is put together."""
+
+    name: str
+    """Canonical, with the options that differ from the extractor's defaults."""
+    backbone: str
+    """One of `shared.vision.extractors.BACKBONES`."""
+    width: int
+    """Length of one local feature."""
+    preprocessing: str
+    """One of `shared.vision.preprocessing.PREPROCESSINGS`."""
+    aggregator: str
+    """`vlad` needs a vocabulary; `avg` is the mean of the local features."""
+    depth: int | None = None
+    """Blocks of a transformer; None where neither layer nor facet can be chosen."""
+    layer: int | None = None
+    """Index of the block that the features come from, counted from 0."""
+    facet: str | None = None
+    """What is taken from that block: one of FACETS."""
+    clusters: int = 64
+    """Centres that a fit makes unless it says otherwise; any vocabulary's own number goes first."""
+    shipped_vocabulary: str | None = None
+    """File below `shared/vision/vocabularies/`, learnt on photographs of elsewhere: a new map
+    answers with it at once, whatever `clusters` says about later fits.
+    """
+    for_tests: bool = False
+
+    @property
+    def needs_vocabulary(self) -> bool:
+        return self.aggregator == "vlad"
+
+    @property
+    def dimension(self) -> int:
+        """Length of a descriptor once a fit has made `clusters` centres."""
+        return self.width * (self.clusters if self.needs_vocabulary else 1)
+
+    @property
+    def local_features(self) -> tuple[str, int | None, str | None]:
+        """Recipes that agree in this can share one loaded backbone."""
+        return (self.backbone, self.layer, self.facet)
+
+
+def _anyloc(size: str, *, depth: int, width: int, layer: int) -> Recipe:
+    """AnyLoc (Keetha et al., RA-L 2023): DINOv2 value features and VLAD.
+
+    The layers are those that its authors recommend for each size of the network.
+    """
+    return Recipe(
+        name=f"anyloc-{size}",
+        backbone=f"dinov2-{size}",
+        width=width,
+        preprocessing="square224",
+        aggregator="vlad",
+        depth=depth,
+        layer=layer,
+        facet="value",
+    )
+
+
+RECIPES = {
+    recipe.name: recipe
+    for recipe in (
+        Recipe(
+            name="efficientnet-lite0-vlad",
+            backbone="efficientnet-lite0",
+            width=112,
+            preprocessing="square224",
+            aggregator="vlad",
+            shipped_vocabulary="efficientnet-lite0.npy",
+        ),
+        _anyloc("vits14", depth=12, width=384, layer=10),
+        _anyloc("vitb14", depth=12, width=768, layer=10),
+        _anyloc("vitl14", depth=24, width=1024, layer=20),
+        _anyloc("vitg14", depth=40, width=1536, layer=31),
+        Recipe(
+            name="test-tiny-avg",
+            backbone="test-tiny",
+            width=16,
+            preprocessing="square32",
+            aggregator="avg",
+            for_tests=True,
+        ),
+        Recipe(
+            name="test-tiny-vlad",
+            backbone="test-tiny",
+            width=16,
+            preprocessing="square32",
+            aggregator="vlad",
+            clusters=8,
+            for_tests=True,
+        ),
+    )
+}
+
+
+def get_recipe(name: str, *, allow_test_extractors: bool) -> Recipe:
+    """The recipe that `name` and its options mean; its own name is the canonical one.
+
+    Misconfigured: `unknown_extractor`, `test_extractor` (for tests, and not allowed),
+    `bad_extractor_option` (naming the option, its value, and what is allowed).
+    """
+    base, colon, written = name.partition(":")
+    recipe = RECIPES.get(base)
+    if recipe is None:
+        known = ", ".join(sorted(r.name for r in RECIPES.values() if not r.for_tests))
+        raise Misconfigured(
+            "unknown_extractor",
+            f"There is no extractor {base!r}. Known: {known} (EXTRACTOR).",
+        )
+    if recipe.for_tests and not allow_test_extractors:
+        raise Misconfigured(
+            "test_extractor",
+            f"The extractor {base!r} exists for tests and knows nothing of places. "
+            "Tests set ALLOW_TEST_EXTRACTORS=true.",
+        )
+    return _with_options(recipe, written) if colon else recipe
+
+
+def _with_options(recipe: Recipe, written: str) -> Recipe:
+    """`recipe` with the options of `option=value,option=value`."""
+    allowed = _allowed_options(recipe)
+    chosen: dict[str, int | str] = {}
+    for part in written.split(","):
+        option, _, value = part.partition("=")
+        if option not in allowed:
+            raise _bad_option(
+                f"The extractor {recipe.name} has no option {option!r}. "
+                + (f"Its options: {', '.join(sorted(allowed))}." if allowed else "It has none.")
+            )
+        if option in chosen:
+            raise _bad_option(f"The option {option} of {recipe.name} is given twice.")
+        read, expected = allowed[option]
+        try:
+            chosen[option] = read(value)
+        except ValueError:
+            raise _bad_option(
+                f"The option {option}={value} of {recipe.name} can't be used: "
+                f"{option} is {expected}."
+            ) from None
+    differing = {o: v for o, v in sorted(chosen.items()) if v != getattr(recipe, o)}
+    if not differing:
+        return recipe
+    options = ",".join(f"{option}={value}" for option, value in differing.items())
+    changed: dict[str, Any] = {"name": f"{recipe.name}:{options}", **differing}
+    return replace(recipe, **changed)
+
+
+def _allowed_options(recipe: Recipe) -> dict[str, tuple[Callable[[str], int | str], str]]:
+    """How the recipe's options are read, and what a refusal says is allowed."""
+    allowed: dict[str, tuple[Callable[[str], int | str], str]] = {}
+    if recipe.needs_vocabulary:
+        allowed["clusters"] = (
+            _whole(1, MOST_CLUSTERS),
+            f"a whole number from 1 to {MOST_CLUSTERS}",
+        )
+    if recipe.depth is not None:
+        last = recipe.depth - 1
+        allowed["facet"] = (_facet, f"one of {', '.join(FACETS)}")
+        allowed["layer"] = (
+            _whole(0, last),
+            f"a whole number from 0 to {last} ({recipe.backbone} has {recipe.depth} blocks)",
+        )
+    return allowed
+
+
+def _whole(least: int, most: int) -> Callable[[str], int]:
+    def read(value: str) -> int:
+        # int() would also take "+9", "1_0" and other scripts' digits.
+        if not (value.isascii() and value.isdigit()) or not least <= int(value) <= most:
+            raise ValueError(value)
+        return int(value)
+
+    return read
+
+
+def _facet(value: str) -> str:
+    if value not in FACETS:
+        raise ValueError(value)
+    return value
+
+
+def _bad_option(detail: str) -> Misconfigured:
+    return Misconfigured("bad_extractor_option", detail)

@@ -1,0 +1,134 @@
+"""Recipes: extractors by name and options, one name for one extractor, and what is refused."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+from shared.errors import Misconfigured
+from shared.recipes import RECIPES, Recipe, get_recipe
+
+
+def recipe(name: str) -> Recipe:
+    return get_recipe(name, allow_test_extractors=False)
+
+
+def refusal(name: str, code: str) -> str:
+    """The detail with which the name is refused."""
+    with pytest.raises(Misconfigured) as caught:
+        recipe(name)
+    assert caught.value.code == code
+    return caught.value.detail
+
+
+@pytest.mark.parametrize("name", ["test-tiny-avg", "test-tiny-vlad"])
+def test_test_extractors_are_refused_unless_allowed(name: str) -> None:
+    assert "ALLOW_TEST_EXTRACTORS" in refusal(name, "test_extractor")
+    refusal(f"{name}:clusters=3", "test_extractor")
+    assert get_recipe(name, allow_test_extractors=True).name == name
+
+
+@pytest.mark.parametrize("name", ["anyloc", "", "anyloc:layer=9", ":clusters=3", "ANYLOC-VITB14"])
+def test_unknown_extractor_names_the_known_but_not_those_for_tests(name: str) -> None:
+    detail = refusal(name, "unknown_extractor")
+    for known in ("efficientnet-lite0-vlad", "anyloc-vits14", "anyloc-vitg14"):
+        assert known in detail
+    assert "test-" not in detail
+
+
+@pytest.mark.parametrize(
+    ("name", "layer", "dimension"),
+    [
+        ("anyloc-vits14", 10, 64 * 384),
+        ("anyloc-vitb14", 10, 64 * 768),
+        ("anyloc-vitl14", 20, 64 * 1024),
+        ("anyloc-vitg14", 31, 98_304),
+    ],
+)
+def test_anyloc_takes_the_value_facet_of_its_authors_layer(
+    name: str, layer: int, dimension: int
+) -> None:
+    found = recipe(name)
+    assert (found.layer, found.facet, found.dimension) == (layer, "value", dimension)
+    assert found.needs_vocabulary
+    assert found.shipped_vocabulary is None
+
+
+def test_dimension_follows_the_clusters_of_vlad_only() -> None:
+    assert recipe("efficientnet-lite0-vlad").dimension == 7168
+    assert recipe("efficientnet-lite0-vlad:clusters=8").dimension == 8 * 112
+    assert RECIPES["test-tiny-avg"].dimension == 16
+
+
+def test_options_are_taken() -> None:
+    found = recipe("anyloc-vitb14:layer=9,facet=key,clusters=32")
+    assert (found.layer, found.facet, found.clusters) == (9, "key", 32)
+    assert found.dimension == 32 * 768
+    assert found.backbone == "dinov2-vitb14"
+
+
+@pytest.mark.parametrize(
+    ("written", "canonical"),
+    [
+        ("anyloc-vitb14:layer=9,facet=key,clusters=32", "clusters=32,facet=key,layer=9"),
+        ("anyloc-vitb14:facet=key,clusters=32,layer=9", "clusters=32,facet=key,layer=9"),
+        ("anyloc-vitb14:layer=10,facet=token", "facet=token"),
+        ("anyloc-vitb14:clusters=0032", "clusters=32"),
+        ("anyloc-vitb14:layer=10,facet=value,clusters=64", ""),
+    ],
+)
+def test_one_extractor_has_one_name(written: str, canonical: str) -> None:
+    found = recipe(written)
+    assert found.name == ("anyloc-vitb14:" + canonical).rstrip(":")
+    assert recipe(found.name) == found
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("anyloc-vitb14:depth=9", ["'depth'", "clusters, facet, layer"]),
+        ("anyloc-vitb14:", ["''", "clusters, facet, layer"]),
+        ("anyloc-vitb14:layer=9,", ["''", "clusters, facet, layer"]),
+        ("anyloc-vitb14:layer", ["layer=", "0 to 11"]),
+        ("anyloc-vitb14:layer=12", ["layer=12", "0 to 11", "12 blocks"]),
+        ("anyloc-vitg14:layer=40", ["layer=40", "0 to 39"]),
+        ("anyloc-vitb14:layer=-1", ["layer=-1", "0 to 11"]),
+        ("anyloc-vitb14:layer=+9", ["layer=+9"]),
+        ("anyloc-vitb14:layer=nine", ["layer=nine"]),
+        ("anyloc-vitb14:facet=values", ["facet=values", "query, key, value, token"]),
+        ("anyloc-vitb14:clusters=0", ["clusters=0", "1 to 4096"]),
+        ("anyloc-vitb14:clusters=4097", ["clusters=4097", "1 to 4096"]),
+        ("anyloc-vitb14:layer=9,layer=8", ["layer", "twice"]),
+        ("efficientnet-lite0-vlad:layer=3", ["'layer'", "Its options: clusters."]),
+    ],
+)
+def test_bad_options_are_named_with_what_is_allowed(name: str, said: list[str]) -> None:
+    detail = refusal(name, "bad_extractor_option")
+    assert name.partition(":")[0] in detail
+    for words in said:
+        assert words in detail
+
+
+def test_an_extractor_without_a_vocabulary_has_no_clusters() -> None:
+    with pytest.raises(Misconfigured, match=r"no option 'clusters'.*It has none"):
+        get_recipe("test-tiny-avg:clusters=3", allow_test_extractors=True)
+
+
+def test_shipped_vocabulary_begins_a_map_whatever_number_later_fits_make() -> None:
+    own = recipe("efficientnet-lite0-vlad")
+    assert own.shipped_vocabulary is not None
+    assert recipe("efficientnet-lite0-vlad:clusters=8").shipped_vocabulary == own.shipped_vocabulary
+
+
+def test_only_what_changes_the_local_features_needs_another_backbone() -> None:
+    own = recipe("anyloc-vitb14").local_features
+    assert recipe("anyloc-vitb14:clusters=8").local_features == own
+    for other in ("anyloc-vitb14:layer=9", "anyloc-vitb14:facet=key", "anyloc-vits14"):
+        assert recipe(other).local_features != own
+
+
+def test_extractors_are_chosen_without_torch() -> None:
+    code = "import shared.recipes, sys; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
