@@ -30,7 +30,7 @@ app = typer.Typer(help="VLAD's cluster centres: fit them on the map's own photos
 @app.command("fit")
 def fit(
     clusters: Annotated[
-        int | None, typer.Option(min=1, help="Cluster centres; default 64.")
+        int | None, typer.Option(min=1, help="Cluster centres; default: the extractor's.")
     ] = None,
     sample: Annotated[int | None, typer.Option(min=1, help="Photos to learn from.")] = None,
     seed: Annotated[int | None, typer.Option(min=0)] = None,

@@ -101,7 +101,13 @@ class ModelChanges:
         chosen = sorted(rng.choice(len(photo_ids), size=size, replace=False).tolist())
         plan = [str(photo_ids[index]) for index in chosen]
         self._store.put(work_key(job.id, "plan.json"), json.dumps(plan).encode())
-        self._go_on(job, stage="sample", progress_total=len(plan) + len(photo_ids))
+        clusters = job.params["clusters"] or self._extractor(job).recipe.clusters
+        self._go_on(
+            job,
+            stage="sample",
+            params={**job.params, "clusters": clusters},
+            progress_total=len(plan) + len(photo_ids),
+        )
 
     def _sample(self, job: Job) -> None:
         """Local features of the next few photos of the plan, thinned to what a fit can hold."""

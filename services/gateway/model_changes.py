@@ -26,6 +26,7 @@ from shared.errors import Conflict, PlacewiseError
 from shared.jobs import Job, JobKind
 from shared.jobs.model_changes import start_model_change
 from shared.objects.keys import new_vocabulary_key
+from shared.recipes import MOST_CLUSTERS
 
 router = APIRouter(tags=["model changes"])
 
@@ -35,8 +36,12 @@ class FitRequest(BaseModel):
 
     model_config = ConfigDict(extra="forbid")
 
-    clusters: int = Field(
-        64, ge=1, le=4096, description="fewer are made when the photos bear fewer"
+    clusters: int | None = Field(
+        None,
+        ge=1,
+        le=MOST_CLUSTERS,
+        description="null: as many as the extractor's name says (64 unless it says otherwise); "
+        "fewer are made when the photos bear fewer",
     )
     sample: int = Field(1000, ge=1, le=1_000_000, description="photos to learn from, at most")
     seed: int = Field(0, ge=0, le=2**31 - 1)

@@ -35,8 +35,8 @@ log = logging.getLogger(__name__)
 
 FILL_JOBS = 2000  # reindex jobs queued in one transaction
 
-# What `POST /vocabularies` with {} asks for.
-DEFAULT_FIT = {"clusters": 64, "sample": 1000, "seed": 0}
+# What `POST /vocabularies` with {} asks for; no `clusters` means the extractor's own number.
+DEFAULT_FIT = {"clusters": None, "sample": 1000, "seed": 0}
 
 
 def advance_model_changes(catalog: Catalog, hints: Hints) -> None:

@@ -165,6 +165,20 @@ def test_few_photos_bear_few_clusters(vlads: Workplace) -> None:
     assert (provenance["photos"], provenance["seed"]) == (3, 0)
 
 
+def test_a_fit_that_names_no_number_makes_as_many_clusters_as_the_extractors_name_says(
+    workplace_of: Callable[[str], Workplace],
+) -> None:
+    workplace = workplace_of("test-tiny-vlad:clusters=2")
+    workplace.upload(1, 2, 3)
+    job = workplace.fit(clusters=None)
+    assert job.state == JobState.SUCCEEDED
+    generation = workplace.active()
+    assert (generation.extractor, generation.spec["clusters"]) == ("test-tiny-vlad:clusters=2", 2)
+    assert workplace.vocabulary(generation.vocabulary_id).provenance["clusters_asked"] == 2
+    assert workplace.fit(clusters=3, seed=1).result is not None
+    assert workplace.active().spec["clusters"] == 3, "what a fit says goes before the name"
+
+
 def test_a_fit_without_photos_fails_with_the_reason(vlads: Workplace) -> None:
     job = vlads.fit()
     assert job.state == JobState.FAILED
