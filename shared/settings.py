@@ -60,6 +60,10 @@ class Settings(BaseSettings):
     device: Literal["auto", "cpu", "cuda"] = Field(
         "auto", description="where photos are described; auto takes CUDA where it is"
     )
+    dino_weights: Path | None = Field(
+        None,
+        description="DINOv2's weights: a .pth, .pt or .safetensors file; unset: timm's on the hub",
+    )
     batch_photos: int = Field(16, ge=1, le=1024, description="most photos in one batch")
     decode_processes: int = Field(2, ge=1, le=64, description="photos decoded at once")
     decode_memory_bytes: int = Field(
@@ -133,6 +137,17 @@ class Settings(BaseSettings):
     @classmethod
     def _absolute(cls, value: Path | None) -> Path | None:
         return value and value.expanduser().resolve()
+
+    @field_validator("dino_weights", mode="before")
+    @classmethod
+    def _empty_is_unset(cls, value: object) -> object:
+        return None if value == "" else value  # or Path("") would be the working directory
+
+    @field_validator("dino_weights")
+    @classmethod
+    def _absolute_weights(cls, value: Path | None) -> Path | None:
+        # Not resolved: a link in a Hugging Face cache has a better name than what it points to.
+        return None if value is None else value.expanduser().absolute()
 
     @model_validator(mode="after")
     def _a_batch_fits_into_a_slot(self) -> Self:

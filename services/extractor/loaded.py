@@ -49,7 +49,7 @@ class LoadedModels:
         for loaded in self._extractors.values():
             if loaded.recipe.local_features == recipe.local_features:
                 return Extractor(recipe, self._device, backbone=loaded.backbone)
-        return Extractor(recipe, self._device)
+        return Extractor(recipe, self._device, dino_weights=self._settings.dino_weights)
 
     def centres(self, vocabulary: Vocabulary) -> Centres:
         """The vocabulary's centres, checked against the catalog's hash."""

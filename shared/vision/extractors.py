@@ -16,6 +16,7 @@ from torch.nn.functional import normalize
 from shared.errors import Misconfigured
 from shared.recipes import Recipe
 from shared.vision.backbones import Backbone
+from shared.vision.backbones.dinov2 import SHAPES, Dinov2
 from shared.vision.backbones.efficientnet_lite0 import EfficientNetLite0
 from shared.vision.backbones.tiny import TinyBackbone
 from shared.vision.decode import DECODER
@@ -26,9 +27,17 @@ from shared.vision.vocabulary import Centres, decode_centres
 SHIPPED = Path(__file__).parent / "vocabularies"
 
 
-BACKBONES: dict[str, Callable[[Recipe, torch.device], Backbone]] = {
-    "efficientnet-lite0": lambda _recipe, device: EfficientNetLite0(device),
-    "test-tiny": lambda _recipe, device: TinyBackbone(device),
+def _dinov2(recipe: Recipe, device: torch.device, weights: Path | None) -> Backbone:
+    assert recipe.layer is not None
+    assert recipe.facet is not None
+    size = recipe.backbone.removeprefix("dinov2-")
+    return Dinov2(size, recipe.layer, recipe.facet, device, weights)
+
+
+BACKBONES: dict[str, Callable[[Recipe, torch.device, Path | None], Backbone]] = {
+    "efficientnet-lite0": lambda _recipe, device, _weights: EfficientNetLite0(device),
+    "test-tiny": lambda _recipe, device, _weights: TinyBackbone(device),
+    **{f"dinov2-{size}": _dinov2 for size in SHAPES},
 }
 
 
@@ -49,12 +58,21 @@ class Extractor:
     """A recipe with its weights loaded: the backbone is shared by all its vocabularies."""
 
     def __init__(
-        self, recipe: Recipe, device: torch.device, *, backbone: Backbone | None = None
+        self,
+        recipe: Recipe,
+        device: torch.device,
+        *,
+        dino_weights: Path | None = None,
+        backbone: Backbone | None = None,
     ) -> None:
-        """`backbone`: one that is loaded already, of the same `recipe.local_features`."""
+        """`dino_weights`: DINO_WEIGHTS, for the recipes on DINOv2; None takes timm's on the hub.
+        `backbone`: one that is loaded already, of the same `recipe.local_features`.
+
+        Raises Misconfigured (`weights_missing`, `weights_unfit`).
+        """
         self.recipe = recipe
         self.preprocessing: Preprocessing = get_preprocessing(recipe.preprocessing)
-        self.backbone = backbone or BACKBONES[recipe.backbone](recipe, device)
+        self.backbone = backbone or BACKBONES[recipe.backbone](recipe, device, dino_weights)
         assert self.backbone.width == recipe.width, "the recipe tells others the width"
 
     def shipped_vocabulary(self) -> tuple[Centres, dict[str, Any]] | None:

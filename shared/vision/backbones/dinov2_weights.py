@@ -1,0 +1,239 @@
+"""DINOv2's weights: where they lie, and the tensors of a file under one set of names.
+
+Two publishers name the same tensors differently:
+
+    Meta (dinov2_vitg14_pretrain.pth)             timm (model.safetensors), the names used here
+    blocks.7.mlp.w12, .w3 (SwiGLU)                blocks.7.mlp.fc1, .fc2
+    blocks.0.7.norm1 (in chunks, 7 is global)     blocks.7.norm1
+    mask_token (of the training)                  -
+    register_tokens, cls_token, pos_embed         reg_token, cls_token + pos_embed[:, 0],
+                                                  pos_embed[:, 1:]   (networks with registers)
+
+Random weights are never a fallback: what can't be had or does not fit is a Misconfigured that names
+the three ways to get it.
+"""
+
+from __future__ import annotations
+
+import pickle
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from shared.errors import Misconfigured
+
+HUB_FILE = "model.safetensors"
+META_URL = "https://dl.fbaipublicfiles.com/dinov2/dinov2_{size}/dinov2_{size}_pretrain.pth"
+# By the width of the network; the name that timm gives to the size.
+SIZES = {384: "vits14", 768: "vitb14", 1024: "vitl14", 1536: "vitg14"}
+TIMM_SIZES = {"vits14": "small", "vitb14": "base", "vitl14": "large", "vitg14": "giant"}
+NAMED = 3  # tensors that a refusal names before it says how many more there are
+
+Shape = tuple[int, ...]
+
+
+def hub_repository(size: str) -> str:
+    """timm's repository on the Hugging Face hub with the weights of `vitg14`, for example."""
+    return f"timm/vit_{TIMM_SIZES[size]}_patch14_dinov2.lvd142m"
+
+
+def three_ways(size: str) -> str:
+    """What to do about missing weights: the end of every refusal."""
+    repository = hub_repository(size)
+    cache = f"~/.cache/huggingface/hub/models--{repository.replace('/', '--')}"
+    return (
+        f"Three ways to get the weights of dinov2-{size}: (1) with internet access and "
+        f"DINO_WEIGHTS unset, timm's {repository} is downloaded from huggingface.co on first use; "
+        f"(2) download Meta's {META_URL.format(size=size)} and set DINO_WEIGHTS to that file; "
+        f"(3) copy {HUB_FILE} of {repository} from another machine ({cache}) and set "
+        "DINO_WEIGHTS to the copy."
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class WeightsFile:
+    """Tensors by timm's names; nothing is read before it is asked for."""
+
+    path: Path
+    shapes: dict[str, Shape]
+    read: Callable[[str], torch.Tensor]
+    """The tensor of that name, on the CPU, as it was stored."""
+
+    @property
+    def registers(self) -> int:
+        """How many register tokens the network of these weights has."""
+        return self.shapes.get("reg_token", (1, 0))[1]
+
+
+def find_weights(size: str, given: Path | None) -> Path:
+    """The file of the weights: the one given, else timm's on the hub, downloaded if need be."""
+    if given is not None:
+        if not given.is_file():
+            what = "is not a file" if given.exists() else "does not exist"
+            raise _missing(f"DINO_WEIGHTS={given} {what}.", size)
+        return given
+    return cached_weights(size) or _download(size)
+
+
+def cached_weights(size: str) -> Path | None:
+    """timm's file in the Hugging Face cache of this machine; asks no network."""
+    import huggingface_hub
+
+    found = huggingface_hub.try_to_load_from_cache(hub_repository(size), HUB_FILE)
+    return Path(found) if isinstance(found, str) else None
+
+
+def _download(size: str) -> Path:
+    import httpx2
+    import huggingface_hub
+
+    try:
+        return Path(huggingface_hub.hf_hub_download(hub_repository(size), HUB_FILE))
+    except (OSError, RuntimeError, httpx2.HTTPError) as error:
+        raise _missing(
+            f"DINO_WEIGHTS is not set, and {hub_repository(size)} can't be downloaded: "
+            f"{_first_line(error)}",
+            size,
+        ) from error
+
+
+def open_weights(path: Path, size: str) -> WeightsFile:
+    """The tensors in a `.safetensors` or PyTorch file in either naming; only its index is read.
+
+    Misconfigured (`weights_unfit`) when it is neither, or not a whole one.
+    """
+    from safetensors import SafetensorError
+
+    try:
+        with path.open("rb") as file:
+            begin = file.read(9)
+        # By its content: in a Hugging Face cache the file itself has no suffix.
+        stored = _open_safetensors(path) if begin[8:] == b"{" else _open_torch(path)
+        return _under_timms_names(stored)
+    except (
+        OSError,
+        EOFError,
+        RuntimeError,
+        AssertionError,
+        KeyError,
+        ValueError,
+        TypeError,
+        SafetensorError,
+        pickle.UnpicklingError,
+    ) as error:
+        reason = f"it can't be read as a file of tensors: {_first_line(error)}"
+        raise unfit(path, reason, size) from error
+
+
+def unfit(path: Path, reason: str, size: str) -> Misconfigured:
+    """The refusal of a file of weights."""
+    return Misconfigured(
+        "weights_unfit",
+        f"The weights {path} can't be used for dinov2-{size}: {reason}. {three_ways(size)}",
+    )
+
+
+def check_fit(file: WeightsFile, wanted: dict[str, Shape], size: str, registers: int) -> None:
+    """Misconfigured (`weights_unfit`) unless the file has every wanted tensor in its shape."""
+    if file.registers != registers:
+        raise unfit(
+            file.path,
+            f"they are of a network with {file.registers} register tokens, {registers} are "
+            "expected",
+            size,
+        )
+    differing = [
+        f"{name} is {file.shapes[name]}, expected {shape}"
+        for name, shape in wanted.items()
+        if name in file.shapes and file.shapes[name] != shape
+    ]
+    missing = [f"{name} {shape}" for name, shape in wanted.items() if name not in file.shapes]
+    faults = []
+    if missing:
+        faults.append("it has no tensor " + _some(missing))
+    if differing:
+        faults.append(_some(differing))
+    if faults:
+        raise unfit(file.path, "; ".join(faults) + _guess(file, size), size)
+
+
+def _guess(file: WeightsFile, size: str) -> str:
+    """Which network the file seems to be of, when it is another one."""
+    shape = file.shapes.get("cls_token", ())
+    found = SIZES.get(shape[-1]) if shape else None
+    return f" (these look like the weights of dinov2-{found})" if found not in (None, size) else ""
+
+
+def _open_safetensors(path: Path) -> WeightsFile:
+    from safetensors import safe_open
+
+    stored: Any = safe_open(path, framework="pt", device="cpu")  # its methods are untyped
+    names: list[str] = stored.keys()
+    shapes = {name: tuple(stored.get_slice(name).get_shape()) for name in names}
+    return WeightsFile(path, shapes, stored.get_tensor)
+
+
+def _open_torch(path: Path) -> WeightsFile:
+    """Mapped into memory, so that only what is asked for is read; weights only, no code."""
+    try:
+        state = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
+    except RuntimeError as error:
+        if "mmap" not in str(error):
+            raise
+        # Files of PyTorch before 1.6 can't be mapped.
+        state = torch.load(path, map_location="cpu", weights_only=True)
+    if not isinstance(state, dict):
+        raise ValueError(f"it holds a {type(state).__name__}, not named tensors")
+    tensors = {str(n): t for n, t in state.items() if isinstance(t, torch.Tensor)}
+    if not tensors:
+        raise ValueError(f"it holds no tensors, but {_some([str(name) for name in state])}")
+    shapes = {name: tuple(tensor.shape) for name, tensor in tensors.items()}
+    return WeightsFile(path, shapes, tensors.__getitem__)
+
+
+def _under_timms_names(stored: WeightsFile) -> WeightsFile:
+    names = {_timms_name(name): name for name in stored.shapes}
+    shapes = {ours: stored.shapes[theirs] for ours, theirs in names.items()}
+
+    def read(name: str) -> torch.Tensor:
+        return stored.read(names[name])
+
+    folded = {"register_tokens", "cls_token", "pos_embed"}
+    if not folded <= stored.shapes.keys():
+        return WeightsFile(stored.path, shapes, read)
+    # Meta's, with registers. timm has added the position of the class token to it.
+    batch, positions, width = shapes["pos_embed"]
+    shapes["pos_embed"] = (batch, positions - 1, width)
+
+    def read_folded(name: str) -> torch.Tensor:
+        if name == "pos_embed":
+            return read(name)[:, 1:]
+        if name == "cls_token":
+            return read(name) + read("pos_embed")[:, :1]
+        return read(name)
+
+    return WeightsFile(stored.path, shapes, read_folded)
+
+
+def _timms_name(name: str) -> str:
+    name = re.sub(r"^blocks\.\d+\.(\d+)\.", r"blocks.\1.", name)
+    name = re.sub(r"^(blocks\.\d+\.mlp)\.w12\.", r"\1.fc1.", name)
+    name = re.sub(r"^(blocks\.\d+\.mlp)\.w3\.", r"\1.fc2.", name)
+    return "reg_token" if name == "register_tokens" else name
+
+
+def _missing(reason: str, size: str) -> Misconfigured:
+    return Misconfigured("weights_missing", f"{reason} {three_ways(size)}")
+
+
+def _some(faults: list[str]) -> str:
+    more = len(faults) - NAMED
+    return ", ".join(faults[:NAMED]) + (f" and {more} more" if more > 0 else "")
+
+
+def _first_line(error: BaseException) -> str:
+    return (str(error).strip() or type(error).__name__).splitlines()[0]

@@ -1,0 +1,182 @@
+"""DINOv2's features: held to a plain forward pass of the whole network, and no work beyond them."""
+
+from __future__ import annotations
+
+import functools
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from torch.nn.modules.module import register_module_forward_hook
+
+from shared.recipes import FACETS, RECIPES
+from shared.vision.backbones.dinov2 import SHAPES, Dinov2, VitShape, resample_positions
+from tests.support.vit import (
+    PLAIN,
+    SIDE,
+    SWIGLU,
+    WITH_REGISTERS,
+    bicubic_weights,
+    plain_forward,
+    random_weights,
+    save,
+)
+
+CPU = torch.device("cpu")
+NETWORKS = {"plain": PLAIN, "swiglu": SWIGLU, "registers": WITH_REGISTERS}
+SIZES = [(224, 224), (126, 70), (518, 518)]
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Each network's weights as Meta publishes them."""
+    folder = tmp_path_factory.mktemp("weights")
+    return {
+        name: save(random_weights(shape), folder / f"{name}.pth")
+        for name, shape in NETWORKS.items()
+    }
+
+
+def load(file: Path, shape: VitShape, layer: int, facet: str) -> Dinov2:
+    return Dinov2("vits14", layer, facet, CPU, file, shape=shape)
+
+
+@functools.cache
+def photos(height: int, width: int) -> NDArray[np.uint8]:
+    count = 1 if height > 300 else 2
+    rng = np.random.default_rng(height)
+    return rng.integers(0, 256, (count, height, width, 3), dtype=np.uint8)
+
+
+@functools.cache
+def expected(network: str, size: tuple[int, int]) -> list[dict[str, NDArray[np.float64]]]:
+    shape = NETWORKS[network]
+    return plain_forward(random_weights(shape), shape, photos(*size))
+
+
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("facet", FACETS)
+@pytest.mark.parametrize("network", NETWORKS)
+def test_features_are_those_of_a_whole_forward_pass(
+    files: dict[str, Path], network: str, facet: str, size: tuple[int, int]
+) -> None:
+    shape = NETWORKS[network]
+    for layer in range(shape.depth):
+        backbone = load(files[network], shape, layer, facet)
+        features = backbone.features(torch.from_numpy(photos(*size)))
+        assert features.dtype == torch.float32
+        wanted = expected(network, size)[layer][facet]
+        assert features.shape == wanted.shape
+        np.testing.assert_allclose(features, wanted, atol=2e-5, err_msg=f"layer {layer}")
+
+
+def test_facets_and_layers_differ_from_each_other() -> None:
+    found = [facets[name] for facets in expected("plain", (126, 70)) for name in FACETS]
+    for index, one in enumerate(found):
+        for other in found[index + 1 :]:
+            assert np.abs(one - other).max() > 0.1
+
+
+@pytest.mark.parametrize("facet", FACETS)
+@pytest.mark.parametrize("layer", range(PLAIN.depth))
+def test_nothing_runs_after_the_facet_is_known(
+    files: dict[str, Path], layer: int, facet: str
+) -> None:
+    backbone = load(files["plain"], PLAIN, layer, facet)
+    ran: Counter[Any] = Counter()
+
+    def count(module: torch.nn.Module, _inputs: object, _output: object) -> None:
+        if isinstance(module, torch.nn.Linear):
+            ran[module.in_features, module.out_features] += 1
+        ran[type(module).__name__] += 1
+
+    with register_module_forward_hook(count):
+        backbone.features(torch.from_numpy(photos(126, 70)))
+    whole_blocks = layer + 1 if facet == "token" else layer
+    width = PLAIN.width
+    assert ran["Block"] == ran[width, 3 * width] == ran[width, 4 * width] == whole_blocks
+    # The projection after each attention, and the one third of the last block's qkv.
+    assert ran[width, width] == (whole_blocks if facet == "token" else whole_blocks + 1)
+
+
+def test_weights_that_are_not_used_are_not_kept(files: dict[str, Path]) -> None:
+    def kept(facet: str) -> int:
+        tensors: list[torch.Tensor] = [*load(files["plain"], PLAIN, 1, facet)._vit.parameters()]
+        assert all(tensor.device == CPU for tensor in tensors)
+        return sum(tensor.untyped_storage().nbytes() for tensor in tensors) // 4
+
+    width = PLAIN.width
+    block = 12 * width**2 + (3 + 1 + 4 + 1) * width + 6 * width
+    before = (2 + SIDE * SIDE + 3 * 14 * 14 + 1) * width
+    assert kept("token") == before + 2 * block
+    assert kept("value") == before + block + width**2 + 3 * width
+
+
+def test_photos_are_described_alike_alone_and_together(files: dict[str, Path]) -> None:
+    backbone = load(files["swiglu"], SWIGLU, 2, "value")
+    pixels = torch.from_numpy(photos(224, 224))
+    together = backbone.features(pixels)
+    for index in range(2):
+        alone = backbone.features(pixels[index : index + 1])
+        np.testing.assert_allclose(alone[0], together[index], atol=1e-5)
+
+
+def test_photos_of_no_whole_patches_are_refused(files: dict[str, Path]) -> None:
+    backbone = load(files["plain"], PLAIN, 0, "value")
+    with pytest.raises(ValueError, match="100 x 70 pixels are no whole patches of 14"):
+        backbone.features(torch.zeros((1, 100, 70, 3), dtype=torch.uint8))
+
+
+# --- positions -------------------------------------------------------------------------------
+
+
+def some_positions(width: int = 8) -> torch.Tensor:
+    values = np.random.default_rng(5).standard_normal((1, SIDE * SIDE, width))
+    return torch.from_numpy(values.astype(np.float32))
+
+
+@pytest.mark.parametrize(("rows", "columns"), [(16, 16), (34, 45), (5, 60), (1, 1), (37, 36)])
+def test_positions_are_resampled_by_metas_formula(rows: int, columns: int) -> None:
+    learnt = some_positions()
+    moved = resample_positions(learnt, rows, columns)
+    grid = learnt[0].double().numpy().reshape(SIDE, SIDE, -1)
+    formula = np.einsum("rh,hwd,cw->rcd", bicubic_weights(rows), grid, bicubic_weights(columns))
+    np.testing.assert_allclose(moved[0], formula.reshape(rows * columns, -1), atol=1e-4)
+
+
+def test_positions_of_the_trainings_size_stay_as_they_are() -> None:
+    learnt = some_positions()
+    assert torch.equal(resample_positions(learnt, SIDE, SIDE), learnt)
+
+
+def test_timm_would_resample_positions_otherwise() -> None:
+    from timm.layers.pos_embed import resample_abs_pos_embed
+
+    learnt = some_positions()
+    ours = resample_positions(learnt, 16, 16)
+    for antialias in (True, False):
+        timms = resample_abs_pos_embed(learnt, [16, 16], num_prefix_tokens=0, antialias=antialias)
+        assert float((ours - timms).abs().max()) > 0.05
+
+
+# --- the published networks ------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("size", SHAPES)
+def test_shapes_are_those_of_timms_networks_and_of_the_recipes(size: str) -> None:
+    import timm
+
+    shape, recipe = SHAPES[size], RECIPES[f"anyloc-{size}"]
+    assert (shape.depth, shape.width) == (recipe.depth, recipe.width)
+    with torch.device("meta"):
+        network: Any = timm.create_model(shape.timm_name, pretrained=False)
+        assert len(network.blocks) == shape.depth
+        assert network.embed_dim == shape.width
+        assert network.blocks[0].attn.num_heads == shape.heads
+        assert network.pos_embed.shape == (1, 1 + SIDE * SIDE, shape.width)
+    assert network.pretrained_cfg["mean"] == (0.485, 0.456, 0.406)
+    assert network.pretrained_cfg["std"] == (0.229, 0.224, 0.225)

@@ -1,0 +1,267 @@
+"""DINOv2's weights: one network under any publisher's names, and files that are refused."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from shared.errors import Misconfigured
+from shared.recipes import get_recipe
+from shared.vision.backbones.dinov2 import Dinov2, VitShape
+from shared.vision.extractors import Extractor
+from tests.support.vit import (
+    PLAIN,
+    SWIGLU,
+    WITH_REGISTERS,
+    Weights,
+    chunked,
+    random_weights,
+    save,
+    timms,
+)
+
+CPU = torch.device("cpu")
+THREE_WAYS = (
+    "(1) with internet access and DINO_WEIGHTS unset, timm's timm/vit_small_patch14_dinov2.lvd142m",
+    "(2) download Meta's https://dl.fbaipublicfiles.com/dinov2/dinov2_vits14/dinov2_vits14_pretrain",
+    "(3) copy model.safetensors",
+)
+
+
+def load(
+    path: Path | None, shape: VitShape = PLAIN, layer: int = 2, facet: str = "value"
+) -> Dinov2:
+    return Dinov2("vits14", layer, facet, CPU, path, shape=shape)
+
+
+def refusal(path: Path | None, code: str, shape: VitShape = PLAIN) -> str:
+    """The detail with which the weights are refused; it always names the three ways."""
+    with pytest.raises(Misconfigured) as caught:
+        load(path, shape)
+    assert caught.value.code == code
+    for way in THREE_WAYS:
+        assert way in caught.value.detail
+    return caught.value.detail
+
+
+def save_before_pytorch_1_6(weights: Weights, path: Path) -> Path:
+    torch.save(weights, path, _use_new_zipfile_serialization=False)
+    return path
+
+
+# --- one network, several files --------------------------------------------------------------
+
+
+@pytest.mark.parametrize("shape", [PLAIN, SWIGLU, WITH_REGISTERS])
+def test_the_same_weights_are_the_same_network_in_every_naming_and_format(
+    shape: VitShape, tmp_path: Path
+) -> None:
+    metas = random_weights(shape)
+    files = [
+        save(metas, tmp_path / "meta.pth"),
+        save(chunked(metas), tmp_path / "chunked.pt"),
+        save(metas, tmp_path / "meta.safetensors"),
+        save(timms(metas), tmp_path / "timm.safetensors"),
+        save(timms(metas), tmp_path / "timm.bin"),
+        save_before_pytorch_1_6(metas, tmp_path / "old.pth"),
+    ]
+    pixels = torch.from_numpy(
+        np.random.default_rng(1).integers(0, 256, (1, 56, 70, 3), dtype=np.uint8)
+    )
+    loaded = [load(file, shape, layer=1) for file in files]
+    features = loaded[0].features(pixels)
+    for file, backbone in zip(files, loaded, strict=True):
+        assert torch.equal(backbone.features(pixels), features), file.name
+        assert backbone.fingerprint == loaded[0].fingerprint, file.name
+        assert backbone.card["file"] == file.name
+        assert backbone.card["source"] == "DINO_WEIGHTS"
+
+
+def test_format_is_told_by_the_content_as_files_of_a_cache_have_no_suffix(tmp_path: Path) -> None:
+    timms_file = save(timms(random_weights(PLAIN)), tmp_path / "model.safetensors")
+    blob = timms_file.rename(tmp_path / "3fa9c2")
+    link = tmp_path / "model.safetensors"
+    link.symlink_to(blob)
+    assert load(blob).fingerprint == load(link).fingerprint
+
+
+def test_fingerprint_is_that_of_the_tensors_in_use(tmp_path: Path) -> None:
+    weights = random_weights(PLAIN)
+    own = load(save(weights, tmp_path / "own.pth")).fingerprint
+
+    def fingerprint_with(changed: str) -> str:
+        nudged = {**weights, changed: weights[changed] + 1e-3}
+        return load(save(nudged, tmp_path / "nudged.pth")).fingerprint
+
+    for used in ("cls_token", "blocks.1.mlp.fc2.bias", "blocks.2.norm1.weight"):
+        assert fingerprint_with(used) != own, used
+    for unused in ("mask_token", "norm.weight", "blocks.2.norm2.bias", "blocks.3.norm1.weight"):
+        assert fingerprint_with(unused) == own, unused
+
+
+def test_facets_of_one_layer_have_one_fingerprint(tmp_path: Path) -> None:
+    file = save(random_weights(PLAIN), tmp_path / "meta.pth")
+    facets = {load(file, facet=facet).fingerprint for facet in ("query", "key", "value")}
+    assert len(facets) == 1
+
+
+def test_half_precision_is_computed_in_single(tmp_path: Path) -> None:
+    halves = {name: tensor.half() for name, tensor in random_weights(PLAIN).items()}
+    widened = {name: tensor.float() for name, tensor in halves.items()}
+    backbone = load(save(halves, tmp_path / "half.safetensors"))
+    assert backbone.fingerprint == load(save(widened, tmp_path / "full.pth")).fingerprint
+    assert backbone.features(torch.zeros((1, 28, 28, 3), dtype=torch.uint8)).dtype == torch.float32
+
+
+def test_a_file_may_go_once_it_is_loaded(tmp_path: Path) -> None:
+    file = save(random_weights(PLAIN), tmp_path / "meta.pth")
+    pixels = torch.zeros((1, 28, 28, 3), dtype=torch.uint8)
+    backbone = load(file)
+    before = backbone.features(pixels)
+    file.write_bytes(b"\xff" * file.stat().st_size)
+    assert torch.equal(backbone.features(pixels), before)
+
+
+# --- files that are refused ------------------------------------------------------------------
+
+
+def test_a_missing_file_is_refused_with_three_ways_to_get_it(tmp_path: Path) -> None:
+    said = refusal(tmp_path / "gone.pth", "weights_missing")
+    assert f"DINO_WEIGHTS={tmp_path / 'gone.pth'} does not exist" in said
+    assert "is not a file" in refusal(tmp_path, "weights_missing")
+
+
+def test_nothing_is_random_when_a_tensor_is_missing(tmp_path: Path) -> None:
+    weights = random_weights(PLAIN)
+    del weights["blocks.1.ls2.gamma"]
+    said = refusal(save(weights, tmp_path / "w.pth"), "weights_unfit")
+    assert (
+        "w.pth can't be used for dinov2-vits14: it has no tensor blocks.1.ls2.gamma (32,)" in said
+    )
+
+
+def test_many_missing_tensors_are_counted(tmp_path: Path) -> None:
+    said = refusal(save(random_weights(PLAIN, blocks=1), tmp_path / "w.pth"), "weights_unfit")
+    assert "blocks.1.norm1.weight (32,)" in said
+    assert "and 15 more" in said
+
+
+def test_a_wrong_shape_is_named_with_the_one_expected(tmp_path: Path) -> None:
+    weights = random_weights(PLAIN)
+    weights["pos_embed"] = weights["pos_embed"][:, :257].clone()
+    said = refusal(save(weights, tmp_path / "w.safetensors"), "weights_unfit")
+    assert "pos_embed is (1, 257, 32), expected (1, 1370, 32)" in said
+
+
+def test_weights_of_another_size_are_recognised(tmp_path: Path) -> None:
+    base = {"cls_token": torch.zeros(1, 1, 768)}
+    said = refusal(save(base, tmp_path / "w.pth"), "weights_unfit")
+    assert "look like the weights of dinov2-vitb14" in said
+
+
+def test_weights_with_registers_are_not_taken_for_those_without(tmp_path: Path) -> None:
+    weights = random_weights(WITH_REGISTERS)
+    for file in (save(weights, tmp_path / "w.pth"), save(timms(weights), tmp_path / "w.pt")):
+        assert "4 register tokens, 0 are expected" in refusal(file, "weights_unfit")
+    plain = save(random_weights(PLAIN), tmp_path / "plain.pth")
+    assert "0 register tokens, 4" in refusal(plain, "weights_unfit", WITH_REGISTERS)
+
+
+@pytest.mark.parametrize(
+    "spoilt", [torch.full((32,), float("nan")), torch.ones(32, dtype=torch.int32)]
+)
+def test_numbers_that_are_no_weights_are_refused(spoilt: torch.Tensor, tmp_path: Path) -> None:
+    weights = {**random_weights(PLAIN), "blocks.0.norm1.bias": spoilt}
+    said = refusal(save(weights, tmp_path / "w.pth"), "weights_unfit")
+    assert "blocks.0.norm1.bias is not all finite floats" in said
+
+
+def _half_of(suffix: str) -> Callable[[Path], bytes]:
+    def cut(folder: Path) -> bytes:
+        data = save(random_weights(PLAIN), folder / f"whole{suffix}").read_bytes()
+        return data[: len(data) // 2]
+
+    return cut
+
+
+def _python_code(folder: Path) -> bytes:
+    torch.save(VitShape, folder / "code.pth")
+    return (folder / "code.pth").read_bytes()
+
+
+def _one_tensor(folder: Path) -> bytes:
+    torch.save(torch.zeros(3), folder / "tensor.pth")
+    return (folder / "tensor.pth").read_bytes()
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        lambda _folder: b"",
+        lambda _folder: b"<html>404 Not Found</html>",
+        lambda _folder: b"\xff\xff\xff\xff\xff\xff\xff\x7f{",
+        _half_of(".pth"),
+        _half_of(".safetensors"),
+        _python_code,
+        _one_tensor,
+        lambda folder: save({"model": {}}, folder / "nested.pth").read_bytes(),
+    ],
+    ids=["empty", "text", "promise", "half a zip", "half", "code", "tensor", "nested"],
+)
+def test_what_is_no_file_of_weights_is_refused(
+    content: Callable[[Path], bytes], tmp_path: Path
+) -> None:
+    file = tmp_path / "w.pth"
+    file.write_bytes(content(tmp_path))
+    assert f"{file} can't be used" in refusal(file, "weights_unfit")
+
+
+# --- timm's file on the hub ------------------------------------------------------------------
+
+
+@pytest.fixture
+def offline_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty Hugging Face cache, on a machine that may not ask the hub."""
+    from huggingface_hub import constants
+
+    monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)
+    monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path / "hub"))
+    return tmp_path / "hub"
+
+
+@pytest.mark.usefixtures("offline_cache")
+def test_weights_that_can_not_be_downloaded_are_an_error_and_never_random() -> None:
+    said = refusal(None, "weights_missing")
+    assert "DINO_WEIGHTS is not set" in said
+    with pytest.raises(Misconfigured, match=r"timm/vit_giant_patch14_dinov2\.lvd142m"):
+        Extractor(get_recipe("anyloc-vitg14", allow_test_extractors=False), CPU)
+
+
+def test_timms_file_in_the_cache_is_taken_without_asking_the_hub(offline_cache: Path) -> None:
+    repository = offline_cache / "models--timm--vit_small_patch14_dinov2.lvd142m"
+    snapshot = repository / "snapshots" / "0123abc"
+    snapshot.mkdir(parents=True)
+    (repository / "refs").mkdir()
+    (repository / "refs" / "main").write_text("0123abc")
+    save(timms(random_weights(PLAIN)), snapshot / "model.safetensors")
+    backbone = load(None)
+    assert backbone.card["source"] == "timm/vit_small_patch14_dinov2.lvd142m"
+    assert backbone.card["size_bytes"] > 0
+
+
+def test_a_network_that_breaks_off_is_an_error_with_the_three_ways(
+    monkeypatch: pytest.MonkeyPatch, offline_cache: Path
+) -> None:
+    import httpx2
+    import huggingface_hub
+
+    def breaks(*_arguments: object) -> str:
+        raise httpx2.ReadError("the connection was reset")
+
+    monkeypatch.setattr(huggingface_hub, "hf_hub_download", breaks)
+    assert "the connection was reset" in refusal(None, "weights_missing")
+    assert not offline_cache.exists()
