@@ -38,7 +38,6 @@ from shared.home import announced, lock_home
 from shared.jobs import InProcessHints
 from shared.objects import FolderStore
 from shared.objects.upload_dir import place_originals
-from shared.recipes import get_recipe
 from shared.settings import Settings
 
 log = logging.getLogger(__name__)
@@ -76,11 +75,9 @@ def standalone(settings: Settings, *, new_key: bool = False) -> Iterator[Standal
 
     Beyond loopback, or with an ADMIN_KEY, every call needs a key; `new_key` replaces the one that
     an earlier start has made. Raises Misconfigured: `home_in_use` for a folder that another server
-    has, `address_in_use`, `no_key_needed` for a new key on loopback, those of `admin_key` and
-    `place_originals`, and for an extractor of new maps that is unknown: no photo could ever be
-    described.
+    has, `address_in_use`, `no_key_needed` for a new key on loopback, and those of `admin_key` and
+    `place_originals`.
     """
-    get_recipe(settings.extractor, allow_test_extractors=settings.allow_test_extractors)
     home = settings.placewise_home
     objects = home / "objects"
     with contextlib.ExitStack() as held:
@@ -91,7 +88,7 @@ def standalone(settings: Settings, *, new_key: bool = False) -> Iterator[Standal
         hints = InProcessHints()
         catalog.migrate()
         with catalog.write() as session:
-            ensure_default_map(session, settings.extractor)
+            ensure_default_map(session, settings.new_map_extractor)
         # The lock says that no other worker lives: what was leased belongs to a killed process.
         free_leases(catalog, settings.max_attempts, everyone=True)
 

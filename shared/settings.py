@@ -13,6 +13,10 @@ from typing import Literal, Self
 from pydantic import Field, SecretStr, field_validator, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
+from shared.errors import Misconfigured
+from shared.predecessor import extractor_of
+from shared.recipes import get_recipe
+
 LEAST_KEY_CHARACTERS = 16
 
 
@@ -20,7 +24,11 @@ class Settings(BaseSettings):
     """What is in force. Each field is an environment variable of the same name in capitals."""
 
     model_config = SettingsConfigDict(
-        env_file=".env", extra="ignore", frozen=True, validate_default=True
+        env_file=".env",
+        env_ignore_empty=True,  # compose files pass on what is unset as empty
+        extra="ignore",
+        frozen=True,
+        validate_default=True,
     )
 
     # Where it listens and where it keeps things.
@@ -53,7 +61,25 @@ class Settings(BaseSettings):
     max_wait_seconds: int = Field(60, ge=0, description="longest `Prefer: wait` and `?wait=`")
 
     # How photos are described.
-    extractor: str = Field("efficientnet-lite0-vlad", description="extractor of new maps")
+    extractor: str = Field(
+        "efficientnet-lite0-vlad",
+        description="extractor of new maps, with options: anyloc-vitb14:layer=9,clusters=32",
+    )
+    dino_model: str | None = Field(
+        None, description="extractor of new maps by its DINOv2: dinov2_vits14|vitb14|vitl14|vitg14"
+    )
+    desc_layer: int | None = Field(
+        None, description="DINO_MODEL's block, from 0; unset: 10, 10, 20 or 31 by its size"
+    )
+    desc_facet: str | None = Field(
+        None, description="query, key, value or token of that block; unset: value"
+    )
+    vlad_clusters: int | None = Field(
+        None, description="centres that fits make with DINO_MODEL; unset: 64"
+    )
+    vlad_desc_dim: int | None = Field(
+        None, description="width of DINO_MODEL's features, checked against the model"
+    )
     allow_test_extractors: bool = Field(
         False, description="lets a map use the tiny extractors that exist for tests"
     )
@@ -118,8 +144,8 @@ class Settings(BaseSettings):
     @field_validator("admin_key")
     @classmethod
     def _can_be_sent_and_not_guessed(cls, value: SecretStr | None) -> SecretStr | None:
-        if value is None or not value.get_secret_value():
-            return None  # `ADMIN_KEY=` is how a compose file says that it is not set
+        if value is None:
+            return None
         key = value.get_secret_value()
         if len(key) < LEAST_KEY_CHARACTERS or not re.fullmatch(r"[!-~]+", key):
             raise ValueError(
@@ -128,20 +154,10 @@ class Settings(BaseSettings):
             )
         return value
 
-    @field_validator("upload_dir", mode="before")
-    @classmethod
-    def _empty_is_unset(cls, value: object) -> object:
-        return value or None
-
     @field_validator("placewise_home", "upload_dir")
     @classmethod
     def _absolute(cls, value: Path | None) -> Path | None:
         return value and value.expanduser().resolve()
-
-    @field_validator("dino_weights", mode="before")
-    @classmethod
-    def _empty_is_unset(cls, value: object) -> object:
-        return None if value == "" else value  # or Path("") would be the working directory
 
     @field_validator("dino_weights")
     @classmethod
@@ -157,6 +173,47 @@ class Settings(BaseSettings):
                 "a batch becomes one chunk, and a chunk has to fit into a slot"
             )
         return self
+
+    @model_validator(mode="after")
+    def _dino_model_is_there_if_it_is_spoken_of(self) -> Self:
+        for name in ("desc_layer", "desc_facet", "vlad_clusters", "vlad_desc_dim"):
+            value = getattr(self, name)
+            if value is not None and self.dino_model is None:
+                raise ValueError(
+                    f"{name.upper()}={value} says how DINO_MODEL is used, which is not set. "
+                    "Set DINO_MODEL, or use the options of EXTRACTOR instead: "
+                    "anyloc-vitb14:layer=9,facet=key,clusters=32"
+                )
+        return self
+
+    @model_validator(mode="after")
+    def _new_maps_have_one_extractor(self) -> Self:
+        try:
+            named = get_recipe(
+                self.extractor, allow_test_extractors=self.allow_test_extractors
+            ).name
+        except Misconfigured as error:
+            raise ValueError(f"EXTRACTOR={self.extractor}: {error.detail}") from error
+        chosen = self.new_map_extractor
+        if "extractor" in self.model_fields_set and named != chosen:
+            raise ValueError(
+                f"EXTRACTOR={self.extractor} contradicts DINO_MODEL={self.dino_model}, which "
+                f"means {chosen}. Unset one of them"
+            )
+        return self
+
+    @property
+    def new_map_extractor(self) -> str:
+        """The canonical name of the extractor that EXTRACTOR or DINO_MODEL chooses."""
+        if self.dino_model is None:
+            return get_recipe(self.extractor, allow_test_extractors=self.allow_test_extractors).name
+        return extractor_of(
+            self.dino_model,
+            desc_layer=self.desc_layer,
+            desc_facet=self.desc_facet,
+            vlad_clusters=self.vlad_clusters,
+            vlad_desc_dim=self.vlad_desc_dim,
+        )
 
     def catalog_url(self) -> str:
         """The SQLAlchemy URL of the catalog."""

@@ -16,7 +16,11 @@ def read_settings() -> Settings:
         return Settings()
     except ValidationError as error:
         faults = [
-            f"{'.'.join(str(part) for part in fault['loc']).upper()}: {fault['msg']}"
+            ": ".join(
+                # A fault of several settings together has no place of its own: it names them.
+                [str(part).upper() for part in fault["loc"]]
+                + [fault["msg"].removeprefix("Value error, ")]
+            )
             for fault in error.errors(include_input=False)  # a value may hold a password
         ]
         raise Misconfigured("bad_setting", "; ".join(faults)) from None

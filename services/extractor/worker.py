@@ -99,7 +99,7 @@ class ExtractorWorker:
     def run(self, stop: threading.Event) -> None:
         """Drain whenever there is work, until `stop` is set."""
         try:
-            self._models.extractor(self._settings.extractor)
+            self._models.extractor(self._settings.new_map_extractor)
         except PlacewiseError as error:
             # Maps may use another one; photos that need this one will say the same.
             log.error("the extractor of new maps can't be loaded: %s", error.detail)

@@ -201,8 +201,9 @@ def test_an_address_has_one_server(server: ServerProcess, tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     ("settings", "code", "named"),
     [
-        ({"extractor": "anylock-vitg14"}, "unknown_extractor", "efficientnet-lite0-vlad"),
-        ({"allow_test_extractors": False}, "test_extractor", "test-tiny-avg"),
+        ({"extractor": "anylock-vitg14"}, "bad_setting", "efficientnet-lite0-vlad"),
+        ({"allow_test_extractors": False}, "bad_setting", "test-tiny-avg"),
+        ({"dino_model": "dinov2_vitg14"}, "bad_setting", "EXTRACTOR=test-tiny-avg contradicts"),
         ({"port": "http"}, "bad_setting", "PORT"),
     ],
 )

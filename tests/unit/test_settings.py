@@ -7,6 +7,8 @@ from pathlib import Path
 import pytest
 from pydantic import ValidationError
 
+from services.cli.configuration import read_settings
+from shared.errors import Misconfigured
 from shared.settings import Settings
 
 
@@ -86,6 +88,166 @@ def test_values_out_of_range_are_refused_by_name(
     monkeypatch.setenv(name, value)
     with pytest.raises(ValidationError, match=name.lower()):
         Settings()
+
+
+def test_an_empty_variable_is_an_unset_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("DINO_WEIGHTS", "DINO_MODEL", "DESC_LAYER", "DATABASE_URL", "PORT"):
+        monkeypatch.setenv(name, "")
+    settings = Settings()
+    assert settings.dino_weights is None
+    assert settings.new_map_extractor == "test-tiny-avg"
+    assert (settings.database_url, settings.port) == (None, 8000)
+
+
+def test_path_of_the_weights_is_absolute_and_a_link_keeps_its_name(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "model.safetensors").symlink_to(tmp_path / "3fa9c2")
+    monkeypatch.setenv("DINO_WEIGHTS", "model.safetensors")
+    assert Settings().dino_weights == tmp_path / "model.safetensors"
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("DINO_WEIGHTS", "~/vitg.pth")
+    assert Settings().dino_weights == tmp_path / "vitg.pth"
+
+
+# --- the extractor of new maps ---------------------------------------------------------------
+
+
+@pytest.fixture
+def production(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Neither EXTRACTOR nor the extractors for tests."""
+    monkeypatch.delenv("EXTRACTOR")
+    monkeypatch.delenv("ALLOW_TEST_EXTRACTORS")
+
+
+def refusal(monkeypatch: pytest.MonkeyPatch, **variables: str) -> str:
+    """What a person reads when these settings are refused."""
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+    with pytest.raises(Misconfigured) as caught:
+        read_settings()
+    assert caught.value.code == "bad_setting"
+    return caught.value.detail
+
+
+PREDECESSORS = {
+    "DINO_MODEL": "dinov2_vitg14",
+    "DESC_LAYER": "31",
+    "DESC_FACET": "value",
+    "VLAD_CLUSTERS": "64",
+    "VLAD_DESC_DIM": "1536",
+}
+
+
+@pytest.mark.usefixtures("production")
+@pytest.mark.parametrize(
+    ("variables", "extractor"),
+    [
+        ({}, "efficientnet-lite0-vlad"),
+        (PREDECESSORS, "anyloc-vitg14"),
+        ({**PREDECESSORS, "VLAD_CLUSTERS": "32"}, "anyloc-vitg14:clusters=32"),
+        ({"DINO_MODEL": "dinov2_vitl14"}, "anyloc-vitl14"),
+        ({"DINO_MODEL": "dinov2_vitl14", "DESC_LAYER": "20"}, "anyloc-vitl14"),
+        (
+            {"DINO_MODEL": "dinov2_vits14", "DESC_LAYER": "9", "DESC_FACET": "key"},
+            "anyloc-vits14:facet=key,layer=9",
+        ),
+        ({"DINO_MODEL": "dinov2_vitb14", "EXTRACTOR": "anyloc-vitb14"}, "anyloc-vitb14"),
+        ({"EXTRACTOR": "anyloc-vitb14:layer=9,clusters=8"}, "anyloc-vitb14:clusters=8,layer=9"),
+    ],
+)
+def test_extractor_of_new_maps_has_its_canonical_name(
+    monkeypatch: pytest.MonkeyPatch, variables: dict[str, str], extractor: str
+) -> None:
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+    assert Settings().new_map_extractor == extractor
+
+
+@pytest.mark.usefixtures("production")
+@pytest.mark.parametrize("extractor", ["anylock-vitg14", "anyloc", "dinov2_vitg14"])
+def test_an_unknown_extractor_is_refused_with_the_known_ones(
+    monkeypatch: pytest.MonkeyPatch, extractor: str
+) -> None:
+    said = refusal(monkeypatch, EXTRACTOR=extractor)
+    assert said.startswith(f"EXTRACTOR={extractor}: ")
+    for known in ("efficientnet-lite0-vlad", "anyloc-vits14", "anyloc-vitg14"):
+        assert known in said
+
+
+@pytest.mark.usefixtures("production")
+def test_extractors_for_tests_are_refused_where_they_are_not_allowed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    assert "ALLOW_TEST_EXTRACTORS" in refusal(monkeypatch, EXTRACTOR="test-tiny-avg")
+
+
+@pytest.mark.usefixtures("production")
+def test_options_of_an_extractor_are_checked_at_the_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    said = refusal(monkeypatch, EXTRACTOR="anyloc-vitb14:layer=12")
+    assert "layer=12" in said
+    assert "0 to 11" in said
+
+
+@pytest.mark.usefixtures("production")
+@pytest.mark.parametrize("model", ["dinov2_vitx14", "vitg14", "anyloc-vitg14", "dinov2_vitg14_reg"])
+def test_an_unknown_dino_model_is_refused_with_the_known_ones(
+    monkeypatch: pytest.MonkeyPatch, model: str
+) -> None:
+    said = refusal(monkeypatch, DINO_MODEL=model)
+    assert said.startswith(f"DINO_MODEL={model} is unknown")
+    assert "dinov2_vits14, dinov2_vitb14, dinov2_vitl14, dinov2_vitg14" in said
+
+
+@pytest.mark.usefixtures("production")
+@pytest.mark.parametrize("name", [name for name in PREDECESSORS if name != "DINO_MODEL"])
+def test_what_says_how_dino_is_used_is_refused_without_it(
+    monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    said = refusal(monkeypatch, **{name: PREDECESSORS[name]})
+    assert said.startswith(f"{name}={PREDECESSORS[name]} says how DINO_MODEL is used")
+
+
+@pytest.mark.usefixtures("production")
+@pytest.mark.parametrize(
+    ("variables", "said"),
+    [
+        (
+            {"EXTRACTOR": "efficientnet-lite0-vlad", "DINO_MODEL": "dinov2_vitg14"},
+            (
+                "EXTRACTOR=efficientnet-lite0-vlad contradicts DINO_MODEL=dinov2_vitg14, which "
+                "means anyloc-vitg14"
+            ),
+        ),
+        (
+            {"EXTRACTOR": "anyloc-vitb14", "DINO_MODEL": "dinov2_vitb14", "VLAD_CLUSTERS": "32"},
+            (
+                "EXTRACTOR=anyloc-vitb14 contradicts DINO_MODEL=dinov2_vitb14, which means "
+                "anyloc-vitb14:clusters=32"
+            ),
+        ),
+        (
+            {**PREDECESSORS, "VLAD_DESC_DIM": "768"},
+            "VLAD_DESC_DIM=768 contradicts DINO_MODEL=dinov2_vitg14, whose features have 1536",
+        ),
+        (
+            {"DINO_MODEL": "dinov2_vitb14", "DESC_LAYER": "31"},
+            (
+                "DESC_LAYER=31 with DINO_MODEL=dinov2_vitb14: The option layer=31 of anyloc-vitb14 "
+                "can't be used: layer is a whole number from 0 to 11"
+            ),
+        ),
+        ({**PREDECESSORS, "DESC_LAYER": "-1"}, "DESC_LAYER=-1 with DINO_MODEL=dinov2_vitg14"),
+        ({**PREDECESSORS, "DESC_LAYER": "last"}, "DESC_LAYER: Input should be a valid integer"),
+        ({**PREDECESSORS, "DESC_FACET": "values"}, "query, key, value, token"),
+        ({**PREDECESSORS, "VLAD_CLUSTERS": "0"}, "VLAD_CLUSTERS=0 with DINO_MODEL=dinov2_vitg14"),
+    ],
+)
+def test_contradictions_are_refused_with_both_values(
+    monkeypatch: pytest.MonkeyPatch, variables: dict[str, str], said: str
+) -> None:
+    assert said in refusal(monkeypatch, **variables)
 
 
 def test_settings_in_force_do_not_change(settings: Settings) -> None:
