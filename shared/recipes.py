@@ -32,6 +32,8 @@ class Recipe:
     """One of `shared.vision.extractors.BACKBONES`."""
     width: int
     """Length of one local feature."""
+    parameters: int
+    """Of the whole backbone, rounded up; each takes 4 bytes."""
     preprocessing: str
     """One of `shared.vision.preprocessing.PREPROCESSINGS`."""
     aggregator: str
@@ -65,7 +67,7 @@ class Recipe:
         return (self.backbone, self.layer, self.facet)
 
 
-def _anyloc(size: str, *, depth: int, width: int, layer: int) -> Recipe:
+def _anyloc(size: str, *, depth: int, width: int, layer: int, parameters: int) -> Recipe:
     """AnyLoc (Keetha et al., RA-L 2023): DINOv2 value features and VLAD.
 
     The layers are those that its authors recommend for each size of the network.
@@ -74,6 +76,7 @@ def _anyloc(size: str, *, depth: int, width: int, layer: int) -> Recipe:
         name=f"anyloc-{size}",
         backbone=f"dinov2-{size}",
         width=width,
+        parameters=parameters,
         preprocessing="square224",
         aggregator="vlad",
         depth=depth,
@@ -89,18 +92,20 @@ RECIPES = {
             name="efficientnet-lite0-vlad",
             backbone="efficientnet-lite0",
             width=112,
+            parameters=5_000_000,
             preprocessing="square224",
             aggregator="vlad",
             shipped_vocabulary="efficientnet-lite0.npy",
         ),
-        _anyloc("vits14", depth=12, width=384, layer=10),
-        _anyloc("vitb14", depth=12, width=768, layer=10),
-        _anyloc("vitl14", depth=24, width=1024, layer=20),
-        _anyloc("vitg14", depth=40, width=1536, layer=31),
+        _anyloc("vits14", depth=12, width=384, layer=10, parameters=22_100_000),
+        _anyloc("vitb14", depth=12, width=768, layer=10, parameters=86_600_000),
+        _anyloc("vitl14", depth=24, width=1024, layer=20, parameters=304_400_000),
+        _anyloc("vitg14", depth=40, width=1536, layer=31, parameters=1_136_500_000),
         Recipe(
             name="test-tiny-avg",
             backbone="test-tiny",
             width=16,
+            parameters=1_000,
             preprocessing="square32",
             aggregator="avg",
             for_tests=True,
@@ -109,6 +114,7 @@ RECIPES = {
             name="test-tiny-vlad",
             backbone="test-tiny",
             width=16,
+            parameters=1_000,
             preprocessing="square32",
             aggregator="vlad",
             clusters=8,

@@ -10,17 +10,18 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass
 
 import typer
+from rich.markup import escape
 from sqlalchemy import func, select
 from sqlalchemy.exc import SQLAlchemyError
 
 from services.cli.configuration import read_settings
-from services.cli.output import JsonOption, answers, explained, print_json
+from services.cli.extractor_checks import device_check, extractor_check, memory_check
+from services.cli.output import JsonOption, answers, print_json
 from shared.catalog.photos import Photo
 from shared.catalog.session import Catalog
 from shared.client import Client
 from shared.errors import Misconfigured, PlacewiseError
 from shared.home import running_server
-from shared.recipes import get_recipe
 from shared.settings import Settings
 
 LOW_DISK_BYTES = 1_000_000_000
@@ -35,24 +36,33 @@ class Finding:
 
 def doctor(as_json: JsonOption = False) -> None:
     """Check this installation; exit code 1 when something needs attention."""
-    with explained(as_json):
+    try:
         settings = read_settings()
+    except Misconfigured as error:
+        _report([Finding("settings", False, error.detail)], as_json)
+        raise typer.Exit(1) from None
     checks: list[tuple[str, Callable[[Settings], str]]] = [
         ("python", _python),
         ("folder", _folder),
         ("server", _server),
-        ("device", _device),
-        ("extractor", _extractor),
+        ("device", device_check),
+        ("memory", memory_check),
+        ("extractor", extractor_check),
     ]
     findings = [_look(part, check, settings) for part, check in checks]
-    if as_json:
-        print_json([asdict(finding) for finding in findings])
-    else:
-        for finding in findings:
-            mark = "[green]ok[/green]  " if finding.ok else "[red]look[/red]"
-            answers.print(f"{mark} {finding.part}: {finding.detail}", soft_wrap=True)
+    _report(findings, as_json)
     if not all(finding.ok for finding in findings):
         raise typer.Exit(1)
+
+
+def _report(findings: list[Finding], as_json: bool) -> None:
+    if as_json:
+        print_json([asdict(finding) for finding in findings])
+        return
+    for finding in findings:
+        mark = "[green]ok[/green]  " if finding.ok else "[red]look[/red]"
+        # What was found is no markup: a path may hold brackets.
+        answers.print(f"{mark} {finding.part}: {escape(finding.detail)}", soft_wrap=True)
 
 
 def _look(part: str, check: Callable[[Settings], str], settings: Settings) -> Finding:
@@ -106,25 +116,3 @@ def _server(settings: Settings) -> str:
     finally:
         catalog.close()
     return f"not running; {photos} photos are stored (start it: make run)"
-
-
-def _device(settings: Settings) -> str:
-    import torch
-
-    from shared.vision.extractors import choose_device
-
-    device = choose_device(settings.device)
-    if device.type == "cuda":
-        return f"CUDA: {torch.cuda.get_device_name(device)}, PyTorch {torch.__version__}"
-    return f"CPU, PyTorch {torch.__version__} (CUDA available: {torch.cuda.is_available()})"
-
-
-def _extractor(settings: Settings) -> str:
-    from shared.vision.extractors import Extractor, choose_device
-
-    recipe = get_recipe(settings.extractor, allow_test_extractors=settings.allow_test_extractors)
-    extractor = Extractor(recipe, choose_device(settings.device))
-    shipped = extractor.shipped_vocabulary()
-    return f"{recipe.name}: weights {extractor.backbone.fingerprint[:12]} load, " + (
-        f"{shipped[0].clusters} shipped centres" if shipped else "no shipped vocabulary"
-    )

@@ -379,15 +379,27 @@ def test_a_setting_that_can_not_be_read_is_named(tmp_path: Path) -> None:
 @pytest.mark.usefixtures("indexed")
 def test_doctor_finds_the_running_server(server: ServerProcess, placewise: CommandLine) -> None:
     findings = {finding["part"]: finding for finding in placewise("doctor", "--json").json()}
-    assert set(findings) == {"python", "folder", "server", "device", "extractor"}
+    assert set(findings) == {"python", "folder", "server", "device", "memory", "extractor"}
     assert all(finding["ok"] for finding in findings.values())
     assert str(server.client.base_url).rstrip("/") in findings["server"]["detail"]
     assert "test-tiny-avg" in findings["extractor"]["detail"]
 
 
 def test_doctor_says_what_needs_attention(tmp_path: Path) -> None:
-    command = CommandLine(tmp_path, tmp_path / "home", extractor="anylock-vitg14")
+    settings = {"extractor": "anyloc-vits14", "dino_weights": tmp_path / "[gone].pth"}
+    command = CommandLine(tmp_path, tmp_path / "home", **settings)
     findings = {f["part"]: f for f in command("doctor", "--json").json(code=1)}
     assert [part for part, finding in findings.items() if not finding["ok"]] == ["extractor"]
-    assert "anylock-vitg14" in findings["extractor"]["detail"]
+    assert "Three ways to get the weights of dinov2-vits14" in findings["extractor"]["detail"]
     assert "not running" in findings["server"]["detail"]
+    shown = command("doctor")
+    assert shown.code == 1
+    assert f"DINO_WEIGHTS={tmp_path}/[gone].pth does not exist" in shown.stdout
+
+
+def test_doctor_says_which_setting_keeps_everything_else_from_starting(tmp_path: Path) -> None:
+    command = CommandLine(tmp_path, tmp_path / "home", extractor="anylock-vitg14")
+    (finding,) = command("doctor", "--json").json(code=1)
+    assert (finding["part"], finding["ok"]) == ("settings", False)
+    assert "EXTRACTOR=anylock-vitg14" in finding["detail"]
+    assert "anyloc-vitg14" in finding["detail"]

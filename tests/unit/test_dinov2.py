@@ -177,6 +177,8 @@ def test_shapes_are_those_of_timms_networks_and_of_the_recipes(size: str) -> Non
         assert len(network.blocks) == shape.depth
         assert network.embed_dim == shape.width
         assert network.blocks[0].attn.num_heads == shape.heads
+        parameters = sum(tensor.numel() for tensor in network.parameters())
+        assert parameters <= recipe.parameters < 1.01 * parameters
         assert network.pos_embed.shape == (1, 1 + SIDE * SIDE, shape.width)
     assert network.pretrained_cfg["mean"] == (0.485, 0.456, 0.406)
     assert network.pretrained_cfg["std"] == (0.229, 0.224, 0.225)

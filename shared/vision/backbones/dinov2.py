@@ -125,12 +125,12 @@ class Dinov2:
         return torch.cat([prefix.expand(len(patches), -1, -1), placed], dim=1)
 
 
-def wanted_shapes(shape: VitShape, layer: int, facet: str) -> dict[str, tuple[int, ...]]:
-    """The tensors that this facet of this layer needs, under timm's names."""
-    return {
-        name: tuple(tensor.shape)
-        for name, tensor in _outline(shape, layer, facet).state_dict().items()
-    }
+def check_weights(
+    size: str, layer: int, facet: str, file: WeightsFile, *, shape: VitShape | None = None
+) -> None:
+    """Misconfigured (`weights_unfit`) when loading would refuse the file; reads its index only."""
+    shape = shape or SHAPES[size]
+    check_fit(file, _shapes(_outline(shape, layer, facet)), size, shape.registers)
 
 
 def resample_positions(
@@ -177,9 +177,13 @@ def _outline(shape: VitShape, layer: int, facet: str) -> Any:
     return vit.eval().requires_grad_(False)
 
 
+def _shapes(vit: Any) -> dict[str, tuple[int, ...]]:
+    return {name: tuple(tensor.shape) for name, tensor in vit.state_dict().items()}
+
+
 def _fill(vit: Any, file: WeightsFile, shape: VitShape, size: str, device: torch.device) -> str:
     """Give the outline its tensors; returns their sha256: name-sorted, as float32 bytes."""
-    wanted = {name: tuple(tensor.shape) for name, tensor in vit.state_dict().items()}
+    wanted = _shapes(vit)
     check_fit(file, wanted, size, shape.registers)
     digest = hashlib.sha256()
     state = {}

@@ -79,6 +79,20 @@ def find_weights(size: str, given: Path | None) -> Path:
     return cached_weights(size) or _download(size)
 
 
+def weights_at_hand(size: str, given: Path | None) -> Path:
+    """As `find_weights`, but what would have to be downloaded is missing."""
+    if given is None:
+        cached = cached_weights(size)
+        if cached is None:
+            raise _missing(
+                f"DINO_WEIGHTS is not set, and {hub_repository(size)} is not in the Hugging Face "
+                "cache of this machine.",
+                size,
+            )
+        return cached
+    return find_weights(size, given)
+
+
 def cached_weights(size: str) -> Path | None:
     """timm's file in the Hugging Face cache of this machine; asks no network."""
     import huggingface_hub

@@ -1,0 +1,108 @@
+"""The doctor's look at what describes photos: the device, its memory, the extractor's weights."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from shared.errors import Misconfigured
+from shared.recipes import Recipe, get_recipe
+from shared.settings import Settings
+
+PARAMETER_BYTES = 4  # float32
+# Twice what was measured in the forward pass of ViT-g, the widest, at 224 pixels: the next batch
+# is being decoded meanwhile.
+BATCH_PHOTO_BYTES = 40_000_000
+PROCESS_BYTES = 1_000_000_000  # PyTorch, or CUDA's context, before any weights
+CONTAINER_LIMIT = Path("/sys/fs/cgroup/memory.max")
+
+
+def device_check(settings: Settings) -> str:
+    """Where photos are described."""
+    import torch
+
+    from shared.vision.extractors import choose_device
+
+    device = choose_device(settings.device)
+    if device.type == "cuda":
+        return f"CUDA: {torch.cuda.get_device_name(device)}, PyTorch {torch.__version__}"
+    return f"CPU, PyTorch {torch.__version__} (CUDA available: {torch.cuda.is_available()})"
+
+
+def memory_check(settings: Settings) -> str:
+    """Whether the extractor of new maps fits into the memory of its device: an estimate."""
+    import torch
+
+    from shared.vision.extractors import choose_device
+
+    recipe = _recipe(settings)
+    device = choose_device(settings.device)
+    if device.type == "cuda":
+        there, whose = torch.cuda.get_device_properties(device).total_memory, "the GPU"
+    else:
+        there, whose = ram_bytes(), "this machine"
+    weights = recipe.parameters * PARAMETER_BYTES
+    batch = settings.batch_photos * BATCH_PHOTO_BYTES
+    needed = PROCESS_BYTES + weights + batch
+    estimate = (
+        f"{recipe.name} takes about {needed / 1e9:.1f} GB (weights {weights / 1e9:.1f}, a batch of "
+        f"{settings.batch_photos} photos {batch / 1e9:.1f}), {whose} has {there / 1e9:.1f} GB"
+    )
+    if needed <= there:
+        return estimate
+    ways = []
+    if PROCESS_BYTES + weights + BATCH_PHOTO_BYTES <= there:
+        ways.append(f"a smaller BATCH_PHOTOS than {settings.batch_photos}")
+    if recipe.depth is not None:
+        ways.append("a smaller DINO_MODEL (dinov2_vits14 takes 0.1 GB of weights)")
+    if device.type == "cuda":
+        ways.append("DEVICE=cpu")
+    raise Misconfigured("memory_short", f"{estimate}. Set {', or '.join(ways) or 'more memory'}.")
+
+
+def extractor_check(settings: Settings) -> str:
+    """Whether the extractor of new maps has its weights.
+
+    DINOv2's, up to 4.5 GB, are looked at without being loaded; the others are loaded.
+    """
+    recipe = _recipe(settings)
+    if recipe.depth is not None:
+        return _dinov2_check(recipe, settings.dino_weights)
+    from shared.vision.extractors import Extractor, choose_device
+
+    extractor = Extractor(recipe, choose_device(settings.device))
+    shipped = extractor.shipped_vocabulary()
+    return f"{recipe.name}: weights {extractor.backbone.fingerprint[:12]} load, " + (
+        f"{shipped[0].clusters} shipped centres" if shipped else "no shipped vocabulary"
+    )
+
+
+def ram_bytes() -> int:
+    """The memory that this process may have: the machine's, or less in a container."""
+    machine = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    try:
+        limit = CONTAINER_LIMIT.read_text().strip()
+    except OSError:
+        return machine
+    return min(machine, int(limit)) if limit.isdigit() else machine  # "max" is no limit
+
+
+def _dinov2_check(recipe: Recipe, given: Path | None) -> str:
+    from shared.vision.backbones.dinov2 import check_weights
+    from shared.vision.backbones.dinov2_weights import open_weights, weights_at_hand
+
+    assert recipe.layer is not None
+    assert recipe.facet is not None
+    size = recipe.backbone.removeprefix("dinov2-")
+    path = weights_at_hand(size, given)
+    check_weights(size, recipe.layer, recipe.facet, open_weights(path, size))
+    return (
+        f"{recipe.name}: the weights {path} ({path.stat().st_size / 1e9:.1f} GB) fit, no shipped "
+        f"vocabulary: photos wait until one is fitted on them or imported"
+    )
+
+
+def _recipe(settings: Settings) -> Recipe:
+    return get_recipe(
+        settings.new_map_extractor, allow_test_extractors=settings.allow_test_extractors
+    )

@@ -1,0 +1,149 @@
+"""The doctor's look at weights and memory: what works, and what to do about what does not."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from services.cli import extractor_checks
+from services.cli.extractor_checks import device_check, extractor_check, memory_check, ram_bytes
+from shared.errors import Misconfigured
+from shared.settings import Settings
+from shared.vision.backbones import dinov2
+from shared.vision.backbones.dinov2 import SHAPES
+from tests.support.vit import random_weights, save
+
+GB = 1_000_000_000
+
+
+def settings_with(monkeypatch: pytest.MonkeyPatch, **variables: str | Path) -> Settings:
+    """Settings without the extractor of the tests."""
+    monkeypatch.delenv("EXTRACTOR")
+    for name, value in variables.items():
+        monkeypatch.setenv(name, str(value))
+    return Settings()
+
+
+# --- weights ---------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def small(tmp_path: Path) -> Path:
+    """Weights of what `anyloc-vits14:layer=0` needs."""
+    return save(random_weights(SHAPES["vits14"], blocks=1), tmp_path / "vits.pth")
+
+
+def test_weights_that_fit_are_named_without_being_loaded(
+    monkeypatch: pytest.MonkeyPatch, small: Path
+) -> None:
+    def load(*_arguments: object) -> None:
+        raise AssertionError("the weights were loaded")
+
+    monkeypatch.setattr(dinov2, "_fill", load)
+    settings = settings_with(
+        monkeypatch, DINO_MODEL="dinov2_vits14", DESC_LAYER="0", DINO_WEIGHTS=small
+    )
+    said = extractor_check(settings)
+    assert "anyloc-vits14:layer=0" in said
+    assert str(small) in said
+    assert "GB) fit" in said
+
+
+def test_weights_without_the_chosen_layer_are_found_out(
+    monkeypatch: pytest.MonkeyPatch, small: Path
+) -> None:
+    settings = settings_with(monkeypatch, DINO_MODEL="dinov2_vits14", DINO_WEIGHTS=small)
+    with pytest.raises(Misconfigured, match=r"it has no tensor blocks\.1\.norm1\.weight") as caught:
+        extractor_check(settings)
+    assert caught.value.code == "weights_unfit"
+
+
+@pytest.mark.parametrize("given", [True, False])
+def test_missing_weights_come_with_three_ways_to_get_them(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, given: bool
+) -> None:
+    from huggingface_hub import constants
+
+    monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path / "hub"))
+    path = {"DINO_WEIGHTS": tmp_path / "gone.pth"} if given else {}
+    settings = settings_with(monkeypatch, DINO_MODEL="dinov2_vitg14", **path)
+    with pytest.raises(Misconfigured) as caught:
+        extractor_check(settings)
+    assert caught.value.code == "weights_missing"
+    assert ("gone.pth does not exist" if given else "not in the Hugging Face cache") in (
+        caught.value.detail
+    )
+    for way in ("(1)", "(2)", "(3)", "dinov2_vitg14_pretrain.pth"):
+        assert way in caught.value.detail
+
+
+def test_other_extractors_are_loaded() -> None:
+    assert "test-tiny-avg: weights" in extractor_check(Settings())
+
+
+# --- device and memory -----------------------------------------------------------------------
+
+
+def test_missing_cuda_is_found_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    settings = settings_with(monkeypatch, DEVICE="cuda")
+    for check in (device_check, memory_check):
+        with pytest.raises(Misconfigured, match="nvidia-smi"):
+            check(settings)
+
+
+def pretend_gpu(monkeypatch: pytest.MonkeyPatch, total: int) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(
+        torch.cuda, "get_device_properties", lambda _device: SimpleNamespace(total_memory=total)
+    )
+
+
+def test_memory_that_is_enough_is_shown_with_the_estimate(monkeypatch: pytest.MonkeyPatch) -> None:
+    pretend_gpu(monkeypatch, 16 * GB)
+    said = memory_check(settings_with(monkeypatch, DINO_MODEL="dinov2_vitg14", DEVICE="cuda"))
+    assert "anyloc-vitg14 takes about 6.2 GB (weights 4.5, a batch of 16 photos 0.6)" in said
+    assert "the GPU has 16.0 GB" in said
+
+
+def test_a_gpu_that_is_too_small_comes_with_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    pretend_gpu(monkeypatch, 4 * GB)
+    settings = settings_with(monkeypatch, DINO_MODEL="dinov2_vitg14", DEVICE="cuda")
+    with pytest.raises(Misconfigured) as caught:
+        memory_check(settings)
+    assert caught.value.code == "memory_short"
+    assert "a smaller DINO_MODEL" in caught.value.detail
+    assert "DEVICE=cpu" in caught.value.detail
+    assert "BATCH_PHOTOS" not in caught.value.detail, "the weights alone are too large"
+
+
+def test_a_batch_that_is_too_large_comes_with_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    pretend_gpu(monkeypatch, 6 * GB)
+    settings = settings_with(
+        monkeypatch, DINO_MODEL="dinov2_vitg14", DEVICE="cuda", BATCH_PHOTOS="64"
+    )
+    with pytest.raises(Misconfigured, match="a smaller BATCH_PHOTOS than 64"):
+        memory_check(settings)
+
+
+def test_ram_that_is_too_small_is_found_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(extractor_checks, "ram_bytes", lambda: 2 * GB)
+    settings = settings_with(monkeypatch, DINO_MODEL="dinov2_vitl14", DEVICE="cpu")
+    with pytest.raises(Misconfigured) as caught:
+        memory_check(settings)
+    assert "this machine has 2.0 GB" in caught.value.detail
+    assert "DEVICE=cpu" not in caught.value.detail
+
+
+def test_ram_of_a_container_is_its_limit(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    limit = tmp_path / "memory.max"
+    monkeypatch.setattr(extractor_checks, "CONTAINER_LIMIT", limit)
+    machine = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    assert ram_bytes() == machine
+    for written, expected in (("max\n", machine), ("1000000\n", 1_000_000), ("9" * 30, machine)):
+        limit.write_text(written)
+        assert ram_bytes() == expected
