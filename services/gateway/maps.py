@@ -26,8 +26,10 @@ from shared.catalog.maps import (
 )
 from shared.catalog.photos import PhotoRole, count_live
 from shared.catalog.vocabularies import standing_of
+from shared.errors import Misconfigured, invalid_field
 from shared.jobs import Job
 from shared.jobs.finish import cancel_all
+from shared.recipes import get_recipe
 
 router = APIRouter(tags=["maps"])
 
@@ -70,7 +72,13 @@ def maps(gateway: GatewayDep) -> list[MapAnswer]:
 def new_map(gateway: GatewayDep, wanted: NewMap) -> MapAnswer:
     """Make an empty map; 409 when the name is taken."""
     settings = gateway.settings
-    extractor = wanted.extractor or settings.extractor
+    try:
+        extractor = get_recipe(
+            wanted.extractor or settings.new_map_extractor,
+            allow_test_extractors=settings.allow_test_extractors,
+        ).name
+    except Misconfigured as error:
+        raise invalid_field("extractor", error.detail) from None
     with gateway.catalog.write() as session:
         return _answer(session, create_map(session, wanted.name, extractor))
 
@@ -90,7 +98,7 @@ def delete_map(gateway: GatewayDep, name: MapPath) -> MapDeleted:
         cancel_all(session, Job.map_id == map_.id)
         mark_map_deleted(session, map_)
         if name == DEFAULT_MAP:
-            ensure_default_map(session, gateway.settings.extractor)
+            ensure_default_map(session, gateway.settings.new_map_extractor)
     return MapDeleted(success=True, message=f"The map {name} is deleted.", deleted_map=name)
 
 
