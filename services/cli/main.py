@@ -10,6 +10,7 @@ from services.cli import (
     ask,
     bench,
     configuration,
+    datasets,
     doctor,
     evaluate,
     import_anyloc,
@@ -33,6 +34,7 @@ app.command("query")(ask.query)
 app.command("evaluate")(evaluate.evaluate)
 app.add_typer(maps.app, name="maps")
 app.add_typer(vocabulary.app, name="vocabulary")
+app.add_typer(datasets.app, name="datasets")
 app.add_typer(bench.app, name="bench")
 app.command("config")(configuration.config)
 app.command("doctor")(doctor.doctor)

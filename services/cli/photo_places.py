@@ -1,21 +1,15 @@
 """Where the photos of a folder were taken: from a CSV, or from `@UTM@` file names.
 
 EXIF is read by the server, and fills what is not said here.
-
-The `@` convention of visual place recognition data sets: `@ UTM_east @ UTM_north @ zone_number @
-zone_letter @ latitude @ longitude @ pano_id @ tile @ heading @ pitch @ roll @ height @ timestamp @
-note @ .jpg`; only the first two are always there.
 """
 
 from __future__ import annotations
 
-import contextlib
 import csv
 from dataclasses import dataclass
 from pathlib import Path
 
-import utm
-
+from shared.datasets.utm_names import fields_of_name
 from shared.errors import InvalidRequest
 
 SUFFIXES = {".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff"}
@@ -61,34 +55,6 @@ def find_photos(
             fields["place"] = path.parent.name
         found.append(FoundPhoto(path, {**fields, **said.get(path, {})}))
     return found
-
-
-def fields_of_name(name: str, utm_zone: str | None) -> dict[str, str]:
-    """What an `@UTM@` file name says; {} for any other name."""
-    parts = name.split("@")
-    if len(parts) < 4 or parts[0]:
-        return {}
-    parts += [""] * (16 - len(parts))
-    east, north, number, letter, latitude, longitude = parts[1:7]
-    if not (latitude and longitude):
-        zone = f"{number}{letter}" if number and letter else utm_zone
-        if zone is None:
-            raise InvalidRequest(
-                "no_utm_zone",
-                f"{name} says UTM east and north but no zone. Give it: --utm-zone 32T.",
-            )
-        try:
-            found = utm.to_latlon(float(east), float(north), int(zone[:-1]), zone[-1].upper())
-        except (ValueError, utm.OutOfRangeError) as error:
-            raise InvalidRequest(
-                "bad_coordinates",
-                f"{name}: its UTM coordinates can't be read ({error}).",
-            ) from error
-        latitude, longitude = f"{float(found[0]):.7f}", f"{float(found[1]):.7f}"
-    fields = {"latitude": latitude, "longitude": longitude}
-    with contextlib.suppress(ValueError):  # the heading is optional in the convention
-        fields["heading"] = f"{float(parts[9]) % 360:g}"
-    return fields
 
 
 def _read_table(folder: Path, table: Path, paths: set[Path]) -> dict[Path, dict[str, str]]:

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from services.cli.photo_places import fields_of_name, find_photos
+from services.cli.photo_places import find_photos
+from shared.datasets.utm_names import fields_of_name
 from shared.errors import InvalidRequest
 
 # The Mole Antonelliana in Turin, zone 32T.

@@ -1,0 +1,83 @@
+"""`placewise datasets synth`: a generated city in the layouts of the field."""
+
+from __future__ import annotations
+
+import re
+import time
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from services.cli.output import JsonOption, answers, explained, print_json, progress_bar
+from shared.datasets.city.plan import CityOptions, Plan, make_plan
+from shared.datasets.city.write import NOT_COMPARABLE, check_empty, describe, write_city
+
+SIZE = re.compile(r"(\d{2,4})x(\d{2,4})")
+
+app = typer.Typer(help="Data sets: make a city to try things on.", no_args_is_help=True)
+
+
+@app.callback()
+def _datasets() -> None:
+    """A group, so that each way of getting a data set has its own name."""
+
+
+def parse_size(text: str) -> tuple[int, int]:
+    """`320x240` -> (320, 240); typer.BadParameter for anything else, and outside 64 to 1920."""
+    match = SIZE.fullmatch(text)
+    if match is None or not all(64 <= int(side) <= 1920 for side in match.groups()):
+        raise typer.BadParameter("WxH is needed, each side from 64 to 1920, such as 320x240.")
+    return int(match[1]), int(match[2])
+
+
+@app.command("synth")
+def synth(
+    out: Annotated[Path, typer.Argument(help="Folder to write; it must not hold anything yet.")],
+    places: Annotated[int, typer.Option(min=1, max=20_000)] = 1000,
+    views: Annotated[int, typer.Option(min=1, max=32, help="Database photos per place.")] = 4,
+    queries: Annotated[
+        int | None, typer.Option(min=1, max=100_000, help="Left out: half as many as places.")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Which city of that style.")] = 0,
+    catalogue_seed: Annotated[
+        int, typer.Option(min=0, help="Which style: walls, colours, windows.")
+    ] = 0,
+    out_of_map: Annotated[
+        float,
+        typer.Option(min=0.0, max=1.0, help="Share of the queries taken outside the database."),
+    ] = 0.1,
+    size: Annotated[str, typer.Option(metavar="WxH", help="Of a photo, in pixels.")] = "320x240",
+    as_json: JsonOption = False,
+) -> None:
+    """Draw a made-up city: database, queries and a training set, the same for the same arguments.
+
+    OUT/database and OUT/queries have @UTM@ names; OUT/gsv_xs is what a trainer learns from, drawn
+    in streets of their own; OUT/city.json says how it was made and what kind each query is.
+    """
+    width, height = parse_size(size)
+    asked = queries if queries is not None else max(1, places // 2)
+    options = CityOptions(places, views, asked, seed, catalogue_seed, out_of_map, width, height)
+    with explained(as_json):
+        check_empty(out)
+        started = time.perf_counter()
+        plan = make_plan(options)
+        with progress_bar() as progress:
+            bar = progress.add_task("drawing", total=len(plan.shots))
+            write_city(plan, out, lambda count: progress.advance(bar, count))
+        seconds = time.perf_counter() - started
+        figures = _figures(plan, out, seconds)
+    if as_json:
+        print_json(figures)
+        return
+    answers.print(f"{len(plan.shots)} photos in {out}: {seconds:.1f} s.", soft_wrap=True)
+
+
+def _figures(plan: Plan, out: Path, seconds: float) -> dict[str, Any]:
+    about = describe(plan)
+    return {
+        "out": str(out),
+        "note": NOT_COMPARABLE,
+        **{key: about[key] for key in ("arguments", "counts", "query_kinds")},
+        "drawing": {"seconds": seconds, "photos_per_second": len(plan.shots) / seconds},
+    }

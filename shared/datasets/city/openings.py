@@ -1,0 +1,182 @@
+"""Windows and doors: types that a city repeats, each in a few variants of curtains and panes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from PIL import Image, ImageDraw
+
+from shared.datasets.city.codes import PANE_0, PANES, SHOP, SOLID
+from shared.datasets.city.walls import PIXELS_PER_METRE, Colour
+
+GLASS: tuple[Colour, ...] = ((70, 86, 100), (84, 98, 108), (58, 70, 82), (96, 112, 122))
+CURTAINS: tuple[Colour, ...] = ((214, 208, 196), (196, 184, 160), (224, 224, 222), (170, 150, 136))
+
+
+@dataclass(frozen=True, slots=True)
+class WindowType:
+    """How one type of window is built; metres."""
+
+    width: float
+    height: float
+    mullions: int
+    """upright bars between the panes"""
+    transoms: int
+    """level bars between the panes"""
+    frame: Colour
+    surround: Colour
+    surround_width: float
+    arched: bool
+    shutters: Colour | None
+    pediment: bool
+    balcony: bool
+
+
+def px(metres: float) -> int:
+    """Metres as whole pixels of a facade's texture."""
+    return round(metres * PIXELS_PER_METRE)
+
+
+def darker(colour: Colour, factor: float) -> Colour:
+    """The colour times the factor, within range."""
+    red, green, blue = (min(255, int(c * factor)) for c in colour)
+    return red, green, blue
+
+
+def draw_window(kind: WindowType, variant: int, rng: np.random.Generator) -> Image.Image:
+    """An RGBA picture with the codes of `codes` as its fourth channel; `variant` below PANES."""
+    width, height, edge = px(kind.width), px(kind.height), max(1, px(kind.surround_width))
+    wing = px(kind.width * 0.48) if kind.shutters else 0
+    top = edge + (px(0.28) if kind.pediment else 0) + (width // 3 if kind.arched else 0)
+    rail = px(0.95) if kind.balcony else 0
+    side = max(wing, px(0.35) if kind.balcony else 0) + edge
+    picture = Image.new("RGBA", (width + 2 * side, top + height + edge + 3), (0, 0, 0, 0))
+    draw = ImageDraw.Draw(picture)
+    left, right, bottom = side, side + width - 1, top + height - 1
+    trim = (*kind.surround, SOLID)
+    glass = (*GLASS[int(rng.integers(len(GLASS)))], PANE_0 + variant % PANES)
+    if kind.arched:
+        draw.ellipse(
+            (left - edge, top - width // 2 - edge, right + edge, top + width // 2 + edge), fill=trim
+        )
+        draw.ellipse((left, top - width // 2, right, top + width // 2), fill=glass)
+    draw.rectangle(
+        (left - edge, top if kind.arched else top - edge, right + edge, bottom + edge), fill=trim
+    )
+    draw.rectangle((left, top, right, bottom), fill=glass)
+    # The sky mirrored in the upper half, and the shadow of the reveal above and on the left.
+    for row in range(top, top + height // 2):
+        mirrored = darker(glass[:3], 1.32 - 0.32 * (row - top) / max(1, height // 2))
+        draw.line((left, row, right, row), fill=(*mirrored, glass[3]))
+    _curtain(draw, (left, top, right, bottom), variant, glass[3], rng)
+    frame = (*kind.frame, SOLID)
+    draw.rectangle((left, top, right, bottom), outline=frame, width=2)
+    for bar in range(1, kind.mullions + 1):
+        x = left + bar * width // (kind.mullions + 1)
+        draw.line((x, top, x, bottom), fill=frame, width=2)
+    for bar in range(1, kind.transoms + 1):
+        y = top + bar * height // (kind.transoms + 1)
+        draw.line((left, y, right, y), fill=frame, width=1)
+    draw.line((left, top, right, top), fill=(*darker(kind.surround, 0.45), SOLID), width=2)
+    sill = darker(kind.surround, 1.06)
+    draw.rectangle((left - edge - 2, bottom + 1, right + edge + 2, bottom + 3), fill=(*sill, SOLID))
+    draw.line((left - edge, bottom + 4, right + edge, bottom + 4), fill=(*darker(sill, 0.5), SOLID))
+    if kind.pediment:
+        _pediment(draw, left - edge - 2, right + edge + 2, top - edge, kind.surround)
+    if kind.shutters:
+        for x in (left - edge - wing, right + edge + 1):
+            _shutter(draw, (x, top, x + wing - 1, bottom), kind.shutters)
+    if kind.balcony:
+        _railing(draw, (1, bottom - rail + 2, picture.width - 2, bottom + 2))
+    return picture
+
+
+def _curtain(
+    draw: ImageDraw.ImageDraw,
+    box: tuple[int, int, int, int],
+    variant: int,
+    code: int,
+    rng: np.random.Generator,
+) -> None:
+    left, top, right, bottom = box
+    cloth = CURTAINS[int(rng.integers(len(CURTAINS)))]
+    fill = (*cloth, code)
+    width, height = right - left, bottom - top
+    style = variant % 5
+    if style == 1:  # drawn to both sides
+        draw.rectangle((left, top, left + width // 4, bottom), fill=fill)
+        draw.rectangle((right - width // 4, top, right, bottom), fill=fill)
+    elif style == 2:  # a blind, let down some way
+        draw.rectangle((left, top, right, top + int(height * rng.uniform(0.3, 0.7))), fill=fill)
+    elif style == 3:  # half a net curtain
+        draw.rectangle((left, top + height // 2, right, bottom), fill=fill)
+    elif style == 4 and variant > 4:  # closed
+        draw.rectangle(box, fill=fill)
+
+
+def _pediment(
+    draw: ImageDraw.ImageDraw, left: int, right: int, bottom: int, colour: Colour
+) -> None:
+    draw.rectangle((left, bottom - 3, right, bottom - 1), fill=(*darker(colour, 1.05), SOLID))
+    draw.polygon(
+        [(left, bottom - 4), (right, bottom - 4), ((left + right) // 2, bottom - 9)],
+        fill=(*colour, SOLID),
+    )
+    draw.line((left, bottom, right, bottom), fill=(*darker(colour, 0.55), SOLID))
+
+
+def _shutter(draw: ImageDraw.ImageDraw, box: tuple[int, int, int, int], colour: Colour) -> None:
+    draw.rectangle(box, fill=(*colour, SOLID), outline=(*darker(colour, 0.7), SOLID))
+    for y in range(box[1] + 3, box[3] - 1, 3):
+        draw.line((box[0] + 2, y, box[2] - 2, y), fill=(*darker(colour, 0.82), SOLID))
+
+
+def _railing(draw: ImageDraw.ImageDraw, box: tuple[int, int, int, int]) -> None:
+    left, top, right, bottom = box
+    iron = (44, 46, 50, SOLID)
+    draw.rectangle((left, bottom - 3, right, bottom), fill=(150, 146, 138, SOLID))
+    draw.line((left, top, right, top), fill=iron, width=2)
+    for x in range(left, right + 1, 4):
+        draw.line((x, top, x, bottom - 3), fill=iron)
+
+
+def draw_door(colour: Colour, panels: int, glazed: bool, rng: np.random.Generator) -> Image.Image:
+    """A house door of about 1.3 x 2.6 m with its frame and steps, RGBA with codes."""
+    width, height = px(1.3), px(2.6)
+    picture = Image.new("RGBA", (width + 8, height + 4), (168, 162, 150, SOLID))
+    draw = ImageDraw.Draw(picture)
+    draw.rectangle((4, 4, width + 3, height + 3), fill=(*colour, SOLID))
+    light = height // 5
+    draw.rectangle((6, 6, width + 1, light), fill=(*GLASS[0], PANE_0 + int(rng.integers(PANES))))
+    rows = max(1, panels)
+    for row in range(rows):
+        y0 = light + 5 + row * (height - light - 4) // rows
+        y1 = light + 1 + (row + 1) * (height - light - 4) // rows
+        for x0, x1 in ((7, width // 2 + 1), (width // 2 + 5, width)):
+            if glazed and row == 0:
+                draw.rectangle((x0, y0, x1, y1), fill=(*GLASS[1], PANE_0 + 3))
+            else:
+                draw.rectangle((x0, y0, x1, y1), outline=(*darker(colour, 0.62), SOLID))
+                draw.line((x0, y0, x1, y0), fill=(*darker(colour, 1.3), SOLID))
+    draw.line((width // 2 + 3, light, width // 2 + 3, height), fill=(*darker(colour, 0.5), SOLID))
+    draw.rectangle((0, height + 1, width + 7, height + 3), fill=(140, 136, 128, SOLID))
+    return picture
+
+
+def draw_shop_glass(width: int, height: int, rng: np.random.Generator) -> Image.Image:
+    """A display window of that many pixels, with things standing in it."""
+    picture = Image.new("RGBA", (width, height), (*darker(GLASS[2], 0.9), SHOP))
+    draw = ImageDraw.Draw(picture)
+    for row in range(height // 2):
+        shade = darker(GLASS[1], 1.15 - 0.4 * row / max(1, height // 2))
+        draw.line((0, row, width, row), fill=(*shade, SHOP))
+    x = int(rng.integers(2, 8))
+    while x < width - 6:
+        wide, high = int(rng.integers(4, 14)), int(height * rng.uniform(0.15, 0.55))
+        hue = rng.integers(60, 220, 3)
+        fill = (int(hue[0]), int(hue[1]), int(hue[2]), SHOP)
+        draw.rectangle((x, height - 3 - high, min(width - 3, x + wide), height - 3), fill=fill)
+        x += wide + int(rng.integers(3, 16))
+    draw.line((width // 5, height - 1, width // 3, 0), fill=(168, 182, 190, SHOP), width=2)
+    return picture

@@ -1,0 +1,91 @@
+"""All textures of a drawing process in one flat array, each with its smaller copies.
+
+One flat array lets a single gather read, for every column of a photo, from another texture at
+another size. Textures lie column by column, so that a photo's column reads neighbouring memory.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+LEVELS = 6
+"""each half as fine as the one before"""
+
+Packed = NDArray[np.uint32]
+
+
+@dataclass(frozen=True, slots=True)
+class Texture:
+    """Where one texture lies: one entry per level."""
+
+    offsets: NDArray[np.int64]
+    widths: NDArray[np.int64]
+    """columns"""
+    heights: NDArray[np.int64]
+    """rows, which is also the distance between two columns"""
+
+
+class TextureMemory:
+    """Textures by key; when it is full it forgets all of them and they are drawn again."""
+
+    def __init__(self, capacity: int = 36_000_000) -> None:
+        """`capacity` in pixels of 4 bytes; memory is taken as it is used."""
+        self.pixels: Packed = np.zeros(capacity, np.uint32)
+        self._used = 0
+        self._kept: dict[Hashable, Texture] = {}
+
+    def reserve(self, pixels: int) -> None:
+        """Forget everything unless that many more pixels fit."""
+        if self._used + pixels > len(self.pixels):
+            self._used = 0
+            self._kept.clear()
+
+    def get(self, key: Hashable, draw: Callable[[], Image.Image], *, rim: bool) -> Texture:
+        """The texture called `key`, drawn now if it is not kept.
+
+        `rim` gives every level a see-through edge of one pixel, for what is seen on all sides.
+        """
+        if key not in self._kept:
+            self._kept[key] = self._store(np.asarray(draw()), rim)
+        return self._kept[key]
+
+    def _store(self, picture: NDArray[np.uint8], rim: bool) -> Texture:
+        offsets, widths, heights = [], [], []
+        for level in range(LEVELS):
+            if level:
+                picture = halve(picture, careful=rim)
+            stored = np.pad(picture, ((1, 1), (1, 1), (0, 0))) if rim else picture
+            packed = np.ascontiguousarray(stored.transpose(1, 0, 2)).view(np.uint32).ravel()
+            self.pixels[self._used : self._used + len(packed)] = packed
+            offsets.append(self._used)
+            heights.append(stored.shape[0])
+            widths.append(stored.shape[1])
+            self._used += len(packed)
+        return Texture(np.array(offsets), np.array(widths), np.array(heights))
+
+
+def halve(picture: NDArray[np.uint8], *, careful: bool) -> NDArray[np.uint8]:
+    """(h, w, 4) -> (ceil(h / 2), ceil(w / 2), 4): mean colours, and one of the four codes.
+
+    `careful` leaves see-through pixels out of the mean, as outlines against the sky need it.
+    """
+    height, width = picture.shape[:2]
+    picture = np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
+    quads = picture.reshape(picture.shape[0] // 2, 2, picture.shape[1] // 2, 2, 4)
+    small = np.empty((quads.shape[0], quads.shape[2], 4), np.uint8)
+    colours = quads[..., :3].astype(np.uint16)
+    if not careful:
+        small[..., :3] = colours.sum(axis=(1, 3), dtype=np.uint16) >> 2
+        small[..., 3] = quads[:, 0, :, 0, 3]
+        return small
+    solid = (quads[..., 3] > 0).astype(np.uint16)
+    count = solid.sum(axis=(1, 3))
+    mean = (colours * solid[..., None]).sum(axis=(1, 3)) // np.maximum(count, 1)[..., None]
+    small[..., :3] = mean
+    small[..., 3] = np.where(count >= 2, quads[..., 3].max(axis=(1, 3)), 0)
+    return small

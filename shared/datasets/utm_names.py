@@ -1,0 +1,130 @@
+"""The `@UTM@` file names of visual place recognition data sets: read and written here alone.
+
+`@ UTM_east @ UTM_north @ zone_number @ zone_letter @ latitude @ longitude @ pano_id @ tile @
+heading @ pitch @ roll @ height @ timestamp @ note @ .jpg`; only the first two are always there.
+(github.com/gmberton/VPR-datasets-downloader, "Images naming convention")
+"""
+
+from __future__ import annotations
+
+import contextlib
+from dataclasses import dataclass
+from datetime import UTC, datetime
+
+import utm
+
+from shared.errors import InvalidRequest
+
+FIELDS = 16  # between the leading and the closing `@` lie 14; the split has two more
+FULL_DATES = {8: "%Y%m%d", 14: "%Y%m%d%H%M%S"}  # by their length; a year or a month is no day
+
+
+@dataclass(frozen=True, slots=True)
+class PhotoName:
+    """What a name of the convention says of a photo that is about to be written."""
+
+    east: float
+    """metres"""
+    north: float
+    """metres"""
+    zone_number: int
+    zone_letter: str
+    pano_id: str = ""
+    heading: float | None = None
+    """degrees clockwise from north"""
+    captured_at: datetime | None = None
+    """UTC"""
+    note: str = ""
+
+    def file_name(self, suffix: str = ".jpg") -> str:
+        """The name as the convention writes it; latitude and longitude follow from the UTM."""
+        if "@" in self.pano_id + self.note:
+            raise ValueError("the fields of an @UTM@ name can't hold an @")
+        latitude, longitude = _degrees(self.east, self.north, self.zone_number, self.zone_letter)
+        fields = (
+            f"{self.east:010.2f}",
+            f"{self.north:010.2f}",
+            f"{self.zone_number:02d}",
+            self.zone_letter,
+            f"{latitude:+010.6f}" if latitude < 0 else f"{latitude:09.6f}",
+            f"{longitude:+011.6f}" if longitude < 0 else f"{longitude:010.6f}",
+            self.pano_id,
+            "",
+            "" if self.heading is None else f"{self.heading % 360:06.2f}",
+            "",
+            "",
+            "",
+            f"{self.captured_at:%Y%m%d%H%M%S}" if self.captured_at else "",
+            self.note,
+        )
+        return f"@{'@'.join(fields)}@{suffix}"
+
+
+def position_of_name(name: str) -> tuple[float, float] | None:
+    """UTM east and north in metres as the name says them; None for any other name.
+
+    Raises InvalidRequest (`bad_coordinates`) where the convention's two numbers are none.
+    """
+    parts = name.split("@")
+    if len(parts) < 4 or parts[0]:
+        return None
+    try:
+        return float(parts[1]), float(parts[2])
+    except ValueError as error:
+        raise _bad_coordinates(name, error) from error
+
+
+def fields_of_name(name: str, utm_zone: str | None) -> dict[str, str]:
+    """What a name says, in the upload form's names; {} for a name of no such convention.
+
+    `utm_zone` (such as `32T`) is meant where the name has none. A timestamp becomes `captured_at`
+    only when it is a full date: `201905` names a month, and a photo is not taken in a month's first
+    second. Raises InvalidRequest (`no_utm_zone`, `bad_coordinates`).
+    """
+    parts = name.split("@")
+    if len(parts) < 4 or parts[0]:
+        return {}
+    parts += [""] * (FIELDS - len(parts))
+    east, north, number, letter, latitude, longitude = parts[1:7]
+    if not (latitude and longitude):
+        zone = f"{number}{letter}" if number and letter else utm_zone
+        if zone is None:
+            raise InvalidRequest(
+                "no_utm_zone",
+                f"{name} says UTM east and north but no zone. Give it: --utm-zone 32T.",
+            )
+        try:
+            found = _degrees(float(east), float(north), int(zone[:-1]), zone[-1].upper())
+        except (ValueError, utm.OutOfRangeError) as error:
+            raise _bad_coordinates(name, error) from error
+        latitude, longitude = f"{found[0]:.7f}", f"{found[1]:.7f}"
+    fields = {"latitude": latitude, "longitude": longitude}
+    with contextlib.suppress(ValueError):  # the heading is optional in the convention
+        fields["heading"] = f"{float(parts[9]) % 360:g}"
+    captured_at = _full_date(parts[13])
+    if captured_at:
+        fields["captured_at"] = captured_at.isoformat()
+    return fields
+
+
+def _degrees(east: float, north: float, number: int, letter: str) -> tuple[float, float]:
+    latitude, longitude = utm.to_latlon(east, north, number, letter)
+    return float(latitude), float(longitude)
+
+
+def _full_date(timestamp: str) -> datetime | None:
+    """The date of a timestamp field, the time with it where it is there; None for all others."""
+    digits = timestamp.replace("_", "")
+    pattern = FULL_DATES.get(len(digits)) if digits.isdecimal() and digits.isascii() else None
+    if pattern is None:
+        return None
+    try:
+        return datetime.strptime(digits, pattern).replace(tzinfo=UTC)
+    except ValueError:  # such as a thirteenth month: it is no date
+        return None
+
+
+def _bad_coordinates(name: str, error: Exception) -> InvalidRequest:
+    return InvalidRequest(
+        "bad_coordinates", f"{name}: its UTM coordinates can't be read ({error})."
+    )
