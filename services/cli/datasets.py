@@ -8,11 +8,16 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from rich.table import Column, Table
 
+from services.cli.ladder import KS, climb
 from services.cli.output import JsonOption, answers, explained, print_json, progress_bar
 from shared.datasets.city.plan import CityOptions, Plan, make_plan
 from shared.datasets.city.write import NOT_COMPARABLE, check_empty, describe, write_city
 
+Json = dict[str, Any]
+
+KINDS = ("R@1 in map", "R@1 other way")
 SIZE = re.compile(r"(\d{2,4})x(\d{2,4})")
 
 app = typer.Typer(help="Data sets: make a city to try things on.", no_args_is_help=True)
@@ -48,6 +53,9 @@ def synth(
         typer.Option(min=0.0, max=1.0, help="Share of the queries taken outside the database."),
     ] = 0.1,
     size: Annotated[str, typer.Option(metavar="WxH", help="Of a photo, in pixels.")] = "320x240",
+    ladder: Annotated[
+        bool, typer.Option(help="Measure how hard the city is; takes a network and minutes.")
+    ] = True,
     as_json: JsonOption = False,
 ) -> None:
     """Draw a made-up city: database, queries and a training set, the same for the same arguments.
@@ -65,15 +73,53 @@ def synth(
         with progress_bar() as progress:
             bar = progress.add_task("drawing", total=len(plan.shots))
             write_city(plan, out, lambda count: progress.advance(bar, count))
-        seconds = time.perf_counter() - started
-        figures = _figures(plan, out, seconds)
+            seconds = time.perf_counter() - started
+            rungs = climb(plan, out, progress) if ladder else []
+        figures = {
+            **_figures(plan, out, seconds),
+            "ladder": rungs,
+            "seconds": time.perf_counter() - started,
+        }
     if as_json:
         print_json(figures)
         return
-    answers.print(f"{len(plan.shots)} photos in {out}: {seconds:.1f} s.", soft_wrap=True)
+    _show(figures)
 
 
-def _figures(plan: Plan, out: Path, seconds: float) -> dict[str, Any]:
+def _show(figures: Json) -> None:
+    counts, kinds, drawing = figures["counts"], figures["query_kinds"], figures["drawing"]
+    answers.print(
+        f"{figures['out']}: {counts['database']} database photos, {counts['query']} queries, "
+        f"{counts['train']} to learn from; {drawing['photos_per_second']:.0f} photos/s drawn, "
+        f"{figures['seconds']:.0f} s in all.",
+        soft_wrap=True,
+    )
+    if not figures["ladder"]:
+        return
+    table = Table("rung", *(Column(f"R@{k}", justify="right") for k in KS), *KINDS)
+    for rung in figures["ladder"]:
+        table.add_row(
+            rung["rung"],
+            *(_percent(rung["recall"][str(k)]) for k in KS),
+            *(
+                _percent(rung[f"recall_{kind}"]["1"]) if rung[f"recall_{kind}"] else "-"
+                for kind in ("in_map", "other_way")
+            ),
+        )
+    answers.print(table)
+    answers.print(
+        f"Over the {kinds.get('in_map', 0)} queries in the map and the "
+        f"{kinds.get('other_way', 0)} there that look the other way; 25 m rule.",
+        soft_wrap=True,
+    )
+    answers.print(NOT_COMPARABLE, soft_wrap=True)
+
+
+def _percent(share: float) -> str:
+    return f"{share:.1%}"
+
+
+def _figures(plan: Plan, out: Path, seconds: float) -> Json:
     about = describe(plan)
     return {
         "out": str(out),

@@ -18,8 +18,11 @@ from shared.datasets.city.sessions import Session
 from shared.datasets.city.walls import Grey, smooth_noise
 
 CLOUD_SHAPE = (256, 1024)
-GRAIN_SHAPE = (1200, 1200)
-LAMPLIGHT = np.array([0.62, 0.46, 0.24], np.float32)
+GRAIN = 2048
+"""pixels each way: more than the largest photo"""
+SKY_COARSE = 4
+LAMPLIGHT = (0.62, 0.46, 0.24)
+GLOW = (1.5, 1.2, 0.75)
 
 Light = NDArray[np.float32]
 
@@ -30,6 +33,7 @@ class Film:
 
     clouds: Grey
     grain: Light
+    """(3, GRAIN, GRAIN) of standard deviation 1"""
 
     @classmethod
     def of(cls, seed: int) -> Film:
@@ -39,7 +43,7 @@ class Film:
             + 0.3 * smooth_noise(rng, CLOUD_SHAPE, 24)
             + 0.15 * smooth_noise(rng, CLOUD_SHAPE, 8)
         )
-        grain = rng.standard_normal((*GRAIN_SHAPE, 3), dtype=np.float32)
+        grain = rng.standard_normal((3, GRAIN, GRAIN), dtype=np.float32)
         return cls(np.asarray(clouds, np.float32), grain)
 
 
@@ -47,106 +51,130 @@ def develop(
     view: View, camera: Camera, session: Session, film: Film, rng: np.random.Generator
 ) -> Image.Image:
     """The RGB photo; `rng` is the photo's own."""
-    texels = view.canvas.view(np.uint8).reshape(
-        camera.width, FINE, camera.height, FINE, 4
-    )  # x, fine x, y, fine y, channel
-    colours = np.zeros((camera.width, camera.height, 3), np.float32)
-    cover = np.zeros((camera.width, camera.height), np.float32)
-    shine = np.zeros((camera.width, camera.height), np.float32)
-    table = light_table(session.lit_panes, session.glow)
-    for i in range(FINE):
-        for j in range(FINE):
-            part = texels[:, i, :, j]
-            colours += part[..., :3]
-            cover += part[..., 3] > 0
-            if session.glow:
-                shine += table[part[..., 3]]
-    colours *= np.float32(1 / (255 * FINE**2))
-    cover *= np.float32(1 / FINE**2)
-    shine *= np.float32(1 / FINE**2)
+    light = _light(view, session)
+    colours = _mean_colours(view)  # three planes: far faster than pixels of three
+    solid = (view.canvas >= 1 << 24).view(np.uint8)
+    cover = _mean(solid).astype(np.float32)
     if session.snow or session.wet:
-        _weather(colours, texels[:, 0, :, 0, 3] == FLAT, view, camera, session)
-    light = view.sun[..., None] * np.asarray(session.sun, np.float32)
-    light += np.asarray(session.ambient, np.float32)
-    if session.glow > 0.9:
-        light += view.lamp[:, None, None] * LAMPLIGHT
-    if session.glow:
-        light += shine[..., None] * np.array([1.5, 1.2, 0.75], np.float32)
-    colours *= light
-    through = np.exp(-session.haze_per_m * np.minimum(view.depth, 1000.0))[..., None]
-    haze = np.asarray(session.haze, np.float32)
-    # Where only sky is, cover is 0; a rim pixel takes its share of both.
-    colours *= through
-    colours += cover[..., None] * (1 - through) * haze
-    colours += (1 - cover)[..., None] * _sky(camera, session, film, rng)
+        _weather(colours, view, camera, session)
+    through = np.exp(-session.haze_per_m * np.minimum(view.depth, 1000.0)).astype(np.float32)
+    veil = cover * (1 - through)
+    gap = None if cover.all() else 1 - cover
+    sky = None if gap is None else _sky(camera, session, film, rng)
+    for plane in range(3):
+        # Where only sky is, cover is 0; a rim pixel takes its share of both.
+        colours[plane] *= light[plane]
+        colours[plane] *= through
+        colours[plane] += veil * np.float32(session.haze[plane])
+        if sky is not None:
+            colours[plane] += gap * sky[plane]
     return _expose(colours, session, film, rng)
 
 
-def _weather(
-    colours: Light,
-    flat: NDArray[np.bool_],
-    view: View,
-    camera: Camera,
-    session: Session,
-) -> None:
+def _mean(fine: NDArray[np.uint8] | Light) -> Light:
+    """(FINE * w, FINE * h) -> (w, h) means."""
+    total = fine[::FINE, ::FINE].astype(np.float32)
+    for i, j in ((0, 1), (1, 0), (1, 1)):
+        total += fine[i::FINE, j::FINE]
+    return total * np.float32(1 / FINE**2)
+
+
+def _mean_colours(view: View) -> Light:
+    """(3, width, height) shares of full brightness; what is see-through counts as black."""
+    wide, high = view.canvas.shape
+    packed = Image.frombuffer("RGBX", (high, wide), view.canvas, "raw", "RGBX", 0, 1)
+    small = np.asarray(packed.reduce(FINE))
+    planes = np.empty((3, *small.shape[:2]), np.float32)
+    for plane in range(3):
+        np.multiply(small[..., plane], np.float32(1 / 255), out=planes[plane])
+    return planes
+
+
+def _light(view: View, session: Session) -> Light:
+    """(3, width, height) what falls on each pixel, and what it gives by itself."""
+    light = np.empty((3, *view.sun.shape), np.float32)
+    shine = None
+    if session.glow:
+        codes = view.canvas >> 24
+        shine = _mean(light_table(session.lit_panes, session.glow).take(codes))
+    for plane in range(3):
+        np.multiply(view.sun, np.float32(session.sun[plane]), out=light[plane])
+        light[plane] += np.float32(session.ambient[plane])
+        if session.lamps:
+            light[plane] += view.lamp[:, None] * np.float32(session.lamps * LAMPLIGHT[plane])
+        if shine is not None:
+            light[plane] += shine * np.float32(GLOW[plane])
+    return light
+
+
+def _weather(colours: Light, view: View, camera: Camera, session: Session) -> None:
     """Snow whitens what lies open to the sky; rain darkens the ground and lets it mirror."""
+    flat = (view.canvas[::FINE, ::FINE] >> 24) == FLAT
     if session.snow:
-        trodden = session.snow * (0.75 + 0.25 * np.cos(np.arange(camera.width) * 0.07))
-        share = (flat * trodden[:, None])[..., None].astype(np.float32)
-        colours += share * (np.float32(0.80) * (0.6 + 0.4 * colours / 0.6) - colours)
+        share = flat * np.float32(session.snow)
+        for plane in colours:
+            plane += share * (np.float32(0.48) + np.float32(0.53) * plane - plane)
     if session.wet:
-        ground = flat & (np.arange(camera.height) > camera.horizon * camera.height)
-        gleam = np.asarray(session.sky_horizon, np.float32) * np.float32(0.35)
-        share = (ground * np.float32(session.wet))[..., None]
-        colours += share * (colours * 0.55 + gleam * 0.5 - colours)
+        below = np.arange(camera.height) > camera.horizon * camera.height
+        share = (flat & below) * np.float32(session.wet)
+        for plane, gleam in zip(colours, session.sky_horizon, strict=True):
+            plane += share * (np.float32(0.18 * gleam) - np.float32(0.45) * plane)
 
 
 def _sky(camera: Camera, session: Session, film: Film, rng: np.random.Generator) -> Light:
-    """(width, height, 3): a gradient by elevation, with clouds."""
-    rows = np.arange(camera.height, dtype=np.float32)
+    """(3, width, height): a gradient by elevation, with clouds; coarse, then made smooth."""
+    width, height = camera.width // SKY_COARSE, camera.height // SKY_COARSE
+    rows = np.arange(height, dtype=np.float32) * SKY_COARSE
     elevation = np.clip((camera.horizon * camera.height - rows) / camera.focal, 0, 1.2)
     share = (1 - np.exp(-elevation * 2.2))[:, None]
-    gradient = share * np.asarray(session.sky_top) + (1 - share) * np.asarray(session.sky_horizon)
-    x0 = int(camera.yaw % 360 / 360 * (CLOUD_SHAPE[1] // 2)) + int(rng.integers(64))
     wide = max(8, int(camera.fov / 360 * CLOUD_SHAPE[1]))
+    x0 = int(camera.yaw / 360 * CLOUD_SHAPE[1] / 2) + int(rng.integers(64))
     x0 %= CLOUD_SHAPE[1] - wide
     y0 = int(rng.integers(CLOUD_SHAPE[0] - 128))
     clouds = Image.fromarray(film.clouds).resize(
-        (camera.width, camera.height), Image.Resampling.BILINEAR, box=(x0, y0, x0 + wide, y0 + 128)
+        (width, height), Image.Resampling.BILINEAR, box=(x0, y0, x0 + wide, y0 + 128)
     )
-    mask = np.clip((np.asarray(clouds).T + 2 * session.clouds - 0.9) * 2.0, 0, 1)[..., None]
-    white = np.minimum(1.0, np.asarray(session.sky_horizon) * 1.05 + 0.02)
-    mask = mask * (0.35 + 0.5 * share[None])
-    sky = gradient[None] * (1 - mask) + white * mask
-    return np.asarray(sky, np.float32)
+    mask = np.clip((np.asarray(clouds) + 2 * session.clouds - 0.9) * 2.0, 0, 1)
+    mask *= 0.35 + 0.5 * share
+    planes = np.empty((3, camera.width, camera.height), np.float32)
+    for plane, (top, horizon) in enumerate(zip(session.sky_top, session.sky_horizon, strict=True)):
+        clear = share * top + (1 - share) * horizon
+        coarse = clear + mask * (min(1.0, horizon * 1.05 + 0.02) - clear)
+        image = Image.fromarray(coarse.astype(np.float32))
+        smooth = image.resize((camera.width, camera.height), Image.Resampling.BILINEAR)
+        planes[plane] = np.asarray(smooth).T
+    return planes
 
 
 def _expose(colours: Light, session: Session, film: Film, rng: np.random.Generator) -> Image.Image:
     """Exposure, white balance, contrast, vignette, blur and grain."""
-    gain = np.asarray(session.gain) * math.exp(rng.normal(0, session.exposure_spread))
-    if session.mixing:
-        grey = colours.mean(axis=2, keepdims=True)
-        colours += np.float32(session.mixing) * (grey - colours)
-    colours *= (gain * 255 * rng.normal(1, 0.01, 3)).astype(np.float32)
-    if session.contrast != 1:
-        colours -= 118
-        colours *= np.float32(session.contrast)
-        colours += 118
-    width, height = colours.shape[:2]
+    exposure = math.exp(rng.normal(0, session.exposure_spread))
+    balance = np.asarray(session.gain) * rng.normal(1, 0.01, 3) * exposure * 255
+    _, width, height = colours.shape
     across = np.linspace(-1, 1, width, dtype=np.float32)[:, None] ** 2
     down = np.linspace(-1, 1, height, dtype=np.float32)[None] ** 2
-    colours *= (1 - 0.09 * (across + down))[..., None]
-    x, y = (int(rng.integers(max(1, GRAIN_SHAPE[k] - (width, height)[k]))) for k in (0, 1))
-    grain = film.grain[x : x + width, y : y + height]
-    if session.blur:
-        np.clip(colours, 0, 255, out=colours)
-        soft = Image.fromarray(colours.astype(np.uint8).transpose(1, 0, 2)).filter(
-            ImageFilter.BoxBlur(session.blur)
-        )
-        colours = np.asarray(soft).transpose(1, 0, 2).astype(np.float32)
-    colours += np.float32(session.noise) * grain
-    np.clip(colours, 0, 255, out=colours)
-    return Image.fromarray(np.ascontiguousarray(colours.astype(np.uint8).transpose(1, 0, 2)))
+    vignette = (1 - np.float32(0.09) * (across + down)) * np.float32(session.contrast)
+    if session.mixing:
+        grey = (colours[0] + colours[1] + colours[2]) * np.float32(session.mixing / 3)
+        colours *= np.float32(1 - session.mixing)
+        colours += grey
+    x, y = (int(rng.integers(GRAIN - side)) for side in (width, height))
+    photo = np.empty((height, width, 3), np.uint8)
+    for plane in range(3):
+        colours[plane] *= vignette * np.float32(balance[plane])
+        colours[plane] += np.float32(118 * (1 - session.contrast))
+        if not session.blur:
+            grain = film.grain[plane, x : x + width, y : y + height]
+            colours[plane] += np.float32(session.noise) * grain
+        np.clip(colours[plane], 0, 255, out=colours[plane])
+        photo[..., plane] = colours[plane].T
+    image = Image.fromarray(photo)
+    if session.blur:  # the lens comes before the sensor: grain is not blurred
+        image = image.filter(ImageFilter.BoxBlur(session.blur))
+        grain = film.grain[:, x : x + width, y : y + height].transpose(2, 1, 0)
+        noisy = np.asarray(image) + np.float32(session.noise) * grain
+        image = Image.fromarray(np.clip(noisy, 0, 255).astype(np.uint8))
+    return image
 
 
 def encode(photo: Image.Image, session: Session) -> bytes:

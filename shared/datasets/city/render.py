@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,8 +37,11 @@ FINE = 2
 """canvas pixels per photo pixel, each way"""
 FACADES_WITHIN_M = 190.0
 THINGS_WITHIN_M = 75.0
+BLADES_WITHIN_M = 45.0
 NEAREST_M = 1.3
 """what is nearer to the lens is left out"""
+LARGEST_REACH_M = 4.0
+"""half of the longest vehicle, and some more"""
 KERB_M = 0.16
 LARGEST_HOUSE_PIXELS = 420 * 640 * 4 // 3
 
@@ -143,7 +147,7 @@ class Painter:
             house = self.quarter.house(int(number), int(lot))
             texture = self.memory.get(
                 (self.quarter.name, int(number), int(lot)),
-                lambda house=house: draw_house(house, self.catalogue),
+                partial(draw_house, house, self.catalogue),
                 rim=False,
             )
             at = level[here]
@@ -266,39 +270,49 @@ class Painter:
         self, camera: Camera, session: Session, sides: NDArray[np.int64], slopes: Floats
     ) -> Iterable[_Item]:
         away = np.hypot(*(self._middles - camera.position).T)
-        for number in np.flatnonzero(away < THINGS_WITHIN_M + 60.0):
-            street = self.quarter.streets[number]
-            if number not in self._standing:
-                self._standing[number] = standing_things(self.quarter, street, self.catalogue)
-            for thing in self._standing[number]:
-                item = self._billboard(camera, session, thing)
+        for number in np.flatnonzero(away < THINGS_WITHIN_M + 60.0).tolist():
+            things = self._standing_at(number)
+            for i in _in_sight(camera, [thing.position for thing in things], THINGS_WITHIN_M):
+                item = self._billboard(camera, session, things[i])
                 if item:
                     yield item
-            key = (int(number), session.name)
-            if key not in self._vehicles:
-                self._vehicles[key] = passing_vehicles(
-                    self.quarter, street, self.catalogue, session.name
-                )
-            for vehicle in self._vehicles[key]:
-                gap = vehicle.position - camera.position
-                if np.hypot(*gap) > THINGS_WITHIN_M or gap @ camera.forward < NEAREST_M:
-                    continue
-                for panel in vehicle_panels(vehicle, self.catalogue, camera.position):
+            vehicles = self._vehicles_at(number, session.name)
+            for i in _in_sight(camera, [v.position for v in vehicles], THINGS_WITHIN_M):
+                for panel in vehicle_panels(vehicles[i], self.catalogue, camera.position):
                     item = _panel_item(camera, panel, slopes)
                     if item:
                         yield item
-        for number in sides:
-            if number not in self._blades:
-                self._blades[number] = shop_blades(self.quarter, int(number), self.catalogue)
-            for foot, outwards, index in self._blades[number]:
-                picture = self.catalogue.blades[index]
-                tip = foot + outwards * BLADE_REACH_M
-                for start, direction in ((foot, outwards), (tip, -outwards)):
-                    item = _panel_item(
-                        camera, Panel(start, direction, picture, ("blade", index)), slopes
-                    )
-                    if item:
-                        yield item
+        for side in sides.tolist():
+            blades = self._blades_at(side)
+            for i in _in_sight(camera, [foot for foot, _, _ in blades], BLADES_WITHIN_M):
+                foot, outwards, index = blades[i]
+                away = camera.position - foot
+                # Only one of its two faces is turned towards the camera.
+                from_right = away[0] * outwards[1] - away[1] * outwards[0] > 0
+                start = foot if from_right else foot + outwards * BLADE_REACH_M
+                direction = outwards if from_right else -outwards
+                panel = Panel(start, direction, self.catalogue.blades[index], ("blade", index))
+                item = _panel_item(camera, panel, slopes)
+                if item:
+                    yield item
+
+    def _standing_at(self, number: int) -> list[Thing]:
+        if number not in self._standing:
+            street = self.quarter.streets[number]
+            self._standing[number] = standing_things(self.quarter, street, self.catalogue)
+        return self._standing[number]
+
+    def _vehicles_at(self, number: int, day: str) -> list[Vehicle]:
+        key = (number, day)
+        if key not in self._vehicles:
+            street = self.quarter.streets[number]
+            self._vehicles[key] = passing_vehicles(self.quarter, street, self.catalogue, day)
+        return self._vehicles[key]
+
+    def _blades_at(self, side: int) -> list[tuple[Metres, Metres, int]]:
+        if side not in self._blades:
+            self._blades[side] = shop_blades(self.quarter, side, self.catalogue)
+        return self._blades[side]
 
     def _billboard(self, camera: Camera, session: Session, thing: Thing) -> _Item | None:
         away = thing.position - camera.position
@@ -319,7 +333,9 @@ class Painter:
         if last <= first:
             return None
         alongs = (np.arange(first, last) + 0.5 - middle) / scale - left
-        return _Item(depth, first, np.full(last - first, depth), alongs, picture, key)
+        return _Item(
+            depth, first, np.full(last - first, depth), np.asarray(alongs, np.float64), picture, key
+        )
 
     def _paint_item(self, view: View, camera: Camera, item: _Item, walls: Floats) -> None:
         columns = np.arange(item.first, item.first + len(item.depths))
@@ -339,10 +355,11 @@ class Painter:
         last = min(view.canvas.shape[1], lowest + 2)
         if last <= first:
             return
+        scale = np.asarray(scale, np.float64)
+        tops = np.full(len(columns), top)
         texels = self._gather(
-            camera, columns, item.depths, np.full(len(columns), top), scale, offset, rows,
-            first, last, rim=1,
-        )  # fmt: skip
+            camera, columns, item.depths, tops, scale, offset, rows, first, last, rim=1
+        )
         solid = texels >= 1 << 24
         solid &= (item.depths < walls[columns] + 0.05)[:, None]  # else a house stands before it
         region = view.canvas[item.first : item.first + len(columns), first:last]
@@ -354,6 +371,17 @@ class Painter:
         depths = np.broadcast_to(item.depths[odd_x::FINE, None].astype(np.float32), coarse.shape)
         np.copyto(view.depth[box], depths, where=coarse)
         np.copyto(view.sun[box], np.float32(0.5), where=coarse)
+
+
+def _in_sight(camera: Camera, positions: list[Metres], within: float) -> list[int]:
+    """Which of the positions lie before the camera, not far off, and about in its view."""
+    if not positions:
+        return []
+    away = np.stack(positions) - camera.position
+    depth, lateral = away @ camera.forward, away @ camera.right
+    reach = depth * (camera.width / 2 / camera.focal) + LARGEST_REACH_M
+    seen = (depth > NEAREST_M) & (depth < within) & (np.abs(lateral) < reach)
+    return [int(i) for i in np.flatnonzero(seen)]
 
 
 def _panel_item(camera: Camera, panel: Panel, slopes: Floats) -> _Item | None:
@@ -389,7 +417,7 @@ def _level(
 ) -> NDArray[np.int64]:
     """Which smaller copy to read, so that about one texel falls on one canvas pixel."""
     texels = finest * depth / (camera.focal * FINE)
-    return np.clip(np.log2(np.maximum(texels, 1.0)) + bias, 0, LEVELS - 1).astype(np.int64)
+    return np.asarray(np.clip(np.log2(np.maximum(texels, 1.0)) + bias, 0, LEVELS - 1), np.int64)
 
 
 def _row_of(camera: Camera, z: float, depth: Floats, columns: NDArray[np.int64]) -> Floats:

@@ -31,6 +31,8 @@ class Session:
     """which of the eight kinds of panes are lit"""
     glow: float = 0.0
     """strength of lit windows, signs and lamps"""
+    lamps: float = 0.0
+    """strength of the street lamps"""
     snow: float = 0.0
     wet: float = 0.0
     gain: Rgb = (1.0, 1.0, 1.0)
@@ -131,6 +133,7 @@ NIGHT = Session(
     haze_per_m=0.004,
     lit_panes=(0, 2, 5),
     glow=1.0,
+    lamps=1.0,
     gain=(1.05, 0.98, 0.92),
     contrast=1.05,
     exposure_spread=0.15,

@@ -1,0 +1,112 @@
+"""The ladder's rungs that need a network. Imports torch: only `ladder` imports this, when asked."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import timm
+import torch
+from numpy.typing import NDArray
+from PIL import Image
+from torch.nn.functional import normalize
+
+from shared.vision.backbones.base import normalise_pixels
+from shared.vision.backbones.efficientnet_lite0 import MEAN, STD
+from shared.vision.extractors import RECIPES, Extractor, choose_device
+from shared.vision.kmeans import MAX_ITERATIONS, TOLERANCE, iterate, seed_centres
+from shared.vision.vlad import vlad
+
+EXTRACTOR = "efficientnet-lite0-vlad"
+BATCH = 16
+FIT_PHOTOS = 300
+FIT_PATCHES_PER_PHOTO = 98
+SEED = 0
+
+Rows = NDArray[np.float32]
+
+
+class NetworkRungs:
+    """Describes photos with an untrained network and with the default extractor twice."""
+
+    names = (
+        "untrained network",
+        f"{EXTRACTOR}, shipped vocabulary",
+        f"{EXTRACTOR}, fitted vocabulary",
+    )
+
+    def __init__(self, database: Sequence[Path]) -> None:
+        """`database` are the photos that the fitted vocabulary is learnt from."""
+        self.extractor = Extractor(RECIPES[EXTRACTOR], choose_device("auto"))
+        device = self.extractor.backbone.device
+        torch.manual_seed(SEED)
+        self._untrained = timm.create_model(
+            "tf_efficientnet_lite0", pretrained=False, features_only=True, out_indices=(3,)
+        )
+        self._untrained.eval().requires_grad_(False).to(device)
+        shipped = self.extractor.shipped_vocabulary()
+        assert shipped is not None
+        self._shipped = torch.from_numpy(shipped[0].array).to(device)
+        self._fitted = self._fit(database)
+
+    @torch.inference_mode()
+    def _fit(self, database: Sequence[Path]) -> torch.Tensor:
+        """(clusters, width) centres learnt from evenly spaced photos of the database."""
+        chosen = [database[int(i)] for i in np.linspace(0, len(database) - 1, FIT_PHOTOS)]
+        generator = torch.Generator().manual_seed(SEED)
+        parts = []
+        for pixels in self._batches(list(dict.fromkeys(chosen))):
+            features = self.extractor.features(pixels)
+            for one in features:
+                order = torch.randperm(len(one), generator=generator)[:FIT_PATCHES_PER_PHOTO]
+                parts.append(one[order.to(one.device)])
+        points = torch.cat(parts)
+        centres = seed_centres(points, self.extractor.recipe.clusters, SEED)
+        for _ in range(MAX_ITERATIONS):
+            centres, movement = iterate(points, centres)
+            if movement <= TOLERANCE:
+                break
+        return centres
+
+    @torch.inference_mode()
+    def describe(self, paths: Sequence[Path], advance: Callable[[int], None]) -> dict[str, Rows]:
+        """Unit rows of every photo, by rung; `advance` is told how many more are done."""
+        rows: dict[str, list[Rows]] = {name: [] for name in self.names}
+        for pixels in self._batches(paths):
+            features = self.extractor.features(pixels)
+            described = (
+                self._untrained_rows(pixels),
+                vlad(features, self._shipped),
+                vlad(features, self._fitted),
+            )
+            for name, batch in zip(self.names, described, strict=True):
+                rows[name].append(batch.cpu().numpy())
+            advance(len(pixels))
+        return {name: np.concatenate(parts) for name, parts in rows.items()}
+
+    def _untrained_rows(self, pixels: NDArray[np.uint8]) -> torch.Tensor:
+        on_device = torch.from_numpy(pixels).to(self.extractor.backbone.device)
+        maps = self._untrained(normalise_pixels(on_device, MEAN, STD))[0]
+        return normalize(normalize(maps.flatten(2), dim=1).mean(dim=-1), dim=-1)
+
+    def _batches(self, paths: Sequence[Path]) -> Iterator[NDArray[np.uint8]]:
+        """(up to BATCH, H, W, 3) uint8, in the order of the paths."""
+
+        def read(path: Path) -> NDArray[np.uint8]:
+            with Image.open(path) as image:
+                return np.asarray(self.extractor.preprocessing.apply(image.convert("RGB")))
+
+        with ThreadPoolExecutor(1) as reader:  # the next batch is decoded beside the network
+            starts = range(0, len(paths), BATCH)
+            pending = None
+            for start in starts:
+                upcoming = reader.submit(
+                    lambda s=start: np.stack([read(path) for path in paths[s : s + BATCH]])
+                )
+                if pending is not None:
+                    yield pending.result()
+                pending = upcoming
+            if pending is not None:
+                yield pending.result()
