@@ -98,13 +98,13 @@ class NetworkRungs:
             with Image.open(path) as image:
                 return np.asarray(self.extractor.preprocessing.apply(image.convert("RGB")))
 
+        def read_batch(start: int) -> NDArray[np.uint8]:
+            return np.stack([read(path) for path in paths[start : start + BATCH]])
+
         with ThreadPoolExecutor(1) as reader:  # the next batch is decoded beside the network
-            starts = range(0, len(paths), BATCH)
             pending = None
-            for start in starts:
-                upcoming = reader.submit(
-                    lambda s=start: np.stack([read(path) for path in paths[s : s + BATCH]])
-                )
+            for start in range(0, len(paths), BATCH):
+                upcoming = reader.submit(read_batch, start)
                 if pending is not None:
                     yield pending.result()
                 pending = upcoming

@@ -24,6 +24,7 @@ from shared.datasets.city.street_things import (
     draw_post_sign,
     draw_tree,
     draw_vehicle_end,
+    draw_vehicle_screen,
     draw_vehicle_side,
 )
 from shared.datasets.city.walls import WALL_KINDS, Colour, draw_wall
@@ -70,6 +71,10 @@ class Catalogue:
     vehicle_sides: tuple[Picture, ...]
     vehicle_fronts: tuple[Picture, ...]
     vehicle_rears: tuple[Picture, ...]
+    vehicle_screens: tuple[Picture, ...]
+    """the cabin's front and back"""
+    cabins: tuple[tuple[float, float], ...]
+    """metres from the nose to the cabin's front and to its back"""
     lamps: tuple[Picture, ...]
     posts: tuple[Picture, ...]
     boxes: tuple[Picture, ...]
@@ -92,7 +97,7 @@ def make_catalogue(seed: int) -> Catalogue:
     shapes = [
         (rng.uniform(5.5, 9.5), rng.uniform(3.2, 6.0), rng.uniform(2.0, 2.9)) for _ in range(TREES)
     ]
-    leaf = _colour(rng.uniform(0.20, 0.33), rng.uniform(0.35, 0.6), rng.uniform(0.32, 0.48))
+    leaf = _colour(rng.uniform(0.20, 0.29), rng.uniform(0.35, 0.5), rng.uniform(0.36, 0.48))
     vehicles = [(shape, paint) for shape in VEHICLE_SHAPES for paint in VEHICLE_PAINTS]
     iron = _colour(rng.uniform(), 0.25, 0.25)
     names = [
@@ -128,6 +133,14 @@ def make_catalogue(seed: int) -> Catalogue:
         vehicle_sides=tuple(draw_vehicle_side(*vehicle) for vehicle in vehicles),
         vehicle_fronts=tuple(draw_vehicle_end(*vehicle, rear=False) for vehicle in vehicles),
         vehicle_rears=tuple(draw_vehicle_end(*vehicle, rear=True) for vehicle in vehicles),
+        vehicle_screens=tuple(draw_vehicle_screen(*vehicle) for vehicle in vehicles),
+        cabins=tuple(
+            (
+                shape.length * (shape.cabin[0] + shape.slope / 2),
+                shape.length * (shape.cabin[1] - shape.slope / 2),
+            )
+            for shape, _ in vehicles
+        ),
         lamps=(draw_lamp(iron, 5.5),),
         posts=tuple(draw_post_sign(i, rng) for i in range(4)),
         boxes=tuple(

@@ -16,7 +16,7 @@ TILE_M = 16.0
 def draw_asphalt(seed: int) -> Image.Image:
     """A square tile of TILE_M metres that wraps around."""
     rng = stream(seed, "asphalt")
-    light = 0.36 + 0.012 * rng.normal(0, 1, (TILE_PIXELS, TILE_PIXELS)).astype(np.float32)
+    light = 0.42 + 0.012 * rng.normal(0, 1, (TILE_PIXELS, TILE_PIXELS)).astype(np.float32)
     light += 0.03 * smooth_noise(rng, light.shape, 64) + 0.015 * smooth_noise(rng, light.shape, 16)
     for _ in range(5):  # patches where it was mended
         x, y = rng.integers(0, TILE_PIXELS - 90, 2)

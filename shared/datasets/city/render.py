@@ -306,7 +306,7 @@ class Painter:
         key = (number, day)
         if key not in self._vehicles:
             street = self.quarter.streets[number]
-            self._vehicles[key] = passing_vehicles(self.quarter, street, self.catalogue, day)
+            self._vehicles[key] = passing_vehicles(self.quarter, street, day)
         return self._vehicles[key]
 
     def _blades_at(self, side: int) -> list[tuple[Metres, Metres, int]]:
@@ -355,10 +355,10 @@ class Painter:
         last = min(view.canvas.shape[1], lowest + 2)
         if last <= first:
             return
-        scale = np.asarray(scale, np.float64)
+        scales = np.asarray(scale, np.float64)
         tops = np.full(len(columns), top)
         texels = self._gather(
-            camera, columns, item.depths, tops, scale, offset, rows, first, last, rim=1
+            camera, columns, item.depths, tops, scales, offset, rows, first, last, rim=1
         )
         solid = texels >= 1 << 24
         solid &= (item.depths < walls[columns] + 0.05)[:, None]  # else a house stands before it

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from shared.datasets.city.catalogue import Catalogue
+from shared.datasets.city.catalogue import VEHICLE_PAINTS, Catalogue
 from shared.datasets.city.random_streams import stream
-from shared.datasets.city.street_things import Picture
+from shared.datasets.city.street_things import VEHICLE_SHARES, Picture
 from shared.datasets.city.streets import PAVEMENT_M, Metres, Quarter, Street
 
 KERB_CLEARANCE_M = 1.05
@@ -81,19 +81,16 @@ def standing_things(quarter: Quarter, street: Street, catalogue: Catalogue) -> l
     return things
 
 
-def passing_vehicles(
-    quarter: Quarter, street: Street, catalogue: Catalogue, day: str
-) -> list[Vehicle]:
+def passing_vehicles(quarter: Quarter, street: Street, day: str) -> list[Vehicle]:
     """The vehicles of one day: parked at both kerbs, and a few on the move."""
     rng = stream(quarter.seed, quarter.name, "vehicles", street.number, day)
     vehicles = []
-    kinds = len(catalogue.vehicle_sides)
     lane = street.half_width - PAVEMENT_M - KERB_CLEARANCE_M
     for side in (-1.0, 1.0):
         along = CORNER_M + rng.uniform(0, 6) + street.half_width
         while along < street.length - CORNER_M - street.half_width:
             if rng.uniform() < street.parking:
-                index = int(rng.integers(kinds))
+                index = _any_vehicle(rng)
                 middle = street.start + street.direction * along
                 vehicles.append(
                     Vehicle(middle + street.left * side * lane, street.direction * -side, index)
@@ -106,10 +103,16 @@ def passing_vehicles(
             Vehicle(
                 middle + street.left * side * lane * 0.4,
                 street.direction * -side,
-                int(rng.integers(kinds)),
+                _any_vehicle(rng),
             )
         )
     return vehicles
+
+
+def _any_vehicle(rng: np.random.Generator) -> int:
+    """Its index in the catalogue, where all paints of one shape follow each other."""
+    shape = int(rng.choice(len(VEHICLE_SHARES), p=VEHICLE_SHARES))
+    return shape * len(VEHICLE_PAINTS) + int(rng.integers(len(VEHICLE_PAINTS)))
 
 
 def vehicle_panels(vehicle: Vehicle, catalogue: Catalogue, seen_from: Metres) -> list[Panel]:
@@ -127,13 +130,19 @@ def vehicle_panels(vehicle: Vehicle, catalogue: Catalogue, seen_from: Metres) ->
     elif away @ left < -half_width:
         start = vehicle.position - left * half_width - ahead * half_length
         panels.append(Panel(start, ahead, side, ("side", vehicle.index), mirrored=True))
+    screen = catalogue.vehicle_screens[vehicle.index]
+    to_front, to_back = (half_length - metres for metres in catalogue.cabins[vehicle.index])
     if away @ ahead > half_length:
         start = vehicle.position + ahead * half_length - left * half_width
         panels.append(Panel(start, left, front, ("front", vehicle.index)))
+        start = vehicle.position + ahead * to_front - left * half_width
+        panels.append(Panel(start, left, screen, ("screen", vehicle.index)))
     elif away @ ahead < -half_length:
         start = vehicle.position - ahead * half_length + left * half_width
         rear = catalogue.vehicle_rears[vehicle.index]
         panels.append(Panel(start, -left, rear, ("rear", vehicle.index)))
+        start = vehicle.position + ahead * to_back + left * half_width
+        panels.append(Panel(start, -left, screen, ("screen", vehicle.index)))
     return panels
 
 

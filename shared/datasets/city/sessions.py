@@ -59,7 +59,7 @@ SUMMER = Session(
     clouds=0.35,
     sun_azimuth=205.0,
     sun=(0.46, 0.43, 0.37),
-    ambient=(0.70, 0.72, 0.76),
+    ambient=(0.76, 0.78, 0.82),
     haze=(0.78, 0.85, 0.92),
     haze_per_m=0.0012,
 )

@@ -39,7 +39,7 @@ def draw_tree(
     The same `shape_seed` gives the same tree in every foliage.
     """
     rng = np.random.default_rng(shape_seed)
-    scale = THING_PIXELS_PER_METRE // 2  # leaves need no finer picture
+    scale = THING_PIXELS_PER_METRE * 3 // 4  # leaves need no finer picture
     width, tall = round(crown * scale), round(height * scale)
     picture = Image.new("RGBA", (width, tall), (0, 0, 0, 0))
     draw = ImageDraw.Draw(picture)
@@ -59,7 +59,7 @@ def draw_tree(
     crown_height = (height - trunk) * scale
     for _ in range(26):  # branches
         angle = rng.uniform(-1.15, 1.15)
-        long = crown_height * rng.uniform(0.45, 0.98)
+        long = crown_height * rng.uniform(0.40, 0.85)
         start = fork - int(rng.uniform(0, 0.35) * crown_height)
         end = (middle + np.sin(angle) * long * 0.62, start - np.cos(angle) * long * 0.75)
         draw.line(
@@ -73,16 +73,21 @@ def draw_tree(
     tones = {
         "summer": leaves,
         "spring": darker((leaves[0] + 26, leaves[1] + 22, leaves[2]), 1.12),
-        "autumn": ((190, 120, 44), (172, 82, 40), (196, 158, 62))[shape_seed % 3],
+        "autumn": ((176, 118, 52), (150, 84, 48), (178, 148, 70))[shape_seed % 3],
     }
-    density = {"spring": 250, "summer": 420, "autumn": 260}[foliage]
-    for _ in range(density):
-        angle, radius = rng.uniform(0, 2 * np.pi), np.sqrt(rng.uniform(0, 1))
-        x = middle + np.cos(angle) * radius * width * 0.44
-        y = fork - crown_height * 0.48 + np.sin(angle) * radius * crown_height * 0.50
-        size = rng.uniform(0.10, 0.26) * scale * 1.6
-        lit = 0.72 + 0.42 * (fork - y) / max(1.0, crown_height) + rng.normal(0, 0.10)
-        tone = darker(tones[foliage], float(np.clip(lit, 0.45, 1.35)))
+    density = {"spring": 1300, "summer": 2200, "autumn": 1300}[foliage]
+    limbs = [
+        (rng.uniform(-0.26, 0.26), rng.uniform(-0.34, 0.30), rng.uniform(0.26, 0.38))
+        for _ in range(7)
+    ] + [(0.0, 0.0, 0.44)]
+    for leaf in range(density):
+        across, up, reach = limbs[leaf % len(limbs)]
+        angle, radius = rng.uniform(0, 2 * np.pi), np.sqrt(rng.uniform(0, 1)) * reach
+        x = middle + (across + np.cos(angle) * radius) * width * 0.86
+        y = fork - crown_height * (0.47 + (up + np.sin(angle) * radius) * 0.72)
+        size = rng.uniform(0.08, 0.18) * scale
+        lit = 0.70 + 0.45 * (fork - y) / max(1.0, crown_height) + rng.normal(0, 0.13)
+        tone = darker(tones[foliage], float(np.clip(lit, 0.42, 1.4)))
         draw.ellipse((x - size, y - size * 0.8, x + size, y + size * 0.8), fill=(*tone, SOLID))
     return Picture(picture, crown, height)
 
@@ -102,6 +107,8 @@ class VehicleShape:
     windows: int
 
 
+VEHICLE_SHARES = (0.30, 0.25, 0.25, 0.15, 0.05)
+"""of the shapes in traffic"""
 VEHICLE_SHAPES = (
     VehicleShape(4.1, 1.48, 1.75, 0.92, (0.20, 0.96), 0.10, 2),  # hatchback
     VehicleShape(4.6, 1.44, 1.80, 0.90, (0.22, 0.84), 0.11, 2),  # saloon
@@ -170,39 +177,41 @@ def _wheel(draw: ImageDraw.ImageDraw, x: int, y: int, radius: int) -> None:
 
 
 def draw_vehicle_end(shape: VehicleShape, paint: Colour, rear: bool) -> Picture:
-    """The vehicle from the front or from behind."""
-    width, tall = _px(shape.width), _px(shape.height)
+    """The body's nose or tail, up to the bonnet."""
+    width, tall = _px(shape.width), _px(shape.bonnet)
     picture = Image.new("RGBA", (width, tall + 2), (0, 0, 0, 0))
     draw = ImageDraw.Draw(picture)
-    bonnet = _px(min(shape.bonnet, 1.3))
     draw.rectangle((4, tall - 12, width - 5, tall + 1), fill=(24, 24, 26, SOLID))
-    draw.rounded_rectangle((0, tall - bonnet, width - 1, tall - 8), radius=7, fill=(*paint, SOLID))
-    draw.polygon(
-        [
-            (3, tall - bonnet + 3),
-            (width // 9, 1),
-            (width - width // 9, 1),
-            (width - 4, tall - bonnet + 3),
-        ],
-        fill=(*paint, SOLID),
-    )
-    draw.polygon(
-        [
-            (8, tall - bonnet),
-            (width // 8 + 4, 6),
-            (width - width // 8 - 4, 6),
-            (width - 9, tall - bonnet),
-        ],
-        fill=(58, 68, 78, SOLID),
-    )
+    draw.rounded_rectangle((0, 0, width - 1, tall - 8), radius=5, fill=(*paint, SOLID))
+    draw.line((4, 0, width - 5, 0), fill=(*darker(paint, 1.2), FLAT), width=2)
+    draw.rectangle((1, tall - _px(0.5), width - 2, tall - 9), fill=(*darker(paint, 0.72), SOLID))
+    top = 6 if shape.bonnet < 2 else tall - _px(0.9)
     lamp = (170, 30, 28, LAMP) if rear else (238, 234, 212, LAMP)
     for x in (3, width - 15):
-        draw.rectangle((x, tall - bonnet + 8, x + 11, tall - bonnet + 15), fill=lamp)
-    draw.rectangle(
-        (width // 2 - 10, tall - _px(0.5), width // 2 + 10, tall - _px(0.5) + 5),
-        fill=(226, 226, 220, SOLID),
-    )
+        draw.rectangle((x, top, x + 11, top + 7), fill=lamp)
+    if not rear:
+        grille = (18, top + 1, width - 19, top + 7)
+        draw.rectangle(grille, fill=(*darker(paint, 0.45), SOLID))
+    plate = (width // 2 - 10, tall - _px(0.45), width // 2 + 10, tall - _px(0.45) + 5)
+    draw.rectangle(plate, fill=(226, 226, 220, SOLID))
     return Picture(picture, shape.width, (tall + 2) / THING_PIXELS_PER_METRE)
+
+
+def draw_vehicle_screen(shape: VehicleShape, paint: Colour) -> Picture:
+    """The cabin's front or back above the bonnet; a little lower, so that no gap shows."""
+    overlap = 0.14
+    width, tall = _px(shape.width), _px(shape.height - shape.bonnet + overlap)
+    picture = Image.new("RGBA", (width, tall), (0, 0, 0, 0))
+    draw = ImageDraw.Draw(picture)
+    lean, hem = width // 11, _px(overlap)
+    outline = [(1, tall - 1), (lean, 0), (width - 1 - lean, 0), (width - 2, tall - 1)]
+    draw.polygon(outline, fill=(*paint, SOLID))
+    if tall > 3 * hem:
+        glass = [(7, tall - hem), (lean + 4, 5), (width - 5 - lean, 5), (width - 8, tall - hem)]
+        draw.polygon(glass, fill=(58, 68, 78, SOLID))
+        draw.line((lean + 5, 7, width - 6 - lean, 7), fill=(128, 142, 152, SOLID), width=2)
+    bottom = shape.bonnet - overlap
+    return Picture(picture, shape.width, tall / THING_PIXELS_PER_METRE, bottom)
 
 
 def draw_lamp(colour: Colour, height: float) -> Picture:
