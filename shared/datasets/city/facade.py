@@ -186,7 +186,7 @@ def _street_level(
             )
             sign = catalogue.signs[shop]
             if sign.width > wide:
-                sign = sign.crop((0, 0, wide, sign.height))
+                sign = sign.resize((wide, sign.height), Image.Resampling.NEAREST)
             draw.rectangle(
                 (left, top - 24, left + wide, top - 2),
                 fill=(*darker(catalogue.trims[2], 0.6), SOLID),

@@ -1,0 +1,95 @@
+"""The @UTM@ file names: what is written is what is read."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+
+import pytest
+
+from shared.datasets.utm_names import PhotoName, fields_of_name, position_of_name
+from shared.errors import InvalidRequest
+
+MOLE = PhotoName(
+    east=396877.76,
+    north=4991561.25,
+    zone_number=32,
+    zone_letter="T",
+    pano_id="pano",
+    heading=-10.5,
+    captured_at=datetime(2026, 5, 1, 9, 30, 7, tzinfo=UTC),
+    note="spring",
+)
+
+
+def stamped(timestamp: str) -> str:
+    return f"@396877.76@4991561.25@32@T@45.0@7.0@@@@@@@{timestamp}@@.jpg"
+
+
+def test_written_name_has_all_fields_in_the_order_of_the_convention() -> None:
+    parts = MOLE.file_name().split("@")
+    assert len(parts) == 16
+    assert parts[1:5] == ["0396877.76", "4991561.25", "32", "T"]
+    assert parts[7] == "pano"
+    assert parts[9] == "349.50"
+    assert parts[13:] == ["20260501093007", "spring", ".jpg"]
+
+
+def test_what_is_written_is_read_again() -> None:
+    fields = fields_of_name(MOLE.file_name(), None)
+    assert float(fields["latitude"]) == pytest.approx(45.07, abs=0.01)
+    assert float(fields["longitude"]) == pytest.approx(7.69, abs=0.01)
+    assert fields["heading"] == "349.5"
+    assert datetime.fromisoformat(fields["captured_at"]) == MOLE.captured_at
+
+
+def test_written_degrees_are_exact_to_a_fifth_of_a_metre() -> None:
+    with_degrees = fields_of_name(MOLE.file_name(), None)
+    from_utm = fields_of_name("@396877.76@4991561.25@32@T@.jpg", None)
+    assert float(with_degrees["latitude"]) == pytest.approx(float(from_utm["latitude"]), abs=1.5e-6)
+    assert float(with_degrees["longitude"]) == pytest.approx(
+        float(from_utm["longitude"]), abs=1.5e-6
+    )
+
+
+def test_southern_and_western_degrees_keep_their_sign() -> None:
+    rio = PhotoName(east=683466.0, north=7460687.0, zone_number=23, zone_letter="K")
+    fields = fields_of_name(rio.file_name(), None)
+    assert float(fields["latitude"]) == pytest.approx(-22.95, abs=0.01)
+    assert float(fields["longitude"]) == pytest.approx(-43.21, abs=0.01)
+    assert "heading" not in fields
+    assert "captured_at" not in fields
+
+
+def test_field_with_an_at_sign_is_refused_because_it_would_shift_all_others() -> None:
+    with pytest.raises(ValueError, match="@"):
+        PhotoName(396877.76, 4991561.25, 32, "T", note="a@b").file_name()
+
+
+@pytest.mark.parametrize(
+    ("timestamp", "expected"),
+    [
+        ("20260501", "2026-05-01T00:00:00+00:00"),
+        ("20260501093007", "2026-05-01T09:30:07+00:00"),
+        ("20260501_093007", "2026-05-01T09:30:07+00:00"),
+    ],
+)
+def test_full_date_becomes_the_time_of_capture(timestamp: str, expected: str) -> None:
+    assert fields_of_name(stamped(timestamp), None)["captured_at"] == expected
+
+
+@pytest.mark.parametrize("timestamp", ["", "2019", "201905", "20191301", "2019050125", "yesterday"])
+def test_shorter_or_impossible_timestamp_is_left_alone(timestamp: str) -> None:
+    assert "captured_at" not in fields_of_name(stamped(timestamp), None)
+
+
+def test_position_is_the_two_first_fields() -> None:
+    assert position_of_name(MOLE.file_name()) == (396877.76, 4991561.25)
+    assert position_of_name("@1.5@2.5@.jpg") == (1.5, 2.5)
+    assert position_of_name("photo.jpg") is None
+
+
+def test_position_that_is_no_number_names_the_file() -> None:
+    with pytest.raises(InvalidRequest) as caught:
+        position_of_name("@east@2@.jpg")
+    assert caught.value.code == "bad_coordinates"
+    assert "@east@2@.jpg" in caught.value.detail
