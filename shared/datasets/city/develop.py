@@ -18,8 +18,8 @@ from shared.datasets.city.sessions import Session
 from shared.datasets.city.walls import Grey, smooth_noise
 
 CLOUD_SHAPE = (256, 1024)
-GRAIN = 2048
-"""pixels each way: more than the largest photo"""
+GRAIN_SPARE = 256
+"""pixels each way by which the grain is larger than a photo: so each gets another cut of it"""
 SKY_COARSE = 4
 LAMPLIGHT = (0.62, 0.46, 0.24)
 GLOW = (1.5, 1.2, 0.75)
@@ -33,17 +33,19 @@ class Film:
 
     clouds: Grey
     grain: Light
-    """(3, GRAIN, GRAIN) of standard deviation 1"""
+    """(3, width + GRAIN_SPARE, height + GRAIN_SPARE) of standard deviation 1"""
 
     @classmethod
-    def of(cls, seed: int) -> Film:
+    def of(cls, seed: int, width: int, height: int) -> Film:
+        """For photos of that many pixels."""
         rng = stream(seed, "film")
         clouds = (
             0.6 * smooth_noise(rng, CLOUD_SHAPE, 64)
             + 0.3 * smooth_noise(rng, CLOUD_SHAPE, 24)
             + 0.15 * smooth_noise(rng, CLOUD_SHAPE, 8)
         )
-        grain = rng.standard_normal((3, GRAIN, GRAIN), dtype=np.float32)
+        shape = (3, width + GRAIN_SPARE, height + GRAIN_SPARE)
+        grain = rng.standard_normal(shape, dtype=np.float32)
         return cls(np.asarray(clouds, np.float32), grain)
 
 
@@ -158,7 +160,7 @@ def _expose(colours: Light, session: Session, film: Film, rng: np.random.Generat
         grey = (colours[0] + colours[1] + colours[2]) * np.float32(session.mixing / 3)
         colours *= np.float32(1 - session.mixing)
         colours += grey
-    x, y = (int(rng.integers(GRAIN - side)) for side in (width, height))
+    x, y = (int(at) for at in rng.integers(GRAIN_SPARE, size=2))
     photo = np.empty((height, width, 3), np.uint8)
     for plane in range(3):
         colours[plane] *= vignette * np.float32(balance[plane])

@@ -46,16 +46,21 @@ def write_city(plan: Plan, out: Path, drawn: Callable[[int], None] = lambda coun
     for folder in sorted({shot.folder for shot in plan.shots} | {"database", "queries"}):
         (out / folder).mkdir(parents=True, exist_ok=True)
     starts = range(0, len(plan.shots), SHOTS_PER_TASK)
-    workers = min(len(starts), len(os.sched_getaffinity(0)))
-    # Spawned, not forked: the parent may hold threads, and a fork of those can hang.
-    with ProcessPoolExecutor(
-        workers,
-        mp_context=multiprocessing.get_context("spawn"),
-        initializer=_open_workshop,
-        initargs=(plan, out),
-    ) as pool:
-        for done in as_completed([pool.submit(_draw, start) for start in starts]):
-            drawn(done.result())
+    workers = min(len(starts), os.cpu_count() or 1)
+    if workers <= 1:  # not worth a process
+        workshop = _Workshop(plan, out)
+        for start in starts:
+            drawn(workshop.draw(start))
+    else:
+        # Spawned, not forked: the parent may hold threads, and a fork of those can hang.
+        with ProcessPoolExecutor(
+            workers,
+            mp_context=multiprocessing.get_context("spawn"),
+            initializer=_open_workshop,
+            initargs=(plan, out),
+        ) as pool:
+            for done in as_completed([pool.submit(_draw, start) for start in starts]):
+                drawn(done.result())
     _write_gsv_table(plan, out)
     (out / "city.json").write_text(json.dumps(describe(plan), indent=1) + "\n")
 
@@ -103,7 +108,7 @@ class _Workshop:
         self.plan = plan
         self.out = out
         self.catalogue = make_catalogue(plan.options.catalogue_seed)
-        self.film = Film.of(plan.options.catalogue_seed)
+        self.film = Film.of(plan.options.catalogue_seed, plan.options.width, plan.options.height)
         memory = TextureMemory()
         self.painters = {
             name: Painter(quarter, self.catalogue, memory)
