@@ -15,7 +15,7 @@ from shared.datasets.utm_names import fields_of_name, position_of_name
 from tests.support.server import environment, run_command
 
 SMALL = ("--places", "12", "--queries", "10", "--size", "96x72")
-TINY = ("--places", "3", "--queries", "7", "--size", "64x64")
+TINY = ("--places", "3", "--queries", "8", "--size", "64x64")
 NOTE = "generated: not comparable with published figures"
 
 
