@@ -34,7 +34,7 @@ def catalogue() -> Catalogue:
 
 @pytest.fixture(scope="module")
 def painter(plan: Plan, catalogue: Catalogue) -> Painter:
-    return Painter(plan.quarters["map"], catalogue, TextureMemory(8_000_000))
+    return Painter(plan.quarters["map"], catalogue, TextureMemory())
 
 
 def of_role(plan: Plan, role: str) -> list[Shot]:

@@ -57,6 +57,11 @@ class House:
         """Height of the texture's upper edge."""
         return self.eaves + HEADROOM
 
+    @property
+    def pixels(self) -> int:
+        """Of its texture."""
+        return px(self.width) * px(self.top)
+
 
 def arrange(rng: np.random.Generator, width: float, shopping: float, floors: int) -> House:
     """A house for a plot `width` metres wide; `shopping` is the share of bays with a shop."""

@@ -43,7 +43,6 @@ NEAREST_M = 1.3
 LARGEST_REACH_M = 4.0
 """half of the longest vehicle, and some more"""
 KERB_M = 0.16
-LARGEST_HOUSE_PIXELS = 420 * 640 * 4 // 3
 
 Packed = NDArray[np.uint32]
 WHITE_LINE = np.uint32(0x1EC8CCCC)
@@ -140,15 +139,15 @@ class Painter:
         offset = np.empty(len(columns), np.int64)
         rows = np.empty(len(columns), np.int64)
         top = np.empty(len(columns))
-        houses = np.unique(np.stack([side, plot], axis=1), axis=0)
-        self.memory.reserve(len(houses) * LARGEST_HOUSE_PIXELS)
+        houses = sorted(set(zip(side.tolist(), plot.tolist(), strict=True)))
+        self.memory.make_room(
+            {self._key(*house): self.quarter.house(*house).pixels for house in houses}
+        )
         for number, lot in houses:
             here = np.flatnonzero((side == number) & (plot == lot))
-            house = self.quarter.house(int(number), int(lot))
+            house = self.quarter.house(number, lot)
             texture = self.memory.get(
-                (self.quarter.name, int(number), int(lot)),
-                partial(draw_house, house, self.catalogue),
-                rim=False,
+                self._key(number, lot), partial(draw_house, house, self.catalogue), rim=False
             )
             at = level[here]
             scale = PIXELS_PER_METRE / 2.0**at
@@ -171,6 +170,9 @@ class Painter:
         view.sun[xs] = self._sunlit(session, side[coarse])[:, None]
         wave = 0.5 + 0.5 * np.cos(along[coarse] * (2 * np.pi / 25.0))
         view.lamp[xs] = wave * np.exp(-depth[coarse] / 60.0)
+
+    def _key(self, side: int, plot: int) -> tuple[str, int, int]:
+        return (self.quarter.name, side, plot)
 
     def _sunlit(self, session: Session, sides: NDArray[np.int64]) -> Floats:
         direction = self.quarter.side_directions[sides]

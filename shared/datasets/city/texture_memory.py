@@ -6,7 +6,7 @@ another size. Textures lie column by column, so that a photo's column reads neig
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +15,10 @@ from PIL import Image
 
 LEVELS = 6
 """each half as fine as the one before"""
+LEVELS_TOTAL = 1.36
+"""pixels of all levels per pixel of the first: 4 / 3, and what rounding up adds"""
+SPARE_PIXELS = 6_000_000
+"""more than all trees, vehicles and tiles of a catalogue take together"""
 
 Packed = NDArray[np.uint32]
 
@@ -39,9 +43,14 @@ class TextureMemory:
         self._used = 0
         self._kept: dict[Hashable, Texture] = {}
 
-    def reserve(self, pixels: int) -> None:
-        """Forget everything unless that many more pixels fit."""
-        if self._used + pixels > len(self.pixels):
+    def make_room(self, textures: Mapping[Hashable, int]) -> None:
+        """Forget everything unless the textures, by key with their pixels, fit beside the kept.
+
+        Besides these, SPARE_PIXELS stay free for what is met later in the same photo: nothing may
+        be forgotten while it is being read.
+        """
+        missing = sum(pixels for key, pixels in textures.items() if key not in self._kept)
+        if self._used + missing * LEVELS_TOTAL + SPARE_PIXELS > len(self.pixels):
             self._used = 0
             self._kept.clear()
 
