@@ -1,78 +1,124 @@
-"""`make demo`: index, fit, ask, on photographs that installed packages bring.
+"""`make demo`: a made-up city, indexed, fitted, evaluated and asked, from nothing to a picture.
 
-Each photograph of scikit-learn and scikit-image is cut into overlapping views, which stand for
-places; a query is the same place seen from a little aside, nearer, darker, and saved again. What
-is printed shows that the parts work together. It is no benchmark: the shipped vocabulary was
-learnt on these very photographs.
+    python -m benchmarks.demo [--places 300] [--picture docs/demo.jpg]
+
+Half of the city's queries are uploaded as labelled queries, so that the map learns what its scores
+mean; the other half it has never seen: they are asked as a user's photos, and what is printed of
+them is what a user would get. Every figure is of a generated place: not comparable with published
+figures.
 """
 
 from __future__ import annotations
 
+import argparse
 import os
 import tempfile
+from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import numpy as np
-from PIL import Image, ImageEnhance
-
+from benchmarks.asked import Asked, ask, figures_of
+from benchmarks.picture import draw_answers
 from shared.client import Client
+from shared.datasets.city.plan import CityOptions, make_plan
+from shared.datasets.city.write import NOT_COMPARABLE, write_city
 
-GRID = 3  # places along each side of a photograph
-PLACE = 0.34  # side of a place's view, as a share of the photograph's shorter side
-ASIDE = 0.12  # how far a query stands beside its place, as a share of the view
+if TYPE_CHECKING:
+    from rich.progress import Progress
 
 
 def main() -> None:
+    # As the command does before torch is loaded; see services/cli/__init__.py.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    options = _arguments()
     from services.cli.connect import connect
     from services.cli.output import progress_bar
-    from services.cli.vocabulary import fit_and_wait
-    from shared.vision.shipped_vocabulary import photographs
 
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory() as folder, progress_bar() as progress:
         os.environ["PLACEWISE_HOME"] = str(Path(folder, "home"))
-        pairs = make_places(photographs(), Path(folder))
-        with connect(None, None) as client, progress_bar() as progress:
-            for place, _ in progress.track(pairs, description="indexing"):
-                uploaded = client.upload(place, place=place.stem)
-            client.wait_for(uploaded["job_id"])
-            print(f"{len(pairs)} places; found at once (R@1):")
-            print(f"  with the shipped vocabulary   {found_at_once(client, pairs)} of {len(pairs)}")
-            fit_and_wait(client, {}, progress)
-            print(f"  with one fitted on the map    {found_at_once(client, pairs)} of {len(pairs)}")
+        os.environ["AUTO_EVALUATE_PHOTOS"] = "0"  # the demo evaluates when it wants to print
+        city = Path(folder, "city")
+        _draw(options, city, progress)
+        with connect(None, None) as client:
+            asked = _live(client, city, progress)
+        _print_unseen(asked)
+        if options.picture:
+            draw_answers(asked, city / "database", options.picture)
+            print(f"Queries and their matches: {options.picture}")
 
 
-def found_at_once(client: Client, pairs: list[tuple[Path, Path]]) -> int:
-    """How many queries have their own place first."""
-    return sum(
-        client.similar_to_file(query, top_k=1)["similar_images"][0]["place"] == place.stem
-        for place, query in pairs
+def _arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description="From a made-up city to answers.")
+    parser.add_argument("--places", type=int, default=300)
+    parser.add_argument("--views", type=int, default=3, help="database photos of a place")
+    parser.add_argument("--queries", type=int, default=400, help="half of them labelled")
+    parser.add_argument("--out-of-map", type=float, default=0.2, help="share of the queries")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--picture", type=Path, help="where to draw queries and matches")
+    return parser.parse_args()
+
+
+def _draw(options: argparse.Namespace, city: Path, progress: Progress) -> None:
+    plan = make_plan(
+        CityOptions(
+            places=options.places,
+            views=options.views,
+            queries=options.queries,
+            seed=options.seed,
+            catalogue_seed=0,
+            out_of_map=options.out_of_map,
+            width=320,
+            height=240,
+        )
     )
+    bar = progress.add_task("drawing the city", total=len(plan.shots))
+    write_city(plan, city, lambda count: progress.advance(bar, count))
 
 
-def make_places(photographs: list[Path], folder: Path) -> list[tuple[Path, Path]]:
-    """(place, query) photos, written into the folder."""
-    rng = np.random.default_rng(0)
-    pairs = []
-    for photograph in photographs:
-        image = Image.open(photograph).convert("RGB")
-        side = int(min(image.size) * PLACE)
-        steps = [np.linspace(0.15 * side, length - 1.15 * side, GRID) for length in image.size]
-        for x, left in enumerate(steps[0]):
-            for y, top in enumerate(steps[1]):
-                name = f"{photograph.stem}-{x}{y}"
-                place, query = folder / f"{name}.jpg", folder / f"{name}-asked.jpg"
-                _view(image, left, top, side).save(place, quality=92)
-                aside = rng.uniform(-ASIDE, ASIDE, 2) * side
-                seen = _view(image, left + aside[0], top + aside[1], side * rng.uniform(0.85, 1))
-                dimmed = ImageEnhance.Brightness(seen).enhance(rng.uniform(0.6, 0.9))
-                dimmed.save(query, quality=70)
-                pairs.append((place, query))
-    return pairs
+def _live(client: Client, city: Path, progress: Progress) -> list[Asked]:
+    """Index, evaluate, fit, evaluate, ask; prints recall before and after the fit."""
+    from services.cli.photo_places import find_photos
+    from services.cli.upload_many import upload_many
+    from services.cli.vocabulary import fit_and_wait
+    from services.cli.wait import wait_with_bar
+
+    database = find_photos(city / "database", None, None)
+    queries = find_photos(city / "queries", None, None)
+    labelled = [replace(q, fields={**q.fields, "role": "query"}) for q in queries[::2]]
+    indexed = upload_many(client, database + labelled, fit=False, progress=progress)
+    print(NOT_COMPARABLE)
+    print(f"{indexed['searchable']} photos indexed; R@1 / R@5 / R@10 of the labelled queries:")
+    for vocabulary in ("foreign", "own"):
+        if vocabulary == "own":
+            fit_and_wait(client, {}, progress)
+        job = wait_with_bar(client, client.evaluate()["job_id"], progress, "evaluating")
+        found = job["result"]["labelled_queries"]
+        shares = " / ".join(f"{found[f'R@{k}']:.1%}" for k in (1, 5, 10))
+        print(f"  {vocabulary:7s} vocabulary  {shares}  ({found['queries']} queries)")
+    bar = progress.add_task("asking", total=len(queries[1::2]))
+    asked = []
+    for query in queries[1::2]:
+        asked.append(ask(client, query, database))
+        progress.advance(bar)
+    return asked
 
 
-def _view(image: Image.Image, left: float, top: float, side: float) -> Image.Image:
-    box = (int(left), int(top), int(left + side), int(top + side))
-    return image.crop(box).resize((320, 320), Image.Resampling.BICUBIC)
+def _print_unseen(asked: list[Asked]) -> None:
+    found = figures_of(asked)
+    print(f"{found['queries']} photos that it had never seen, {found['out_of_map']} out of map:")
+    print(f"  right place first, of those in the map    {found['R@1']:.1%}")
+    print(f"  of the estimates that it gave, right      {_percent(found['right_of_accepted'])}")
+    print(f"  places in the map that it gave            {_percent(found['accepted_in_map'])}")
+    print(f"  false accepts of photos out of map        {_percent(found['false_accepts'])}")
+    print(f"  median error of the right ones            {found['median_error_m']:.1f} m")
+    if found["calibration_error"] is not None:
+        print(f"  calibration error of the confidence       {found['calibration_error']:.3f}")
+        print(f"  AUROC                                     {found['auroc']:.3f}")
+        print(f"  recall at 99 % precision                  {found['recall_at_99_precision']:.1%}")
+
+
+def _percent(share: float | None) -> str:
+    return "-" if share is None else f"{share:.1%}"
 
 
 if __name__ == "__main__":

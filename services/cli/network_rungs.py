@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch.nn.functional import normalize
 
+from shared.recipes import RECIPES
 from shared.vision.backbones.base import normalise_pixels
 from shared.vision.backbones.efficientnet_lite0 import MEAN, STD
-from shared.vision.extractors import RECIPES, Extractor, choose_device
+from shared.vision.extractors import Extractor, choose_device
 from shared.vision.kmeans import MAX_ITERATIONS, TOLERANCE, iterate, seed_centres
 from shared.vision.vlad import vlad
 

@@ -73,6 +73,7 @@ def test_a_photo_tells_all_that_is_known_of_it(server: ServerProcess, file_id: s
         "longitude": -7.25,
         "heading": 90,
         "place": "yard",
+        "role": "database",
         "media_type": "image/jpeg",
         "sha256": hashlib.sha256(photo_bytes(1)).hexdigest(),
         "searchable": True,
