@@ -52,8 +52,8 @@ types: $(INSTALLED) ## mypy, strict
 bench: $(INSTALLED) ## time the main job: upload, describe, search
 	$(BIN)/placewise bench spine
 
-demo: $(INSTALLED) ## index photographs that packages bring, fit, ask, print what was found
-	$(BIN)/python -m benchmarks.demo
+demo: $(INSTALLED) ## draw a city, index it, fit, ask, print recall, write docs/demo.jpg
+	$(BIN)/python -m benchmarks.demo --picture docs/demo.jpg
 
 clean: ## remove the environment and what tools left behind (your data under PLACEWISE_HOME stays)
 	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis

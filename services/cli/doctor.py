@@ -44,7 +44,9 @@ def doctor(as_json: JsonOption = False) -> None:
     checks: list[tuple[str, Callable[[Settings], str]]] = [
         ("python", _python),
         ("folder", _folder),
+        ("uploads", _uploads),
         ("server", _server),
+        ("vocabulary", _vocabulary),
         ("device", device_check),
         ("memory", memory_check),
         ("extractor", extractor_check),
@@ -88,6 +90,37 @@ def _folder(settings: Settings) -> str:
         raise OSError(errno.ENOSPC, f"only {free / 1e9:.1f} GB are free", str(there))
     state = "is writable" if there == home else "is not there yet and can be made"
     return f"{home} {state}, {free / 1e9:.0f} GB free"
+
+
+def _uploads(settings: Settings) -> str:
+    folder = settings.upload_dir
+    if folder is None:
+        return "originals lie under PLACEWISE_HOME"
+    there = next(parent for parent in (folder, *folder.parents) if parent.exists())
+    if not os.access(there, os.W_OK | os.X_OK):
+        raise OSError(errno.EACCES, "UPLOAD_DIR: this user may not write there", str(there))
+    return f"UPLOAD_DIR {folder} is writable"
+
+
+def _vocabulary(settings: Settings) -> str:
+    running = running_server(settings.placewise_home)
+    if running is None:
+        return "asked of a running server only"
+    with Client(running.url, key=running.key) as client:
+        maps = client.maps()
+    waiting = [m for m in maps if m["photos"] and m["generation_id"] is None]
+    if waiting:
+        named = ", ".join(f"{m['name']} ({m['photos']} photos)" for m in waiting)
+        raise Misconfigured(
+            "vocabulary_missing",
+            f"Photos wait to be described: {named}. Fit a vocabulary (placewise vocabulary fit "
+            "--map NAME) or import one (placewise vocabulary import FILE --map NAME), unless they "
+            "were uploaded a moment ago.",
+        )
+    foreign = [m["name"] for m in maps if m["vocabulary"] == "foreign"]
+    if foreign:
+        return f"foreign in {', '.join(foreign)}: `placewise vocabulary fit` makes it their own"
+    return "no map has a foreign one"
 
 
 def _server(settings: Settings) -> str:
