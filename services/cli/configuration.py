@@ -39,3 +39,4 @@ def config(as_json: JsonOption = False) -> None:
         default = field.get_default(call_default_factory=True, validated_data={})
         table.add_row(name.upper(), str(values[name]), str(default), field.description or "")
     answers.print(table)
+    answers.print(f"New maps are described by {settings.new_map_extractor}.", soft_wrap=True)

@@ -1,0 +1,247 @@
+"""From a ranking to a place: what speaks for it, where it lies, what the answer says of it."""
+
+from __future__ import annotations
+
+from uuid import UUID
+
+import numpy as np
+import pytest
+
+from services.gateway.estimate import estimate
+from services.gateway.schemas import EstimateAnswer
+from shared.catalog.generations import Generation
+from shared.catalog.photos import Photo
+from shared.estimate.calibration import (
+    FALSE_ACCEPTS,
+    LEAST_IMPOSTORS,
+    Calibration,
+    Logistic,
+    cross_validated,
+    learn_confidence,
+    learn_threshold,
+)
+from shared.estimate.evidence import Evidence, Ranked, locate, weigh
+from shared.estimate.places import Spot, elsewhere, same_place
+from shared.search_protocol import Hit
+
+RADIUS_M = 25.0
+DEGREE_M = 111_195.0  # of latitude, on the sphere
+
+
+def north(metres: float, place: str | None = None) -> Spot:
+    """So many metres north of a fixed point."""
+    return Spot(45.0 + metres / DEGREE_M, 7.0, place)
+
+
+def ranking(*pairs: tuple[float, Spot]) -> list[Ranked]:
+    return [Ranked(score, spot) for score, spot in pairs]
+
+
+# --- places ----------------------------------------------------------------------------------
+
+
+def test_near_photos_and_photos_of_one_label_show_one_place() -> None:
+    assert same_place(north(0), north(24.9), RADIUS_M)
+    assert not same_place(north(0), north(25.2), RADIUS_M)
+    assert same_place(Spot(None, None, "lab"), Spot(None, None, "lab"), RADIUS_M)
+    assert same_place(north(0, "square"), north(80, "square"), RADIUS_M)
+    assert not same_place(Spot(None, None, None), Spot(None, None, None), RADIUS_M)
+    assert not same_place(north(0), Spot(None, None, "lab"), RADIUS_M)
+
+
+def test_between_the_radius_and_a_hundred_metres_lies_neither() -> None:
+    assert not elsewhere(north(0), north(60))
+    assert not same_place(north(0), north(60), RADIUS_M)
+    assert elsewhere(north(0), north(101))
+
+
+def test_another_label_is_elsewhere_only_where_coordinates_do_not_say_otherwise() -> None:
+    assert elsewhere(Spot(None, None, "lab"), Spot(None, None, "kitchen"))
+    assert not elsewhere(north(0, "lab"), north(30, "kitchen"))
+    assert elsewhere(north(0, "lab"), north(300, "kitchen"))
+    assert not elsewhere(north(0, "park"), north(300, "park"))
+    assert not elsewhere(north(0), Spot(None, None, "lab"))
+
+
+# --- evidence --------------------------------------------------------------------------------
+
+
+def test_support_adds_up_what_agreeing_photos_are_ahead_of_the_best_other_place() -> None:
+    found = weigh(
+        ranking((0.5, north(0)), (0.45, north(10)), (0.3, north(500)), (0.2, north(5))), RADIUS_M
+    )
+    assert found is not None
+    # 0.5 and 0.45 lead 0.3; the last agrees but is behind it, and takes nothing away.
+    assert found.support == pytest.approx(0.2 + 0.15)
+    assert found.agreement == pytest.approx(3 / 4)
+
+
+def test_what_is_neither_here_nor_elsewhere_is_no_rival() -> None:
+    found = weigh(ranking((0.5, north(0)), (0.49, north(60)), (0.1, north(900))), RADIUS_M)
+    assert found is not None
+    assert found.support == pytest.approx(0.4)
+
+
+def test_without_a_rival_in_sight_the_last_photo_stands_for_it() -> None:
+    found = weigh(ranking((0.5, north(0)), (0.4, north(1)), (0.3, north(2))), RADIUS_M)
+    assert found is not None
+    assert found.support == pytest.approx(0.2 + 0.1)
+
+
+def test_a_ranking_without_a_place_gives_no_evidence() -> None:
+    nowhere = Spot(None, None, None)
+    assert weigh([], RADIUS_M) is None
+    assert weigh(ranking((0.9, nowhere), (0.8, north(0))), RADIUS_M) is None
+
+
+def test_the_estimate_lies_between_the_photos_near_the_best_nearer_to_the_better() -> None:
+    found = locate(
+        ranking((0.5, north(0)), (0.4, north(10)), (0.35, north(400)), (0.3, north(900))), RADIUS_M
+    )
+    assert found.latitude is not None
+    metres = (found.latitude - 45.0) * DEGREE_M
+    assert metres == pytest.approx(10 * 0.1 / (0.2 + 0.1), abs=0.01)
+
+
+def test_the_estimate_between_two_sides_of_the_antimeridian_stays_there() -> None:
+    sides = ranking((0.5, Spot(0.0, 179.9999, None)), (0.5, Spot(0.0, -179.9999, None)))
+    found = locate(sides, RADIUS_M)
+    assert found.longitude is not None
+    assert abs(abs(found.longitude) - 180.0) < 1e-9
+
+
+def test_a_label_is_the_best_photos_label() -> None:
+    found = locate(
+        ranking((0.5, Spot(None, None, "lab")), (0.4, Spot(None, None, "hall"))), RADIUS_M
+    )
+    assert found == Spot(None, None, "lab")
+
+
+# --- calibration -----------------------------------------------------------------------------
+
+
+def test_one_new_impostor_in_twenty_passes_the_threshold_whatever_their_distribution() -> None:
+    rng = np.random.default_rng(0)
+    for draw in (rng.exponential, rng.standard_normal, lambda size: rng.pareto(1.5, size)):
+        shares = []
+        for _ in range(300):
+            seen = [Evidence(support, 0.1) for support in draw(size=100)]
+            threshold = learn_threshold(seen)
+            assert threshold is not None
+            shares.append(float(np.mean(np.asarray(draw(size=200)) > threshold)))
+        assert np.mean(shares) <= FALSE_ACCEPTS + 0.005
+
+
+def test_too_few_impostors_give_no_threshold() -> None:
+    few = [Evidence(0.1, 0.1)] * (LEAST_IMPOSTORS - 1)
+    assert learn_threshold(few) is None
+    assert learn_threshold([*few, Evidence(0.2, 0.1)]) is not None
+
+
+def labelled(count: int, seed: int = 0) -> list[tuple[Evidence, bool]]:
+    """Queries whose true P(right) is a logistic function of their support."""
+    rng = np.random.default_rng(seed)
+    supports = rng.uniform(0, 0.4, count)
+    right = rng.random(count) < 1 / (1 + np.exp(-(supports - 0.15) * 25))
+    return [
+        (Evidence(float(s), float(min(1.0, s + 0.2))), bool(ok))
+        for s, ok in zip(supports, right, strict=True)
+    ]
+
+
+def test_the_confidence_recovers_the_probability_that_made_the_labels() -> None:
+    learnt = learn_confidence(labelled(5000))
+    assert learnt is not None
+    for support in (0.05, 0.15, 0.3):
+        truth = 1 / (1 + np.exp(-(support - 0.15) * 25))
+        assert learnt.probability(Evidence(support, support + 0.2)) == pytest.approx(
+            truth, abs=0.03
+        )
+
+
+def test_labels_that_separate_perfectly_give_a_finite_confidence() -> None:
+    pairs = [(Evidence(x, x), x > 0.5) for x in np.linspace(0, 1, 100).tolist()]
+    learnt = learn_confidence(pairs)
+    assert learnt is not None
+    assert 0.5 < learnt.probability(Evidence(0.9, 0.9)) < 1.0
+    assert 0.0 < learnt.probability(Evidence(0.1, 0.1)) < 0.5
+
+
+def test_evidence_that_never_varies_does_not_break_the_fit() -> None:
+    learnt = learn_confidence([(Evidence(0.1, 0.1), i % 2 == 0) for i in range(60)])
+    assert learnt is not None
+    assert learnt.probability(Evidence(0.1, 0.1)) == pytest.approx(0.5)
+
+
+def test_too_few_labels_or_only_one_kind_stay_uncalibrated() -> None:
+    assert learn_confidence(labelled(39)) is None
+    assert learn_confidence([(Evidence(0.1, 0.1), True)] * 100) is None
+    assert cross_validated(labelled(30)) is None
+
+
+def test_a_cross_validated_confidence_is_one_that_never_saw_its_query() -> None:
+    pairs = labelled(200)
+    predicted = cross_validated(pairs)
+    assert predicted is not None
+    others = [pair for index, pair in enumerate(pairs) if index % 5 != 3]
+    learnt = learn_confidence(others)
+    assert learnt is not None
+    assert predicted[3] == learnt.probability(pairs[3][0])
+
+
+# --- the answer ------------------------------------------------------------------------------
+
+
+def photo(number: int, spot: Spot) -> Photo:
+    return Photo(
+        id=UUID(int=number), latitude=spot.latitude, longitude=spot.longitude, place=spot.place
+    )
+
+
+def answer(calibration: Calibration | None, *pairs: tuple[float, Spot]) -> EstimateAnswer:
+    photos = {UUID(int=n): photo(n, spot) for n, (_, spot) in enumerate(pairs)}
+    hits = [Hit(photo_id=UUID(int=n), score=score) for n, (score, _) in enumerate(pairs)]
+    stored = calibration.model_dump(mode="json") if calibration else None
+    return estimate(Generation(calibration=stored), hits, photos, RADIUS_M)
+
+
+def calibration(threshold: float | None, confidence: Logistic | None = None) -> Calibration:
+    return Calibration(
+        radius_m=RADIUS_M,
+        support_threshold=threshold,
+        impostors=100,
+        labelled_queries=0,
+        confidence=confidence,
+    )
+
+
+PAIRS = ((0.5, north(0)), (0.2, north(700)))
+
+
+def test_before_an_evaluation_the_place_is_given_and_nothing_is_claimed_of_it() -> None:
+    for known in (None, calibration(None)):
+        said = answer(known, *PAIRS)
+        assert (said.in_map, said.confidence, said.calibration) == (None, None, "uncalibrated")
+        assert said.latitude == pytest.approx(45.0)
+        assert said.radius_m == RADIUS_M
+
+
+def test_support_over_the_threshold_is_in_the_map_and_under_it_is_not() -> None:
+    inside, outside = answer(calibration(0.29), *PAIRS), answer(calibration(0.31), *PAIRS)
+    assert (inside.in_map, outside.in_map) == (True, False)
+    assert inside.latitude is not None
+    assert (outside.latitude, outside.longitude, outside.radius_m, outside.place) == (None,) * 4
+    assert outside.reason.startswith("Not in this map")
+
+
+def test_labelled_queries_give_a_confidence() -> None:
+    learnt = learn_confidence(labelled(500))
+    said = answer(calibration(0.1, learnt), *PAIRS)
+    assert learnt is not None
+    assert said.calibration == "calibrated"
+    assert said.confidence == pytest.approx(learnt.probability(Evidence(0.3, 0.5)))
+
+
+def test_nothing_found_and_nothing_known_are_told_apart() -> None:
+    assert answer(None).reason == "No photo of the map passes the filter."
+    assert "neither coordinates nor a place" in answer(None, (0.9, Spot(None, None, None))).reason
