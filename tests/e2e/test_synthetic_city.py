@@ -151,6 +151,13 @@ def test_folder_that_holds_anything_is_refused_and_left_alone(command: Command, 
     assert contents(out) == before
 
 
+def test_folder_that_cannot_be_made_is_an_error_that_names_it(command: Command, out: Path) -> None:
+    run = command(out / "city.json" / "in", *TINY, "--no-ladder", "--json", code=1)
+    problem = json.loads(run.stdout)
+    assert problem["code"] == "out_unwritable"
+    assert "city.json" in problem["detail"]
+
+
 @pytest.mark.parametrize(
     "wrong",
     [

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from shared.datasets.city.camera import Camera, cast
+from shared.datasets.city.canvas import FINE, View
 from shared.datasets.city.catalogue import Catalogue, make_catalogue
 from shared.datasets.city.plan import CityOptions, Plan, Shot, make_plan
-from shared.datasets.city.render import FINE, Painter, View
+from shared.datasets.city.render import Painter
 from shared.datasets.city.sessions import NIGHT, SESSIONS, SUMMER
 from shared.datasets.city.streets import Quarter
 from shared.datasets.city.texture_memory import TextureMemory

@@ -17,12 +17,14 @@ from shared.datasets.city.openings import WindowType, draw_door, draw_window
 from shared.datasets.city.random_streams import stream
 from shared.datasets.city.street_things import (
     FOLIAGE,
-    VEHICLE_SHAPES,
     Picture,
     draw_box,
     draw_lamp,
     draw_post_sign,
     draw_tree,
+)
+from shared.datasets.city.vehicles import (
+    VEHICLE_SHAPES,
     draw_vehicle_end,
     draw_vehicle_screen,
     draw_vehicle_side,
@@ -34,6 +36,10 @@ WINDOW_TYPES = 7
 DOORS = 5
 SHOPS = 16
 TREES = 6
+ACCENTS = 6
+"""colours of doors, signs and awnings"""
+TRIMS = 4
+ROOFS = 3
 SYLLABLES = (
     "ba be bo ca da do el fa gi ko la li lo ma mi mo na ni no pa pe ra ri ro sa so ta ti to va zo"
 )
@@ -89,10 +95,11 @@ def make_catalogue(seed: int) -> Catalogue:
     walls = tuple(
         draw_wall(kinds[i % 5] if i % 2 else "plaster", colours[i], rng) for i in range(WALLS)
     )
-    trims = tuple(_grey_to(hue, rng.uniform(0.04, 0.16), v) for v in (0.94, 0.86, 0.74, 0.58))
+    trims = tuple(_colour(hue, rng.uniform(0.04, 0.16), v) for v in (0.94, 0.86, 0.74, 0.58))
     window_types = tuple(_window_type(rng, trims) for _ in range(WINDOW_TYPES))
     accents = [
-        _colour(rng.uniform(), rng.uniform(0.35, 0.75), rng.uniform(0.3, 0.7)) for _ in range(6)
+        _colour(rng.uniform(), rng.uniform(0.35, 0.75), rng.uniform(0.3, 0.7))
+        for _ in range(ACCENTS)
     ]
     shapes = [
         (rng.uniform(5.5, 9.5), rng.uniform(3.2, 6.0), rng.uniform(2.0, 2.9)) for _ in range(TREES)
@@ -158,10 +165,6 @@ def make_catalogue(seed: int) -> Catalogue:
 def _colour(hue: float, saturation: float, value: float) -> Colour:
     red, green, blue = colorsys.hsv_to_rgb(hue % 1, saturation, value)
     return int(red * 255), int(green * 255), int(blue * 255)
-
-
-def _grey_to(hue: float, saturation: float, value: float) -> Colour:
-    return _colour(hue, saturation, value)
 
 
 def _wall_colour(rng: np.random.Generator, hue: float) -> Colour:

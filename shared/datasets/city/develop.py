@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from PIL import Image, ImageFilter
 
 from shared.datasets.city.camera import Camera
+from shared.datasets.city.canvas import FINE, View
 from shared.datasets.city.codes import FLAT, light_table
 from shared.datasets.city.random_streams import stream
-from shared.datasets.city.render import FINE, View
 from shared.datasets.city.sessions import Session
 from shared.datasets.city.walls import Grey, smooth_noise
 

@@ -1,101 +1,19 @@
-"""One house: the arrangement that makes it this house, and its facade as a texture."""
+"""A house's facade as a texture: walls, openings and shops, from the eaves to the pavement."""
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import numpy as np
 from PIL import Image, ImageDraw
 
 from shared.datasets.city.catalogue import Catalogue
 from shared.datasets.city.codes import FLAT, PANES, SHOP, SOLID
+from shared.datasets.city.house import House, bay_middle
 from shared.datasets.city.openings import darker, draw_shop_glass, px
-from shared.datasets.city.walls import PIXELS_PER_METRE, TILE_HEIGHT, TILE_WIDTH, Colour
+from shared.datasets.city.roofs import draw_eaves, draw_roof
+from shared.datasets.city.walls import TILE_HEIGHT, TILE_WIDTH, Colour
 
-HEADROOM = 3.6
-"""metres above the eaves for roof, gable and chimneys; also the see-through rim of the texture"""
-
-
-@dataclass(frozen=True, slots=True)
-class House:
-    """The arrangement of one house, metres; indices are those of the catalogue."""
-
-    width: float
-    floors: int
-    ground_floor: float
-    """height of the ground floor"""
-    storey: float
-    """height of every floor above it"""
-    wall: int
-    base_wall: int
-    window: int
-    upper_window: int
-    bays: int
-    blank_bays: tuple[int, ...]
-    """bays without windows"""
-    door_bay: int
-    door: int
-    shops: tuple[int, ...]
-    """sign of each bay's shop, -1 for none"""
-    awning: int
-    trim: int
-    roof: str
-    roof_colour: int
-    chimneys: tuple[float, ...]
-    string_courses: bool
-    quoins: bool
-    drainpipe: float
-    detail_seed: int
-
-    @property
-    def eaves(self) -> float:
-        """Height of the wall's top."""
-        return self.ground_floor + (self.floors - 1) * self.storey
-
-    @property
-    def top(self) -> float:
-        """Height of the texture's upper edge."""
-        return self.eaves + HEADROOM
-
-    @property
-    def pixels(self) -> int:
-        """Of its texture."""
-        return px(self.width) * px(self.top)
-
-
-def arrange(rng: np.random.Generator, width: float, shopping: float, floors: int) -> House:
-    """A house for a plot `width` metres wide; `shopping` is the share of bays with a shop."""
-    bays = max(1, round(width / rng.uniform(2.3, 3.3)))
-    trade = rng.uniform() < shopping
-    shops = tuple(
-        int(rng.integers(16)) if trade and rng.uniform() < 0.8 else -1 for _ in range(bays)
-    )
-    window = int(rng.integers(7))
-    blank = tuple(int(b) for b in range(bays) if bays > 2 and rng.uniform() < 0.10)
-    return House(
-        width=width,
-        floors=int(np.clip(floors + rng.integers(-1, 2), 2, 5)),
-        ground_floor=float(rng.choice([3.3, 3.7, 4.2])),
-        storey=float(rng.choice([2.9, 3.1, 3.4])),
-        wall=int(rng.integers(10)),
-        base_wall=int(rng.integers(10)) if rng.uniform() < 0.45 else -1,
-        window=window,
-        upper_window=window if rng.uniform() < 0.6 else int(rng.integers(7)),
-        bays=bays,
-        blank_bays=blank,
-        door_bay=int(rng.integers(bays)),
-        door=int(rng.integers(5)),
-        shops=shops,
-        awning=int(rng.integers(6)) if rng.uniform() < 0.6 else -1,
-        trim=int(rng.integers(4)),
-        roof=str(rng.choice(["cornice", "cornice", "mansard", "gable", "parapet"])),
-        roof_colour=int(rng.integers(3)),
-        chimneys=tuple(float(x) for x in rng.uniform(0.05, 0.9, int(rng.integers(0, 4)))),
-        string_courses=bool(rng.uniform() < 0.5),
-        quoins=bool(rng.uniform() < 0.3),
-        drainpipe=float(rng.choice([-1.0, 0.02, 0.98])),
-        detail_seed=int(rng.integers(2**31)),
-    )
+ANY_CODE = [0] + [255] * 255
+"""a table for `point`: 255 wherever something is"""
 
 
 def draw_house(house: House, catalogue: Catalogue) -> Image.Image:
@@ -105,7 +23,7 @@ def draw_house(house: House, catalogue: Catalogue) -> Image.Image:
     eaves = height - px(house.eaves)
     picture = Image.new("RGBA", (width, height), (0, 0, 0, 0))
     trim = catalogue.trims[house.trim]
-    _roof(picture, house, catalogue, eaves)
+    draw_roof(picture, house, catalogue, eaves)
     _wall(picture, catalogue.walls[house.wall], (0, eaves, width, height), rng)
     ground = height - px(house.ground_floor)
     if house.base_wall >= 0:
@@ -116,8 +34,8 @@ def draw_house(house: House, catalogue: Catalogue) -> Image.Image:
     _floors(picture, draw, house, catalogue, rng, trim)
     _street_level(picture, draw, house, catalogue, rng)
     draw.rectangle((0, height - px(0.35), width, height), fill=(*darker(trim, 0.62), SOLID))
-    _repaint_openings_at_foot(picture, house, catalogue)
-    _eaves(draw, house, width, eaves, trim)
+    _door(picture, house, catalogue)
+    draw_eaves(draw, house, width, eaves, trim)
     draw.line((0, eaves, 0, height), fill=(*darker(trim, 0.5), SOLID))
     if house.drainpipe >= 0:
         x = int(house.drainpipe * (width - 3))
@@ -136,10 +54,6 @@ def _wall(
     y = int(rng.integers(max(1, TILE_HEIGHT - (bottom - top))))
     piece = tile.crop((x, y, x + right - left, y + bottom - top)).convert("RGBA")
     picture.paste(piece, (left, top))
-
-
-def _bay_middle(house: House, bay: int) -> int:
-    return round((bay + 0.5) * house.width / house.bays * PIXELS_PER_METRE)
 
 
 def _floors(
@@ -162,7 +76,7 @@ def _floors(
                 continue
             sprite = catalogue.windows[index][int(rng.integers(PANES))]
             kind = catalogue.window_types[index]
-            x = _bay_middle(house, bay) - sprite.width // 2
+            x = bay_middle(house, bay) - sprite.width // 2
             foot = 0.15 if kind.balcony else 0.85
             picture.paste(sprite, (x, y - px(foot) - sprite.height + 4), _solid(sprite))
 
@@ -177,7 +91,7 @@ def _street_level(
     height = picture.height
     pitch = house.width / house.bays
     for bay in range(house.bays):
-        middle = _bay_middle(house, bay)
+        middle = bay_middle(house, bay)
         if bay == house.door_bay:
             continue
         shop = house.shops[bay]
@@ -209,10 +123,10 @@ def _street_level(
             picture.paste(sprite, (middle - sprite.width // 2, y), _solid(sprite))
 
 
-def _repaint_openings_at_foot(picture: Image.Image, house: House, catalogue: Catalogue) -> None:
+def _door(picture: Image.Image, house: House, catalogue: Catalogue) -> None:
     """The door reaches the pavement: it goes over the plinth."""
     door = catalogue.doors[house.door]
-    x = _bay_middle(house, house.door_bay) - door.width // 2
+    x = bay_middle(house, house.door_bay) - door.width // 2
     picture.paste(door, (x, picture.height - door.height), _solid(door))
 
 
@@ -235,62 +149,6 @@ def _quoins(draw: ImageDraw.ImageDraw, width: int, top: int, bottom: int, trim: 
             draw.rectangle((x0, y, x1, y + 9), fill=(*trim, SOLID))
 
 
-def _roof(picture: Image.Image, house: House, catalogue: Catalogue, eaves: int) -> None:
-    draw = ImageDraw.Draw(picture)
-    width = picture.width
-    colour = catalogue.roofs[house.roof_colour]
-    tiles = (*colour, FLAT)
-    ridge = {"mansard": eaves - px(2.3), "gable": eaves - px(2.6)}.get(house.roof, eaves - px(0.7))
-    for share in house.chimneys:
-        x = int(share * (width - 16))
-        draw.rectangle((x, ridge - px(0.7), x + 13, eaves), fill=(134, 92, 76, SOLID))
-        draw.rectangle(
-            (x - 1, ridge - px(0.7), x + 14, ridge - px(0.7) + 3), fill=(96, 88, 84, FLAT)
-        )
-    if house.roof == "mansard":
-        slope = px(0.5)
-        draw.polygon(
-            [(0, eaves), (slope, ridge), (width - slope, ridge), (width, eaves)], fill=tiles
-        )
-        for y in range(ridge + 3, eaves, 4):
-            draw.line((slope, y, width - slope, y), fill=(*darker(colour, 0.86), FLAT))
-        for bay in range(house.bays):
-            x = _bay_middle(house, bay)
-            draw.rectangle(
-                (x - 12, ridge + 10, x + 12, eaves), fill=(*catalogue.trims[house.trim], SOLID)
-            )
-            draw.rectangle(
-                (x - 8, ridge + 15, x + 8, eaves - 3), fill=(66, 80, 92, 1 + bay % PANES)
-            )
-            draw.polygon([(x - 15, ridge + 11), (x, ridge + 2), (x + 15, ridge + 11)], fill=tiles)
-    elif house.roof == "gable":
-        draw.polygon(
-            [(0, eaves), (width // 2, ridge), (width, eaves)],
-            fill=(*catalogue.wall_colours[house.wall], SOLID),
-        )
-        draw.line((0, eaves, width // 2, ridge), fill=tiles, width=7)
-        draw.line((width // 2, ridge, width, eaves), fill=tiles, width=7)
-        middle = (ridge + 2 * eaves) // 3
-        draw.ellipse((width // 2 - 9, middle - 9, width // 2 + 9, middle + 9), fill=(62, 74, 86, 2))
-    else:
-        draw.rectangle((0, ridge + 6, width, eaves), fill=tiles)
-
-
-def _eaves(draw: ImageDraw.ImageDraw, house: House, width: int, eaves: int, trim: Colour) -> None:
-    if house.roof == "gable":
-        return
-    if house.roof == "parapet":
-        draw.rectangle((0, eaves - px(0.8), width, eaves), fill=(*darker(trim, 0.94), SOLID))
-        for x in range(4, width - 6, 14):
-            draw.rectangle((x, eaves - px(0.6), x + 7, eaves - 5), fill=(*darker(trim, 0.7), SOLID))
-        draw.rectangle((0, eaves - px(0.85), width, eaves - px(0.8) + 3), fill=(*trim, FLAT))
-        return
-    draw.rectangle((0, eaves - 4, width, eaves + 5), fill=(*trim, SOLID))
-    draw.rectangle((0, eaves + 6, width, eaves + 9), fill=(*darker(trim, 0.5), SOLID))
-    for x in range(3, width, 12):  # brackets
-        draw.rectangle((x, eaves + 6, x + 4, eaves + 11), fill=(*darker(trim, 0.85), SOLID))
-
-
 def _solid(sprite: Image.Image) -> Image.Image:
     """The mask of a part: everything that is not see-through."""
-    return sprite.getchannel("A").point(lambda code: 255 if code else 0)
+    return sprite.getchannel("A").point(ANY_CODE)

@@ -1,16 +1,24 @@
-"""The ground: asphalt and paving slabs as tiles that repeat over the whole city."""
+"""The ground: asphalt and paving slabs as tiles that repeat over the whole city, in perspective."""
 
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 from PIL import Image
 
+from shared.datasets.city.camera import Camera, Hits
+from shared.datasets.city.canvas import FINE, View, level_for, row_of
 from shared.datasets.city.codes import FLAT
 from shared.datasets.city.random_streams import stream
+from shared.datasets.city.streets import PAVEMENT_M, Quarter
+from shared.datasets.city.texture_memory import TextureMemory
 from shared.datasets.city.walls import Grey, smooth_noise
 
 TILE_PIXELS = 512
 TILE_M = 16.0
+KERB_M = 0.16
+WHITE_LINE = np.uint32(FLAT << 24 | 0xC8CCCC)
+KERB_STONE = np.uint32(FLAT << 24 | 0x8E9498)
 
 
 def draw_asphalt(seed: int) -> Image.Image:
@@ -48,3 +56,68 @@ def _tile(light: Grey, tint: tuple[float, float, float]) -> Image.Image:
     colours = np.clip(light[..., None] * np.asarray(tint) * 255, 0, 255).astype(np.uint8)
     codes = np.full((*light.shape, 1), FLAT, np.uint8)
     return Image.fromarray(np.concatenate([colours, codes], axis=2))
+
+
+def paint_ground(
+    view: View,
+    camera: Camera,
+    hits: Hits,
+    quarter: Quarter,
+    sides: NDArray[np.int64],
+    memory: TextureMemory,
+) -> None:
+    """Paint what lies below the houses' feet; `hits` are those against the quarter's `sides`."""
+    fine_height = view.canvas.shape[1]
+    columns = np.arange(view.canvas.shape[0])
+    horizon = camera.horizons(FINE)
+    contact = row_of(camera, 0.0, hits.depth, columns)
+    first = max(0, int(min(contact.min(), horizon.min() * FINE)))
+    if first >= fine_height:
+        return
+    ys = (np.arange(first, fine_height) + 0.5) / FINE
+    below = np.maximum(ys[None, :] - horizon[:, None], 0.4).astype(np.float32)
+    depth = np.float32(camera.focal * camera.eye) / below
+    slopes = camera.slopes(FINE)
+    rays = camera.forward + slopes[:, None] * camera.right
+    east = depth * rays[:, :1].astype(np.float32) + np.float32(camera.x % TILE_M)
+    north = depth * rays[:, 1:].astype(np.float32) + np.float32(camera.y % TILE_M)
+    per_metre = TILE_PIXELS / TILE_M
+    level = level_for(per_metre, depth[len(depth) // 2], camera, bias=0.6)
+    scale = (per_metre / 2.0**level).astype(np.float32)
+    mask = (TILE_PIXELS >> level) - 1
+    shift = (np.log2(TILE_PIXELS) - level).astype(np.int32)
+    cell = (east * scale).astype(np.int32) & mask
+    cell <<= shift
+    cell += (north * scale).astype(np.int32) & mask
+    hit = np.isfinite(hits.depth)
+    facing = np.where(hit, np.maximum(hits.facing, 1e-3), 1.0).astype(np.float32)
+    wall = np.where(hit, hits.depth, 1e4).astype(np.float32)
+    to_wall = (wall[:, None] - depth) * facing[:, None]  # metres before the facade
+    asphalt = memory.get("asphalt", lambda: draw_asphalt(quarter.seed), rim=False)
+    paving = memory.get("paving", lambda: draw_paving(quarter.seed), rim=False)
+    road = to_wall > PAVEMENT_M
+    base = np.where(
+        road, asphalt.offsets[level].astype(np.int32), paving.offsets[level].astype(np.int32)
+    )
+    texels = memory.pixels.take(cell + base)
+    kerb = np.abs(to_wall - PAVEMENT_M) < KERB_M / 2
+    texels[kerb] = KERB_STONE
+    middles = np.array([quarter.sides[s].half_width for s in sides], np.float32)
+    middle = np.where(hit, middles[hits.plane], 1e6).astype(np.float32)
+    directions = quarter.side_directions[sides][hits.plane]
+    dash = (rays * directions).sum(axis=1).astype(np.float32)
+    line = np.abs(to_wall - middle[:, None]) < 0.07
+    if line.any():
+        line &= ((dash[:, None] * depth) % 4.5) < 1.8
+        texels[line] = WHITE_LINE
+    shown = (np.arange(first, fine_height)[None, :] >= contact[:, None]) & (
+        ys[None, :] > horizon[:, None]
+    )
+    region = view.canvas[:, first:]
+    np.copyto(region, texels, where=shown)
+    odd = first % FINE
+    coarse = shown[::FINE, odd::FINE]
+    start = (first + odd) // FINE
+    target = view.depth[:, start : start + coarse.shape[1]]
+    np.copyto(target, depth[::FINE, odd::FINE], where=coarse)
+    np.copyto(view.sun[:, start : start + coarse.shape[1]], np.float32(0.6), where=coarse)

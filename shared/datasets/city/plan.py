@@ -14,6 +14,7 @@ from datetime import datetime, timedelta
 import numpy as np
 
 from shared.datasets.city.camera import Camera
+from shared.datasets.city.places import Place, quarter_with
 from shared.datasets.city.random_streams import stream
 from shared.datasets.city.sessions import (
     DATABASE_SESSIONS,
@@ -21,7 +22,7 @@ from shared.datasets.city.sessions import (
     SESSIONS,
     Session,
 )
-from shared.datasets.city.streets import Quarter, Street
+from shared.datasets.city.streets import Quarter
 from shared.datasets.utm_names import PhotoName
 
 ZONE_NUMBER, ZONE_LETTER = 32, "T"
@@ -29,12 +30,8 @@ ORIGIN_M = (480_000.0, 4_880_000.0)
 """open sea south of Genoa: nobody mistakes it for a real city"""
 APART_M = 400.0
 """between two quarters: more than the 200 m that "out of map" promises"""
-PLACE_SPACING_M = (15.0, 25.0)
-FROM_CROSSING_M = 14.0
 LANE_M = 1.6
 """by which a camera drives to the right of the street's middle; it looks to the left"""
-LOOK_M = (42.0, 64.0)
-"""degrees between the driving direction and a street's viewing direction"""
 DATABASE_FOV = 72.0
 QUERY_FOV = (58.0, 86.0)
 STEP_M = 3.0
@@ -60,18 +57,6 @@ class CityOptions:
     """share of the queries"""
     width: int
     height: int
-
-
-@dataclass(frozen=True, slots=True)
-class Place:
-    """A spot in a street that the camera passes, and where it looks from there."""
-
-    number: int
-    street: Street
-    along: float
-    """metres from the street's start"""
-    yaw: float
-    """degrees clockwise from north"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,7 +102,7 @@ def make_plan(options: CityOptions) -> Plan:
         ("outskirts", max(1, min(outside, options.places))),
         ("school", options.places),
     ):
-        quarter, found = _quarter_with(options.seed, name, wanted, origin)
+        quarter, found = quarter_with(options.seed, name, wanted, origin)
         quarters[name], places[name] = quarter, found
         origin = (quarter.far_east + APART_M, origin[1])
     shots = _database_shots(options, places["map"])
@@ -135,32 +120,6 @@ def make_plan(options: CityOptions) -> Plan:
     shots += _train_shots(options, places["school"])
     shots.sort(key=lambda shot: (shot.quarter, shot.place, shot.role, shot.number))
     return Plan(options, quarters, shots)
-
-
-def _quarter_with(
-    seed: int, name: str, wanted: int, origin: tuple[float, float]
-) -> tuple[Quarter, list[Place]]:
-    """The smallest quarter with that many places, and its first ones."""
-    size = 2
-    while True:
-        quarter = Quarter(seed, name, size, origin)
-        places = _find_places(quarter)
-        if len(places) >= wanted:
-            return quarter, places[:wanted]
-        size += 1
-
-
-def _find_places(quarter: Quarter) -> list[Place]:
-    rng = stream(quarter.seed, quarter.name, "places")
-    places: list[Place] = []
-    for street in quarter.streets:
-        heading = math.degrees(math.atan2(street.direction[0], street.direction[1]))
-        yaw = heading - rng.uniform(*LOOK_M)
-        along = FROM_CROSSING_M + rng.uniform(0, 5)
-        while along < street.length - FROM_CROSSING_M:
-            places.append(Place(len(places), street, along, yaw + rng.normal(0, 3)))
-            along += rng.uniform(*PLACE_SPACING_M)
-    return places
 
 
 def _database_shots(options: CityOptions, places: list[Place]) -> list[Shot]:

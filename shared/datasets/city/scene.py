@@ -9,8 +9,9 @@ import numpy as np
 
 from shared.datasets.city.catalogue import VEHICLE_PAINTS, Catalogue
 from shared.datasets.city.random_streams import stream
-from shared.datasets.city.street_things import VEHICLE_SHARES, Picture
+from shared.datasets.city.street_things import Picture
 from shared.datasets.city.streets import PAVEMENT_M, Metres, Quarter, Street
+from shared.datasets.city.vehicles import VEHICLE_SHARES
 
 KERB_CLEARANCE_M = 1.05
 """from the kerb to the middle of a parked vehicle"""

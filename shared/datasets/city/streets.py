@@ -12,7 +12,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.datasets.city.facade import House, arrange
+from shared.datasets.city.house import House, arrange
 from shared.datasets.city.random_streams import stream
 
 SPACING_M = (88.0, 132.0)

@@ -19,10 +19,12 @@ from shared.datasets.city.plan import Plan, Shot, city_name
 from shared.datasets.city.random_streams import stream
 from shared.datasets.city.render import Painter
 from shared.datasets.city.texture_memory import TextureMemory
-from shared.errors import Conflict
+from shared.errors import Conflict, Misconfigured
 
 SHOTS_PER_TASK = 160
 """a few streets: their houses are drawn once for all photos of a task"""
+MOST_WORKERS = 16
+"""each keeps about 300 MB: textures, and a photo at work"""
 GSV_COLUMNS = ("place_id", "class_name", "UTMx", "UTMy", "filename")
 NOT_COMPARABLE = "generated: not comparable with published figures"
 
@@ -40,29 +42,37 @@ def write_city(plan: Plan, out: Path, drawn: Callable[[int], None] = lambda coun
     """Write `database/`, `queries/`, `gsv_xs/` and `city.json` below `out`.
 
     The gsv_xs photos are drawn for themselves, in a quarter of their own. `drawn` is told how many
-    photos are ready. Raises Conflict when `out` is not empty.
+    photos are ready. Raises Conflict when `out` is not empty, Misconfigured (`out_unwritable`) when
+    it can't be written.
     """
     check_empty(out)
-    for folder in sorted({shot.folder for shot in plan.shots} | {"database", "queries"}):
-        (out / folder).mkdir(parents=True, exist_ok=True)
-    starts = range(0, len(plan.shots), SHOTS_PER_TASK)
-    workers = min(len(starts), os.cpu_count() or 1)
+    try:
+        for folder in sorted({shot.folder for shot in plan.shots} | {"database", "queries"}):
+            (out / folder).mkdir(parents=True, exist_ok=True)
+        _draw_all(plan, out, drawn)
+        _write_gsv_table(plan, out)
+        (out / "city.json").write_text(json.dumps(describe(plan), indent=1) + "\n")
+    except OSError as error:
+        raise Misconfigured("out_unwritable", f"Can't write below {out}: {error}.") from error
+
+
+def _draw_all(plan: Plan, out: Path, drawn: Callable[[int], None]) -> None:
+    tasks = [(start, start + SHOTS_PER_TASK) for start in range(0, len(plan.shots), SHOTS_PER_TASK)]
+    workers = min(len(tasks), os.cpu_count() or 1, MOST_WORKERS)
     if workers <= 1:  # not worth a process
         workshop = _Workshop(plan, out)
-        for start in starts:
-            drawn(workshop.draw(start))
-    else:
-        # Spawned, not forked: the parent may hold threads, and a fork of those can hang.
-        with ProcessPoolExecutor(
-            workers,
-            mp_context=multiprocessing.get_context("spawn"),
-            initializer=_open_workshop,
-            initargs=(plan, out),
-        ) as pool:
-            for done in as_completed([pool.submit(_draw, start) for start in starts]):
-                drawn(done.result())
-    _write_gsv_table(plan, out)
-    (out / "city.json").write_text(json.dumps(describe(plan), indent=1) + "\n")
+        for task in tasks:
+            drawn(workshop.draw(*task))
+        return
+    # Spawned, not forked: the parent may hold threads, and a fork of those can hang.
+    with ProcessPoolExecutor(
+        workers,
+        mp_context=multiprocessing.get_context("spawn"),
+        initializer=_open_workshop,
+        initargs=(plan, out),
+    ) as pool:
+        for done in as_completed([pool.submit(_draw, *task) for task in tasks]):
+            drawn(done.result())
 
 
 def describe(plan: Plan) -> dict[str, Any]:
@@ -115,8 +125,9 @@ class _Workshop:
             for name, quarter in plan.quarters.items()
         }
 
-    def draw(self, start: int) -> int:
-        shots = self.plan.shots[start : start + SHOTS_PER_TASK]
+    def draw(self, start: int, stop: int) -> int:
+        """Draw and write the plan's shots from `start` to before `stop`; how many they are."""
+        shots = self.plan.shots[start:stop]
         for shot in shots:
             (self.out / shot.folder / shot.name).write_bytes(self.photo(shot))
         return len(shots)
@@ -135,7 +146,6 @@ def _open_workshop(plan: Plan, out: Path) -> None:
     _workshop = _Workshop(plan, out)
 
 
-def _draw(start: int) -> int:
-    """Draw a task's shots, beginning with that one; the number of them."""
+def _draw(start: int, stop: int) -> int:
     assert _workshop is not None
-    return _workshop.draw(start)
+    return _workshop.draw(start, stop)

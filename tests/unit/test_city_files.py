@@ -1,0 +1,49 @@
+"""The city's files: the same bytes however the work is shared out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from shared.datasets.city import write
+from shared.datasets.city.plan import CityOptions, make_plan
+from shared.errors import Conflict
+
+PLAN = make_plan(CityOptions(2, 4, 4, 1, 2, 0.25, 64, 64))
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes()
+        for path in folder.rglob("*")
+        if path.is_file()
+    }
+
+
+def test_bytes_do_not_depend_on_how_many_processes_draw(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    drawn: list[int] = []
+    write.write_city(PLAN, tmp_path / "alone", drawn.append)
+    assert drawn == [len(PLAN.shots)]
+    monkeypatch.setattr(write, "SHOTS_PER_TASK", 7)
+    monkeypatch.setattr("os.cpu_count", lambda: 2)
+    drawn.clear()
+    write.write_city(PLAN, tmp_path / "shared", drawn.append)
+    assert len(drawn) == 3
+    assert sum(drawn) == len(PLAN.shots) == 8 + 4 + 8
+    assert contents(tmp_path / "alone") == contents(tmp_path / "shared")
+
+
+def test_folder_that_holds_anything_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "mine.txt").write_text("mine")
+    with pytest.raises(Conflict) as caught:
+        write.write_city(PLAN, tmp_path)
+    assert caught.value.code == "out_not_empty"
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
+
+
+def test_empty_folder_may_be_written_into(tmp_path: Path) -> None:
+    write.check_empty(tmp_path)
+    write.check_empty(tmp_path / "not there yet")
