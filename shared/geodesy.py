@@ -9,7 +9,15 @@ from numpy.typing import NDArray
 
 EARTH_RADIUS_M = 6_371_008.8  # mean radius of the GRS 80 ellipsoid (Moritz 2000)
 
+LEAST_DEGREES = 1e-12  # less than a micrometre on the ground
+
 Degrees = NDArray[np.float64]
+
+
+def without_dust(degrees: float) -> float:
+    """0 for what is next to 0, else the same: PostgreSQL refuses to compute with numbers whose
+    squares are too small for a double, and one such photo would end every search."""
+    return 0.0 if abs(degrees) < LEAST_DEGREES else degrees
 
 
 def distance_m(
@@ -18,13 +26,15 @@ def distance_m(
     """Great-circle distance in metres of two points in degrees (haversine, Sinnott 1984).
 
     Within 0.6 % of the distance on the ellipsoid; exact to a millimetre on the sphere, also for
-    points a metre apart, across the antimeridian and at the poles.
+    points a metre apart, across the antimeridian, at the poles, and near the antipodes: there the
+    haversine alone loses metres to rounding, and the distance to the antipode, `g`, decides.
     """
     phi_1, phi_2 = math.radians(latitude_1), math.radians(latitude_2)
-    half_phi = (phi_2 - phi_1) / 2
     half_lambda = math.radians(longitude_2 - longitude_1) / 2
-    h = math.sin(half_phi) ** 2 + math.cos(phi_1) * math.cos(phi_2) * math.sin(half_lambda) ** 2
-    return 2 * EARTH_RADIUS_M * math.asin(min(1.0, math.sqrt(h)))
+    shrunk = math.cos(phi_1) * math.cos(phi_2)
+    h = math.sin((phi_2 - phi_1) / 2) ** 2 + shrunk * math.sin(half_lambda) ** 2
+    g = math.sin((phi_2 + phi_1) / 2) ** 2 + shrunk * math.cos(half_lambda) ** 2
+    return 2 * EARTH_RADIUS_M * math.atan2(math.sqrt(h), math.sqrt(g))
 
 
 def distances_m(
@@ -32,10 +42,11 @@ def distances_m(
 ) -> Degrees:
     """`distance_m` from one point to (n,) others; NaN where a point has no coordinates."""
     phi, phis = np.radians(latitude), np.radians(latitudes)
-    half_phis = (phis - phi) / 2
     half_lambdas = np.radians(longitudes - longitude) / 2
-    h = np.sin(half_phis) ** 2 + np.cos(phi) * np.cos(phis) * np.sin(half_lambdas) ** 2
-    metres: Degrees = 2 * EARTH_RADIUS_M * np.arcsin(np.minimum(1.0, np.sqrt(h)))
+    shrunk = np.cos(phi) * np.cos(phis)
+    h = np.sin((phis - phi) / 2) ** 2 + shrunk * np.sin(half_lambdas) ** 2
+    g = np.sin((phis + phi) / 2) ** 2 + shrunk * np.cos(half_lambdas) ** 2
+    metres: Degrees = 2 * EARTH_RADIUS_M * np.arctan2(np.sqrt(h), np.sqrt(g))
     return metres
 
 

@@ -6,9 +6,14 @@ The same filter narrows a similarity search (inside the scan) and a metadata sea
 from __future__ import annotations
 
 from datetime import datetime
+from typing import Annotated
 from uuid import UUID
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import AfterValidator, BaseModel, ConfigDict
+
+from shared.geodesy import without_dust
+
+Degrees = Annotated[float, AfterValidator(without_dust)]
 
 
 class _Condition(BaseModel):
@@ -18,8 +23,8 @@ class _Condition(BaseModel):
 class Circle(_Condition):
     """Everything within `radius_m` metres (inclusive) of a point in degrees."""
 
-    latitude: float
-    longitude: float
+    latitude: Degrees
+    longitude: Degrees
     radius_m: float
 
 
@@ -29,10 +34,10 @@ class Box(_Condition):
     A pole has every longitude: a box that reaches latitude 90 holds whatever lies there.
     """
 
-    south: float
-    west: float
-    north: float
-    east: float
+    south: Degrees
+    west: Degrees
+    north: Degrees
+    east: Degrees
 
     def longitude_ranges(self) -> list[tuple[float, float]]:
         """The longitudes as ranges that don't cross the antimeridian, in [-180, 180].

@@ -121,7 +121,7 @@ class Settings(BaseSettings):
     )
 
     job_retention_days: float = Field(
-        30.0, gt=0, description="life of a finished job; failed uploads keep theirs"
+        30.0, gt=0, description="life of a finished job; photos that were not described keep theirs"
     )
     search_history_days: float = Field(90.0, gt=0, description="life of a search in the history")
 

@@ -13,6 +13,7 @@ from sqlalchemy import select
 
 from services.extractor.loaded import LoadedModels
 from shared.catalog.generations import Generation, GenerationState
+from shared.catalog.maps import Map
 from shared.catalog.session import Catalog
 from shared.catalog.vocabularies import Vocabulary
 from shared.errors import Conflict, PlacewiseError
@@ -29,7 +30,8 @@ def renew_outdated_generations(catalog: Catalog, models: LoadedModels) -> int:
         found = session.execute(
             select(Generation, Vocabulary)
             .outerjoin(Vocabulary, Vocabulary.id == Generation.vocabulary_id)
-            .where(Generation.state == GenerationState.ACTIVE)
+            .join(Map, Map.id == Generation.map_id)
+            .where(Generation.state == GenerationState.ACTIVE, Map.deleted_at.is_(None))
         ).all()
     started = 0
     for generation, vocabulary in found:

@@ -20,6 +20,7 @@ from shared.search_protocol import SearchPort
 from shared.settings import Settings
 
 API = "/api/v1"
+NO_NUL = r"^[^\x00]*$"  # PostgreSQL has no text with a NUL
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +63,13 @@ def read_cursor(cursor: str | None) -> UUID | None:
 GatewayDep = Annotated[Gateway, Depends(get_gateway)]
 MapName = Annotated[
     str,
-    Query(alias="map", description="The map that is meant.", min_length=1, max_length=100),
+    Query(
+        alias="map",
+        description="The map that is meant.",
+        min_length=1,
+        max_length=100,
+        pattern=NO_NUL,
+    ),
 ]
 FileId = Annotated[UUID, _known_shape("photo")]
 JobId = Annotated[UUID, _known_shape("job")]
@@ -75,6 +82,7 @@ MinScore = Annotated[
 __all__ = [
     "API",
     "DEFAULT_MAP",
+    "NO_NUL",
     "FileId",
     "Gateway",
     "GatewayDep",

@@ -11,10 +11,11 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from services.gateway.context import DEFAULT_MAP, GatewayDep, MapName, read_cursor
 from services.gateway.schemas import Answer, JobStarted, job_started
+from shared.catalog.chunks import count_located
 from shared.catalog.evaluations import Evaluation, list_evaluations
 from shared.catalog.generations import active_generation
 from shared.catalog.maps import get_map
-from shared.catalog.photos import count_located
+from shared.catalog.photos import PhotoRole
 from shared.errors import Conflict
 from shared.ids import new_id
 from shared.jobs import Job, JobKind, Priority
@@ -74,7 +75,8 @@ def evaluate(
     params = (wanted or EvaluationRequest.model_validate({})).model_dump()
     with gateway.catalog.write() as session:
         map_ = get_map(session, map_name)
-        if active_generation(session, map_.id) is None or not count_located(session, map_.id):
+        generation = active_generation(session, map_.id)
+        if generation is None or not count_located(session, generation.id, PhotoRole.DATABASE):
             raise Conflict(
                 "nothing_to_evaluate",
                 "The map has no described photo with coordinates or a place. Upload some, and wait "

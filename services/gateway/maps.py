@@ -10,7 +10,7 @@ from fastapi import APIRouter, Path
 from pydantic import BaseModel, ConfigDict, Field
 from sqlalchemy.orm import Session
 
-from services.gateway.context import DEFAULT_MAP, GatewayDep
+from services.gateway.context import DEFAULT_MAP, NO_NUL, GatewayDep
 from services.gateway.schemas import Answer
 from shared.catalog.chunks import count_searchable
 from shared.catalog.generations import active_generation
@@ -33,14 +33,18 @@ from shared.recipes import get_recipe
 
 router = APIRouter(tags=["maps"])
 
-MapPath = Annotated[str, Path(description="the map's name", min_length=1, max_length=100)]
+MapPath = Annotated[
+    str, Path(description="the map's name", min_length=1, max_length=100, pattern=NO_NUL)
+]
 
 
 class NewMap(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
     name: str = Field(pattern=MAP_NAME, description="letters, digits, `.`, `_`, `-`; at most 100")
-    extractor: str | None = Field(None, max_length=200, description="left out: the configured one")
+    extractor: str | None = Field(
+        None, max_length=200, pattern=NO_NUL, description="left out: the configured one"
+    )
 
 
 class MapAnswer(Answer):

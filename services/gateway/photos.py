@@ -17,7 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from services.gateway.context import DEFAULT_MAP, FileId, GatewayDep, MapName
+from services.gateway.context import DEFAULT_MAP, NO_NUL, FileId, GatewayDep, MapName
 from services.gateway.filters import FilterDep
 from services.gateway.photo_fields import (
     check_metadata,
@@ -72,8 +72,8 @@ class PhotoPatch(BaseModel):
     longitude: Annotated[float | None, Field(ge=-180, le=180, allow_inf_nan=False)] = None
     heading: Annotated[float | None, Field(ge=0, le=360, allow_inf_nan=False)] = None
     captured_at: str | None = None
-    place: Annotated[str | None, Field(max_length=500, pattern=r"^[^\x00]*$")] = None
-    tags: list[Annotated[str, Field(pattern=r"^[^\x00]*$")]] | None = None
+    place: Annotated[str | None, Field(max_length=500, pattern=NO_NUL)] = None
+    tags: list[Annotated[str, Field(pattern=NO_NUL)]] | None = None
     metadata: dict[str, Any] | None = None
     role: PhotoRole | None = None
 
@@ -84,6 +84,8 @@ class PhotoPatch(BaseModel):
             said["captured_at"] = parse_time("captured_at", said["captured_at"])
         if said.get("heading") is not None:
             said["heading"] %= 360
+        if "place" in said:
+            said["place"] = (said["place"] or "").strip() or None
         if "tags" in said:
             said["tags"] = parse_tags(said["tags"] or [])
         if "metadata" in said:

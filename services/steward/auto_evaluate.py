@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+from typing import Any
 from uuid import UUID
 
 from sqlalchemy import exists, select
 from sqlalchemy.orm import Session
 
-from shared.catalog.chunks import count_searchable
+from shared.catalog.chunks import count_located, count_searchable
 from shared.catalog.evaluations import last_evaluation
-from shared.catalog.generations import active_generation
+from shared.catalog.generations import Generation, active_generation
 from shared.catalog.maps import list_maps, lock_map
-from shared.catalog.photos import PhotoRole, count_live, count_located
+from shared.catalog.photos import PhotoRole
 from shared.catalog.session import Catalog
 from shared.ids import new_id
 from shared.jobs import Job, JobKind, JobState, Priority
@@ -26,12 +27,12 @@ def evaluate_changed_maps(catalog: Catalog, least_photos: int) -> None:
     if not least_photos:
         return
     with catalog.read() as session:
-        due = [map_.id for map_ in list_maps(session) if _is_due(session, map_.id, least_photos)]
+        due = [map_.id for map_ in list_maps(session) if _due(session, map_.id, least_photos)]
     for map_id in due:
-        params = {"sample": SAMPLE_PHOTOS, "seed": 0, "automatic": True}
         with catalog.write() as session:
             lock_map(session, map_id)
-            if not _is_due(session, map_id, least_photos):
+            params = _due(session, map_id, least_photos)
+            if params is None:
                 continue  # another steward was first
             session.add(
                 Job(
@@ -44,18 +45,26 @@ def evaluate_changed_maps(catalog: Catalog, least_photos: int) -> None:
             )
 
 
-def _is_due(session: Session, map_id: UUID, least_photos: int) -> bool:
+def _due(session: Session, map_id: UUID, least_photos: int) -> dict[str, Any] | None:
+    """The evaluation that the map should have now, if any: the parameters of its job."""
     generation = active_generation(session, map_id)
     if generation is None or _is_busy(session, map_id):
-        return False
-    if count_located(session, map_id) < least_photos:
-        return False
-    last = last_evaluation(session, generation.id)
-    if last is None:
-        return not _has_failed(session, map_id)
-    return _differs(count_searchable(session, generation.id), last.searchable) or _differs(
-        count_live(session, map_id, PhotoRole.QUERY), last.labelled_queries
-    )
+        return None
+    if count_located(session, generation.id, PhotoRole.DATABASE) < least_photos:
+        return None
+    searchable = count_searchable(session, generation.id)
+    queries = count_located(session, generation.id, PhotoRole.QUERY)
+    seen = _seen(session, generation)
+    if seen is not None and not (_differs(searchable, seen[0]) or _differs(queries, seen[1])):
+        return None
+    return {
+        "sample": SAMPLE_PHOTOS,
+        "seed": 0,
+        "automatic": True,
+        "generation_id": str(generation.id),
+        "searchable": searchable,
+        "labelled_queries": queries,
+    }
 
 
 def _is_busy(session: Session, map_id: UUID) -> bool:
@@ -66,15 +75,23 @@ def _is_busy(session: Session, map_id: UUID) -> bool:
     return bool(session.scalar(select(unfinished)))
 
 
-def _has_failed(session: Session, map_id: UUID) -> bool:
-    """An evaluation that can't be done is not tried for ever: its reason is in its job."""
-    last = session.scalar(
-        select(Job.state)
-        .where(Job.map_id == map_id, Job.kind == JobKind.EVALUATE)
+def _seen(session: Session, generation: Generation) -> tuple[int, int] | None:
+    """How many photos and labelled queries the last evaluation saw, also one that was queued here
+    and came to nothing: its reason is in its job, and it is not tried for ever."""
+    job = session.scalar(
+        select(Job)
+        .where(Job.map_id == generation.map_id, Job.kind == JobKind.EVALUATE)
         .order_by(Job.id.desc())
         .limit(1)
     )
-    return last in (JobState.FAILED, JobState.CANCELLED)
+    if (
+        job is not None
+        and job.state in (JobState.FAILED, JobState.CANCELLED)
+        and job.params.get("generation_id") == str(generation.id)
+    ):
+        return job.params["searchable"], job.params["labelled_queries"]
+    last = last_evaluation(session, generation.id)
+    return None if last is None else (last.searchable, last.labelled_queries)
 
 
 def _differs(now: int, then: int) -> bool:

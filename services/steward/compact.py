@@ -12,7 +12,7 @@ from sqlalchemy.orm import Session
 from shared.catalog.base import db_now
 from shared.catalog.chunks import Chunk, Descriptor, live_rows
 from shared.catalog.generations import Generation, GenerationState, lock_generation
-from shared.catalog.maps import bump_version, lock_map
+from shared.catalog.maps import Map, bump_version, lock_map
 from shared.catalog.photos import Photo
 from shared.catalog.session import Catalog
 from shared.chunks import read_chunk, write_chunk
@@ -139,7 +139,9 @@ def _worth_merging(catalog: Catalog, compact_chunks: int) -> list[tuple[UUID, in
                 func.sum(live),
             )
             .join(Generation, Generation.id == Chunk.generation_id)
+            .join(Map, Map.id == Generation.map_id)
             .where(
+                Map.deleted_at.is_(None),
                 Chunk.superseded_at.is_(None),
                 Generation.state.in_((GenerationState.ACTIVE, GenerationState.BUILDING)),
             )

@@ -92,9 +92,9 @@ class Evaluator:
     def _evaluate(self, job: Job, stop: threading.Event) -> None:
         with self._catalog.read() as session:
             generation = active_generation(session, job.map_id)
-            searchable = count_searchable(session, generation.id) if generation else 0
-        if generation is None:
-            raise Conflict("nothing_to_evaluate", "The map has no described photo yet.")
+            if generation is None:
+                raise Conflict("nothing_to_evaluate", "The map has no described photo yet.")
+            searchable = count_searchable(session, generation.id)
         asked, reported = 0, time.monotonic()
 
         def on_asked() -> None:

@@ -9,11 +9,11 @@ from datetime import datetime
 from uuid import UUID
 
 import numpy as np
-from sqlalchemy import or_, select
+from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from shared.catalog.chunks import Descriptor
-from shared.catalog.photos import Photo, PhotoRole
+from shared.catalog.photos import Photo, PhotoRole, has_place
 from shared.estimate.places import Spot
 from shared.geodesy import distances_m, latitude_band
 
@@ -64,7 +64,7 @@ def read_located(
             Descriptor.generation_id == generation_id,
             Photo.deleted_at.is_(None),
             Photo.role == role,
-            or_(Photo.latitude.is_not(None), Photo.place.is_not(None)),
+            has_place(),
         )
         .order_by(Photo.id)
     )

@@ -21,7 +21,7 @@ from shared.catalog.generations import Generation
 from shared.catalog.maps import Map
 from shared.catalog.photos import PhotoRole
 from shared.catalog.session import Catalog
-from shared.errors import Gone
+from shared.errors import Conflict, Gone, Unavailable
 from shared.estimate.calibration import Calibration, learn_confidence, learn_threshold
 from shared.estimate.evidence import DEPTH, Evidence, Ranked, locate, weigh
 from shared.estimate.places import Spot, elsewhere, metres_between, same_place
@@ -107,6 +107,9 @@ class Measure:
         recall, impostors, alone = Recall(), [], 0
         for query in sample:
             ranking = self._ask(query, DEPTH)
+            self._on_asked()
+            if ranking is None:
+                continue
             if self._database.showing(query.spot, self._radius_m) > 1:  # itself is one of them
                 recall.add([same_place(query.spot, spot, self._radius_m) for _, spot in ranking])
             else:
@@ -114,7 +117,6 @@ class Measure:
             evidence = weigh(self._strangers(query, ranking), self._radius_m)
             if evidence is not None:
                 impostors.append(evidence)
-            self._on_asked()
         return recall, impostors, alone
 
     def _strangers(self, query: Located, ranking: list[tuple[Hit, Spot]]) -> list[Ranked]:
@@ -125,12 +127,15 @@ class Measure:
             if len(strangers) >= DEPTH // 2 or len(ranking) < depth or depth >= MOST_RANKS:
                 return strangers[:DEPTH]
             depth *= 2
-            ranking = self._ask(query, depth)
+            ranking = self._ask(query, depth) or []
 
     def _ask_labelled(self, calibration: Calibration) -> Labelled:
         labelled = Labelled()
         for query in self.queries:
             ranking = self._ask(query, DEPTH)
+            self._on_asked()
+            if ranking is None:
+                continue
             in_map = self._database.showing(query.spot, self._radius_m) > 0
             if in_map:
                 labelled.recall.add(
@@ -148,7 +153,6 @@ class Measure:
                     accepted=calibration.accepts(evidence) if evidence else None,
                 )
             )
-            self._on_asked()
         return labelled
 
     def _same_session(self, query: Located, best: Hit) -> bool:
@@ -157,13 +161,14 @@ class Measure:
             return False
         return abs(match.captured_at - query.captured_at) < SESSION
 
-    def _ask(self, query: Located, k: int) -> list[tuple[Hit, Spot]]:
-        """The k most similar database photos and their spots, without the query itself."""
+    def _ask(self, query: Located, k: int) -> list[tuple[Hit, Spot]] | None:
+        """The k most similar database photos and their spots, without the query itself; None for
+        a query that was deleted since. Conflict (`map_damaged`) when a part can't be searched."""
         for attempt in range(1, TRIES + 1):
             with self._catalog.read() as session:
                 found = descriptor_of(session, self._generation.id, query.photo_id)
             if found is None:
-                return []  # deleted since
+                return None
             descriptor, chunk = found
             request = SearchRequest(
                 map_id=self._generation.map_id,
@@ -180,12 +185,26 @@ class Measure:
                 if attempt == TRIES:
                     raise
                 continue
+            except Unavailable as error:
+                if error.code == "chunk_unreadable":
+                    raise _damaged([chunk.object_key]) from error
+                raise
+            if answer.missing:
+                raise _damaged(answer.missing)
             return [(hit, self._spot(hit)) for hit in answer.hits]
         raise AssertionError("the last try returns or raises")
 
     def _spot(self, hit: Hit) -> Spot:
         found = self._by_id.get(hit.photo_id)
         return found.spot if found else UNKNOWN
+
+
+def _damaged(missing: Sequence[str]) -> Conflict:
+    return Conflict(
+        "map_damaged",
+        f"{', '.join(missing)} can't be read, and figures of a part of the map would mislead. "
+        "Restore it from a backup, or describe its photos again, then evaluate.",
+    )
 
 
 def _ranked(ranking: Sequence[tuple[Hit, Spot]]) -> list[Ranked]:

@@ -22,7 +22,7 @@ from shared.catalog.generations import (
     lock_generation,
 )
 from shared.catalog.maps import Map, bump_version, lock_map
-from shared.catalog.photos import Photo
+from shared.catalog.photos import Photo, PhotoRole
 from shared.catalog.session import Catalog
 from shared.errors import Conflict
 from shared.ids import new_id
@@ -62,7 +62,12 @@ def fit_maps_that_wait(catalog: Catalog, hints: Hints, auto_fit_photos: int) -> 
     with catalog.read() as session:
         ready = session.scalars(
             select(Job.map_id)
-            .where(Job.kind == JobKind.INDEX, Job.waiting_for == WaitingFor.VOCABULARY)
+            .join(Photo, Photo.id == Job.photo_id)
+            .where(
+                Job.kind == JobKind.INDEX,
+                Job.waiting_for == WaitingFor.VOCABULARY,
+                Photo.role == PhotoRole.DATABASE,
+            )
             .group_by(Job.map_id)
             .having(func.count() >= auto_fit_photos)
         ).all()

@@ -15,18 +15,17 @@ DAY_SECONDS = 86_400.0
 
 
 def forget_old_jobs(catalog: Catalog, retention_days: float) -> None:
-    """Jobs that ended long ago. A photo's failed job stays: it holds the reason."""
-    reason_of_a_photo = exists().where(Photo.job_id == Job.id)
+    """Jobs that ended long ago. One that left its photo undescribed stays: it holds the reason, and
+    the same bytes again, or a retry, queue it anew."""
+    of_a_photo = exists().where(Photo.job_id == Job.id)
     old = (
         select(Job.id)
         .where(
             Job.finished_at < db_now_plus(-retention_days * DAY_SECONDS),
-            or_(
-                Job.state.in_((JobState.SUCCEEDED, JobState.CANCELLED)),
-                (Job.state == JobState.FAILED) & ~reason_of_a_photo,
-            ),
+            or_(Job.state == JobState.SUCCEEDED, ~of_a_photo),
         )
         .limit(AT_ONCE)
+        .with_for_update(skip_locked=True)
     )
     with catalog.write() as session:
         session.execute(delete(Job).where(Job.id.in_(session.scalars(old).all())))

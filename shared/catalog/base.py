@@ -17,7 +17,7 @@ from sqlalchemy.sql.elements import ColumnElement
 from sqlalchemy.sql.functions import FunctionElement
 from sqlalchemy.types import Boolean, Float, TypeDecorator
 
-from shared.geodesy import EARTH_RADIUS_M
+from shared.geodesy import EARTH_RADIUS_M, without_dust
 
 SQLITE_DISTANCE = "placewise_distance_m"
 
@@ -40,6 +40,16 @@ class UtcDateTime(TypeDecorator[datetime]):
         if value is None:
             return None
         return value.replace(tzinfo=UTC) if value.tzinfo is None else value.astimezone(UTC)
+
+
+class Degrees(TypeDecorator[float]):
+    """A latitude or longitude, without what is too small to compute with."""
+
+    impl = Float
+    cache_ok = True
+
+    def process_bind_param(self, value: float | None, dialect: Dialect) -> float | None:
+        return None if value is None else without_dust(value)
 
 
 JsonValue = JSON(none_as_null=True).with_variant(JSONB(none_as_null=True), "postgresql")
@@ -129,10 +139,12 @@ def _distance_postgresql(element: db_distance_m, compiler: Any, **kw: Any) -> st
     lat_1, lon_1, lat_2, lon_2 = (
         f"CAST({compiler.process(clause, **kw)} AS double precision)" for clause in element.clauses
     )
+    shrunk = f"cos(radians({lat_1})) * cos(radians({lat_2}))"
+    half_lambda = f"radians({lon_2} - {lon_1}) / 2"
     return (
-        f"({2 * EARTH_RADIUS_M!r} * asin(least(1.0, sqrt("
-        f"power(sin(radians({lat_2} - {lat_1}) / 2), 2) + cos(radians({lat_1})) * "
-        f"cos(radians({lat_2})) * power(sin(radians({lon_2} - {lon_1}) / 2), 2)))))"
+        f"({2 * EARTH_RADIUS_M!r} * atan2("
+        f"sqrt(sin(radians({lat_2} - {lat_1}) / 2) ^ 2 + {shrunk} * sin({half_lambda}) ^ 2), "
+        f"sqrt(sin(radians({lat_2} + {lat_1}) / 2) ^ 2 + {shrunk} * cos({half_lambda}) ^ 2)))"
     )
 
 

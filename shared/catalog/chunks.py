@@ -25,7 +25,7 @@ from sqlalchemy.orm import Mapped, Session, mapped_column
 
 from shared.catalog.base import Base, UtcDateTime, db_now
 from shared.catalog.generations import Generation
-from shared.catalog.photos import Photo, PhotoFacts, PhotoRole
+from shared.catalog.photos import Photo, PhotoFacts, PhotoRole, has_place
 from shared.ids import new_id
 
 
@@ -135,6 +135,24 @@ def count_described(session: Session, generation_id: UUID, role: PhotoRole | Non
 def count_searchable(session: Session, generation_id: UUID) -> int:
     """How many photos can be found in the generation."""
     return count_described(session, generation_id, PhotoRole.DATABASE)
+
+
+def count_located(session: Session, generation_id: UUID, role: PhotoRole) -> int:
+    """How many live photos of a role have a descriptor in the generation and a known place."""
+    return (
+        session.scalar(
+            select(func.count())
+            .select_from(Descriptor)
+            .join(Photo, Photo.id == Descriptor.photo_id)
+            .where(
+                Descriptor.generation_id == generation_id,
+                Photo.deleted_at.is_(None),
+                Photo.role == role,
+                has_place(),
+            )
+        )
+        or 0
+    )
 
 
 def take_slot(generation: Generation, rows: int, slot_rows: int) -> int:

@@ -31,6 +31,7 @@ from sqlalchemy.orm import Mapped, Session, mapped_column
 from shared.catalog.base import (
     Base,
     Condition,
+    Degrees,
     JsonValue,
     UtcDateTime,
     db_distance_m,
@@ -70,8 +71,8 @@ class Photo(Base):
     size_bytes: Mapped[int] = mapped_column(BigInteger)
     width: Mapped[int] = mapped_column(Integer)
     height: Mapped[int] = mapped_column(Integer)
-    latitude: Mapped[float | None] = mapped_column(Float)
-    longitude: Mapped[float | None] = mapped_column(Float)
+    latitude: Mapped[float | None] = mapped_column(Degrees)
+    longitude: Mapped[float | None] = mapped_column(Degrees)
     heading: Mapped[float | None] = mapped_column(Float)
     captured_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
     place: Mapped[str | None] = mapped_column(Text)
@@ -188,22 +189,9 @@ def count_live(session: Session, map_id: UUID, role: PhotoRole | None = None) ->
     return session.scalar(counted) or 0
 
 
-def count_located(session: Session, map_id: UUID) -> int:
-    """How many live database photos have coordinates or a place label."""
-    located = or_(Photo.latitude.is_not(None), Photo.place.is_not(None))
-    return (
-        session.scalar(
-            select(func.count())
-            .select_from(Photo)
-            .where(
-                Photo.map_id == map_id,
-                Photo.deleted_at.is_(None),
-                Photo.role == PhotoRole.DATABASE,
-                located,
-            )
-        )
-        or 0
-    )
+def has_place() -> Condition:
+    """True for photos with coordinates or a place label."""
+    return or_(Photo.latitude.is_not(None), Photo.place.is_not(None))
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,137 @@
+"""A filter means the same to a metadata search, in SQL, and to a similarity search, in the scan."""
+
+from __future__ import annotations
+
+from uuid import UUID
+
+import pytest
+from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import strategies as some
+from sqlalchemy import delete, select
+
+from services.search.select import select as select_rows
+from services.search.snapshot import PhotoColumns
+from shared.catalog.photos import (
+    MetadataFilter,
+    Photo,
+    PhotoFacts,
+    PhotoRole,
+    filter_conditions,
+    search_metadata,
+)
+from shared.catalog.session import Catalog
+from shared.photo_filter import Box, Circle, PhotoFilter
+from tests.support.catalog_rows import add_map, add_photo
+from tests.support.photo_filters import (
+    HALF_EARTH_M,
+    IDS,
+    passes,
+    photo_facts,
+    photo_filters,
+)
+
+FILTERS = 25  # asked of each population of photos
+
+
+@pytest.fixture
+def map_id(catalog: Catalog) -> UUID:
+    with catalog.write() as session:
+        return add_map(session).id
+
+
+def store(catalog: Catalog, map_id: UUID, photos: list[PhotoFacts]) -> list[PhotoFacts]:
+    """Exactly these photos lie in the catalog; what search reads of them."""
+    with catalog.write() as session:
+        session.execute(delete(Photo))
+        for photo in photos:
+            add_photo(
+                session,
+                map_id,
+                id=photo.photo_id,
+                role=photo.role,
+                latitude=photo.latitude,
+                longitude=photo.longitude,
+                captured_at=photo.captured_at,
+                place=photo.place,
+                tags=photo.tags,
+            )
+    with catalog.read() as session:
+        found = session.execute(select(*PhotoFacts.COLUMNS).order_by(Photo.id))
+        return [PhotoFacts(*facts) for facts in found]
+
+
+def in_sql(catalog: Catalog, wanted: PhotoFilter) -> set[UUID]:
+    with catalog.read() as session:
+        return set(session.scalars(select(Photo.id).where(*filter_conditions(wanted))))
+
+
+def in_scan(photos: list[PhotoFacts], wanted: PhotoFilter) -> set[UUID]:
+    columns = PhotoColumns.of(len(photos), enumerate(photos))
+    return set(columns.photo_id[select_rows(columns, wanted, ())])
+
+
+def test_sql_and_the_scan_let_pass_what_the_filter_means(catalog: Catalog, map_id: UUID) -> None:
+    @settings(
+        max_examples=8,
+        deadline=None,
+        phases=[Phase.generate],  # shrinking would store thousands of populations
+        suppress_health_check=list(HealthCheck),
+    )
+    @given(data=some.data())
+    def agree(data: some.DataObject) -> None:
+        drawn = [data.draw(photo_facts(photo_id)) for photo_id in IDS[:30]]
+        photos = store(catalog, map_id, drawn)
+        for _ in range(FILTERS):
+            wanted = data.draw(photo_filters(photos))
+            sql, scan = in_sql(catalog, wanted), in_scan(photos, wanted)
+            for photo in photos:
+                expected = passes(photo, wanted)
+                if expected is None:
+                    continue
+                here = (photo, wanted)
+                assert (photo.photo_id in sql) == expected, here
+                findable = photo.role == PhotoRole.DATABASE
+                assert (photo.photo_id in scan) == (expected and findable), here
+
+    agree()
+
+
+def test_coordinates_too_small_for_a_double_spoil_no_search(catalog: Catalog, map_id: UUID) -> None:
+    """PostgreSQL raises where a square underflows: one such photo would end every search."""
+    tiny = 5e-324
+    with catalog.write() as session:
+        odd = add_photo(session, map_id, latitude=tiny, longitude=-tiny).id
+        far = add_photo(session, map_id, latitude=1e-200, longitude=180).id
+    for centre in (0.0, tiny, -1e-300):
+        circle = Circle(latitude=centre, longitude=centre, radius_m=0)
+        assert in_sql(catalog, PhotoFilter(near=circle)) == {odd}
+        larger = circle.model_copy(update={"radius_m": HALF_EARTH_M})
+        assert in_sql(catalog, PhotoFilter(near=larger)) == {odd, far}
+    assert in_sql(catalog, PhotoFilter(box=Box(south=0, west=0, north=0, east=tiny))) == {odd}
+
+
+def test_filters_narrow_the_metadata_search_of_one_map_and_role(
+    catalog: Catalog, map_id: UUID
+) -> None:
+    here = {"latitude": 45.07, "longitude": 7.69, "place": "hall"}
+    with catalog.write() as session:
+        other = add_map(session, "other").id
+        right = add_photo(session, map_id, **here).id
+        asking = add_photo(session, map_id, role=PhotoRole.QUERY, **here).id
+        add_photo(session, map_id, latitude=45.08, longitude=7.69, place="hall")
+        add_photo(session, map_id, latitude=45.07, longitude=7.69)
+        add_photo(session, other, **here)
+    about = PhotoFilter(
+        place="hall", near=Circle(latitude=45.0701, longitude=7.69, radius_m=100), tags=()
+    )
+    for role, expected in (
+        (PhotoRole.DATABASE, {right}),
+        (PhotoRole.QUERY, {asking}),
+        (None, {right, asking}),
+    ):
+        with catalog.read() as session:
+            page, total = search_metadata(
+                session, map_id, MetadataFilter(photos=about, role=role), 10, None
+            )
+        assert {photo.id for photo in page} == expected
+        assert total == len(expected)

@@ -1,0 +1,130 @@
+"""Which rows a filter lets pass: the mask against a reference of its own, photo by photo."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime, timedelta, timezone
+from uuid import UUID
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as some
+
+from services.search.select import select
+from services.search.snapshot import PhotoColumns
+from shared.catalog.photos import PhotoFacts, PhotoRole
+from shared.photo_filter import EVERYTHING, Box, Circle, PhotoFilter
+from tests.support.photo_facts import facts_of
+from tests.support.photo_filters import HALF_EARTH_M, IDS, passes, photo_facts, photo_filters
+
+MOMENT = datetime(2024, 5, 6, 7, 8, 9, 123456, tzinfo=UTC)
+
+
+def selected(
+    photos: list[PhotoFacts], wanted: PhotoFilter, exclude: frozenset[UUID] = frozenset()
+) -> list[UUID]:
+    columns = PhotoColumns.of(len(photos), enumerate(photos))
+    return list(columns.photo_id[select(columns, wanted, exclude)])
+
+
+@settings(max_examples=150, deadline=None)
+@given(data=some.data(), count=some.integers(1, 12))
+def test_the_mask_lets_pass_what_the_filter_means(data: some.DataObject, count: int) -> None:
+    photos = [data.draw(photo_facts(photo_id)) for photo_id in IDS[:count]]
+    wanted = data.draw(photo_filters(photos))
+    found = selected(photos, wanted)
+    for photo in photos:
+        expected = passes(photo, wanted)
+        if expected is not None:
+            findable = photo.role == PhotoRole.DATABASE
+            assert (photo.photo_id in found) == (expected and findable), (photo, wanted)
+
+
+@settings(max_examples=50, deadline=None)
+@given(data=some.data())
+def test_what_is_excluded_or_dead_or_asks_never_passes(data: some.DataObject) -> None:
+    photos = [data.draw(photo_facts(photo_id)) for photo_id in IDS[:6]]
+    columns = PhotoColumns.of(8, enumerate(photos))  # the last two rows belong to no photo
+    excluded = frozenset(data.draw(some.sets(some.sampled_from(IDS[:8]))))
+    found = columns.photo_id[select(columns, EVERYTHING, excluded)]
+    assert list(found) == [
+        photo.photo_id
+        for photo in photos
+        if photo.role == PhotoRole.DATABASE and photo.photo_id not in excluded
+    ]
+
+
+@pytest.mark.parametrize(
+    ("wanted", "passing"),
+    [
+        pytest.param(PhotoFilter(), "west east pole nowhere", id="nothing wanted"),
+        pytest.param(PhotoFilter(ids=()), "", id="no ids"),
+        pytest.param(PhotoFilter(ids=(IDS[1], IDS[1], IDS[39])), "east", id="ids"),
+        pytest.param(
+            PhotoFilter(box=Box(south=-1, west=179, north=1, east=-179)),
+            "west east",
+            id="a box across the antimeridian",
+        ),
+        pytest.param(
+            PhotoFilter(box=Box(south=0, west=180, north=0, east=180)), "west", id="a point's box"
+        ),
+        pytest.param(
+            PhotoFilter(box=Box(south=-90, west=-180, north=90, east=180)),
+            "west east pole",
+            id="a box round the Earth",
+        ),
+        pytest.param(
+            PhotoFilter(box=Box(south=80, west=0, north=90, east=1)), "pole", id="up to the pole"
+        ),
+        pytest.param(
+            PhotoFilter(near=Circle(latitude=89.9, longitude=-60, radius_m=12_000)),
+            "pole",
+            id="a circle over the pole",
+        ),
+        pytest.param(
+            PhotoFilter(near=Circle(latitude=0, longitude=180, radius_m=112_000)),
+            "west east",
+            id="a circle across the antimeridian",
+        ),
+        pytest.param(
+            PhotoFilter(near=Circle(latitude=0, longitude=-179, radius_m=0)), "east", id="radius 0"
+        ),
+        pytest.param(
+            PhotoFilter(near=Circle(latitude=-33, longitude=12, radius_m=HALF_EARTH_M)),
+            "west east pole",
+            id="half the Earth round",
+        ),
+    ],
+)
+def test_borders_of_the_globe(wanted: PhotoFilter, passing: str) -> None:
+    names = {IDS[0]: "west", IDS[1]: "east", IDS[2]: "pole", IDS[3]: "nowhere"}
+    photos = [
+        facts_of(IDS[0], latitude=0, longitude=-180),
+        facts_of(IDS[1], latitude=0, longitude=-179),
+        facts_of(IDS[2], latitude=90, longitude=123),
+        facts_of(IDS[3]),
+    ]
+    assert [names[photo_id] for photo_id in selected(photos, wanted)] == passing.split()
+
+
+def test_bounds_of_the_time_are_inclusive_to_the_microsecond() -> None:
+    step = timedelta(microseconds=1)
+    photos = [facts_of(IDS[n], captured_at=MOMENT + (n - 1) * step) for n in range(3)]
+    photos.append(facts_of(IDS[3]))
+    elsewhere = MOMENT.astimezone(timezone(timedelta(hours=9)))
+    assert selected(photos, PhotoFilter(captured_after=elsewhere)) == IDS[1:3]
+    assert selected(photos, PhotoFilter(captured_before=elsewhere)) == IDS[:2]
+    both = PhotoFilter(captured_after=elsewhere, captured_before=elsewhere)
+    assert selected(photos, both) == [IDS[1]]
+    assert selected(photos, PhotoFilter(captured_after=MOMENT + 9 * step)) == []
+
+
+def test_changed_columns_leave_those_before_them_alone() -> None:
+    """Queries under way go on with the snapshot that they began with."""
+    before = PhotoColumns.of(2, enumerate([facts_of(IDS[0], place="hall"), facts_of(IDS[1])]))
+    after = before.changed({IDS[1]: facts_of(IDS[1], place="hall", tags=("wet",), latitude=1.0)})
+    in_hall = PhotoFilter(place="hall")
+    assert list(select(before, in_hall, ())) == [True, False]
+    assert list(select(after, in_hall, ())) == [True, True]
+    assert np.isnan(before.latitude[1])
+    assert before.changed({IDS[7]: facts_of(IDS[7])}) is before
