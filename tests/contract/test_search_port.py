@@ -5,8 +5,10 @@ from __future__ import annotations
 import shutil
 import tempfile
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Collection
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from typing import Any
 from uuid import UUID
 
 import numpy as np
@@ -29,16 +31,19 @@ from shared.catalog.chunks import Chunk, Descriptor, live_chunks
 from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.maps import Map, bump_version, lock_map
 from shared.catalog.models import ensure_model
-from shared.catalog.photos import Photo, mark_deleted
+from shared.catalog.photos import Photo, PhotoRole, mark_deleted
 from shared.catalog.session import Catalog
 from shared.chunks import decode_rows, encode_rows, manifest_key, write_chunk
 from shared.errors import Gone, Unavailable
 from shared.ids import new_id
 from shared.objects import FolderStore, ObjectStore
+from shared.photo_filter import Box, Circle, PhotoFilter
 from shared.search_protocol import SearchPort, SearchRequest, SearchResponse
 from shared.settings import Settings
 
 DIMENSION = 12
+NOON = datetime(2024, 5, 6, 12, tzinfo=UTC)
+HOUR = timedelta(hours=1)
 Rows = NDArray[np.float32]
 Reference = tuple[str, int]
 """A descriptor: object key and row."""
@@ -83,8 +88,17 @@ class SmallMap:
         with self.catalog.read() as session:
             return session.get_one(Map, self.map_id).version
 
-    def add(self, rows: Rows, slot: int = 0, dead: int = 0) -> list[UUID]:
-        """Publish a chunk of photos; its first `dead` rows belong to none (a lease was lost)."""
+    def add(
+        self,
+        rows: Rows,
+        slot: int = 0,
+        dead: int = 0,
+        about: Callable[[int], dict[str, Any]] = lambda row: {},
+    ) -> list[UUID]:
+        """Publish a chunk of photos; its first `dead` rows belong to none (a lease was lost).
+
+        `about` says what is known of the photo of a row: columns of `Photo`.
+        """
         chunk_id, photo_ids = new_id(), [new_id() for _ in rows]
         written = write_chunk(
             self.store,
@@ -96,7 +110,9 @@ class SmallMap:
         )
         with self.catalog.write() as session:
             lock_map(session, self.map_id)
-            session.add_all(self._photo(photo_id) for photo_id in photo_ids)
+            session.add_all(
+                self._photo(photo_id, **about(row)) for row, photo_id in enumerate(photo_ids)
+            )
             session.add(
                 Chunk(
                     id=chunk_id,
@@ -120,7 +136,7 @@ class SmallMap:
         self.rows |= dict(list(zip(photo_ids, rows, strict=True))[dead:])
         return photo_ids
 
-    def _photo(self, photo_id: UUID) -> Photo:
+    def _photo(self, photo_id: UUID, **columns: Any) -> Photo:
         return Photo(
             id=photo_id,
             map_id=self.map_id,
@@ -131,7 +147,17 @@ class SmallMap:
             size_bytes=1,
             width=1,
             height=1,
+            **columns,
         )
+
+    def patch(self, photo_id: UUID, **columns: Any) -> None:
+        """As `PATCH /uploads/{file_id}` does it."""
+        with self.catalog.write() as session:
+            lock_map(session, self.map_id)
+            photo = session.get_one(Photo, photo_id)
+            for name, value in columns.items():
+                setattr(photo, name, value)
+            photo.changed_version = bump_version(session, self.map_id)
 
     def delete(self, photo_id: UUID) -> None:
         with self.catalog.write() as session:
@@ -165,7 +191,9 @@ class SmallMap:
         min_version: int | None = None,
         min_score: float | None = None,
         exclude: tuple[UUID, ...] = (),
+        **photos: Any,
     ) -> SearchRequest:
+        """`photos` are the filter's conditions."""
         return SearchRequest(
             map_id=self.map_id,
             generation_id=self.generation_id,
@@ -173,14 +201,19 @@ class SmallMap:
             row=reference[1],
             min_version=self.version if min_version is None else min_version,
             k=k,
+            photos=PhotoFilter(**photos),
             min_score=min_score,
             exclude=exclude,
         )
 
-    def brute_force(self, vector: Rows, k: int = 10) -> list[tuple[UUID, float]]:
+    def brute_force(
+        self, vector: Rows, k: int = 10, among: Collection[UUID] | None = None
+    ) -> list[tuple[UUID, float]]:
         exact = vector.astype(np.float64)
         exact /= np.linalg.norm(exact)
         scored = [(-float(row.astype(np.float64) @ exact), p) for p, row in self.rows.items()]
+        if among is not None:
+            scored = [(score, photo_id) for score, photo_id in scored if photo_id in among]
         return [(photo_id, -score) for score, photo_id in sorted(scored)[:k]]
 
 
@@ -246,6 +279,145 @@ class SearchPortContract:
         bound = (expected[7][1] + expected[8][1]) / 2
         request = places.request(places.query(vector), k=30, min_score=bound)
         assert_answers(port().search(request), expected[:8])
+
+    def test_filtered_hits_are_the_best_of_what_passes(
+        self, places: SmallMap, port: OpenPort
+    ) -> None:
+        """For filters that let most, half, few and one of the photos pass."""
+
+        def about(row: int) -> dict[str, Any]:
+            return {
+                "latitude": 45 + row / 1000,
+                "longitude": 7.0,
+                "captured_at": NOON + row * HOUR,
+                "place": f"room {row % 2}",
+                "tags": ["all", *(["rare"] if row % 20 == 3 else [])],
+            }
+
+        photo_ids = places.add(unit_rows(1, 40), about=about)
+        more = places.add(unit_rows(2, 40), dead=2, about=lambda row: about(row + 40))
+        photo_ids += more
+        unknown = places.add(unit_rows(3, 10))
+        search = port()
+        for filters, rows in (
+            ({}, range(80)),
+            ({"tags": ("all",)}, range(80)),
+            ({"place": "room 1"}, range(1, 80, 2)),
+            ({"tags": ("rare", "all")}, range(3, 80, 20)),
+            (
+                {"captured_after": NOON + 11 * HOUR, "captured_before": NOON + 50 * HOUR},
+                range(11, 51),
+            ),
+            ({"near": Circle(latitude=45.02, longitude=7, radius_m=1120)}, range(10, 31)),
+            ({"box": Box(south=45.0395, west=7, north=45.0445, east=8)}, range(42, 45)),
+            ({"ids": (photo_ids[5], photo_ids[60], new_id())}, (5, 60)),
+            ({"place": "room 1", "ids": (photo_ids[4],)}, ()),
+            ({"ids": ()}, ()),
+        ):
+            passing = {photo_ids[row] for row in rows} - set(more[:2])
+            if not filters:
+                passing |= set(unknown)
+            for k in (1, 7, 200):
+                vector = unit_rows(100 + k, 1)[0]
+                response = search.search(places.request(places.query(vector), k=k, **filters))
+                assert_answers(response, places.brute_force(vector, k, passing))
+                assert response.rows_scanned == len(passing)
+                assert response.certificate == "exhaustive"
+
+    def test_a_filter_that_lets_one_of_thousands_pass_finds_it(
+        self, places: SmallMap, port: OpenPort
+    ) -> None:
+        """Also where the photo is the least similar of all."""
+        rows = unit_rows(1, 1200)
+        places.add(rows[:600], about=lambda row: {"tags": ["common"]})
+        photo_ids = places.add(rows[600:], about=lambda row: {"tags": ["common"]})
+        vector = -places.rows[photo_ids[77]]
+        places.patch(photo_ids[77], tags=["needle", "common"], latitude=89.9, longitude=180.0)
+        search = port()
+        for filters in (
+            {"tags": ("needle",)},
+            {"near": Circle(latitude=90, longitude=0, radius_m=20_000)},
+            {"ids": (photo_ids[77],)},
+        ):
+            response = search.search(places.request(places.query(vector), k=10, **filters))
+            assert_answers(response, places.brute_force(vector, 10, {photo_ids[77]}))
+            assert response.hits[0].score == pytest.approx(-1)
+        assert not search.search(places.request(places.query(vector), tags=("Needle",))).hits
+
+    def test_a_filter_and_exclusions_and_the_least_score_work_together(
+        self, places: SmallMap, port: OpenPort
+    ) -> None:
+        photo_ids = places.add(unit_rows(1, 30), about=lambda row: {"place": f"room {row % 3}"})
+        passing = set(photo_ids[1::3]) - {photo_ids[4]}
+        vector = places.rows[photo_ids[4]]
+        expected = places.brute_force(vector, 30, passing)
+        bound = (expected[4][1] + expected[5][1]) / 2
+        request = places.request(
+            places.reference(photo_ids[4]),
+            k=30,
+            min_score=bound,
+            exclude=(photo_ids[4],),
+            place="room 1",
+        )
+        assert_answers(port().search(request), expected[:5])
+
+    def test_what_is_changed_of_a_photo_is_seen_by_the_next_call_without_reading_its_chunk(
+        self, places: SmallMap, port: OpenPort
+    ) -> None:
+        first, second = places.add(unit_rows(1, 5)), places.add(unit_rows(2, 5))
+        vector = unit_rows(3, 1)[0]
+        reference = places.query(vector)
+        search = port()
+        search.search(places.request(reference))
+        for key in places.chunk_keys():
+            places.store.delete(key)
+
+        def found(**filters: Any) -> set[UUID]:
+            response = search.search(places.request(reference, k=20, **filters))
+            assert response.missing == ()
+            return {hit.photo_id for hit in response.hits}
+
+        nowhere = {"latitude": None, "longitude": None}
+        here = {"latitude": 1.0, "longitude": 2.0}
+        for columns, cleared, filters in (
+            ({"place": "hall"}, {"place": None}, {"place": "hall"}),
+            ({"tags": ["night", "wet"]}, {"tags": ["night"]}, {"tags": ("wet",)}),
+            ({"captured_at": NOON}, {"captured_at": None}, {"captured_before": NOON}),
+            (here, nowhere, {"near": Circle(latitude=1, longitude=2, radius_m=1)}),
+        ):
+            assert found(**filters) == set()
+            places.patch(first[1], **columns)
+            places.patch(second[2], **columns)
+            assert found(**filters) == {first[1], second[2]}
+            places.patch(first[1], **cleared)
+            assert found(**filters) == {second[2]}
+        assert found() == {*first, *second}
+
+    def test_labelled_queries_are_never_answered_and_can_be_asked_with(
+        self, places: SmallMap, port: OpenPort
+    ) -> None:
+        photo_ids = places.add(unit_rows(1, 12))
+        asking = places.add(
+            places.rows[photo_ids[3]][np.newaxis], about=lambda row: {"role": PhotoRole.QUERY}
+        )[0]
+        vector = places.rows.pop(asking)
+        search = port()
+
+        def check() -> None:
+            for ids in (None, (asking, *photo_ids)):
+                request = places.request(places.reference(asking), k=30, ids=ids)
+                assert_answers(search.search(request), places.brute_force(vector, 30))
+            assert search.status().rows == len(places.rows)
+
+        check()
+        assert places.merge(), "a merged chunk holds the queries as well"
+        check()
+        hidden = places.rows.pop(photo_ids[3])
+        places.patch(photo_ids[3], role=PhotoRole.QUERY)
+        check()
+        places.patch(photo_ids[3], role=PhotoRole.DATABASE)
+        places.rows[photo_ids[3]] = hidden
+        check()
 
     def test_map_without_photos_answers_nothing(self, places: SmallMap, port: OpenPort) -> None:
         response = port().search(places.request(places.query(unit_rows(1, 1)[0])))

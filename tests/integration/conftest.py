@@ -11,6 +11,7 @@ import torch
 from services.extractor import worker as worker_module
 from services.extractor.decoding import DecoderPool
 from services.extractor.worker import ExtractorWorker
+from shared.catalog.maps import ensure_default_map
 from shared.catalog.session import Catalog
 from shared.errors import PlacewiseError
 from shared.jobs import InProcessHints
@@ -18,6 +19,7 @@ from shared.objects import FolderStore
 from shared.settings import Settings
 from shared.vision.decode import Decoded
 from shared.vision.preprocessing import Preprocessing
+from tests.integration.gateway import Service
 from tests.integration.workplace import Workplace
 from tests.support.catalog_rows import add_map
 
@@ -75,6 +77,19 @@ def make_worker(
     yield make
     for worker in made:
         worker.close()
+
+
+@pytest.fixture
+def service(
+    catalog: Catalog,
+    store: FolderStore,
+    settings: Settings,
+    make_worker: Callable[[], ExtractorWorker],
+) -> Service:
+    """The HTTP API on an empty catalog with the map `default`."""
+    with catalog.write() as session:
+        ensure_default_map(session, settings.extractor)
+    return Service(catalog, store, settings, make_worker)
 
 
 @pytest.fixture

@@ -128,3 +128,14 @@ def test_changed_columns_leave_those_before_them_alone() -> None:
     assert list(select(after, in_hall, ())) == [True, True]
     assert np.isnan(before.latitude[1])
     assert before.changed({IDS[7]: facts_of(IDS[7])}) is before
+
+
+def test_all_tags_are_wanted_and_their_case_matters() -> None:
+    photos = [
+        facts_of(IDS[0], tags=("wet", "night", "old")),
+        facts_of(IDS[1], tags=("night",)),
+        facts_of(IDS[2], tags=("Night", "wet")),
+        facts_of(IDS[3]),
+    ]
+    assert selected(photos, PhotoFilter(tags=("night", "wet"))) == [IDS[0]]
+    assert selected(photos, PhotoFilter(tags=("wet",))) == [IDS[0], IDS[2]]

@@ -1,0 +1,84 @@
+"""The HTTP API in this process, on the test's catalog: what e2e tests can't do on PostgreSQL."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import httpx2
+from starlette.testclient import TestClient
+
+from services.extractor.worker import ExtractorWorker
+from services.gateway.app import create_app
+from services.gateway.context import Gateway
+from services.search.worker import SearchWorker
+from shared.catalog.session import Catalog
+from shared.jobs import InProcessHints
+from shared.objects import ObjectStore
+from shared.settings import Settings
+from tests.support.photos import photo_bytes
+
+API = "/api/v1"
+
+
+class Service:
+    """A gateway with its search worker; `drain` does what an extractor does meanwhile."""
+
+    def __init__(
+        self,
+        catalog: Catalog,
+        store: ObjectStore,
+        settings: Settings,
+        make_worker: Callable[[], ExtractorWorker],
+    ) -> None:
+        self.catalog, self.store = catalog, store
+        self.search = SearchWorker(catalog, store, settings)
+        gateway = Gateway(catalog, store, InProcessHints(), self.search, settings)
+        self._client = TestClient(create_app(gateway))
+        self.make_worker = make_worker
+        self._worker: ExtractorWorker | None = None
+
+    @property
+    def worker(self) -> ExtractorWorker:
+        if self._worker is None:
+            self._worker = self.make_worker()
+        return self._worker
+
+    def __call__(self, method: str, path: str, **options: Any) -> httpx2.Response:
+        """`METHOD /api/v1PATH`."""
+        return self._client.request(method, f"{API}{path}", **options)
+
+    def json(self, method: str, path: str, status: int = 200, **options: Any) -> Any:
+        answer = self(method, path, **options)
+        assert answer.status_code == status, answer.text
+        return answer.json()
+
+    def upload(self, data: bytes, map_name: str = "default", **fields: Any) -> Any:
+        """A photo that was acknowledged and is not described yet."""
+        return self.json(
+            "POST",
+            "/upload",
+            202,
+            params={"map": map_name},
+            files={"file": ("photo.jpg", data)},
+            data={name: str(value) for name, value in fields.items()},
+        )
+
+    def indexed(self, *numbers: int, map_name: str = "default", **fields: Any) -> list[str]:
+        """Photos that can be found; their ids."""
+        found = [
+            self.upload(photo_bytes(number), map_name, **fields)["file_id"] for number in numbers
+        ]
+        self.drain()
+        return found
+
+    def ask(self, data: bytes, map_name: str = "default", **params: Any) -> str:
+        """A query with a new photo; its job."""
+        files = {"file": ("query.jpg", data)}
+        params = {"map": map_name, **params}
+        started = self.json("POST", "/similarity", 202, params=params, files=files)
+        return str(started["job_id"])
+
+    def drain(self) -> None:
+        self.worker.drain(threading.Event())
