@@ -36,11 +36,15 @@ from shared.jobs import InProcessHints, Job, JobKind, JobState
 from shared.objects import FolderStore
 from shared.settings import Settings
 from tests.integration.gateway import Service
-from tests.support.catalog_rows import add_photo
+from tests.support.catalog_rows import add_job, add_photo, read_job
 from tests.support.photos import near_copy, photo_bytes
 from tests.support.problems import problem
 
 ROUNDS = 50
+
+
+class Away(Exception):
+    pass
 
 
 def rows(catalog: Catalog) -> Counter[str]:
@@ -145,7 +149,10 @@ def test_a_name_is_free_at_once_and_the_new_map_is_left_alone(
 ) -> None:
     service.json("POST", "/maps", 201, json={"name": "town"})
     old = service.indexed(1, 2, map_name="town")
+    removed = id_of(service, "town")
     service.json("DELETE", "/maps/town")
+    kept_as = {"map": f"deleted/{removed}"}  # its row's name, which no one may ask for
+    problem(service("GET", "/search", params=kept_as), 404, "map_not_found")
     made = service.json("POST", "/maps", 201, json={"name": "town"})
     assert (made["photos"], made["searchable"], made["generation_id"]) == (0, 0, None)
     (new,) = service.indexed(1, map_name="town")
@@ -315,6 +322,24 @@ def test_a_photo_that_slips_in_at_the_last_moment_is_removed_by_the_next_round(
     assert objects(store) == set()
 
 
+def test_a_job_that_slips_in_is_cancelled_before_anything_is_removed(
+    service: Service, catalog: Catalog, store: FolderStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    service.json("POST", "/maps", 201, json={"name": "gone"})
+    map_id = id_of(service, "gone")
+    service.json("DELETE", "/maps/gone")
+    with catalog.write() as session:
+        job = add_job(session, map_id, photo_id=add_photo(session, map_id).id)
+
+    def away(*_: Any) -> bool:
+        raise Away
+
+    monkeypatch.setattr(delete_maps_module, "_chunks", away)
+    with pytest.raises(Away):
+        delete_maps(catalog, store)
+    assert read_job(catalog, job.id).state == JobState.CANCELLED
+
+
 def test_an_upload_whose_map_went_meanwhile_is_not_found_and_leaves_no_bytes(
     service: Service, catalog: Catalog, store: FolderStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -334,10 +359,6 @@ def test_an_upload_whose_map_went_meanwhile_is_not_found_and_leaves_no_bytes(
 
 
 # --- removing --------------------------------------------------------------------------------
-
-
-class Away(Exception):
-    pass
 
 
 def test_removal_that_was_killed_anywhere_goes_on(

@@ -1,0 +1,160 @@
+"""A map laid out by hand: each photo's descriptor is a direction in the plane.
+
+The cosine of two photos is that of the angle between them, so that every ranking, and with it
+every figure of an evaluation, can be told with a pencil.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+from uuid import UUID
+
+import numpy as np
+from sqlalchemy import select
+
+from services.search.worker import SearchWorker
+from services.steward.evaluate import Evaluator
+from shared.catalog.chunks import Chunk, Descriptor, take_slot
+from shared.catalog.evaluations import Evaluation
+from shared.catalog.generations import Generation, lock_generation
+from shared.catalog.maps import DEFAULT_MAP, bump_version
+from shared.catalog.session import Catalog
+from shared.chunks import write_chunk
+from shared.ids import new_id
+from shared.jobs import Job, JobKind, Priority
+from shared.objects import FolderStore
+from shared.search_protocol import SearchPort, SearchRequest, SearchResponse, SearchStatus
+from shared.settings import Settings
+from tests.support.catalog_rows import add_generation, add_map, add_photo, read_job
+
+Seen = tuple[float, dict[str, Any]]
+"""A photo: its angle in degrees, and what is known of it (columns of `Photo`)."""
+
+
+class Town:
+    """Photos at angles, published as an extractor does it, and an evaluator to ask them."""
+
+    def __init__(self, catalog: Catalog, store: FolderStore, name: str = DEFAULT_MAP) -> None:
+        self.catalog, self.store = catalog, store
+        with catalog.write() as session:
+            self.map_id = add_map(session, name).id
+            self.generation_id = add_generation(session, self.map_id, dimension=2).id
+        self.search = SearchWorker(catalog, store, Settings())
+
+    def publish(self, photos: Sequence[Seen], generation_id: UUID | None = None) -> list[UUID]:
+        """A chunk of described photos; their ids."""
+        into = generation_id or self.generation_id
+        photo_ids, chunk_id = [new_id() for _ in photos], new_id()
+        angles = np.radians([angle for angle, _ in photos])
+        written = write_chunk(
+            self.store,
+            generation_id=into,
+            chunk_id=chunk_id,
+            rows=np.column_stack([np.cos(angles), np.sin(angles)]).astype(np.float32),
+            photo_ids=photo_ids,
+            spec={},
+        )
+        with self.catalog.write() as session:
+            generation = lock_generation(session, into)
+            for photo_id, (_, columns) in zip(photo_ids, photos, strict=True):
+                add_photo(session, self.map_id, id=photo_id, **columns)
+            session.add(
+                Chunk(
+                    id=chunk_id,
+                    generation_id=into,
+                    slot=take_slot(generation, len(photos), 1000),
+                    object_key=written.object_key,
+                    rows=written.rows,
+                    size_bytes=written.size_bytes,
+                    sha256=written.sha256,
+                )
+            )
+            session.flush()
+            session.add_all(
+                Descriptor(generation_id=into, photo_id=photo_id, chunk_id=chunk_id, row=row)
+                for row, photo_id in enumerate(photo_ids)
+            )
+            bump_version(session, self.map_id)
+        return photo_ids
+
+    def start(self, **params: Any) -> UUID:
+        """Queue an evaluation, as `POST /evaluations` does it; its job."""
+        with self.catalog.write() as session:
+            job = Job(
+                id=new_id(),
+                map_id=self.map_id,
+                kind=JobKind.EVALUATE,
+                priority=Priority.EVALUATION,
+                params={"sample": 1000, "seed": 0, "automatic": False, **params},
+            )
+            session.add(job)
+        return job.id
+
+    def evaluator(self, search: SearchPort | None = None) -> Evaluator:
+        return Evaluator(self.catalog, search or self.search, Settings(), "evaluator")
+
+    def work(self, search: SearchPort | None = None, stop: threading.Event | None = None) -> bool:
+        """Do the next evaluation; False when there was none."""
+        return self.evaluator(search).evaluate_next(stop or threading.Event())
+
+    def figures(self, **params: Any) -> dict[str, Any]:
+        """What an evaluation of now comes to."""
+        job_id = self.start(**params)
+        assert self.work()
+        job = read_job(self.catalog, job_id)
+        assert job.state == "succeeded", job.error
+        assert job.result is not None
+        return job.result
+
+    def evaluations(self) -> list[Evaluation]:
+        """All of the map, oldest first."""
+        with self.catalog.read() as session:
+            return list(
+                session.scalars(
+                    select(Evaluation)
+                    .where(Evaluation.map_id == self.map_id)
+                    .order_by(Evaluation.id)
+                )
+            )
+
+    def evaluation_jobs(self) -> list[Job]:
+        with self.catalog.read() as session:
+            return list(
+                session.scalars(
+                    select(Job)
+                    .where(Job.map_id == self.map_id, Job.kind == JobKind.EVALUATE)
+                    .order_by(Job.id)
+                )
+            )
+
+    def calibration(self) -> dict[str, Any] | None:
+        with self.catalog.read() as session:
+            return session.get_one(Generation, self.generation_id).calibration
+
+
+@dataclass(slots=True)
+class Watched:
+    """A search port that has something done before its n-th search (counted from 1)."""
+
+    port: SearchPort
+    at: int
+    do: Callable[[], object]
+    asked: int = 0
+
+    def search(self, request: SearchRequest) -> SearchResponse:
+        self.asked += 1
+        if self.asked == self.at:
+            self.do()
+        return self.port.search(request)
+
+    def status(self) -> SearchStatus:
+        return self.port.status()
+
+
+def metres_north(metres: float) -> float:
+    """As degrees of latitude."""
+    return math.degrees(metres / 6_371_008.8)
