@@ -1,0 +1,201 @@
+"""From similar photos to a place: what an answer says of it, before and after an evaluation."""
+
+from __future__ import annotations
+
+import itertools
+import time
+from typing import Any
+
+import httpx2
+import pytest
+
+from tests.support.photos import photo_bytes
+from tests.support.problems import problem
+from tests.support.server import ServerProcess
+
+AUTOMATIC = 24  # located photos from which a map is evaluated by itself
+SETTINGS = {"auto_evaluate_photos": AUTOMATIC}
+ENOUGH = 22  # to tell one in twenty, and not evaluated by itself
+MANY = 60  # more than an estimate looks at
+ESTIMATE_FIELDS = {
+    "in_map",
+    "latitude",
+    "longitude",
+    "radius_m",
+    "place",
+    "confidence",
+    "calibration",
+    "reason",
+}
+fresh = itertools.count(9000)
+
+
+def got(answer: httpx2.Response, status: int = 200) -> Any:
+    assert answer.status_code == status, answer.text
+    return answer.json()
+
+
+def re_encoded(number: int) -> bytes:
+    """The photo `number` with other bytes, and as alike as the tiny extractor can bear."""
+    return photo_bytes(number, quality=50)
+
+
+def fill(server: ServerProcess, name: str, numbers: list[int], *about: dict[str, Any]) -> None:
+    """A new map with these photos, `about` says what of each; all can be found."""
+    got(server.client.post("/api/v1/maps", json={"name": name}), 201)
+    for number, fields in zip(numbers, about, strict=True):
+        answer = server.client.post(
+            "/api/v1/upload",
+            params={"map": name},
+            files={"file": ("photo.jpg", photo_bytes(number))},
+            data={key: str(value) for key, value in fields.items()},
+        )
+        got(answer, 202)
+    while got(server.client.get(f"/api/v1/maps/{name}"))["searchable"] < len(numbers):
+        time.sleep(0.02)
+
+
+def ask(server: ServerProcess, name: str, data: bytes, **params: Any) -> dict[str, Any]:
+    answer: dict[str, Any] = got(server.ask(data, map=name, **params))
+    assert set(answer["estimate"]) == ESTIMATE_FIELDS
+    assert answer["estimate"]["reason"]
+    assert answer["total_similar"] == len(answer["similar_images"])
+    return answer
+
+
+def evaluate(server: ServerProcess, name: str) -> dict[str, Any]:
+    started = got(server.client.post("/api/v1/evaluations", params={"map": name}), 202)
+    while True:
+        job: dict[str, Any] = got(
+            server.client.get(f"/api/v1/jobs/{started['job_id']}", params={"map": name, "wait": 30})
+        )
+        if job["state"] not in ("queued", "running"):
+            assert job["state"] == "succeeded", job
+            return job
+
+
+@pytest.fixture(scope="module")
+def streets(server: ServerProcess) -> list[int]:
+    """The numbers of ENOUGH photos in the map `streets`, each a degree from the next."""
+    numbers = [next(fresh) for _ in range(ENOUGH)]
+    fill(server, "streets", numbers, *({"latitude": n, "longitude": 7} for n in range(ENOUGH)))
+    return numbers
+
+
+def test_an_evaluation_lets_answers_say_whether_the_place_is_in_the_map(
+    server: ServerProcess, streets: list[int]
+) -> None:
+    before = ask(server, "streets", re_encoded(streets[3]))["estimate"]
+    assert before["in_map"] is None
+    assert "POST /api/v1/evaluations" in before["reason"]
+    assert (before["confidence"], before["calibration"]) == (None, "uncalibrated")
+    assert (before["latitude"], before["longitude"]) == (pytest.approx(3), pytest.approx(7))
+
+    job = evaluate(server, "streets")
+    assert job["progress"] == {"done": ENOUGH, "total": ENOUGH, "failed": 0}
+    (kept,) = got(server.client.get("/api/v1/evaluations", params={"map": "streets"}))[
+        "evaluations"
+    ]
+    assert not kept["automatic"]
+    assert kept["searchable"] == ENOUGH
+    assert job["result"] == {
+        "evaluation_id": kept["evaluation_id"],
+        "generation_id": kept["generation_id"],
+        **kept["figures"],
+    }
+    assert kept["figures"]["leave_one_out"]["without_positive"] == ENOUGH
+
+    copies = [ask(server, "streets", re_encoded(number))["estimate"] for number in streets]
+    accepted = [(n, estimate) for n, estimate in enumerate(copies) if estimate["in_map"]]
+    assert accepted
+    for n, estimate in accepted:
+        assert (estimate["latitude"], estimate["longitude"]) == (
+            pytest.approx(n, abs=1e-6),
+            pytest.approx(7),
+        )
+        assert (estimate["radius_m"], estimate["place"]) == (25, None)
+        assert (estimate["confidence"], estimate["calibration"]) == (None, "uncalibrated")
+    strangers = [ask(server, "streets", photo_bytes(next(fresh)))["estimate"] for _ in range(20)]
+    refused = [estimate for estimate in strangers if estimate["in_map"] is False]
+    assert len(refused) >= 14, "about one in twenty is accepted"
+    for estimate in refused:
+        assert (estimate["latitude"], estimate["place"], estimate["radius_m"]) == (None,) * 3
+        assert estimate["reason"].startswith("Not in this map")
+    history = got(server.client.get("/api/v1/searches", params={"map": "streets"}))["searches"]
+    assert [search["in_map"] for search in history][::-1] == [
+        None,
+        *(estimate["in_map"] for estimate in [*copies, *strangers]),
+    ]
+
+
+def test_a_filter_that_nothing_passes_gives_no_place_and_says_so(
+    server: ServerProcess, streets: list[int]
+) -> None:
+    answer = ask(server, "streets", re_encoded(streets[0]), near="-80,7,1000")
+    assert answer["similar_images"] == []
+    assert answer["estimate"]["latitude"] is None
+    assert "passes the filter" in answer["estimate"]["reason"]
+    narrowed = ask(server, "streets", re_encoded(streets[0]), box="4.5,6,6.5,8")
+    assert sorted(found["latitude"] for found in narrowed["similar_images"]) == [5, 6]
+
+
+def test_rooms_have_a_label_and_no_coordinates(server: ServerProcess) -> None:
+    numbers = [next(fresh) for _ in range(6)]
+    fill(server, "rooms", numbers, *({"place": f"room {n // 2}"} for n in range(6)))
+    estimate = ask(server, "rooms", re_encoded(numbers[5]))["estimate"]
+    assert estimate["place"] == "room 2"
+    assert (estimate["latitude"], estimate["longitude"], estimate["radius_m"]) == (None,) * 3
+    figures = evaluate(server, "rooms")["result"]["leave_one_out"]
+    assert (figures["queries"], figures["without_positive"]) == (6, 0)
+
+
+def test_photos_of_nowhere_give_a_reason_instead_of_a_place(server: ServerProcess) -> None:
+    numbers = [next(fresh) for _ in range(2)]
+    fill(server, "nowhere", numbers, {}, {"latitude": 1, "longitude": 2})
+    estimate = ask(server, "nowhere", re_encoded(numbers[0]))["estimate"]
+    assert (estimate["in_map"], estimate["latitude"], estimate["place"]) == (None, None, None)
+    assert "neither coordinates nor a place" in estimate["reason"]
+    assert ask(server, "nowhere", re_encoded(numbers[1]))["estimate"]["latitude"] == pytest.approx(
+        1
+    )
+
+
+def test_more_photos_than_an_estimate_looks_at_are_answered(server: ServerProcess) -> None:
+    numbers = [next(fresh) for _ in range(MANY)]
+    fill(server, "many", numbers, *({} for _ in numbers))
+    everything = ask(server, "many", re_encoded(numbers[0]), top_k=100)
+    scores = [found["similarity_score"] for found in everything["similar_images"]]
+    assert len(scores) == MANY
+    assert scores == sorted(scores, reverse=True)
+    for top_k in (1, 49, 50, 51, 57):
+        answer = ask(server, "many", re_encoded(numbers[0]), top_k=top_k)
+        shown = [found["image_id"] for found in answer["similar_images"]]
+        assert shown == [found["image_id"] for found in everything["similar_images"]][:top_k]
+    for rank in (5, 55):
+        bound = (scores[rank - 1] + scores[rank]) / 2
+        answer = ask(server, "many", re_encoded(numbers[0]), top_k=100, min_score=bound)
+        assert answer["total_similar"] == rank
+    none = ask(server, "many", photo_bytes(next(fresh)), min_score=1)
+    assert none["similar_images"] == []
+    assert "neither" in none["estimate"]["reason"], "it looks below the least score"
+
+
+def test_a_map_that_has_grown_is_evaluated_by_itself(server: ServerProcess) -> None:
+    numbers = [next(fresh) for _ in range(AUTOMATIC)]
+    fill(server, "grown", numbers, *({"latitude": 0, "longitude": n} for n in range(AUTOMATIC)))
+    deadline = time.monotonic() + 60
+    found: list[Any] = []
+    while not found:
+        assert time.monotonic() < deadline, "no evaluation came"
+        time.sleep(0.05)
+        found = got(server.client.get("/api/v1/evaluations", params={"map": "grown"}))[
+            "evaluations"
+        ]
+    assert found[0]["automatic"]
+    assert ask(server, "grown", re_encoded(numbers[1]))["estimate"]["in_map"] is not None
+
+
+def test_there_is_nothing_to_evaluate_in_an_empty_map(server: ServerProcess) -> None:
+    got(server.client.post("/api/v1/maps", json={"name": "empty"}), 201)
+    answer = server.client.post("/api/v1/evaluations", params={"map": "empty"})
+    problem(answer, 409, "nothing_to_evaluate")

@@ -1,0 +1,328 @@
+"""Several maps in one server: made and deleted, over HTTP and by command, each for itself."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import time
+from pathlib import Path
+from typing import Any
+from uuid import uuid4
+
+import httpx2
+import pytest
+
+from tests.support.photos import near_copy, photo_bytes
+from tests.support.problems import field_refused, problem
+from tests.support.server import ServerProcess, environment, run_command
+
+SETTINGS = {"auto_evaluate_photos": 0, "auto_fit_photos": 10_000}
+MAPS = "/api/v1/maps"
+fresh = itertools.count(7000)
+names = (f"town-{number}" for number in itertools.count())
+
+
+def got(answer: httpx2.Response, status: int = 200) -> Any:
+    assert answer.status_code == status, answer.text
+    return answer.json()
+
+
+def make(server: ServerProcess, **wanted: Any) -> str:
+    """A new map; its name."""
+    name = next(names)
+    made = got(server.client.post(MAPS, json={"name": name, **wanted}), 201)
+    assert made["name"] == name
+    return name
+
+
+def store(server: ServerProcess, name: str, *numbers: int, **fields: Any) -> list[str]:
+    """Photos that can be found in the map; their ids."""
+    found = []
+    for number in numbers:
+        answer = server.client.post(
+            "/api/v1/upload",
+            params={"map": name},
+            files={"file": ("photo.jpg", photo_bytes(number))},
+            data={key: str(value) for key, value in fields.items()},
+            headers={"Prefer": "wait=30"},
+        )
+        found.append(got(answer, 201)["file_id"])
+    return found
+
+
+def ended(server: ServerProcess, name: str, job_id: str) -> dict[str, Any]:
+    while True:
+        job: dict[str, Any] = got(
+            server.client.get(f"/api/v1/jobs/{job_id}", params={"map": name, "wait": 30})
+        )
+        if job["state"] not in ("queued", "running"):
+            return job
+
+
+# --- made, listed, refused -------------------------------------------------------------------
+
+
+def test_a_map_is_made_listed_and_looked_at(server: ServerProcess) -> None:
+    name = make(server, extractor="test-tiny-vlad")
+    listed = got(server.client.get(MAPS))
+    assert [map_["name"] for map_ in listed] == sorted(map_["name"] for map_ in listed)
+    assert {"default", name} <= {map_["name"] for map_ in listed}
+    (found,) = (map_ for map_ in listed if map_["name"] == name)
+    assert found == got(server.client.get(f"{MAPS}/{name}"))
+    assert found["extractor"] == "test-tiny-vlad"
+    assert (found["photos"], found["searchable"], found["labelled_queries"]) == (0, 0, 0)
+    assert (found["generation_id"], found["vocabulary"]) == (None, None)
+
+
+def test_a_name_is_taken_once(server: ServerProcess) -> None:
+    name = make(server)
+    for taken in (name, "default"):
+        body = problem(server.client.post(MAPS, json={"name": taken}), 409, "map_exists")
+        assert taken in body["detail"]
+    upper = server.client.post(MAPS, json={"name": name.upper()})
+    assert upper.status_code == 201, "case matters"
+
+
+@pytest.mark.parametrize(
+    "name", ["", " ", "a b", "a/b", "../a", ".a", "-a", "_a", "ä", "a\n", "a\0", "a" * 101, 7, None]
+)
+def test_a_bad_name_is_refused(server: ServerProcess, name: Any) -> None:
+    field_refused(server.client.post(MAPS, json={"name": name}), "name")
+
+
+def test_good_names_may_be_long_and_odd(server: ServerProcess) -> None:
+    for name in ("a" * 100, "0", "A.b_c-d", "maps", "null"):
+        got(server.client.post(MAPS, json={"name": name}), 201)
+        assert got(server.client.get(f"{MAPS}/{name}"))["name"] == name
+        got(server.client.delete(f"{MAPS}/{name}"))
+
+
+def test_every_call_says_how_to_make_the_map_that_is_missing(server: ServerProcess) -> None:
+    api = got(server.client.get("/openapi.json"))
+    asked = []
+    for path, calls in api["paths"].items():
+        for method, call in calls.items():
+            if not any(p["name"] == "map" for p in call.get("parameters", ())):
+                continue
+            content = call.get("requestBody", {}).get("content", {})
+            body: dict[str, Any] = {}
+            if "multipart/form-data" in content:
+                body = {"files": {"file": ("photo.jpg", photo_bytes(1))}}
+            elif "application/json" in content:
+                body = {"json": {}}
+            here = path.replace("{file_id}", str(uuid4())).replace("{job_id}", str(uuid4()))
+            answer = server.client.request(method, here, params={"map": "nowhere"}, **body)
+            detail = problem(answer, 404, "map_not_found")["detail"]
+            assert "placewise maps create nowhere" in detail
+            assert f"POST {MAPS}" in detail
+            asked.append(f"{method} {path}")
+    assert len(asked) >= 22, asked
+    for method in ("GET", "DELETE"):
+        problem(server.client.request(method, f"{MAPS}/nowhere"), 404, "map_not_found")
+
+
+# --- each for itself -------------------------------------------------------------------------
+
+
+def test_the_same_bytes_in_two_maps_are_two_photos(server: ServerProcess) -> None:
+    one, other = make(server), make(server)
+    number = next(fresh)
+    (here,) = store(server, one, number, latitude=1, longitude=2)
+    (there,) = store(server, other, number, latitude=3, longitude=4)
+    assert here != there
+    for name, file_id, latitude in ((one, here, 1), (other, there, 3)):
+        photo = got(server.client.get(f"/api/v1/uploads/{file_id}", params={"map": name}))
+        assert photo["latitude"] == latitude
+    got(server.client.delete(f"/api/v1/uploads/{here}", params={"map": one}))
+    assert got(server.client.get(f"/api/v1/uploads/{there}", params={"map": other}))["searchable"]
+
+
+def test_searches_never_cross(server: ServerProcess) -> None:
+    one, other = make(server), make(server)
+    numbers = [next(fresh) for _ in range(3)]
+    here, there = store(server, one, *numbers), store(server, other, *numbers)
+    for name, ids in ((one, here), (other, there)):
+        by_new = server.client.post(
+            "/api/v1/similarity",
+            params={"map": name, "top_k": 100},
+            files={"file": ("q.jpg", near_copy(numbers[0]))},
+            headers={"Prefer": "wait=30"},
+        )
+        assert {found["image_id"] for found in got(by_new)["similar_images"]} == set(ids)
+        by_stored = server.similar(ids[0], map=name, top_k=100)
+        assert {found["image_id"] for found in got(by_stored)["similar_images"]} == set(ids[1:])
+        listed = got(server.client.get("/api/v1/search", params={"map": name}))
+        assert {found["image_id"] for found in listed["images"]} == set(ids)
+        wanted = ",".join([*here, *there])
+        answer = got(server.similar(ids[0], map=name, ids=wanted))
+        assert {found["image_id"] for found in answer["similar_images"]} == set(ids[1:])
+
+
+def test_what_belongs_to_one_map_is_not_found_in_another(server: ServerProcess) -> None:
+    one, other = make(server), make(server)
+    (here,) = store(server, one, next(fresh))
+    job_id = got(server.client.get(f"/api/v1/uploads/{here}", params={"map": one}))["job_id"]
+    for method, path in (
+        ("GET", f"/uploads/{here}"),
+        ("PATCH", f"/uploads/{here}"),
+        ("DELETE", f"/uploads/{here}"),
+        ("GET", f"/uploads/{here}/image"),
+        ("GET", f"/uploads/{here}/thumbnail"),
+        ("POST", f"/similarity/{here}"),
+    ):
+        said = {"place": "x"} if method == "PATCH" else None
+        answer = server.client.request(method, f"/api/v1{path}", params={"map": other}, json=said)
+        problem(answer, 404, "photo_not_found")
+    for method, path in (
+        ("GET", ""),
+        ("GET", "/events"),
+        ("GET", "/result"),
+        ("POST", "/cancel"),
+        ("POST", "/retry"),
+    ):
+        answer = server.client.request(
+            method, f"/api/v1/jobs/{job_id}{path}", params={"map": other}
+        )
+        problem(answer, 404, "job_not_found")
+    photo = got(server.client.get(f"/api/v1/uploads/{here}", params={"map": one}))
+    assert (photo["place"], photo["searchable"]) == (None, True)
+
+
+def test_lists_and_figures_do_not_cross(server: ServerProcess) -> None:
+    one, other = make(server), make(server)
+    (here, _) = store(server, one, next(fresh), next(fresh), place="hall")
+    store(server, other, next(fresh))
+    got(server.similar(here, map=one))
+    job_id = got(server.client.post("/api/v1/evaluations", params={"map": one}), 202)["job_id"]
+    assert ended(server, one, job_id)["state"] == "succeeded"
+
+    def lengths(name: str) -> list[int]:
+        return [
+            len(got(server.client.get(f"/api/v1/{path}", params={"map": name}))[path])
+            for path in ("jobs", "searches", "evaluations")
+        ]
+
+    assert lengths(one) == [3, 1, 1]
+    assert lengths(other) == [1, 0, 0]
+    stats = [
+        got(server.client.get("/api/v1/database/stats", params={"map": name}))
+        for name in (one, other)
+    ]
+    assert [s["map"] for s in stats] == [one, other]
+    assert [s["total_images"] for s in stats] == [2, 1]
+    assert [s["total_searches"] for s in stats] == [1, 0]
+    assert [sum(s["jobs"].values()) for s in stats] == [3, 1]
+
+
+def test_a_fit_in_one_map_leaves_the_others_generation_alone(server: ServerProcess) -> None:
+    one, other = (make(server, extractor="test-tiny-vlad") for _ in range(2))
+    numbers = [next(fresh) for _ in range(3)]
+    for name in (one, other):
+        for number in numbers:
+            files = {"file": photo_bytes(number)}
+            got(server.client.post("/api/v1/upload", params={"map": name}, files=files), 202)
+
+    def fit(name: str, seed: int) -> str:
+        wanted = {"clusters": 4, "seed": seed}
+        answer = server.client.post("/api/v1/vocabularies", params={"map": name}, json=wanted)
+        job = ended(server, name, got(answer, 202)["job_id"])
+        assert job["state"] == "succeeded", job
+        generation: str = job["result"]["generation_id"]
+        return generation
+
+    def generation(name: str) -> Any:
+        return got(server.client.get(f"{MAPS}/{name}"))
+
+    fit(one, 0)
+    assert generation(other)["generation_id"] is None
+    assert generation(other)["searchable"] == 0
+    kept = fit(other, 0)
+    for seed in (1, 2):
+        fit(one, seed)
+    assert generation(other)["generation_id"] == kept
+    assert len(got(server.client.get("/api/v1/vocabularies", params={"map": other}))) == 1
+    assert len(got(server.client.get("/api/v1/generations", params={"map": one}))) == 3
+    assert generation(one)["searchable"] == generation(other)["searchable"] == 3
+
+
+# --- deleted ---------------------------------------------------------------------------------
+
+
+def test_a_deleted_map_is_gone_at_once_and_its_bytes_soon(server: ServerProcess) -> None:
+    name = make(server)
+    (file_id,) = store(server, name, next(fresh))
+    objects = server.home / "objects"
+    thumbnail = objects / "thumbnails" / f"{file_id}.jpg"
+    assert thumbnail.exists()
+    with server.no_decoding():
+        files = {"file": photo_bytes(next(fresh))}
+        job_id = got(server.client.post("/api/v1/upload", params={"map": name}, files=files), 202)[
+            "job_id"
+        ]
+        deleted = got(server.client.delete(f"{MAPS}/{name}"))
+        assert (deleted["success"], deleted["deleted_map"]) == (True, name)
+        for path in (f"/uploads/{file_id}", f"/jobs/{job_id}", "/search", "/database/stats"):
+            answer = server.client.get(f"/api/v1{path}", params={"map": name})
+            problem(answer, 404, "map_not_found")
+        problem(server.client.delete(f"{MAPS}/{name}"), 404, "map_not_found")
+        assert name not in {map_["name"] for map_ in got(server.client.get(MAPS))}
+        assert make_again(server, name)["photos"] == 0
+    wait_until_gone(thumbnail)
+    (again,) = store(server, name, next(fresh))
+    assert got(server.similar(again, map=name))["similar_images"] == []
+
+
+def make_again(server: ServerProcess, name: str) -> dict[str, Any]:
+    made: dict[str, Any] = got(server.client.post(MAPS, json={"name": name}), 201)
+    return made
+
+
+def wait_until_gone(path: Path) -> None:
+    deadline = time.monotonic() + 60
+    while path.exists():
+        assert time.monotonic() < deadline, f"{path} is still there"
+        time.sleep(0.05)
+
+
+# --- by command ------------------------------------------------------------------------------
+
+
+def test_maps_are_made_filled_asked_and_deleted_by_command(
+    server: ServerProcess, tmp_path: Path
+) -> None:
+    env = environment(server.home, **SETTINGS)
+
+    def placewise(*arguments: str | Path, code: int = 0) -> Any:
+        run = run_command(*arguments, "--json", env=env, cwd=tmp_path)
+        assert run.returncode == code, run.stdout + run.stderr
+        return json.loads(run.stdout)
+
+    name = next(names)
+    assert placewise("maps", "create", name)["name"] == name
+    photos, queries = tmp_path / "photos", tmp_path / "queries"
+    numbers = [next(fresh) for _ in range(3)]
+    for folder, quality in ((photos, 75), (queries, 50)):
+        folder.mkdir()
+        for number in numbers:
+            (folder / f"{number}.jpg").write_bytes(photo_bytes(number, quality=quality))
+        (folder / "places.csv").write_text(
+            "filename,place\n" + "".join(f"{n}.jpg,room {n}\n" for n in numbers)
+        )
+    table = "places.csv"
+    placewise("index", photos, "--csv", photos / table, "--map", name)
+    placewise("index", queries, "--csv", queries / table, "--map", name, "--role", "query")
+    (listed,) = (map_ for map_ in placewise("maps", "list") if map_["name"] == name)
+    assert (listed["photos"], listed["searchable"], listed["labelled_queries"]) == (3, 3, 3)
+    answer = placewise(
+        "query", queries / f"{numbers[1]}.jpg", "--map", name, "--place", f"room {numbers[2]}"
+    )
+    assert [found["place"] for found in answer["similar_images"]] == [f"room {numbers[2]}"]
+    figures = placewise("evaluate", "--map", name)
+    assert figures["leave_one_out"]["without_positive"] == 3
+    assert figures["labelled_queries"]["queries"] == 3
+    assert figures["labelled_queries"]["R@1"] == 1
+    kept = run_command("maps", "delete", name, env=env, cwd=tmp_path)
+    assert kept.returncode != 0, "nobody said yes"
+    assert placewise("maps", "delete", name, "--yes")["deleted_map"] == name
+    refused = placewise("maps", "create", "not a name", code=1)
+    assert refused["code"] == "invalid_field"
