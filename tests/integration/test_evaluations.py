@@ -13,6 +13,7 @@ import sqlalchemy as sql
 
 from services.steward import evaluate as evaluate_module
 from services.steward.auto_evaluate import evaluate_changed_maps
+from services.steward.collect import collect_superseded_chunks
 from services.steward.compact import merge_slot
 from shared.catalog.base import db_now
 from shared.catalog.chunks import Descriptor
@@ -69,7 +70,7 @@ STREETS: list[Seen] = [
     (10, at(0, 24)),  # second as well: R@5
     (4, at(1)),  # its place comes behind all that is near: not even among ten
     (100, at(1, 10)),  # third, after 50 and 10: R@5
-    (50, at(2)),  # alone
+    (50, at(2, place="yard")),  # alone, and counted once though it has both
     (200, {"place": "hall"}),  # first: R@1
     (201, {"place": "hall", **at(30)}),  # first, by the label; it also has coordinates
     (300, at(3)),  # six strangers lie between the two: R@10
@@ -215,13 +216,16 @@ def _forget(catalog: Catalog, photo_id: UUID) -> None:
         session.execute(sql.delete(Descriptor).where(Descriptor.photo_id == photo_id))
 
 
-def test_chunks_merged_meanwhile_change_no_figure(town: Town) -> None:
+def test_chunks_merged_and_removed_meanwhile_change_no_figure(town: Town) -> None:
+    """The photo that is asked with has another reference then: it is looked up once more."""
     for begin in range(0, len(STREETS), 3):
         town.publish(STREETS[begin : begin + 3])
     before = town.figures()["leave_one_out"]
 
     def merge() -> None:
         assert merge_slot(town.catalog, town.store, town.generation_id, 0)
+        collect_superseded_chunks(town.catalog, town.store, grace_seconds=0)
+        town.search.follow()
 
     job_id = town.start()
     town.work(Watched(town.search, 4, merge))
