@@ -69,6 +69,7 @@ def _draw(options: argparse.Namespace, city: Path, progress: Progress) -> None:
             out_of_map=options.out_of_map,
             width=320,
             height=240,
+            train=False,
         )
     )
     bar = progress.add_task("drawing the city", total=len(plan.shots))

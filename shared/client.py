@@ -68,6 +68,10 @@ class Client:
         """
         if key is not None and not (key.isascii() and key.isprintable()):
             raise InvalidRequest("bad_key", "A key is made of printable ASCII characters.")
+        if not url.startswith(("http://", "https://")):
+            raise InvalidRequest(
+                "bad_address", f"{url!r} is no address such as http://127.0.0.1:8000."
+            )
         self.url = url.rstrip("/")
         self._http = httpx2.Client(
             base_url=self.url,

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.table import Table
+from rich.table import Column, Table
 
 from services.cli.connect import connect
 from services.cli.output import (
@@ -55,7 +55,14 @@ def query(
         if as_json:
             print_json(answer)
             return
-        table = Table("rank", "score", "photo", "latitude", "longitude", "place")
+        table = Table(
+            "rank",
+            Column("score", no_wrap=True),
+            Column("photo", overflow="fold"),
+            Column("latitude", no_wrap=True),
+            Column("longitude", no_wrap=True),
+            "place",
+        )
         for rank, found in enumerate(answer["similar_images"], start=1):
             table.add_row(
                 str(rank),

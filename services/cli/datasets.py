@@ -56,6 +56,9 @@ def synth(
     ladder: Annotated[
         bool, typer.Option(help="Measure how hard the city is; takes a network and minutes.")
     ] = True,
+    train: Annotated[
+        bool, typer.Option(help="Draw a training set (gsv_xs) as well: nearly half of the work.")
+    ] = True,
     as_json: JsonOption = False,
 ) -> None:
     """Draw a made-up city: database, queries and a training set, the same for the same arguments.
@@ -65,7 +68,9 @@ def synth(
     """
     width, height = parse_size(size)
     asked = queries if queries is not None else max(1, places // 2)
-    options = CityOptions(places, views, asked, seed, catalogue_seed, out_of_map, width, height)
+    options = CityOptions(
+        places, views, asked, seed, catalogue_seed, out_of_map, width, height, train
+    )
     with explained(as_json):
         check_empty(out)
         started = time.perf_counter()
@@ -90,7 +95,7 @@ def _show(figures: Json) -> None:
     counts, kinds, drawing = figures["counts"], figures["query_kinds"], figures["drawing"]
     answers.print(
         f"{figures['out']}: {counts['database']} database photos, {counts['query']} queries, "
-        f"{counts['train']} to learn from; {drawing['photos_per_second']:.0f} photos/s drawn, "
+        f"{counts.get('train', 0)} to learn from; {drawing['photos_per_second']:.0f} photos/s drawn, "
         f"{figures['seconds']:.0f} s in all.",
         soft_wrap=True,
     )

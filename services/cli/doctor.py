@@ -127,11 +127,10 @@ def _server(settings: Settings) -> str:
     running = running_server(settings.placewise_home)
     if running is not None:
         with Client(running.url, key=running.key) as client:
-            stats = client.stats()
-        return (
-            f"running on {running.url}: {stats['searchable_images']} of {stats['total_images']} "
-            f"photos searchable, vocabulary {stats['vocabulary']}"
-        )
+            maps = client.maps()
+        searchable, photos = sum(m["searchable"] for m in maps), sum(m["photos"] for m in maps)
+        named = ", ".join(m["name"] for m in maps)
+        return f"running on {running.url}: {searchable} of {photos} photos searchable ({named})"
     if not (settings.placewise_home / "catalog.sqlite").exists():
         return "not running, and nothing is stored yet (start it: make run)"
     catalog = Catalog(settings.catalog_url())

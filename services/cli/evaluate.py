@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Annotated
 
 import typer
-from rich.table import Table
+from rich.table import Column, Table
 
 from services.cli.connect import connect
 from services.cli.output import (
@@ -20,8 +20,10 @@ from services.cli.output import (
 )
 from services.cli.wait import wait_with_bar
 from shared.client import Client, Json
+from shared.estimate.calibration import LEAST_LABELLED, LEAST_OF_A_KIND
 
-SHOWN = 5  # evaluations before this one
+SHOWN = 6  # evaluations that were asked for, this one and those before
+LOOKED_AT = 100
 
 
 def evaluate(
@@ -40,12 +42,12 @@ def evaluate(
     with explained(as_json):
         with connect(server, map_name, key) as client, progress_bar() as progress:
             job = wait_with_bar(client, client.evaluate(**given)["job_id"], progress, "asking")
-            earlier = client.evaluations(SHOWN + 1)
+            asked_for = [e for e in client.evaluations(LOOKED_AT) if not e["automatic"]][:SHOWN]
             vocabularies = _vocabularies(client)
         if as_json:
             print_json(job["result"])
             return
-        _print(earlier, vocabularies)
+        _print(asked_for, vocabularies)
 
 
 def _vocabularies(client: Client) -> dict[str, str]:
@@ -58,20 +60,23 @@ def _vocabularies(client: Client) -> dict[str, str]:
 
 def _print(evaluations: list[Json], vocabularies: dict[str, str]) -> None:
     table = Table(
-        "evaluated", "vocabulary", "photos", "asked with", "queries", "R@1", "R@5", "R@10"
+        Column("evaluated", no_wrap=True),
+        "vocabulary",
+        "photos",
+        "asked with",
+        *(Column(f"R@{k}", justify="right", no_wrap=True) for k in (1, 5, 10)),
     )
-    for number, found in enumerate(evaluations):
+    for found in evaluations:
         figures = found["figures"]
-        rows = [("own photos, left out", figures["leave_one_out"])]
+        rows = [("own photos", figures["leave_one_out"])]
         if figures["labelled_queries"]:
             rows.append(("labelled queries", figures["labelled_queries"]))
         for what, recall in rows:
             table.add_row(
-                found["evaluated_at"][:19] + (" (newest)" if number == 0 else ""),
+                found["evaluated_at"][5:19].replace("T", " "),
                 vocabularies.get(found["generation_id"], ""),
                 str(found["searchable"]),
-                what,
-                str(recall["queries"]),
+                f"{recall['queries']} {what}",
                 *(_percent(recall[f"R@{k}"]) for k in (1, 5, 10)),
             )
     answers.print(table)
@@ -88,6 +93,13 @@ def _estimate_lines(figures: Json) -> list[str]:
             "labelled queries (placewise index DIR --role query)."
         )
         return lines
+    if estimate["calibration"] == "uncalibrated":
+        teaching = labelled["queries"] + labelled["out_of_map"] - labelled["same_session"]
+        lines.append(
+            f"Confidence is uncalibrated: {teaching} labelled queries of another session are "
+            f"there, at least {LEAST_LABELLED} are needed, with {LEAST_OF_A_KIND} whose answer is "
+            f"right and {LEAST_OF_A_KIND} whose answer is wrong."
+        )
     lines.append(
         f"Of {labelled['queries']} queries in the map {_percent(labelled['accepted_in_map'])} are "
         f"accepted; of {labelled['out_of_map']} out of it {_percent(labelled['false_accepts'])}; "

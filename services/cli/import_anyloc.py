@@ -21,7 +21,7 @@ from services.cli.output import (
     print_json,
     progress_bar,
 )
-from services.cli.upload_many import FitOption, print_faults, upload_many
+from services.cli.upload_many import FitOption, UpdateOption, print_faults, upload_many
 from shared.client import Json
 
 DESCRIPTORS_NOTE = (
@@ -52,6 +52,7 @@ def import_anyloc(
             exists=True, file_okay=False, help="Its photos; left out: uploads/ below DIR."
         ),
     ] = None,
+    update: UpdateOption = False,
     fit: FitOption = True,
     map_name: MapOption = None,
     server: ServerOption = None,
@@ -65,12 +66,12 @@ def import_anyloc(
     with explained(as_json):
         found = read_folder(folder, database, uploads)
         with connect(server, map_name, key) as client, progress_bar() as progress:
-            report = _report(found, upload_many(client, found.photos, fit, progress))
+            report = _report(found, upload_many(client, found.photos, fit, progress, update=update))
         if as_json:
             print_json(report)
         else:
             _print(report)
-        if report["refused"] or report["failed"]:
+        if report["refused"] or report["failed"] or report["missing"]:
             raise typer.Exit(1)
 
 

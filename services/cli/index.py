@@ -21,7 +21,7 @@ from services.cli.output import (
     progress_bar,
 )
 from services.cli.photo_places import find_photos
-from services.cli.upload_many import FitOption, print_faults, upload_many
+from services.cli.upload_many import FitOption, UpdateOption, print_faults, upload_many
 from shared.catalog.photos import PhotoRole
 from shared.client import Json
 
@@ -54,6 +54,7 @@ def index(
         PhotoRole,
         typer.Option(help="`query`: labelled queries, which `placewise evaluate` asks with."),
     ] = PhotoRole.DATABASE,
+    update: UpdateOption = False,
     fit: FitOption = True,
     map_name: MapOption = None,
     server: ServerOption = None,
@@ -70,20 +71,25 @@ def index(
         if role != PhotoRole.DATABASE:
             photos = [replace(p, fields={**p.fields, "role": role}) for p in photos]
         with connect(server, map_name, key) as client, progress_bar() as progress:
-            report = upload_many(client, photos, fit, progress)
+            # Labelled queries teach no vocabulary: they must not start a fit either.
+            learns = fit and role == PhotoRole.DATABASE
+            report = upload_many(client, photos, learns, progress, update=update)
         if as_json:
             print_json(report)
         else:
-            _print(report)
+            _print(report, map_name, role)
         if report["refused"] or report["failed"]:
             raise typer.Exit(1)
 
 
-def _print(report: Json) -> None:
+def _print(report: Json, map_name: str | None, role: PhotoRole) -> None:
     messages.print(
         f"{report['photos']} photos looked at, {report['already_there']} were there already, "
         f"{report['searchable']} searchable in the map (vocabulary: {report['vocabulary']}).",
         soft_wrap=True,
     )
     print_faults(report, "refused", "failed")
-    messages.print(f"Ask: {sys.argv[0]} query PHOTO")
+    named = f" --map {map_name}" if map_name else ""
+    what = "Ask" if role == PhotoRole.DATABASE else "Evaluate"
+    does = "query PHOTO" if role == PhotoRole.DATABASE else "evaluate"
+    messages.print(f"{what}: {sys.argv[0]} {does}{named}", soft_wrap=True)

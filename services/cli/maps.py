@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from typing import Annotated
 
 import typer
@@ -9,6 +10,7 @@ from rich.table import Table
 
 from services.cli.connect import connect
 from services.cli.output import JsonOption, KeyOption, ServerOption, answers, explained, print_json
+from shared.errors import Conflict
 
 app = typer.Typer(help="Named databases of photos, each with its own extractor and vocabulary.")
 
@@ -71,6 +73,11 @@ def delete(
     with explained(as_json):
         with connect(server, None, key) as client:
             photos = next((m["photos"] for m in client.maps() if m["name"] == name), None)
+            if photos and not yes and not sys.stdin.isatty():
+                raise Conflict(
+                    "not_confirmed",
+                    f"The map {name} has {photos} photos. To delete them: --yes.",
+                )
             if photos and not yes:
                 typer.confirm(f"Delete the map {name} with its {photos} photos?", abort=True)
             deleted = client.delete_map(name)

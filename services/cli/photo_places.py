@@ -67,7 +67,15 @@ def _read_table(folder: Path, table: Path, paths: set[Path]) -> dict[Path, dict[
                 raise InvalidRequest(
                     "bad_table",
                     f"{table} has no column {' or '.join(CSV_FILE_COLUMNS)}; "
-                    f"beside it may stand {', '.join(CSV_COLUMNS)}.",
+                    f"beside it may stand {', '.join(CSV_COLUMNS)}. Its first line, read as "
+                    f"separated by commas, is {', '.join(columns) or 'empty'}.",
+                )
+            unknown = [c for c in columns if c not in (name_column, *CSV_COLUMNS)]
+            if unknown:
+                raise InvalidRequest(
+                    "bad_table",
+                    f"{table}: the columns {', '.join(unknown)} mean nothing here. Known are "
+                    f"{name_column}, {', '.join(CSV_COLUMNS)}: rename them, or take them out.",
                 )
             said = {}
             for row in reader:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -15,7 +16,7 @@ from services.cli.output import messages, shown
 from services.cli.photo_places import FoundPhoto
 from services.cli.vocabulary import fit_and_wait
 from shared.client import FINISHED, Client, Json, retry_while_away
-from shared.errors import PlacewiseError
+from shared.errors import Conflict, PlacewiseError
 
 FIT_FROM_PHOTOS = 50
 UPLOADS_AT_ONCE = 4
@@ -30,13 +31,27 @@ FitOption = Annotated[
         "of its own.",
     ),
 ]
+UpdateOption = Annotated[
+    bool,
+    typer.Option(
+        "--update", help="Change what is said otherwise now of photos that are there already."
+    ),
+]
 Pending = list[tuple[FoundPhoto, str]]
 """Photos with the ids of the jobs that describe them."""
 
 
-def upload_many(client: Client, photos: list[FoundPhoto], fit: bool, progress: Progress) -> Json:
+def upload_many(
+    client: Client,
+    photos: list[FoundPhoto],
+    fit: bool,
+    progress: Progress,
+    *,
+    update: bool = False,
+) -> Json:
     """Upload, describe, and fit a vocabulary where the map needs one. Running it again uploads
-    the same bytes again and describes nothing twice.
+    the same bytes again and describes nothing twice; with `update`, what is now said otherwise of
+    a photo that is there already is changed, else such a photo is refused.
 
     Returns counts (`photos`, `uploaded`, `already_there`, `searchable` in the whole map), what is
     `refused` and `failed` with the reasons, and the map's `vocabulary`.
@@ -47,7 +62,7 @@ def upload_many(client: Client, photos: list[FoundPhoto], fit: bool, progress: P
     failed: list[Json] = []
     pending: Pending = []
     uploading = progress.add_task("uploading", total=len(photos))
-    for photo, outcome in _upload_all(client, photos):
+    for photo, outcome in _upload_all(client, photos, update):
         progress.advance(uploading)
         if isinstance(outcome, PlacewiseError):
             refused.append(_fault(photo, outcome.detail))
@@ -94,19 +109,40 @@ def print_faults(report: Json, *words: str) -> None:
 
 
 def _upload_all(
-    client: Client, photos: list[FoundPhoto]
+    client: Client, photos: list[FoundPhoto], update: bool
 ) -> Iterator[tuple[FoundPhoto, Json | PlacewiseError]]:
     def upload(photo: FoundPhoto) -> Json | PlacewiseError:
         fields: dict[str, Any] = dict(photo.fields)
+
+        def send() -> Json:
+            return client.upload(photo.path, filename=photo.name, **fields)
+
         try:
-            return retry_while_away(
-                lambda: client.upload(photo.path, filename=photo.name, **fields), AWAY_SECONDS
-            )
+            try:
+                return retry_while_away(send, AWAY_SECONDS)
+            except Conflict as error:
+                if error.code != "photo_differs" or not update:
+                    raise
+                client.patch_photo(error.extra["file_id"], **_as_json(photo.fields))
+                return retry_while_away(send, AWAY_SECONDS)
         except PlacewiseError as error:
             return error
 
     with ThreadPoolExecutor(UPLOADS_AT_ONCE) as pool:
         yield from zip(photos, pool.map(upload, photos), strict=True)
+
+
+def _as_json(fields: dict[str, str]) -> Json:
+    """The upload form's text fields as a PATCH takes them."""
+    typed: Json = dict(fields)
+    for name in ("latitude", "longitude", "heading"):
+        if name in typed:
+            typed[name] = float(typed[name])
+    if "tags" in typed:
+        typed["tags"] = typed["tags"].split(",")
+    if "metadata" in typed:
+        typed["metadata"] = json.loads(typed["metadata"])
+    return typed
 
 
 def _wait_all(

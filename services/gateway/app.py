@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from fastapi import FastAPI, Security
+from fastapi import Depends, FastAPI, Security
 from fastapi.security import HTTPBearer
 
 from services.gateway import (
@@ -20,6 +20,7 @@ from services.gateway import (
 from services.gateway.body_limit import BodyLimit
 from services.gateway.context import API, Gateway
 from services.gateway.key_check import KeyCheck
+from services.gateway.parameters import no_unknown_parameters
 from services.gateway.problems import PROBLEM_RESPONSES, install_problem_handlers
 
 DESCRIPTION = """Photo in, place out. Upload geotagged photos, poll their jobs, and ask which known
@@ -57,6 +58,10 @@ def create_app(gateway: Gateway) -> FastAPI:
         figures,
         health,
     ):
-        app.include_router(module.router, prefix=API, dependencies=[Security(BEARER)])
+        app.include_router(
+            module.router,
+            prefix=API,
+            dependencies=[Security(BEARER), Depends(no_unknown_parameters)],
+        )
     app.include_router(health.probes)
     return app

@@ -14,16 +14,27 @@ from shared.estimate.places import Spot
 from shared.search_protocol import Hit
 
 
+def rank(hits: Sequence[Hit], photos: Mapping[UUID, Photo]) -> list[Ranked]:
+    """Hits with the places of their photos."""
+    return [Ranked(hit.score, _spot(photos[hit.photo_id])) for hit in hits]
+
+
 def estimate(
-    generation: Generation, hits: Sequence[Hit], photos: Mapping[UUID, Photo], radius_m: float
+    generation: Generation,
+    ranking: Sequence[Ranked],
+    everything: Sequence[Ranked],
+    radius_m: float,
 ) -> EstimateAnswer:
-    """Where the ranking points to, and what the generation's evaluations say of such a ranking."""
-    ranking = [Ranked(hit.score, _spot(photos[hit.photo_id])) for hit in hits]
+    """Where the ranking points to, and what the generation's evaluations say of that place.
+
+    `everything` is the ranking without a filter: the place has to stand up to all others, as it had
+    to when the evaluations learnt what is in the map.
+    """
     calibration = (
         Calibration.model_validate(generation.calibration) if generation.calibration else None
     )
     state = calibration.state if calibration else "uncalibrated"
-    evidence = weigh(ranking, radius_m)
+    evidence = weigh(everything, radius_m, ranking[0].spot) if ranking else None
     if evidence is None:
         reason = (
             "No photo of the map passes the filter."

@@ -50,7 +50,7 @@ def read_filter(
         box=_box(box) if box is not None else None,
         captured_after=parse_time("captured_after", captured_after) if captured_after else None,
         captured_before=parse_time("captured_before", captured_before) if captured_before else None,
-        place=place,
+        place=place or None,
         tags=tuple(parse_tags(tags.split(","))) if tags else (),
         ids=_ids(ids) if ids is not None else None,
     )

@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict
 from sqlalchemy.orm import Session
 
 from services.gateway.context import Gateway
-from services.gateway.estimate import estimate
+from services.gateway.estimate import estimate, rank
 from services.gateway.schemas import (
     PhotoAnswer,
     SimilarityAnswer,
@@ -110,7 +110,11 @@ def find_similar(gateway: Gateway, query: Query, wanted: Wanted) -> SimilarityAn
     started = time.perf_counter()
     # The estimate looks deeper than most answers, and also at what is below the least score.
     hits, photos, response = _search_live(gateway, query, wanted, max(wanted.top_k, DEPTH))
-    found = estimate(query.generation, hits, photos, gateway.settings.estimate_radius_m)
+    ranking = everything = rank(hits, photos)
+    if not wanted.photos.is_empty:
+        without_filter = wanted.model_copy(update={"photos": EVERYTHING})
+        everything = rank(*_search_live(gateway, query, without_filter, DEPTH)[:2])
+    found = estimate(query.generation, ranking, everything, gateway.settings.estimate_radius_m)
     shown = [
         hit
         for hit in hits[: wanted.top_k]

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from datetime import datetime
 from typing import Annotated
 from uuid import UUID
 
 from fastapi import APIRouter, Path
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 from sqlalchemy.orm import Session
 
 from services.gateway.context import DEFAULT_MAP, NO_NUL, GatewayDep
@@ -41,10 +42,20 @@ MapPath = Annotated[
 class NewMap(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
-    name: str = Field(pattern=MAP_NAME, description="letters, digits, `.`, `_`, `-`; at most 100")
+    name: str = Field(json_schema_extra={"pattern": MAP_NAME})
     extractor: str | None = Field(
         None, max_length=200, pattern=NO_NUL, description="left out: the configured one"
     )
+
+    @field_validator("name")
+    @classmethod
+    def _can_stand_in_an_address(cls, name: str) -> str:
+        if not re.fullmatch(MAP_NAME, name):
+            raise ValueError(
+                "a map's name has up to 100 letters, digits, `.`, `_` and `-`, and begins with a "
+                "letter or digit"
+            )
+        return name
 
 
 class MapAnswer(Answer):

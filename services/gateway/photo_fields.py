@@ -69,6 +69,8 @@ def check_pair(latitude: float | None, longitude: float | None) -> None:
 
 def parse_time(field: str, text: str) -> datetime:
     """ISO 8601; a time without an offset is taken as UTC."""
+    # In an address `+` means a blank, and few people write %2B.
+    text = re.sub(r"(?<=:\d\d) (?=\d\d:?\d\d$)", "+", text)
     try:
         parsed = datetime.fromisoformat(text)
     except ValueError:

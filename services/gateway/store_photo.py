@@ -7,7 +7,7 @@ already there, or loses the race for them, deletes its own object.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from uuid import UUID
+from typing import Any
 
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
@@ -18,7 +18,7 @@ from services.gateway.photo_header import PhotoHeader
 from services.gateway.receive import Received
 from shared.catalog.maps import get_map
 from shared.catalog.photos import Photo, PhotoRole, find_live_by_sha256
-from shared.errors import Conflict, PlacewiseError
+from shared.errors import Conflict
 from shared.ids import new_id
 from shared.jobs import Job, JobKind, JobState, Priority
 from shared.jobs.finish import requeue
@@ -47,7 +47,7 @@ class Incoming:
 def store_photo(gateway: Gateway, map_name: str, incoming: Incoming) -> Stored:
     """Acknowledge the photo, or the one with the same bytes that the map has already.
 
-    Raises Conflict (`photo_differs`) when that one has other coordinates or another place.
+    Raises Conflict (`photo_differs`) when something else was said of that one.
     """
     try:
         stored = _store(gateway, map_name, incoming)
@@ -103,8 +103,16 @@ def _store(gateway: Gateway, map_name: str, incoming: Incoming) -> Stored:
 
 
 def _same_again(session: Session, photo: Photo, fields: PhotoFields) -> Stored:
-    if _says_otherwise(photo, fields):
-        raise _differs(photo.id)
+    differing = _differing(photo, fields)
+    if differing:
+        raise Conflict(
+            "photo_differs",
+            "The map has a photo with the same bytes of which something else was said: "
+            f"{', '.join(differing)}. To change that: PATCH {API}/uploads/{photo.id}, or "
+            "`placewise index --update`.",
+            file_id=str(photo.id),
+            differing=differing,
+        )
     job = session.get(Job, photo.job_id, with_for_update=True) if photo.job_id else None
     if job is not None and job.state in (JobState.FAILED, JobState.CANCELLED):
         requeue(job)
@@ -112,25 +120,27 @@ def _same_again(session: Session, photo: Photo, fields: PhotoFields) -> Stored:
     return Stored(photo, job, queued=False)
 
 
-def _says_otherwise(photo: Photo, fields: PhotoFields) -> bool:
-    if fields.place is not None and fields.place != photo.place:
-        return True
-    if fields.role is not None and fields.role != photo.role:
-        return True
-    if fields.latitude is None or fields.longitude is None:
-        return False
-    if photo.latitude is None or photo.longitude is None:
-        return True
-    return (
-        abs(photo.latitude - fields.latitude) > SAME_DEGREES
-        or abs(photo.longitude - fields.longitude) > SAME_DEGREES
-    )
+def _differing(photo: Photo, fields: PhotoFields) -> list[str]:
+    """The fields that say something else of the photo than is stored."""
+    stored = {
+        "latitude": photo.latitude,
+        "longitude": photo.longitude,
+        "heading": photo.heading,
+        "captured_at": photo.captured_at,
+        "place": photo.place,
+        "tags": photo.tags,
+        "metadata": photo.attributes,
+        "role": photo.role,
+    }
+    said = {name: getattr(fields, name) for name in stored}
+    return [
+        name
+        for name, value in said.items()
+        if value is not None and not _alike(value, stored[name])
+    ]
 
 
-def _differs(photo_id: UUID) -> PlacewiseError:
-    return Conflict(
-        "photo_differs",
-        "The map has a photo with the same bytes at other coordinates, with another place or role. "
-        f"To change them: PATCH {API}/uploads/{photo_id}.",
-        file_id=str(photo_id),
-    )
+def _alike(said: Any, stored: Any) -> bool:
+    if isinstance(said, float) and isinstance(stored, float):
+        return abs(said - stored) <= SAME_DEGREES
+    return bool(said == stored)

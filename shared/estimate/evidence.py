@@ -37,11 +37,18 @@ class Evidence:
     agreement: float
 
 
-def weigh(ranking: Sequence[Ranked], radius_m: float) -> Evidence | None:
-    """The evidence of a ranking, best first; None when it is empty or its first has no place."""
-    if not ranking or not ranking[0].spot.is_known:
+def weigh(ranking: Sequence[Ranked], radius_m: float, place: Spot | None = None) -> Evidence | None:
+    """How a ranking, best first, speaks for `place`; left out: for the place of its best photo.
+
+    A filter takes rivals away, and what is left would look sure of itself: weigh the ranking of the
+    whole map for the place that the filter let through. None when the ranking is empty or the
+    place is not known.
+    """
+    if not ranking:
         return None
-    first = ranking[0].spot
+    first = place or ranking[0].spot
+    if not first.is_known:
+        return None
     rival = next((r.score for r in ranking if elsewhere(first, r.spot)), ranking[-1].score)
     voters = ranking[:VOTERS]
     agreeing = [r.score for r in voters if same_place(first, r.spot, radius_m)]
@@ -72,4 +79,5 @@ def locate(ranking: Sequence[Ranked], radius_m: float) -> Spot:
         np.array([r.spot.longitude for r in near], dtype=np.float64),
         weights,
     )
-    return Spot(latitude, longitude, first.place)
+    # Seven digits are a centimetre; more would be rounding errors.
+    return Spot(round(latitude, 7), round(longitude, 7), first.place)

@@ -12,6 +12,7 @@ from starlette.testclient import TestClient
 from services.extractor.worker import ExtractorWorker
 from services.gateway.app import create_app
 from services.gateway.context import Gateway
+from services.gateway.keys import NoKeys
 from services.search.worker import SearchWorker
 from shared.catalog.session import Catalog
 from shared.jobs import InProcessHints
@@ -34,7 +35,7 @@ class Service:
     ) -> None:
         self.catalog, self.store = catalog, store
         self.search = SearchWorker(catalog, store, settings)
-        gateway = Gateway(catalog, store, InProcessHints(), self.search, settings)
+        gateway = Gateway(catalog, store, InProcessHints(), self.search, settings, NoKeys())
         self._client = TestClient(create_app(gateway))
         self.make_worker = make_worker
         self._worker: ExtractorWorker | None = None

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from services.gateway.estimate import estimate
+from services.gateway.estimate import estimate, rank
 from services.gateway.schemas import EstimateAnswer
 from shared.catalog.generations import Generation
 from shared.catalog.photos import Photo
@@ -209,7 +209,8 @@ def answer(calibration: Calibration | None, *pairs: tuple[float, Spot]) -> Estim
     photos = {UUID(int=n): photo(n, spot) for n, (_, spot) in enumerate(pairs)}
     hits = [Hit(photo_id=UUID(int=n), score=score) for n, (score, _) in enumerate(pairs)]
     stored = calibration.model_dump(mode="json") if calibration else None
-    return estimate(Generation(calibration=stored), hits, photos, RADIUS_M)
+    ranked = rank(hits, photos)
+    return estimate(Generation(calibration=stored), ranked, ranked, RADIUS_M)
 
 
 def calibration(threshold: float | None, confidence: Logistic | None = None) -> Calibration:
@@ -252,3 +253,14 @@ def test_labelled_queries_give_a_confidence() -> None:
 def test_nothing_found_and_nothing_known_are_told_apart() -> None:
     assert answer(None).reason == "No photo of the map passes the filter."
     assert "neither coordinates nor a place" in answer(None, (0.9, Spot(None, None, None))).reason
+
+
+def test_a_filter_that_leaves_no_rival_makes_nobody_sure() -> None:
+    everything = ranking((0.5, north(0)), (0.45, north(700)), (0.2, north(3000)))
+    filtered = [everything[2]]
+    stored = calibration(0.01).model_dump(mode="json")
+    said = estimate(Generation(calibration=stored), filtered, everything, RADIUS_M)
+    assert said.in_map is False
+    alone = estimate(Generation(calibration=stored), everything[:1], everything, RADIUS_M)
+    whole = estimate(Generation(calibration=stored), everything, everything, RADIUS_M)
+    assert alone.in_map is whole.in_map is True

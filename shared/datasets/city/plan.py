@@ -57,6 +57,8 @@ class CityOptions:
     """share of the queries"""
     width: int
     height: int
+    train: bool = True
+    """whether a training set (gsv_xs) is drawn as well"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,7 +119,8 @@ def make_plan(options: CityOptions) -> Plan:
             kind, quarter_name = "out_of_map", "outskirts"
             place = places["outskirts"][(number - inside) % len(places["outskirts"])]
         shots.append(_query_shot(options, place, quarter_name, kind, number))
-    shots += _train_shots(options, places["school"])
+    if options.train:
+        shots += _train_shots(options, places["school"])
     shots.sort(key=lambda shot: (shot.quarter, shot.place, shot.role, shot.number))
     return Plan(options, quarters, shots)
 

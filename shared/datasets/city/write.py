@@ -6,6 +6,7 @@ import csv
 import json
 import multiprocessing
 import os
+import signal
 from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -34,7 +35,8 @@ def check_empty(out: Path) -> None:
     if out.is_file() or (out.is_dir() and any(out.iterdir())):
         raise Conflict(
             "out_not_empty",
-            f"{out} is not an empty folder. Name a folder that does not exist yet, or empty it.",
+            f"{out} is not an empty folder. Name a folder that does not exist yet, or empty it "
+            "(an interrupted drawing leaves its photos there, without a city.json).",
         )
 
 
@@ -50,7 +52,8 @@ def write_city(plan: Plan, out: Path, drawn: Callable[[int], None] = lambda coun
         for folder in sorted({shot.folder for shot in plan.shots} | {"database", "queries"}):
             (out / folder).mkdir(parents=True, exist_ok=True)
         _draw_all(plan, out, drawn)
-        _write_gsv_table(plan, out)
+        if plan.options.train:
+            _write_gsv_table(plan, out)
         (out / "city.json").write_text(json.dumps(describe(plan), indent=1) + "\n")
     except OSError as error:
         raise Misconfigured("out_unwritable", f"Can't write below {out}: {error}.") from error
@@ -71,8 +74,12 @@ def _draw_all(plan: Plan, out: Path, drawn: Callable[[int], None]) -> None:
         initializer=_open_workshop,
         initargs=(plan, out),
     ) as pool:
-        for done in as_completed([pool.submit(_draw, *task) for task in tasks]):
-            drawn(done.result())
+        try:
+            for done in as_completed([pool.submit(_draw, *task) for task in tasks]):
+                drawn(done.result())
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
 
 
 def describe(plan: Plan) -> dict[str, Any]:
@@ -143,6 +150,8 @@ _workshop: _Workshop | None = None  # of this drawing process
 
 def _open_workshop(plan: Plan, out: Path) -> None:
     global _workshop
+    # Ctrl-C is for the parent, which ends its pool; a child's own trace would only confuse.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     _workshop = _Workshop(plan, out)
 
 
