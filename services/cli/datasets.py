@@ -95,8 +95,8 @@ def _show(figures: Json) -> None:
     counts, kinds, drawing = figures["counts"], figures["query_kinds"], figures["drawing"]
     answers.print(
         f"{figures['out']}: {counts['database']} database photos, {counts['query']} queries, "
-        f"{counts.get('train', 0)} to learn from; {drawing['photos_per_second']:.0f} photos/s drawn, "
-        f"{figures['seconds']:.0f} s in all.",
+        f"{counts.get('train', 0)} to learn from; {drawing['photos_per_second']:.0f} photos/s "
+        f"drawn, {figures['seconds']:.0f} s in all.",
         soft_wrap=True,
     )
     if not figures["ladder"]:

@@ -114,9 +114,9 @@ def test_table_says_what_is_known_of_each_photo(tmp_path: Path) -> None:
     make(tmp_path, "a.jpg", "in/b.jpg", "c.jpg")
     table = table_of(
         tmp_path,
-        "filename,latitude,longitude,place,tags,colour\n"
-        'a.jpg,45.1,7.6,,"night,rain",red\n'
-        "in/b.jpg,,,corridor,,\n",
+        "filename,latitude,longitude,place,tags\n"
+        'a.jpg,45.1,7.6,,"night,rain"\n'
+        "in/b.jpg,,,corridor,\n",
     )
     found = {photo.path.name: photo.fields for photo in find_photos(tmp_path, table, None)}
     assert found == {
@@ -124,6 +124,14 @@ def test_table_says_what_is_known_of_each_photo(tmp_path: Path) -> None:
         "b.jpg": {"place": "corridor"},
         "c.jpg": {},
     }
+
+
+def test_table_with_a_column_that_means_nothing_is_refused(tmp_path: Path) -> None:
+    make(tmp_path, "a.jpg")
+    table = table_of(tmp_path, "filename,lat,lon\na.jpg,45.1,7.6\n")
+    with pytest.raises(InvalidRequest, match="the columns lat, lon mean nothing here") as caught:
+        find_photos(tmp_path, table, None)
+    assert caught.value.code == "bad_table"
 
 
 def test_table_goes_before_the_name(tmp_path: Path) -> None:
