@@ -6,6 +6,7 @@ from typing import Any
 
 from fastapi import Request
 
+from services.gateway.context import API
 from shared.errors import invalid_field
 
 # Clients send it with every call, also with the few that mean no map.
@@ -17,7 +18,8 @@ def no_unknown_parameters(request: Request) -> None:
     if not request.query_params:
         return
     paths: dict[str, Any] = request.app.openapi()["paths"]
-    call = paths.get(request.scope["route"].path_format, {}).get(request.method.lower())
+    path = API + request.scope["route"].path_format  # a route knows nothing of its prefix
+    call = paths.get(path, {}).get(request.method.lower())
     if call is None:  # such as HEAD, which the description leaves out
         return
     known = EVERYWHERE | {

@@ -1,0 +1,94 @@
+"""`placewise index` of photos that are there already, and of queries."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from tests.support.photos import photo_bytes
+from tests.support.server import ServerProcess, environment, run_command
+
+
+def index(server: ServerProcess, cwd: Path, *options: str | Path, code: int = 0) -> dict[str, Any]:
+    env = environment(server.home)
+    ended = run_command("index", cwd / "photos", *options, "--json", env=env, cwd=cwd)
+    assert ended.returncode == code, ended.stdout + ended.stderr
+    report: dict[str, Any] = json.loads(ended.stdout)
+    return report
+
+
+def folder_of(tmp_path: Path, *photos: bytes) -> None:
+    (tmp_path / "photos").mkdir()
+    for number, photo in enumerate(photos):
+        (tmp_path / "photos" / f"{number}.jpg").write_bytes(photo)
+
+
+def table_of(tmp_path: Path, text: str) -> Path:
+    table = tmp_path / "said.csv"
+    table.write_text(text)
+    return table
+
+
+def test_a_corrected_table_is_refused_by_name_and_taken_with_update(
+    server: ServerProcess, tmp_path: Path
+) -> None:
+    folder_of(tmp_path, photo_bytes(700))
+    index(server, tmp_path)
+    table = table_of(
+        tmp_path, 'filename,latitude,longitude,captured_at,tags\n0.jpg,45,7,2026-05-01,"a,b"\n'
+    )
+    report = index(server, tmp_path, "--csv", table, code=1)
+    reason = report["refused"][0]["reason"]
+    assert "latitude, longitude, captured_at, tags" in reason
+    assert "--update" in reason
+
+    report = index(server, tmp_path, "--csv", table, "--update")
+    assert (report["uploaded"], report["already_there"], report["refused"]) == (0, 1, [])
+    [photo] = server.client.get("/api/v1/search", params={"near": "45,7,1"}).json()["images"]
+    assert photo["tags"] == ["a", "b"]
+    assert photo["captured_at"] == "2026-05-01T00:00:00Z"
+    # What is said as before is no difference.
+    assert index(server, tmp_path, "--csv", table)["already_there"] == 1
+
+
+def test_a_misspelt_parameter_is_refused_and_not_taken_for_no_filter(
+    server: ServerProcess,
+) -> None:
+    for path in ("/search", "/jobs", "/database/stats"):
+        answer = server.client.get(f"/api/v1{path}", params={"neer": "45,7,1"})
+        assert (answer.status_code, answer.json()["code"]) == (422, "invalid_field")
+        assert "neer" in answer.json()["detail"]
+    asked = server.ask(photo_bytes(701), neer="45,7,1")
+    assert asked.status_code == 422
+
+
+def test_a_blank_where_an_address_had_a_plus_is_read_as_plus(server: ServerProcess) -> None:
+    wanted = "/api/v1/search?captured_after=2026-05-01T12:00:00+02:00"
+    assert server.client.get(wanted).status_code == 200
+
+
+def test_an_outsider_stays_one_however_narrow_the_filter(server: ServerProcess) -> None:
+    client = server.client
+    client.post("/api/v1/maps", json={"name": "narrow"}).raise_for_status()
+    for number in range(30):
+        server.client.post(
+            "/api/v1/upload",
+            params={"map": "narrow"},
+            files={"file": ("p.jpg", photo_bytes(710 + number))},
+            data={"latitude": str(45 + number / 100), "longitude": "7"},
+            headers={"Prefer": "wait=30"},
+        ).raise_for_status()
+    job = client.post("/api/v1/evaluations", params={"map": "narrow"}).json()
+    done = client.get(f"/api/v1/jobs/{job['job_id']}", params={"map": "narrow", "wait": 30}).json()
+    assert done["state"] == "succeeded", done
+    refused = 0
+    for number in range(12):
+        stranger = photo_bytes(800 + number)
+        whole = server.ask(stranger, map="narrow").json()["estimate"]
+        for near in ("45.05,7,1", "45.2,7,2000"):
+            narrow = server.ask(stranger, map="narrow", near=near).json()["estimate"]
+            if whole["in_map"] is False:
+                assert narrow["in_map"] is False
+                refused += 1
+    assert refused >= 12
