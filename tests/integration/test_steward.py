@@ -613,7 +613,8 @@ def test_each_duty_is_done_by_the_loop(
     house.delete(gone)
     with house.catalog.write() as session:
         other = add_map(session, "other", "test-tiny-vlad").id
-        add_job(session, other, waiting_for="vocabulary")
+        waiting = add_photo(session, other).id
+        add_job(session, other, photo_id=waiting, waiting_for="vocabulary")
         lost = add_job(session, house.map_id).id
     take(house.catalog)
     house.change(Job, lost, lease_until=db_now_plus(-1))
