@@ -1,5 +1,6 @@
 """Everything in one process, no servers: gateway, extractor, search and steward on SQLite and a
-local folder. These are the very classes that the separate services run; only the ports differ:
+local folder (with S3_ENDPOINT, a bucket). These are the very classes that the separate services
+run; only the ports differ:
 
 | port | here | between machines |
 |---|---|---|
@@ -36,8 +37,9 @@ from shared.catalog.session import Catalog
 from shared.errors import Misconfigured
 from shared.home import announced, lock_home
 from shared.jobs import InProcessHints
-from shared.objects import FolderStore
-from shared.objects.upload_dir import place_originals
+from shared.objects.bucket_owner import claim_bucket
+from shared.objects.open_store import open_store
+from shared.objects.s3 import S3Store
 from shared.settings import Settings
 
 log = logging.getLogger(__name__)
@@ -75,16 +77,17 @@ def standalone(settings: Settings, *, new_key: bool = False) -> Iterator[Standal
 
     Beyond loopback, or with an ADMIN_KEY, every call needs a key; `new_key` replaces the one that
     an earlier start has made. Raises Misconfigured: `home_in_use` for a folder that another server
-    has, `address_in_use`, `no_key_needed` for a new key on loopback, and those of `admin_key` and
-    `place_originals`.
+    has, `address_in_use`, `no_key_needed` for a new key on loopback, and those of `admin_key`,
+    `open_store` and `claim_bucket`; Unavailable for a bucket that can't be used.
     """
     home = settings.placewise_home
-    objects = home / "objects"
     with contextlib.ExitStack() as held:
         held.enter_context(lock_home(home))
         listener = held.enter_context(_listener(settings))
         catalog = Catalog(settings.catalog_url())
-        store = FolderStore(objects, place_originals(home, objects, settings.upload_dir))
+        store = open_store(settings)
+        if isinstance(store, S3Store):
+            claim_bucket(home, store)
         hints = InProcessHints()
         catalog.migrate()
         with catalog.write() as session:

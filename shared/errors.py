@@ -10,6 +10,7 @@ PlacewiseError
 ├── UnsupportedMedia 415        unsupported_photo, unsupported_body
 ├── Unprocessable 422           invalid_field, undecodable_photo, too_many_pixels, ...
 ├── Unavailable 503             search_behind, chunk_unreadable, ... (may be tried again)
+│                           object_store_unavailable, bucket_not_found, ...
 └── Misconfigured 500           weights_missing, home_in_use, ... (an operator must act)
 
 `shared.errors` knows nothing of HTTP libraries: the gateway turns these into RFC 9457 problems,

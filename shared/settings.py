@@ -50,6 +50,19 @@ class Settings(BaseSettings):
         description="SQLAlchemy URL of the catalog; unset: SQLite under PLACEWISE_HOME",
     )
 
+    # Where objects lie when not in PLACEWISE_HOME: a bucket of any S3 server.
+    s3_endpoint: str | None = Field(
+        None, description="host:port of an S3 server for all objects; unset: PLACEWISE_HOME/objects"
+    )
+    s3_access_key: str | None = Field(None, description="who asks S3_ENDPOINT")
+    s3_secret_key: SecretStr | None = Field(None, description="the secret of S3_ACCESS_KEY")
+    s3_bucket: str = Field("placewise", description="a bucket that belongs to this Placewise alone")
+    s3_secure: bool = Field(True, description="speak HTTPS with S3_ENDPOINT")
+    s3_region: str = Field("us-east-1", description="the region of S3_BUCKET")
+    s3_timeout_seconds: float = Field(
+        10.0, gt=0, description="longest silence of S3_ENDPOINT, and longest time to send it 5 MiB"
+    )
+
     debug: bool = Field(
         False, description="log every call and every refusal; answers stay the same"
     )
@@ -164,6 +177,39 @@ class Settings(BaseSettings):
     def _absolute_weights(cls, value: Path | None) -> Path | None:
         # Not resolved: a link in a Hugging Face cache has a better name than what it points to.
         return None if value is None else value.expanduser().absolute()
+
+    @field_validator("s3_endpoint")
+    @classmethod
+    def _host_and_port(cls, value: str | None) -> str | None:
+        if value is not None and not re.fullmatch(r"(\[[0-9a-fA-F:]+\]|[\w.-]+)(:\d+)?", value):
+            raise ValueError(
+                "is a host and a port without a scheme, such as s3.example.com or 10.0.0.5:8333; "
+                "S3_SECURE says whether it is HTTPS"
+            )
+        return value
+
+    @field_validator("s3_bucket")
+    @classmethod
+    def _a_bucket_name(cls, value: str) -> str:
+        if not re.fullmatch(r"[a-z0-9][a-z0-9.-]{1,61}[a-z0-9]", value):
+            raise ValueError(
+                "a bucket's name has 3 to 63 small letters, digits, hyphens and dots, and begins "
+                "and ends with a letter or digit"
+            )
+        return value
+
+    @model_validator(mode="after")
+    def _s3_has_its_keys_and_all_objects(self) -> Self:
+        if self.s3_endpoint is None:
+            return self
+        if not (self.s3_access_key and self.s3_secret_key):
+            raise ValueError("S3_ENDPOINT needs S3_ACCESS_KEY and S3_SECRET_KEY")
+        if self.upload_dir is not None:
+            raise ValueError(
+                "With S3_ENDPOINT the photos lie in S3_BUCKET, and UPLOAD_DIR names a folder for "
+                "them. Unset one of the two"
+            )
+        return self
 
     @model_validator(mode="after")
     def _a_batch_fits_into_a_slot(self) -> Self:

@@ -22,6 +22,7 @@ from shared.catalog.session import Catalog
 from shared.client import Client
 from shared.errors import Misconfigured, PlacewiseError
 from shared.home import running_server
+from shared.objects.open_store import open_store
 from shared.settings import Settings
 
 LOW_DISK_BYTES = 1_000_000_000
@@ -93,6 +94,9 @@ def _folder(settings: Settings) -> str:
 
 
 def _uploads(settings: Settings) -> str:
+    if settings.s3_endpoint is not None:
+        open_store(settings).check()
+        return f"S3_BUCKET {settings.s3_bucket} at {settings.s3_endpoint} is writable"
     folder = settings.upload_dir
     if folder is None:
         return "originals lie under PLACEWISE_HOME"

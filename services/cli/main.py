@@ -17,6 +17,7 @@ from services.cli import (
     index,
     maps,
     serve,
+    storage,
     vocabulary,
 )
 
@@ -35,6 +36,7 @@ app.command("evaluate")(evaluate.evaluate)
 app.add_typer(maps.app, name="maps")
 app.add_typer(vocabulary.app, name="vocabulary")
 app.add_typer(datasets.app, name="datasets")
+app.add_typer(storage.app, name="storage")
 app.add_typer(bench.app, name="bench")
 app.command("config")(configuration.config)
 app.command("doctor")(doctor.doctor)

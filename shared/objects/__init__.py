@@ -1,5 +1,7 @@
 """The object store: bytes under keys. A folder when embedded; S3 for many machines.
 
+`shared.objects.open_store` chooses between the two by the settings.
+
 | keys | what lies there |
 |---|---|
 | `originals/<uuid>` | an uploaded photo |

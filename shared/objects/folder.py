@@ -16,6 +16,7 @@ from typing import BinaryIO
 
 from shared.errors import NotFound, Unavailable
 from shared.ids import new_id
+from shared.objects.keys import check_key
 from shared.objects.port import ObjectInfo
 
 # No file there, or a folder on the way or at the end: to a store of keys it is all the same.
@@ -103,9 +104,7 @@ class FolderStore:
 
     def _place(self, key: str) -> tuple[Path, Sequence[str]]:
         """The folder that a key lies in, and the names that lead to it from there."""
-        folder, parts = self.root, key.split("/")
-        if any(part in ("", ".", "..") for part in parts):
-            raise ValueError(f"not an object key: {key!r}")
+        folder, parts = self.root, check_key(key).split("/")
         if parts[0] in self._elsewhere and len(parts) > 1:
             folder, parts = self._elsewhere[parts[0]], parts[1:]
         if parts[0] in RESERVED:
@@ -150,8 +149,13 @@ class FolderWriter:
         changed = [self._target.parent]
         while not changed[-1].exists():
             changed.append(changed[-1].parent)
-        self._target.parent.mkdir(parents=True, exist_ok=True)
-        self._partial.replace(self._target)
+        try:
+            self._target.parent.mkdir(parents=True, exist_ok=True)
+            self._partial.replace(self._target)
+        except (FileExistsError, IsADirectoryError, NotADirectoryError) as error:
+            raise ValueError(
+                f"{self._target.name!r}: one object's key continues another object's key"
+            ) from error
         for folder in changed:
             _sync_folder(folder)
 

@@ -13,6 +13,14 @@ VOCABULARIES = "vocabularies/"
 WORK = "work/"
 
 
+def check_key(key: str) -> str:
+    """The key itself; ValueError unless it is names joined by single slashes, none of them `.` or
+    `..`, without NUL: what means the same in a folder and in a bucket."""
+    if any(part in ("", ".", "..") for part in key.split("/")) or "\0" in key:
+        raise ValueError(f"not an object key: {key!r}")
+    return key
+
+
 def new_original_key() -> str:
     """A fresh key for an upload; user file names never become keys."""
     return f"{ORIGINALS}{new_id()}"

@@ -22,16 +22,25 @@ class ObjectWriter(Protocol):
     def write(self, data: bytes) -> None: ...
 
     def commit(self) -> None:
-        """Make the whole object visible and durable at once."""
+        """Make the whole object visible and durable at once.
+
+        When it raises Unavailable, the object is whole or absent, and no one knows which.
+        """
 
     def abort(self) -> None:
-        """Forget what was written; harmless after `commit`."""
+        """Forget what was written; harmless after `commit`. Raises nothing."""
 
 
 class ObjectStore(Protocol):
     """Objects are whole or absent: a crash never leaves a part of one under its key.
 
-    `get` and `open` raise NotFound (`object_not_found`) for a missing key.
+    A key is names joined by single slashes (`shared.objects.keys.check_key`); ValueError for
+    anything else. No key may continue another one's after a slash: `a` and `a/b` are a file and a
+    folder of one name. A folder refuses the second one with ValueError, a bucket keeps both.
+
+    `get` and `open` raise NotFound (`object_not_found`) for a missing key. Everything raises
+    Unavailable while a store on another machine can't be used: `object_store_unavailable`,
+    `object_store_refused`, `bucket_not_found`. So does reading from what `open` has given.
     """
 
     def writer(self, key: str) -> ObjectWriter: ...

@@ -1,0 +1,24 @@
+"""Which store the settings mean."""
+
+from __future__ import annotations
+
+from shared.objects.bucket_owner import check_no_bucket
+from shared.objects.folder import FolderStore
+from shared.objects.port import ObjectStore
+from shared.objects.s3 import Bucket, S3Store
+from shared.objects.upload_dir import place_originals
+from shared.settings import Settings
+
+
+def open_store(settings: Settings) -> ObjectStore:
+    """The bucket at S3_ENDPOINT, else the folder PLACEWISE_HOME/objects with UPLOAD_DIR.
+
+    Asks nothing of an S3 server: `check` does. Raises Misconfigured as `place_originals` does,
+    and `object_store_changed` for a folder whose objects lie in a bucket.
+    """
+    if settings.s3_endpoint is not None:
+        return S3Store(Bucket.of(settings))
+    home = settings.placewise_home
+    check_no_bucket(home)
+    objects = home / "objects"
+    return FolderStore(objects, place_originals(home, objects, settings.upload_dir))

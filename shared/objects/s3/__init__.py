@@ -1,0 +1,11 @@
+"""Objects in a bucket of any S3 server, through the minio client.
+
+`bucket` connects and turns every failure into one of Placewise's errors; `writer` and `reader`
+stream; `store` is the port; `create` makes the bucket once.
+"""
+
+from shared.objects.s3.bucket import Bucket
+from shared.objects.s3.create import create_bucket
+from shared.objects.s3.store import S3Store
+
+__all__ = ["Bucket", "S3Store", "create_bucket"]

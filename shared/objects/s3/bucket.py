@@ -1,0 +1,187 @@
+"""A bucket, the client that reaches it, and what its failures mean."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+from collections.abc import Iterator
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Self
+from xml.etree.ElementTree import ParseError
+
+import urllib3
+from minio import Minio
+from minio.error import MinioException, S3Error
+from urllib3.connectionpool import ConnectionPool
+from urllib3.exceptions import (
+    ConnectTimeoutError,
+    HTTPError,
+    MaxRetryError,
+    ProtocolError,
+    ReadTimeoutError,
+    SSLError,
+)
+from urllib3.response import BaseHTTPResponse
+
+from shared.errors import Misconfigured, NotFound, PlacewiseError, Unavailable
+from shared.settings import Settings
+
+log = logging.getLogger(__name__)
+
+CONNECTIONS = 32  # kept open: the threads that use the store at once in one process
+RETRY_SECONDS = 0.2
+
+NO_KEY = {"NoSuchKey"}
+NO_BUCKET = {"NoSuchBucket"}
+WRONG_KEYS = {"InvalidAccessKeyId", "SignatureDoesNotMatch", "ExpiredToken", "InvalidToken"}
+REFUSED = {"AccessDenied", "AllAccessDisabled", "AccountProblem", "MethodNotAllowed"}
+WRONG_REGION = {"AuthorizationHeaderMalformed", "PermanentRedirect", "Redirect"}
+WRONG_CLOCK = {"RequestTimeTooSkewed"}
+CHANGED = {"PreconditionFailed"}
+
+
+class OneMoreTry(urllib3.Retry):
+    """Tries again what was cut off or not accepted, but never what was left without an answer.
+
+    A store that is silent was waited for already: a second wait would double the time limit.
+    """
+
+    def increment(
+        self,
+        method: str | None = None,
+        url: str | None = None,
+        response: BaseHTTPResponse | None = None,
+        error: Exception | None = None,
+        _pool: ConnectionPool | None = None,
+        _stacktrace: TracebackType | None = None,
+    ) -> Self:
+        if error is not None and _is_silence(error):
+            raise error
+        return super().increment(method, url, response, error, _pool, _stacktrace)
+
+
+@dataclass(frozen=True, slots=True)
+class Bucket:
+    """One bucket on one server. The client in it may be used by many threads."""
+
+    client: Minio
+    name: str
+    endpoint: str
+
+    @classmethod
+    def of(cls, settings: Settings) -> Bucket:
+        """The bucket that the settings name; nothing is asked of the server yet.
+
+        Raises Misconfigured (`bad_setting`) when S3_ENDPOINT or its keys are not set.
+        """
+        if not (settings.s3_endpoint and settings.s3_access_key and settings.s3_secret_key):
+            raise Misconfigured(
+                "bad_setting",
+                "S3 needs S3_ENDPOINT (host:port), S3_ACCESS_KEY and S3_SECRET_KEY.",
+            )
+        # One limit for both: urllib3 sends a request's body under the connection's.
+        seconds = settings.s3_timeout_seconds
+        connections = urllib3.PoolManager(
+            num_pools=2,
+            maxsize=CONNECTIONS,
+            timeout=urllib3.Timeout(connect=seconds, read=seconds),
+            retries=OneMoreTry(
+                total=1,
+                backoff_factor=RETRY_SECONDS,
+                status_forcelist=(500, 502, 503, 504),
+                raise_on_status=False,
+                respect_retry_after_header=False,  # it may say minutes
+            ),
+            cert_reqs="CERT_REQUIRED",  # against the system's authorities, or SSL_CERT_FILE
+        )
+        client = Minio(
+            settings.s3_endpoint,
+            settings.s3_access_key,
+            settings.s3_secret_key.get_secret_value(),
+            secure=settings.s3_secure,
+            region=settings.s3_region,  # left out, the client asks the server for it first
+            http_client=connections,
+        )
+        return cls(client, settings.s3_bucket, settings.s3_endpoint)
+
+    @contextlib.contextmanager
+    def explained(self, key: str | None = None) -> Iterator[None]:
+        """Turns whatever the client raises inside into NotFound (`object_not_found`, only with a
+        `key`) or Unavailable (`object_store_unavailable`, `object_store_refused`,
+        `bucket_not_found`, `object_changed`).
+
+        Keys and buckets can be put right while jobs wait, so a wrong one is Unavailable as well:
+        a job that meets it is tried again and not failed for good.
+        """
+        try:
+            yield
+        except S3Error as error:
+            raise self._meaning(error, key) from error
+        except (MinioException, HTTPError, ParseError, OSError) as error:
+            log.warning("the object store at %s failed: %s", self.endpoint, error)
+            raise self._away(error) from error
+
+    def missing(self) -> Unavailable:
+        return Unavailable(
+            "bucket_not_found",
+            f"The object store at {self.endpoint} has no bucket {self.name!r} (S3_BUCKET). "
+            "Make it: placewise storage create-bucket.",
+        )
+
+    def _meaning(self, error: S3Error, key: str | None) -> PlacewiseError:
+        code = error.code or ""
+        if code in NO_KEY and key is not None:
+            return NotFound("object_not_found", f"The object store has no {key!r}.", key=key)
+        if code in NO_BUCKET:
+            return self.missing()
+        log.warning("the object store at %s refused: %s", self.endpoint, error)
+        if code in CHANGED:
+            return Unavailable("object_changed", f"{key!r} was written anew while it was read.")
+        advice = _advice(code, self.name)
+        if advice is None:
+            return Unavailable(
+                "object_store_unavailable",
+                f"The object store at {self.endpoint} can't do this now: {code} {error.message}",
+            )
+        return Unavailable(
+            "object_store_refused",
+            f"The object store at {self.endpoint} refuses Placewise ({code}). {advice}",
+        )
+
+    def _away(self, error: Exception) -> Unavailable:
+        reason: object = error.reason if isinstance(error, MaxRetryError) else error
+        if isinstance(reason, SSLError):
+            advice = "Check S3_SECURE: does it speak HTTPS, with a certificate that holds here?"
+        elif isinstance(error, MinioException | ParseError):
+            advice = "It does not answer as S3 does: check S3_ENDPOINT and S3_SECURE."
+        else:
+            advice = "Check S3_ENDPOINT, and that it runs."
+        return Unavailable(
+            "object_store_unavailable",
+            f"The object store at {self.endpoint} can't be reached ({type(reason).__name__}). "
+            f"{advice}",
+        )
+
+
+def _is_silence(error: Exception) -> bool:
+    """Was the time limit reached: while connecting, sending or waiting for an answer?"""
+    if isinstance(error, ProtocolError):
+        return any(isinstance(cause, TimeoutError) for cause in error.args)
+    return isinstance(error, ReadTimeoutError | ConnectTimeoutError)
+
+
+def _advice(code: str, bucket: str) -> str | None:
+    """What to do about a refusal; None for what is no refusal."""
+    if code in WRONG_KEYS:
+        return "Check S3_ACCESS_KEY and S3_SECRET_KEY."
+    if code in REFUSED:
+        return (
+            "Check S3_ACCESS_KEY and S3_SECRET_KEY, and that they may read, write, list and delete "
+            f"in the bucket {bucket!r}."
+        )
+    if code in WRONG_REGION:
+        return "Set S3_REGION to the region of the bucket."
+    if code in WRONG_CLOCK:
+        return "This machine's clock is wrong, or the store's."
+    return None
