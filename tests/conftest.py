@@ -13,7 +13,14 @@ from sqlalchemy.engine import make_url
 from shared.catalog.session import Catalog
 from shared.objects import FolderStore
 from shared.settings import Settings
-from tests.support.postgres import PostgresServer, start_postgres
+from tests.support.servers import (
+    PostgresServer,
+    RedisServer,
+    S3Server,
+    start_postgres,
+    start_redis,
+    start_s3,
+)
 
 REAL_PHOTOS = "PLACEWISE_TEST_DATA"
 
@@ -59,6 +66,20 @@ def real_photos() -> Path:
 def postgres() -> Iterator[PostgresServer]:
     """A real PostgreSQL; the test fails, and says how to get one, where none can be started."""
     with start_postgres() as server:
+        yield server
+
+
+@pytest.fixture(scope="session")
+def redis() -> Iterator[RedisServer]:
+    """A real Redis, as above."""
+    with start_redis() as server:
+        yield server
+
+
+@pytest.fixture(scope="session")
+def s3() -> Iterator[S3Server]:
+    """A real S3 server, as above."""
+    with start_s3() as server:
         yield server
 
 

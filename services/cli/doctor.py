@@ -22,7 +22,6 @@ from shared.catalog.session import Catalog
 from shared.client import Client
 from shared.errors import Misconfigured, PlacewiseError
 from shared.home import running_server
-from shared.objects.open_store import open_store
 from shared.settings import Settings
 
 LOW_DISK_BYTES = 1_000_000_000
@@ -95,6 +94,8 @@ def _folder(settings: Settings) -> str:
 
 def _uploads(settings: Settings) -> str:
     if settings.s3_endpoint is not None:
+        from shared.objects.open_store import open_store  # the minio client takes its time
+
         open_store(settings).check()
         return f"S3_BUCKET {settings.s3_bucket} at {settings.s3_endpoint} is writable"
     folder = settings.upload_dir

@@ -6,7 +6,6 @@ import typer
 
 from services.cli.configuration import read_settings
 from services.cli.output import JsonOption, answers, explained, print_json
-from shared.objects.s3 import Bucket, create_bucket
 
 app = typer.Typer(help="Where objects lie.", no_args_is_help=True)
 
@@ -23,6 +22,8 @@ def create(as_json: JsonOption = False) -> None:
     S3_ACCESS_KEY has to be allowed to make buckets, which Placewise itself need not be.
     """
     with explained(as_json):
+        from shared.objects.s3 import Bucket, create_bucket  # the minio client takes its time
+
         bucket = Bucket.of(read_settings())
         made = create_bucket(bucket)
     if as_json:

@@ -52,7 +52,7 @@ from tests.support.catalog_rows import (
     states,
     take,
 )
-from tests.support.postgres import PostgresServer
+from tests.support.servers import PostgresServer
 
 MAX_ATTEMPTS = 3
 PROBLEM = Unprocessable("undecodable_photo", "The photo can't be decoded.").as_problem()
