@@ -16,7 +16,7 @@ from typing import BinaryIO
 
 from shared.errors import NotFound, Unavailable
 from shared.ids import new_id
-from shared.objects.keys import check_key
+from shared.objects.keys import check_key, is_key
 from shared.objects.port import ObjectInfo
 
 # No file there, or a folder on the way or at the end: to a store of keys it is all the same.
@@ -122,7 +122,7 @@ class FolderStore:
                 path = Path(directory, name)
                 inside = path.relative_to(folder)
                 key = begin + inside.as_posix()
-                if inside.parts[0] in RESERVED or not key.startswith(prefix):
+                if inside.parts[0] in RESERVED or not key.startswith(prefix) or not is_key(key):
                     continue
                 if self.path(key) != path:
                     continue  # in the root's own folder of a name that lies elsewhere

@@ -13,10 +13,17 @@ VOCABULARIES = "vocabularies/"
 WORK = "work/"
 
 
+def is_key(key: str) -> bool:
+    """Is it names joined by single slashes, none of them `.` or `..`, without NUL and backslash
+    (which some S3 servers take for a slash)? Such a key means the same in every store."""
+    return not any(part in ("", ".", "..") for part in key.split("/")) and not set(key) & set(
+        "\0\\"
+    )
+
+
 def check_key(key: str) -> str:
-    """The key itself; ValueError unless it is names joined by single slashes, none of them `.` or
-    `..`, without NUL: what means the same in a folder and in a bucket."""
-    if any(part in ("", ".", "..") for part in key.split("/")) or "\0" in key:
+    """The key itself; ValueError where it is none."""
+    if not is_key(key):
         raise ValueError(f"not an object key: {key!r}")
     return key
 

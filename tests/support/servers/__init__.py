@@ -13,12 +13,13 @@ killed. Those of 2 to 4 may be killed, stopped, started again and paused (`Handl
 
 from tests.support.servers.postgres import PostgresServer, start_postgres
 from tests.support.servers.redis import RedisServer, start_redis
-from tests.support.servers.s3 import S3Server, start_s3
+from tests.support.servers.s3 import S3Server, start_moto, start_s3
 
 __all__ = [
     "PostgresServer",
     "RedisServer",
     "S3Server",
+    "start_moto",
     "start_postgres",
     "start_redis",
     "start_s3",

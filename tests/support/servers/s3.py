@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -30,6 +31,9 @@ HOW_TO_GET = (
 )
 ACCESS_KEY, SECRET_KEY = "placewise-tests", "a secret of the tests"
 TIMEOUT_SECONDS = 2.0
+# SeaweedFS makes files for each bucket, seven unless told otherwise; every test has its bucket.
+BUCKET_VOLUMES = 1
+VOLUMES = 2000
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,11 +93,30 @@ def start_s3(*, own: bool = False) -> Iterator[S3Server]:
         process.close()
 
 
+@contextlib.contextmanager
+def start_moto() -> Iterator[S3Server]:
+    """moto's S3: for the object store's contract alone, because no secret is wrong to it."""
+    port = free_ports(1)[0]
+    command = [sys.executable, "-m", "moto.server", "-H", "127.0.0.1", "-p", str(port)]
+    url = f"http://127.0.0.1:{port}/moto-api/data.json"
+    process = Daemon("moto", command, new_folder("moto"), lambda: _asked(url) is not None)
+    try:
+        process.start()
+        yield S3Server(f"127.0.0.1:{port}", ACCESS_KEY, SECRET_KEY, False, process)
+    finally:
+        process.close()
+
+
 def _container() -> tuple[Container, int]:
     port = free_ports(1)[0]
-    command = ["server", "-s3", "-s3.port=8333", "-master.telemetry=false", "-volume.max=20"]
-    keys = {"AWS_ACCESS_KEY_ID": ACCESS_KEY, "AWS_SECRET_ACCESS_KEY": SECRET_KEY}
-    return Container("SeaweedFS", IMAGE, (8333, port), command, lambda: _answers(port), keys), port
+    command = ["server", "-s3", "-s3.port=8333", "-master.telemetry=false"]
+    command.append(f"-volume.max={VOLUMES}")
+    said = {
+        "AWS_ACCESS_KEY_ID": ACCESS_KEY,
+        "AWS_SECRET_ACCESS_KEY": SECRET_KEY,
+        "WEED_MASTER_VOLUME_GROWTH_COPY_1": str(BUCKET_VOLUMES),
+    }
+    return Container("SeaweedFS", IMAGE, (8333, port), command, lambda: _answers(port), said), port
 
 
 def _daemon() -> tuple[Daemon, int]:
@@ -104,6 +127,7 @@ def _daemon() -> tuple[Daemon, int]:
     credentials = [{"accessKey": ACCESS_KEY, "secretKey": SECRET_KEY}]
     identity = {"name": "tests", "credentials": credentials, "actions": ["Admin"]}
     (folder / "s3.json").write_text(json.dumps({"identities": [identity]}))
+    (folder / "master.toml").write_text(f"[master.volume_growth]\ncopy_1 = {BUCKET_VOLUMES}\n")
     names = ("master.port", "volume.port", "filer.port", "s3.port")
     flags = [flag for name in names for flag in (name, f"{name}.grpc")]
     ports = dict(zip(flags, free_ports(len(flags)), strict=True))
@@ -112,7 +136,7 @@ def _daemon() -> tuple[Daemon, int]:
         *(str(program), "-logtostderr=true", "server", f"-dir={folder}", "-filer", "-s3"),
         *("-ip=127.0.0.1", "-ip.bind=127.0.0.1", *(f"-{flag}={at}" for flag, at in ports.items())),
         *(f"-s3.config={folder / 's3.json'}", "-s3.port.iceberg=0", "-s3.port.lance=0"),
-        *("-master.telemetry=false", "-master.volumeSizeLimitMB=64", "-volume.max=20"),
+        *("-master.telemetry=false", "-master.volumeSizeLimitMB=64", f"-volume.max={VOLUMES}"),
         *("-volume.preStopSeconds=0", "-s3.cacheCapacityMB=0"),
         "-master.electionTimeout=1s",  # of one voter: else it is what a restart waits for
     ]
