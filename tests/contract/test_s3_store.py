@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 from minio.lifecycleconfig import LifecycleConfig
 from typer.testing import CliRunner
+from urllib3.exceptions import ProtocolError
 
 from services.cli import storage
 from services.cli.doctor import _uploads
@@ -131,6 +132,23 @@ def test_aborted_upload_leaves_no_parts(bucket: Bucket) -> None:
     writer.abort()
     assert unfinished(bucket) == []
     writer.abort()
+
+
+def test_put_that_fails_midway_leaves_no_parts(
+    bucket: Bucket, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    upload_part = bucket.client._upload_part
+
+    def first_only(*arguments: Any) -> str:
+        if arguments[-1] == 2:
+            raise ProtocolError("Connection aborted.")
+        return upload_part(*arguments)
+
+    monkeypatch.setattr(bucket.client, "_upload_part", first_only)
+    with pytest.raises(Unavailable):
+        S3Store(bucket).put("a", bytes(3 * PART_BYTES))
+    assert unfinished(bucket) == []
+    assert S3Store(bucket).head("a") is None
 
 
 def test_upload_whose_parts_were_removed_meanwhile_is_not_acknowledged(bucket: Bucket) -> None:
