@@ -15,10 +15,9 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
-import signal
 import socket
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import uvicorn
@@ -27,12 +26,16 @@ from services.extractor.worker import ExtractorWorker
 from services.gateway.app import create_app
 from services.gateway.context import Gateway
 from services.gateway.keys import Keys, KnownKeys, NoKeys
+from services.http_server import http_server, listening, stopped_by_signals, url_of
+from services.parts import start_part
+from services.search.presence import Presence
 from services.search.worker import SearchWorker
 from services.steward.evaluate import Evaluator
 from services.steward.loop import Steward
 from services.steward.queue import free_leases
 from shared.admin_key import AdminKey, admin_key, hash_key, is_loopback, new_local_key
 from shared.catalog.maps import ensure_default_map
+from shared.catalog.search_workers import forget_dead_workers
 from shared.catalog.session import Catalog
 from shared.errors import Misconfigured
 from shared.home import announced, lock_home
@@ -43,9 +46,6 @@ from shared.objects.s3 import S3Store
 from shared.settings import Settings
 
 log = logging.getLogger(__name__)
-
-BACKLOG = 2048  # connections that wait to be accepted
-GRACEFUL_SECONDS = 10  # for requests under way when the server is asked to stop
 
 
 @dataclass(slots=True)
@@ -63,9 +63,14 @@ class Standalone:
     failed: threading.Event
     """Set when one of the parts has died: the process should end and say so."""
 
+    def end(self) -> None:
+        """A part has died: stop the others."""
+        self.failed.set()
+        self.server.should_exit = True
+
     def serve(self) -> None:
         """Answer HTTP until the process is asked to stop."""
-        with _stopped_by_signals(self.server):
+        with stopped_by_signals(self.server):
             self.server.run(sockets=[self.listener])
         if self.failed.is_set():
             raise Misconfigured("part_died", "A part of Placewise died; the log above says why.")
@@ -83,7 +88,7 @@ def standalone(settings: Settings, *, new_key: bool = False) -> Iterator[Standal
     home = settings.placewise_home
     with contextlib.ExitStack() as held:
         held.enter_context(lock_home(home))
-        listener = held.enter_context(_listener(settings))
+        listener = held.enter_context(listening(settings.host, settings.port))
         catalog = Catalog(settings.catalog_url())
         store = open_store(settings)
         if isinstance(store, S3Store):
@@ -92,36 +97,32 @@ def standalone(settings: Settings, *, new_key: bool = False) -> Iterator[Standal
         catalog.migrate()
         with catalog.write() as session:
             ensure_default_map(session, settings.new_map_extractor)
-        # The lock says that no other worker lives: what was leased belongs to a killed process.
+            # The lock says that no other worker lives: what is there is left by a killed process.
+            forget_dead_workers(session, everyone=True)
         free_leases(catalog, settings.max_attempts, everyone=True)
 
         # After all that can be refused: a key that no start gets to show would be lost.
         host, port = listener.getsockname()[:2]
         keys, key, local_key = _make_keys(settings, host, new_key)
-        url = _url(host, port)
+        url = url_of(host, port)
         held.enter_context(announced(home, url, local_key))
 
         search = SearchWorker(catalog, store, settings)
-        extractor = ExtractorWorker(
-            catalog, store, hints, settings, name=f"embedded-{os.getpid()}", only_worker=True
-        )
+        name = f"embedded-{os.getpid()}"
+        presence = Presence(catalog, search, name)
+        extractor = ExtractorWorker(catalog, store, hints, settings, name=name, only_worker=True)
         steward = Steward(catalog, store, hints, settings)
-        evaluator = Evaluator(catalog, search, settings, name=f"embedded-{os.getpid()}")
+        evaluator = Evaluator(catalog, search, settings, name=name)
         gateway = Gateway(catalog, store, hints, search, settings, keys)
-        server = uvicorn.Server(
-            uvicorn.Config(
-                create_app(gateway),
-                log_config=None,
-                access_log=settings.debug,
-                timeout_graceful_shutdown=GRACEFUL_SECONDS,
-            )
-        )
+        server = http_server(create_app(gateway), access_log=settings.debug)
         running = Standalone(url, server, listener, key, local_key, threading.Event())
         stop = threading.Event()
         parts = [
-            _start(name, part, stop, running)
+            start_part(name, part, stop, running.end)
             for name, part in (
                 ("search", search.run),
+                ("search of what is built", search.run_building),
+                ("search's presence", presence.run),
                 ("extractor", extractor.run),
                 ("steward", steward.run),
                 ("evaluator", evaluator.run),
@@ -136,52 +137,6 @@ def standalone(settings: Settings, *, new_key: bool = False) -> Iterator[Standal
                 part.join()
             extractor.close()
             catalog.close()
-
-
-@contextlib.contextmanager
-def _stopped_by_signals(server: uvicorn.Server) -> Iterator[None]:
-    """SIGTERM and Ctrl-C end the block in good order, not the process.
-
-    uvicorn raises the signal that stopped it once more. By Python's own handlers that would end
-    the process there, before its parts have given back what they hold.
-    """
-    if threading.current_thread() is not threading.main_thread():
-        yield  # signals are the main thread's, and so is their handling
-        return
-
-    def stop(_number: int, _frame: object) -> None:
-        server.should_exit = True
-
-    before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
-@contextlib.contextmanager
-def _listener(settings: Settings) -> Iterator[socket.socket]:
-    """The listening socket; port 0 takes a free one."""
-    try:
-        family, kind, protocol, _, address = socket.getaddrinfo(
-            settings.host, settings.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
-        )[0]
-        listener = socket.socket(family, kind, protocol)
-        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        # Inherited by every connection: an answer's second packet waits for no acknowledgement,
-        # which costs 40 ms a call. (asyncio sets it only on sockets that it has made.)
-        listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        listener.bind(address)
-        listener.listen(BACKLOG)
-    except OSError as error:
-        raise Misconfigured(
-            "address_in_use",
-            f"Can't listen on {settings.host}:{settings.port}: {error.strerror or error}. "
-            "Choose another one, for example: make run PORT=8001.",
-        ) from error
-    with listener:
-        yield listener
 
 
 def _make_keys(
@@ -200,28 +155,3 @@ def _make_keys(
             "Give --new-key with the HOST that needs one.",
         )
     return NoKeys(), None, None
-
-
-def _url(host: str, port: int) -> str:
-    """An address that this machine reaches; "every address" is none that can be called."""
-    host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)  # noqa: S104
-    return f"http://{f'[{host}]' if ':' in host else host}:{port}"
-
-
-def _start(
-    name: str,
-    run: Callable[[threading.Event], None],
-    stop: threading.Event,
-    running: Standalone,
-) -> threading.Thread:
-    def guarded() -> None:
-        try:
-            run(stop)
-        except BaseException:
-            log.exception("the %s died", name)
-            running.failed.set()
-            running.server.should_exit = True
-
-    part = threading.Thread(target=guarded, name=name)
-    part.start()
-    return part

@@ -11,7 +11,7 @@ import hashlib
 import io
 import json
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, BinaryIO
 from uuid import UUID
 
 import numpy as np
@@ -21,6 +21,9 @@ from shared.errors import Unavailable
 from shared.objects import ObjectStore
 
 Rows = NDArray[np.float32]
+Row = NDArray[np.float32]
+
+HEADER_BYTES = 1024  # what is read to find out where the rows begin: NumPy's header has 128
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,6 +56,12 @@ def encode_rows(rows: Rows) -> bytes:
 
 def decode_rows(data: bytes) -> Rows:
     """The rows of a `.npy` file, read-only, sharing memory with `data`."""
+    shape, offset = _read_header(data)
+    return np.frombuffer(data, dtype=np.float32, offset=offset).reshape(shape)
+
+
+def _read_header(data: bytes) -> tuple[tuple[int, int], int]:
+    """(rows, dimension), and where the rows begin. ValueError when it is no chunk's."""
     buffer = io.BytesIO(data)
     major, _ = np.lib.format.read_magic(buffer)
     read_header = {
@@ -62,8 +71,7 @@ def decode_rows(data: bytes) -> Rows:
     shape, fortran_order, dtype = read_header(buffer)
     if dtype != np.float32 or fortran_order or len(shape) != 2:
         raise ValueError(f"not a chunk: {dtype}, shape {shape}, fortran_order={fortran_order}")
-    rows = np.frombuffer(data, dtype=np.float32, offset=buffer.tell())
-    return rows.reshape(shape)
+    return shape, buffer.tell()
 
 
 def write_chunk(
@@ -110,6 +118,33 @@ def read_chunk(store: ObjectStore, object_key: str, sha256: str) -> Rows:
             object_key=object_key,
         )
     return decode_rows(data)
+
+
+def read_row(store: ObjectStore, object_key: str, row: int) -> Row:
+    """One row of a chunk, (dimension,), fetching little more than that row.
+
+    No hash is checked: that of a chunk is of all its bytes. IndexError when there is no such row,
+    ValueError for what is no chunk or ends too early, NotFound when the object is missing.
+    """
+    with store.open(object_key) as file:
+        (rows, dimension), offset = _read_header(_read(file, HEADER_BYTES))
+        if row >= rows:
+            raise IndexError(row)
+        size = dimension * np.dtype(np.float32).itemsize
+        file.seek(offset + row * size)
+        data = _read(file, size)
+    if len(data) < size:
+        raise ValueError(f"the object ends {size - len(data)} bytes too early")
+    return np.frombuffer(data, dtype=np.float32)
+
+
+def _read(file: BinaryIO, size: int) -> bytes:
+    """Up to `size` bytes; fewer only at the end. (A network's file may give less at a time.)"""
+    pieces = []
+    while size and (piece := file.read(size)):
+        pieces.append(piece)
+        size -= len(piece)
+    return b"".join(pieces)
 
 
 def delete_chunk(store: ObjectStore, object_key: str) -> None:

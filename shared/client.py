@@ -22,38 +22,12 @@ from uuid import UUID
 
 import httpx2
 
-from shared.errors import (
-    Conflict,
-    Gone,
-    InvalidRequest,
-    NotFound,
-    PlacewiseError,
-    TooLarge,
-    Unauthorized,
-    Unavailable,
-    Unprocessable,
-    UnsupportedMedia,
-)
+from shared.errors import InvalidRequest, Unavailable, refusal
 
 API = "/api/v1"
 FINISHED = ("succeeded", "failed", "cancelled")
 POLL_SECONDS = 20.0  # one long poll
 TIMEOUT_SECONDS = 90.0  # of one call: longer than the longest wait that a server grants
-
-_BY_STATUS: dict[int, type[PlacewiseError]] = {
-    kind.status: kind
-    for kind in (
-        InvalidRequest,
-        Unauthorized,
-        NotFound,
-        Conflict,
-        Gone,
-        TooLarge,
-        UnsupportedMedia,
-        Unprocessable,
-        Unavailable,
-    )
-}
 
 Json = dict[str, Any]
 
@@ -233,7 +207,7 @@ class Client:
         if answer.is_success:
             body: Json = answer.json()
             return body
-        raise _refusal(answer)
+        raise refusal(answer.status_code, answer.text)
 
 
 def retry_while_away(call: Callable[[], Json], seconds: float) -> Json:
@@ -250,15 +224,3 @@ def retry_while_away(call: Callable[[], Json], seconds: float) -> Json:
 
 def _given(**params: Any) -> Json:
     return {name: value for name, value in params.items() if value is not None}
-
-
-def _refusal(answer: httpx2.Response) -> PlacewiseError:
-    """The server's problem document as the error that it was."""
-    try:
-        problem: Json = answer.json()
-        code, detail = problem.pop("code"), problem.pop("detail")
-    except (ValueError, KeyError, TypeError, AttributeError):  # not JSON, or not a problem
-        return PlacewiseError("bad_answer", f"HTTP {answer.status_code}: {answer.text[:200]}")
-    for member in ("type", "title", "status", "instance"):
-        problem.pop(member, None)
-    return _BY_STATUS.get(answer.status_code, PlacewiseError)(code, detail, **problem)

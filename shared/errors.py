@@ -19,6 +19,7 @@ the extractor stores them in `jobs.error`, the command line prints `detail`.
 
 from __future__ import annotations
 
+import json
 from typing import Any, ClassVar
 
 
@@ -120,3 +121,34 @@ def invalid_field(field: str, detail: str) -> Unprocessable:
         f"{field}: {detail}",
         errors=[{"field": field, "detail": detail}],
     )
+
+
+_BY_STATUS: dict[int, type[PlacewiseError]] = {
+    kind.status: kind
+    for kind in (
+        InvalidRequest,
+        Unauthorized,
+        NotFound,
+        Conflict,
+        Gone,
+        TooLarge,
+        UnsupportedMedia,
+        Unprocessable,
+        Unavailable,
+    )
+}
+
+
+def refusal(status: int, body: str) -> PlacewiseError:
+    """The error that a server answered with, made from its problem document.
+
+    PlacewiseError (`bad_answer`) for whatever is no problem document: a proxy's page, say.
+    """
+    try:
+        problem: dict[str, Any] = json.loads(body)
+        code, detail = problem.pop("code"), problem.pop("detail")
+    except (ValueError, KeyError, TypeError, AttributeError):
+        return PlacewiseError("bad_answer", f"HTTP {status}: {body[:200]}")
+    for member in ("type", "title", "status", "instance"):
+        problem.pop(member, None)
+    return _BY_STATUS.get(status, PlacewiseError)(code, detail, **problem)

@@ -1,7 +1,8 @@
 """What is asked of a search worker and what it answers.
 
 A query is a reference to one descriptor row in the object store, never the vector itself: the
-gateway stays free of vectors. In one process the port is a call; between machines it is HTTP.
+gateway stays free of vectors. In one process the port is a call (`services.search.worker`);
+between machines it is HTTP, with a map's slots spread over shards (`shared.search_http`).
 """
 
 from __future__ import annotations
@@ -12,6 +13,11 @@ from uuid import UUID
 from pydantic import BaseModel, ConfigDict, Field
 
 from shared.photo_filter import EVERYTHING, PhotoFilter
+from shared.shards import WHOLE
+
+EXHAUSTIVE = "exhaustive"  # every row was compared exactly
+CERTIFICATES = (EXHAUSTIVE,)
+"""How an answer can have been reached, strongest first."""
 
 
 class _Message(BaseModel):
@@ -49,21 +55,47 @@ class SearchResponse(_Message):
 
     hits: tuple[Hit, ...]
     certificate: str
-    """How the answer was reached; `exhaustive`: every row was compared exactly."""
+    """How the answer was reached, one of CERTIFICATES."""
     rows_scanned: int
     rows_reranked: int
     snapshot_version: int
     missing: tuple[str, ...] = ()
-    """Objects that could not be read and whose photos can't be in the answer."""
+    """Whose photos can't be in the answer: objects that could not be read, and shards (`shard
+    1/3`) of which no worker answered."""
+
+
+class Lag(_Message):
+    """How far a snapshot is behind its map. `seconds` since it was last known to be level."""
+
+    versions: int
+    seconds: float
+    answers: bool
+    """Whether the generation is the active one; False for one that is only being built."""
 
 
 class SearchStatus(_Message):
-    """How far a worker has followed: rows and bytes in memory, version by generation."""
+    """How far a worker has followed: rows and bytes in memory, version by generation.
 
+    Of several workers together: the sums, and the least version that every shard has.
+    """
+
+    shard: str = str(WHOLE)
     rows: int
     resident_bytes: int
     versions: dict[UUID, int]
+    incomplete: tuple[UUID, ...] = ()
+    """Generations of which a chunk can't be read."""
     missing: tuple[str, ...]
+    """The chunks that can't be read."""
+    lags: dict[UUID, Lag] = {}
+    """Empty where no one follows the catalog."""
+    away: tuple[str, ...] = ()
+    """Shards of which no worker answers, as `missing` of an answer names them."""
+
+    @property
+    def loaded(self) -> dict[UUID, int]:
+        """The versions of the generations that are there without a gap."""
+        return {key: value for key, value in self.versions.items() if key not in self.incomplete}
 
 
 class SearchPort(Protocol):

@@ -16,6 +16,7 @@ from pydantic_settings import BaseSettings, SettingsConfigDict
 from shared.errors import Misconfigured
 from shared.predecessor import extractor_of
 from shared.recipes import get_recipe
+from shared.shards import Shard
 
 LEAST_KEY_CHARACTERS = 16
 
@@ -154,6 +155,18 @@ class Settings(BaseSettings):
     )
     search_wait_seconds: float = Field(5.0, gt=0, description="longest wait for `min_version`")
 
+    # How search is spread over machines (`placewise search`, which listens on HOST and PORT, too).
+    search_shard: str = Field(
+        "0/1", description="what this search worker holds: 1/3 is the second of three shards"
+    )
+    search_urls: str | None = Field(
+        None,
+        description="every search worker's address, separated by commas; unset: in this process",
+    )
+    search_timeout_seconds: float = Field(
+        10.0, gt=0, description="longest wait for the shards' answers; who is late is left out"
+    )
+
     @field_validator("admin_key")
     @classmethod
     def _can_be_sent_and_not_guessed(cls, value: SecretStr | None) -> SecretStr | None:
@@ -165,6 +178,22 @@ class Settings(BaseSettings):
                 f"a key has at least {LEAST_KEY_CHARACTERS} printable ASCII characters and no "
                 "blanks; this makes one: openssl rand -hex 24"
             )
+        return value
+
+    @field_validator("search_shard")
+    @classmethod
+    def _names_a_shard(cls, value: str) -> str:
+        return str(Shard.parse(value))
+
+    @field_validator("search_urls")
+    @classmethod
+    def _are_addresses(cls, value: str | None) -> str | None:
+        for url in _split(value):
+            if not re.fullmatch(r"https?://[^\s/?#]+/?", url):
+                raise ValueError(
+                    f"{url!r} is no address like http://search-0:8000; several are separated by "
+                    "commas"
+                )
         return value
 
     @field_validator("placewise_home", "upload_dir")
@@ -261,8 +290,23 @@ class Settings(BaseSettings):
             vlad_desc_dim=self.vlad_desc_dim,
         )
 
+    @property
+    def shard(self) -> Shard:
+        """The part of every generation that this process's search worker holds."""
+        return Shard.parse(self.search_shard)
+
+    @property
+    def search_addresses(self) -> tuple[str, ...]:
+        """The search workers' addresses, each once; () when search is in this process."""
+        return tuple(dict.fromkeys(url.rstrip("/") for url in _split(self.search_urls)))
+
     def catalog_url(self) -> str:
         """The SQLAlchemy URL of the catalog."""
         if self.database_url is not None:
             return self.database_url.get_secret_value()
         return f"sqlite:///{self.placewise_home / 'catalog.sqlite'}"
+
+
+def _split(value: str | None) -> list[str]:
+    """What is separated by commas or blanks."""
+    return (value or "").replace(",", " ").split()

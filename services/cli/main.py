@@ -16,6 +16,7 @@ from services.cli import (
     import_anyloc,
     index,
     maps,
+    search,
     serve,
     storage,
     vocabulary,
@@ -29,6 +30,7 @@ app = typer.Typer(
     add_completion=False,
 )
 app.command("serve")(serve.serve)
+app.command("search")(search.search)
 app.command("index")(index.index)
 app.command("import-anyloc")(import_anyloc.import_anyloc)
 app.command("query")(ask.query)

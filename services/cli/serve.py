@@ -30,13 +30,13 @@ def serve(
         settings = read_settings()
         from services.standalone import standalone  # brings torch, as `connect` says
 
-        _set_log_levels(settings.debug)
+        set_log_levels(settings.debug)
         with standalone(settings, new_key=new_key) as running:
             messages.print(_welcome(running.url, running.key, settings), soft_wrap=True)
             running.serve()
 
 
-def _set_log_levels(debug: bool) -> None:
+def set_log_levels(debug: bool) -> None:
     """What Placewise itself says, in detail with DEBUG; of others, never each statement."""
     logging.getLogger().setLevel(logging.INFO)
     for ours in ("services", "shared"):

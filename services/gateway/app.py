@@ -21,7 +21,7 @@ from services.gateway.body_limit import BodyLimit
 from services.gateway.context import API, Gateway
 from services.gateway.key_check import KeyCheck
 from services.gateway.parameters import no_unknown_parameters
-from services.gateway.problems import PROBLEM_RESPONSES, install_problem_handlers
+from shared.problems import PROBLEM_RESPONSES, install_problem_handlers
 
 DESCRIPTION = """Photo in, place out. Upload geotagged photos, poll their jobs, and ask which known
 place a photo shows. Every error is an RFC 9457 problem with a stable `code`."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 from fastapi import Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from services.gateway.problems import problem_response
 from shared.errors import TooLarge
+from shared.problems import problem_response
 
 MAX_JSON_BYTES = 1_000_000
 

@@ -17,6 +17,8 @@ from shared.errors import PlacewiseError
 probes = APIRouter(tags=["operations"])
 router = APIRouter(tags=["operations"])
 
+WORST_FIRST = ("unhealthy", "degraded", "healthy")
+
 VERSION = version("placewise")
 
 
@@ -73,8 +75,9 @@ def livez() -> ProbeAnswer:
 @probes.head("/readyz", include_in_schema=False)
 @probes.get("/readyz", operation_id="readyz", response_model=ProbeAnswer)
 def readyz(gateway: GatewayDep, response: Response) -> ProbeAnswer:
-    """503 while a part that every call needs is away."""
-    ready = all(part.status == "healthy" for part in _parts(gateway).values())
+    """503 while a part that every call needs is away. Where only some shards of search are, the
+    rest still answers, and says so."""
+    ready = all(part.status != "unhealthy" for part in _parts(gateway).values())
     response.status_code = 200 if ready else 503
     return ProbeAnswer(status="ready" if ready else "not ready")
 
@@ -82,12 +85,12 @@ def readyz(gateway: GatewayDep, response: Response) -> ProbeAnswer:
 @router.head("/health", include_in_schema=False)
 @router.get("/health", operation_id="health", response_model=HealthAnswer)
 def health(gateway: GatewayDep, response: Response) -> HealthAnswer:
-    """The state of each part; 503 when one is away."""
+    """The state of each part; 503 when one is away, or `degraded`: a part of it is away."""
     parts = _parts(gateway)
-    healthy = all(part.status == "healthy" for part in parts.values())
-    response.status_code = 200 if healthy else 503
+    states = {part.status for part in parts.values()}
+    response.status_code = 200 if states == {"healthy"} else 503
     return HealthAnswer(
-        status="healthy" if healthy else "unhealthy",
+        status=next(state for state in WORST_FIRST if state in states),
         version=VERSION,
         uptime_seconds=time.monotonic() - gateway.started,
         parts=parts,
@@ -124,6 +127,9 @@ def _search(gateway: Gateway) -> PartAnswer:
         status = gateway.search.status()
     except PlacewiseError as error:
         return PartAnswer(status="unhealthy", detail=error.detail)
+    if status.away:
+        named = ", ".join(status.away)
+        return PartAnswer(status="degraded", detail=f"no search worker answers for: {named}")
     if status.missing:
         return PartAnswer(status="unhealthy", detail=f"{len(status.missing)} chunks can't be read")
     return PartAnswer(status="healthy", detail=f"{status.rows} rows in memory")

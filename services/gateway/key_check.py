@@ -8,8 +8,8 @@ from fastapi import Request
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from services.gateway.keys import Keys
-from services.gateway.problems import problem_response
 from shared.errors import Unauthorized
+from shared.problems import problem_response
 
 log = logging.getLogger(__name__)
 

@@ -132,8 +132,11 @@ class JobAnswer(Answer):
     job_id: UUID
     kind: JobKind
     state: JobState
-    stage: str | None = Field(description="of a model change: sample, cluster, describe")
+    stage: str | None = Field(description="of a model change: sample, cluster, describe, load")
     waiting_for: str | None = Field(description="what has to be there before the job can go on")
+    awaited: list[str] | None = Field(
+        description="the search workers that it waits for, once they take longer than a minute"
+    )
     progress: Progress
     attempts: int
     file_id: UUID | None
@@ -154,6 +157,7 @@ class JobAnswer(Answer):
             state=JobState(job.state),
             stage=job.stage,
             waiting_for=job.waiting_for,
+            awaited=job.awaited,
             progress=Progress(
                 done=job.progress_done,
                 total=job.progress_total,

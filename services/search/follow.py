@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import dataclass
 from uuid import UUID
 
 from sqlalchemy import select
@@ -16,27 +17,41 @@ from shared.catalog.session import Catalog
 from shared.chunks import read_chunk
 from shared.errors import NotFound, Unavailable
 from shared.objects import ObjectStore
+from shared.shards import WHOLE, Shard
 
 log = logging.getLogger(__name__)
 
 FOLLOWED = (GenerationState.ACTIVE, GenerationState.BUILDING)
 
 
-def versions(catalog: Catalog) -> dict[UUID, tuple[UUID, int]]:
-    """Every generation to follow, with its map and that map's version now."""
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """A generation to follow: `version` is its map's, now."""
+
+    version: int
+    state: GenerationState
+
+
+def wanted_versions(catalog: Catalog) -> dict[UUID, Wanted]:
+    """Every generation to follow."""
     with catalog.read() as session:
         found = session.execute(
-            select(Generation.id, Map.id, Map.version)
+            select(Generation.id, Map.version, Generation.state)
             .join(Map, Map.id == Generation.map_id)
             .where(Generation.state.in_(FOLLOWED), Map.deleted_at.is_(None))
         )
-        return {generation: (map_id, version) for generation, map_id, version in found}
+        return {id_: Wanted(version, GenerationState(state)) for id_, version, state in found}
 
 
 def advance(
-    catalog: Catalog, store: ObjectStore, generation_id: UUID, old: Snapshot | None
+    catalog: Catalog,
+    store: ObjectStore,
+    generation_id: UUID,
+    old: Snapshot | None,
+    shard: Shard = WHOLE,
 ) -> Snapshot | None:
-    """The generation as it is now, reusing what `old` has loaded; None when it is gone.
+    """The shard's part of the generation as it is now, reusing what `old` has loaded; None when
+    the generation is gone.
 
     Reads the catalog in one consistent transaction. A chunk that can't be read, or whose hash
     differs, is named in `missing`, and the rest is served.
@@ -46,7 +61,7 @@ def advance(
         if generation is None:
             return None
         version = session.get_one(Map, generation.map_id).version
-        chunks = live_chunks(session, generation_id)
+        chunks = [c for c in live_chunks(session, generation_id) if shard.owns(c.slot)]
         known = {chunk.chunk_id: chunk for chunk in old.chunks} if old else {}
         changed = changed_since(session, generation.map_id, old.version) if old else []
         facts_of = {

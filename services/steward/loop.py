@@ -15,6 +15,7 @@ from services.steward.delete_maps import delete_maps
 from services.steward.model_changes import advance_model_changes, fit_maps_that_wait
 from services.steward.queue import free_leases, resend_hints
 from services.steward.retention import forget_old_jobs, forget_old_searches
+from services.steward.search_workers import remove_dead_workers
 from shared.catalog.session import Catalog
 from shared.jobs import Hints
 from shared.objects import ObjectStore
@@ -47,6 +48,7 @@ class Steward:
                 0.5,
                 lambda: advance_model_changes(catalog, hints),
             ),
+            Duty("remove dead search workers", 2.0, lambda: remove_dead_workers(catalog)),
             Duty(
                 "fit maps that wait",
                 2.0,

@@ -26,6 +26,7 @@ from shared.estimate.calibration import Calibration, learn_confidence, learn_thr
 from shared.estimate.evidence import DEPTH, Evidence, Ranked, locate, weigh
 from shared.estimate.places import Spot, elsewhere, metres_between, same_place
 from shared.search_protocol import Hit, SearchPort, SearchRequest
+from shared.shards import names_a_shard
 
 MOST_RANKS = 800  # looked at to find what is elsewhere, where hundreds show the same place
 
@@ -189,6 +190,12 @@ class Measure:
                 if error.code == "chunk_unreadable":
                     raise _damaged([chunk.object_key]) from error
                 raise
+            if any(names_a_shard(part) for part in answer.missing):
+                raise Unavailable(
+                    "search_incomplete",
+                    f"Without {', '.join(answer.missing)} the figures would be those of a part "
+                    "of the map.",
+                )
             if answer.missing:
                 raise _damaged(answer.missing)
             return [(hit, self._spot(hit)) for hit in answer.hits]

@@ -1,8 +1,9 @@
 """Model changes' duties: queue photos for a generation that is built, switch when it is complete.
 
 Complete means: each live photo that the active generation can find has a descriptor in the new
-one, or a recorded failure there. The last check and the switch are one transaction under the
-map's lock, which publishing takes as well: no photo can slip between them.
+one, or a recorded failure there. Then every live search worker has to have loaded it. The last
+check and the switch are one transaction under the map's lock, which publishing takes as well: no
+photo can slip between them.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from uuid import UUID
 from sqlalchemy import delete, exists, func, insert, select, update
 from sqlalchemy.orm import Session, aliased
 
+from services.steward.search_workers import search_has_loaded
 from shared.catalog.base import Condition, db_now
 from shared.catalog.chunks import Descriptor, count_described
 from shared.catalog.generations import (
@@ -33,6 +35,8 @@ from shared.jobs.table import MODEL_CHANGES, UNFINISHED, WaitingFor
 
 log = logging.getLogger(__name__)
 
+WAITING = (WaitingFor.DESCRIPTORS, WaitingFor.SEARCH)
+
 FILL_JOBS = 2000  # reindex jobs queued in one transaction
 
 # What `POST /vocabularies` with {} asks for; no `clusters` means the extractor's own number.
@@ -40,18 +44,16 @@ DEFAULT_FIT = {"clusters": None, "sample": 1000, "seed": 0}
 
 
 def advance_model_changes(catalog: Catalog, hints: Hints) -> None:
-    """One step for every model change that waits for descriptors."""
+    """One step for every model change that waits for descriptors, or for search to load them."""
     with catalog.read() as session:
         waiting = session.scalars(
-            select(Job).where(
-                Job.kind.in_(MODEL_CHANGES), Job.waiting_for == WaitingFor.DESCRIPTORS
-            )
+            select(Job).where(Job.kind.in_(MODEL_CHANGES), Job.waiting_for.in_(WAITING))
         ).all()
     for job in waiting:
         with catalog.write() as session:
             lock_map(session, job.map_id)
             current = session.get_one(Job, job.id, with_for_update=True)
-            if current.waiting_for == WaitingFor.DESCRIPTORS and current.generation_id:
+            if current.waiting_for in WAITING and current.generation_id:
                 queued = _advance(session, current, current.generation_id)
                 if queued:
                     hints.send()
@@ -99,10 +101,14 @@ def _advance(session: Session, job: Job, generation_id: UUID) -> int:
     if queued or session.scalar(select(exists().where(open_jobs, Job.state.in_(UNFINISHED)))):
         sampled = int(job.params.get("sampled", 0))
         done = count_described(session, generation_id)
+        # Also when it was complete before: photos have come since.
+        job.waiting_for, job.stage, job.awaited = WaitingFor.DESCRIPTORS, "describe", None
         job.progress_done = max(0, min(sampled + done, job.progress_total - 1))
         return queued
     failed = _count(session, open_jobs & (Job.state == JobState.FAILED))
     if generation.state == GenerationState.BUILDING:
+        if not search_has_loaded(session, job, generation):
+            return 0
         _switch(session, generation)
     job.progress_failed = failed
     job.progress_total = max(job.progress_total, failed)

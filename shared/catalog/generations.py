@@ -1,7 +1,7 @@
 """Generations: one complete set of descriptors of a map, made by one extractor spec.
 
-BUILDING --complete and switched--> ACTIVE --another is switched in--> RETIRED --grace--> (removed)
-   \\--its job is cancelled or fails--> ABANDONED --grace--> (removed)
+BUILDING --complete, loaded by search--> ACTIVE --another is switched in--> RETIRED --grace--> gone
+   \\--its job is cancelled or fails--> ABANDONED --grace--> gone
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from enum import StrEnum
 from typing import Any
 from uuid import UUID
 
-from sqlalchemy import ForeignKey, Index, Integer, String, Uuid, select
+from sqlalchemy import BigInteger, ForeignKey, Index, Integer, String, Uuid, select
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
 from shared.catalog.base import Base, JsonValue, UtcDateTime, db_now
@@ -51,6 +51,10 @@ class Generation(Base):
     created_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())
     activated_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
     ended_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
+    # The map's version, and the time, at which every photo was in it for the first time: search
+    # workers have to have loaded that before it is switched in.
+    complete_version: Mapped[int | None] = mapped_column(BigInteger)
+    complete_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
 
     __table_args__ = (
         # One model change at a time: two would describe every photo three times over.

@@ -6,6 +6,7 @@ from shared.catalog.generations import Generation
 from shared.catalog.maps import Map
 from shared.catalog.models import Model
 from shared.catalog.photos import Photo
+from shared.catalog.search_workers import RegisteredWorker
 from shared.catalog.searches import Search
 from shared.catalog.vocabularies import Vocabulary
 from shared.jobs.table import Job
@@ -19,6 +20,7 @@ __all__ = [
     "Map",
     "Model",
     "Photo",
+    "RegisteredWorker",
     "Search",
     "Vocabulary",
 ]

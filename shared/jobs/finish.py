@@ -26,12 +26,17 @@ def _drop_lease(job: Job) -> None:
     job.lease_until = None
 
 
+def _wait_for_nothing(job: Job) -> None:
+    job.waiting_for = None
+    job.awaited = None
+
+
 def succeed(job: Job, result: dict[str, Any] | None = None) -> None:
     """The job has done what it promised."""
     job.state = JobState.SUCCEEDED
     job.result = result
     job.error = None
-    job.waiting_for = None
+    _wait_for_nothing(job)
     job.progress_done = job.progress_total - job.progress_failed
     job.finished_at = db_now()
     _drop_lease(job)
@@ -41,7 +46,7 @@ def fail(job: Job, problem: dict[str, Any]) -> None:
     """The job ends with a stored reason: an RFC 9457 problem."""
     job.state = JobState.FAILED
     job.error = problem
-    job.waiting_for = None
+    _wait_for_nothing(job)
     if job.progress_total == 1:
         job.progress_failed = 1
     job.finished_at = db_now()
@@ -79,7 +84,7 @@ def cancel(job: Job) -> None:
             state=job.state,
         )
     job.state = JobState.CANCELLED
-    job.waiting_for = None
+    _wait_for_nothing(job)
     job.finished_at = db_now()
     _drop_lease(job)
 
@@ -98,6 +103,7 @@ def cancel_all(session: Session, condition: Condition) -> None:
         .values(
             state=JobState.CANCELLED,
             waiting_for=None,
+            awaited=None,
             finished_at=db_now(),
             lease_token=None,
             lease_until=None,
@@ -142,7 +148,7 @@ def requeue(job: Job) -> None:
     job.alone = False
     job.error = None
     job.result = None
-    job.waiting_for = None
+    _wait_for_nothing(job)
     job.run_after = None
     job.progress_done = 0
     job.progress_failed = 0

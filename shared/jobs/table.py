@@ -89,6 +89,7 @@ class Priority(IntEnum):
 class WaitingFor(StrEnum):
     VOCABULARY = "vocabulary"  # the map's extractor needs one and the map has none yet
     DESCRIPTORS = "descriptors"  # every photo has to be described into the new generation
+    SEARCH = "search"  # every live search worker has to load the new generation
 
 
 class Job(Base):
@@ -108,6 +109,8 @@ class Job(Base):
     params: Mapped[dict[str, Any]] = mapped_column(JsonValue, default=dict)
     stage: Mapped[str | None] = mapped_column(String(30))
     waiting_for: Mapped[str | None] = mapped_column(String(30))
+    # The names of those that `waiting_for` waits for, once that takes long.
+    awaited: Mapped[list[str] | None] = mapped_column(JsonValue)
     progress_done: Mapped[int] = mapped_column(Integer, default=0)
     progress_total: Mapped[int] = mapped_column(Integer, default=1)
     progress_failed: Mapped[int] = mapped_column(Integer, default=0)

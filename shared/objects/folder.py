@@ -29,15 +29,20 @@ RESERVED = (PARTIAL, MARK)
 class FolderStore:
     """An object store in a local folder. What killed writers left half written goes at start."""
 
-    def __init__(self, root: Path, elsewhere: Mapping[str, Path] | None = None) -> None:
+    def __init__(
+        self, root: Path, elsewhere: Mapping[str, Path] | None = None, *, alone: bool = True
+    ) -> None:
         """`elsewhere` says in which other folder the keys lie that begin with a name and a slash:
         `{"originals": Path("/photos")}` keeps `originals/a` as `/photos/a`.
+
+        `alone` says that no other process writes there now, so that what is half written is left
+        over from one that was killed.
         """
         self.root = root
         self._elsewhere = dict(elsewhere or {})
         for folder in self._folders():
             (folder / PARTIAL).mkdir(parents=True, exist_ok=True)
-            for left_over in (folder / PARTIAL).iterdir():
+            for left_over in (folder / PARTIAL).iterdir() if alone else ():
                 left_over.unlink()
 
     def path(self, key: str) -> Path:

@@ -10,9 +10,10 @@ from shared.objects.upload_dir import place_originals
 from shared.settings import Settings
 
 
-def open_store(settings: Settings) -> ObjectStore:
+def open_store(settings: Settings, *, alone: bool = True) -> ObjectStore:
     """The bucket at S3_ENDPOINT, else the folder PLACEWISE_HOME/objects with UPLOAD_DIR.
 
+    `alone` says that no other process writes there: a folder is then tidied of half-written files.
     Asks nothing of an S3 server: `check` does. Raises Misconfigured as `place_originals` does,
     and `object_store_changed` for a folder whose objects lie in a bucket.
     """
@@ -21,4 +22,5 @@ def open_store(settings: Settings) -> ObjectStore:
     home = settings.placewise_home
     check_no_bucket(home)
     objects = home / "objects"
-    return FolderStore(objects, place_originals(home, objects, settings.upload_dir))
+    elsewhere = place_originals(home, objects, settings.upload_dir)
+    return FolderStore(objects, elsewhere, alone=alone)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import shutil
 import tempfile
 import threading
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -40,6 +41,7 @@ from shared.objects import FolderStore, ObjectStore
 from shared.photo_filter import Box, Circle, PhotoFilter
 from shared.search_protocol import SearchPort, SearchRequest, SearchResponse
 from shared.settings import Settings
+from tests.support.search_tier import SearchTier
 
 DIMENSION = 12
 NOON = datetime(2024, 5, 6, 12, tzinfo=UTC)
@@ -656,6 +658,30 @@ class TestSearchWorker(SearchPortContract):
         worker.follow()
         assert worker.status().missing == (), "a loaded chunk was read again"
         assert worker.status().rows == 10
+
+
+class TestSearchOverHttp(SearchPortContract):
+    """The same promises, with HTTP between and the map's slots spread over workers."""
+
+    @pytest.fixture(params=[(1,), (2, 1, 1)], ids=["one shard", "three shards, one of them twice"])
+    def port(
+        self,
+        request: pytest.FixtureRequest,
+        catalog: Catalog,
+        store: FolderStore,
+        settings: Settings,
+    ) -> Iterator[OpenPort]:
+        with contextlib.ExitStack() as running:
+
+            def open_port(**changes: object) -> SearchPort:
+                # Whoever waits less for a version waits less for the shards, too.
+                wait = float(str(changes.get("search_wait_seconds", settings.search_wait_seconds)))
+                own = settings.model_copy(update={"search_timeout_seconds": 5 * wait, **changes})
+                tier = SearchTier(catalog, store, own, request.param)
+                tier.follow()  # a search brings only one replica of a shard up to date
+                return running.enter_context(tier).port
+
+            yield open_port
 
 
 class AddDeleteMerge(RuleBasedStateMachine):

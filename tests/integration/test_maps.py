@@ -31,6 +31,7 @@ from shared.catalog.generations import Generation
 from shared.catalog.maps import Map
 from shared.catalog.models import Model
 from shared.catalog.photos import Photo
+from shared.catalog.search_workers import RegisteredWorker
 from shared.catalog.session import Catalog
 from shared.jobs import InProcessHints, Job, JobKind, JobState
 from shared.objects import FolderStore
@@ -48,13 +49,14 @@ class Away(Exception):
 
 
 def rows(catalog: Catalog) -> Counter[str]:
-    """How many rows lie in each table but the models', which belong to no map."""
+    """How many rows lie in each table but the models' and the search workers', which belong to no
+    map."""
     with catalog.read() as session:
         return Counter(
             {
                 table.name: session.scalar(select(func.count()).select_from(table)) or 0
                 for table in Base.metadata.sorted_tables
-                if table.name != Model.__tablename__
+                if table.name not in (Model.__tablename__, RegisteredWorker.__tablename__)
             }
         )
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-from typing import Any
+from pathlib import Path
+from typing import Any, BinaryIO, cast
 from uuid import UUID
 
 import numpy as np
@@ -15,6 +16,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from shared.chunks import (
+    HEADER_BYTES,
     WrittenChunk,
     chunk_key,
     decode_rows,
@@ -22,6 +24,7 @@ from shared.chunks import (
     encode_rows,
     manifest_key,
     read_chunk,
+    read_row,
     write_chunk,
 )
 from shared.errors import NotFound, Unavailable
@@ -175,3 +178,54 @@ def test_deleting_a_chunk_takes_its_manifest_along(store: FolderStore) -> None:
     delete_chunk(store, chunk.object_key)
     assert list(store.list("")) == []
     delete_chunk(store, chunk.object_key)
+
+
+class CountingStore(FolderStore):
+    """Counts the bytes that are read."""
+
+    bytes_read = 0
+
+    def open(self, key: str) -> BinaryIO:
+        store, opened = self, super().open(key)
+
+        class Counted(io.RawIOBase):
+            def readable(self) -> bool:
+                return True
+
+            def read(self, size: int = -1) -> bytes:
+                data = opened.read(min(size, 700))  # less than was asked, as a network may give
+                store.bytes_read += len(data)
+                return data
+
+            def seek(self, offset: int, whence: int = 0) -> int:
+                return opened.seek(offset, whence)
+
+            def close(self) -> None:
+                opened.close()
+                super().close()
+
+        return cast(BinaryIO, Counted())
+
+
+def test_one_row_is_read_without_the_others(tmp_path: Path) -> None:
+    store = CountingStore(tmp_path)
+    rows = some_rows(40, 5000)
+    chunk = written(store, rows, [new_id() for _ in rows])
+    for row in (0, 17, 39):
+        store.bytes_read = 0
+        np.testing.assert_array_equal(read_row(store, chunk.object_key, row), rows[row])
+        assert store.bytes_read == HEADER_BYTES + rows[row].nbytes
+    with pytest.raises(IndexError):
+        read_row(store, chunk.object_key, 40)
+
+
+@pytest.mark.parametrize("damage", ["cut", "other"])
+def test_a_row_of_a_damaged_object_is_not_made_up(store: FolderStore, damage: str) -> None:
+    rows = some_rows()
+    chunk = written(store, rows, [new_id() for _ in rows])
+    whole = store.get(chunk.object_key)
+    store.put(chunk.object_key, whole[:-5] if damage == "cut" else b"something else")
+    with pytest.raises(ValueError):
+        read_row(store, chunk.object_key, 4)
+    with pytest.raises(NotFound):
+        read_row(store, "chunks/no/such.npy", 0)

@@ -1,0 +1,36 @@
+"""`placewise search`: one search worker, for a shard of every map."""
+
+from __future__ import annotations
+
+from services.cli.configuration import read_settings
+from services.cli.output import explained, messages
+from services.cli.serve import set_log_levels
+
+
+def search() -> None:
+    """Answer searches over HTTP (HOST, PORT) for the part of the maps that SEARCH_SHARD names.
+
+    DATABASE_URL is the catalog that it follows. It asks for no key: let only the gateway and the
+    steward reach it, which find it by SEARCH_URLS.
+    """
+    with explained(as_json=False):
+        settings = read_settings()
+        # Imported only here: the other commands need no server.
+        from services.search.server import search_service
+        from shared.catalog.session import Catalog
+        from shared.objects.open_store import open_store
+
+        set_log_levels(settings.debug)
+        catalog = Catalog(settings.catalog_url())
+        try:
+            catalog.migrate()
+            store = open_store(settings, alone=False)  # others write there while this one reads
+            with search_service(settings, catalog, store) as running:
+                messages.print(
+                    f"Placewise search serves shard {settings.shard} on {running.url}\n"
+                    f"  look:     {running.url}/readyz   {running.url}/metrics",
+                    soft_wrap=True,
+                )
+                running.serve()
+        finally:
+            catalog.close()

@@ -1,0 +1,81 @@
+"""What every process that answers HTTP does alike: listen, serve, stop in good order."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import socket
+import threading
+from collections.abc import Iterator
+
+import uvicorn
+from fastapi import FastAPI
+
+from shared.errors import Misconfigured
+
+BACKLOG = 2048  # connections that wait to be accepted
+GRACEFUL_SECONDS = 10  # for requests under way when the server is asked to stop
+
+
+def http_server(app: FastAPI, *, access_log: bool) -> uvicorn.Server:
+    """A server of the application, not started yet."""
+    return uvicorn.Server(
+        uvicorn.Config(
+            app,
+            log_config=None,
+            access_log=access_log,
+            timeout_graceful_shutdown=GRACEFUL_SECONDS,
+        )
+    )
+
+
+@contextlib.contextmanager
+def stopped_by_signals(server: uvicorn.Server) -> Iterator[None]:
+    """SIGTERM and Ctrl-C end the block in good order, not the process.
+
+    uvicorn raises the signal that stopped it once more. By Python's own handlers that would end
+    the process there, before its parts have given back what they hold.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield  # signals are the main thread's, and so is their handling
+        return
+
+    def stop(_number: int, _frame: object) -> None:
+        server.should_exit = True
+
+    before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextlib.contextmanager
+def listening(host: str, port: int) -> Iterator[socket.socket]:
+    """The listening socket; port 0 takes a free one. Misconfigured: `address_in_use`."""
+    try:
+        family, kind, protocol, _, address = socket.getaddrinfo(
+            host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+        )[0]
+        listener = socket.socket(family, kind, protocol)
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        # Inherited by every connection: an answer's second packet waits for no acknowledgement,
+        # which costs 40 ms a call. (asyncio sets it only on sockets that it has made.)
+        listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        listener.bind(address)
+        listener.listen(BACKLOG)
+    except OSError as error:
+        raise Misconfigured(
+            "address_in_use",
+            f"Can't listen on {host}:{port}: {error.strerror or error}. "
+            "Choose another one, for example: make run PORT=8001.",
+        ) from error
+    with listener:
+        yield listener
+
+
+def url_of(host: str, port: int) -> str:
+    """An address that this machine reaches; "every address" is none that can be called."""
+    host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)  # noqa: S104
+    return f"http://{f'[{host}]' if ':' in host else host}:{port}"

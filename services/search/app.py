@@ -1,0 +1,106 @@
+"""The search port over HTTP: `POST /search` and `GET /status`, probes and metrics.
+
+For the gateway and the steward alone. It asks for no key and tells which photos a map has: listen
+where only they can reach it.
+"""
+
+from __future__ import annotations
+
+import time
+from uuid import UUID
+
+from fastapi import FastAPI, Response
+from pydantic import BaseModel
+
+from services.search.metrics import SearchMetrics
+from services.search.worker import SearchWorker
+from shared.errors import PlacewiseError
+from shared.problems import PROBLEM_RESPONSES, install_problem_handlers
+from shared.search_protocol import Lag, SearchRequest, SearchResponse, SearchStatus
+
+# Several looks at the catalog were missed, or loading takes that long.
+READY_LAG_SECONDS = 5.0
+
+
+class Readiness(BaseModel):
+    """`reasons` says in words why the worker is not ready; empty when it is."""
+
+    status: str
+    shard: str
+    reasons: list[str]
+    lags: dict[UUID, Lag]
+    missing: list[str]
+
+
+def create_app(worker: SearchWorker) -> FastAPI:
+    """The HTTP form of one worker, which someone else makes follow the catalog."""
+    app = FastAPI(
+        title="Placewise search",
+        description=f"Exact cosine top-k on shard {worker.shard} of every map.",
+        responses=PROBLEM_RESPONSES,
+    )
+    install_problem_handlers(app)
+    metrics = SearchMetrics(worker)
+
+    @app.post("/search", operation_id="search", response_model=SearchResponse)
+    def search(request: SearchRequest) -> Response:
+        """The rows of this shard that are most similar to the one that is referred to."""
+        started = time.perf_counter()
+        try:
+            answer = worker.search(request)
+        except PlacewiseError as error:
+            metrics.refused(error.code)
+            raise
+        metrics.answered(answer, time.perf_counter() - started)
+        # Written here: the framework would check again what was built a moment ago.
+        return Response(answer.model_dump_json(), media_type="application/json")
+
+    # On the event loop, as the probes are: it has to answer while every thread is searching.
+    @app.get("/status", operation_id="status", response_model=SearchStatus)
+    async def status() -> SearchStatus:
+        """What this worker holds, and how far it has followed."""
+        return worker.status()
+
+    @app.get("/livez", operation_id="livez")
+    async def livez() -> dict[str, str]:
+        """The process answers; nothing else is looked at."""
+        return {"status": "alive"}
+
+    @app.get("/readyz", operation_id="readyz", response_model=Readiness)
+    async def readyz(response: Response) -> Readiness:
+        """503 while what answers is behind the catalog, or a chunk of it can't be read."""
+        found = readiness(worker)
+        response.status_code = 503 if found.reasons else 200
+        return found
+
+    @app.get("/metrics", operation_id="metrics", response_class=Response)
+    async def read_metrics() -> Response:
+        """Prometheus' text format."""
+        return Response(metrics.text(), media_type="text/plain; version=0.0.4; charset=utf-8")
+
+    return app
+
+
+def readiness(worker: SearchWorker) -> Readiness:
+    """A generation that is only being built may lag: no one asks for it yet."""
+    status = worker.status()
+    reasons = []
+    if not worker.lags.has_looked():
+        reasons.append("the catalog was not read yet")
+    for generation_id, lag in status.lags.items():
+        if not lag.answers:
+            continue
+        if lag.seconds > READY_LAG_SECONDS or generation_id not in status.versions:
+            reasons.append(
+                f"generation {generation_id} is {lag.versions} versions behind, "
+                f"level {lag.seconds:.1f} s ago"
+            )
+        if generation_id in status.incomplete:
+            reasons.append(f"chunks of generation {generation_id} can't be read")
+    return Readiness(
+        status="not ready" if reasons else "ready",
+        shard=status.shard,
+        reasons=reasons,
+        lags=status.lags,
+        missing=list(status.missing),
+    )

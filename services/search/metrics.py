@@ -1,0 +1,90 @@
+"""What Prometheus reads of a search worker at `/metrics`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from prometheus_client import CollectorRegistry, Counter, Histogram, generate_latest
+from prometheus_client.core import GaugeMetricFamily
+from prometheus_client.metrics_core import Metric
+from prometheus_client.registry import Collector
+
+from services.search.worker import SearchWorker
+from shared.search_protocol import SearchResponse
+
+# From a small map in memory to a scan of a full shard, and to the longest wait for a version.
+SECONDS = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0)
+
+
+class SearchMetrics:
+    """One worker's figures, in a registry of their own: tests run several workers at once."""
+
+    def __init__(self, worker: SearchWorker) -> None:
+        self._registry = CollectorRegistry()
+        self._searches = Counter(
+            "placewise_search_searches",
+            "Searches by what became of them: answered, or the code of the refusal.",
+            ["outcome"],
+            registry=self._registry,
+        )
+        self._seconds = Histogram(
+            "placewise_search_seconds",
+            "Seconds that an answered search took.",
+            buckets=SECONDS,
+            registry=self._registry,
+        )
+        self._rows = Counter(
+            "placewise_search_rows_scanned",
+            "Descriptor rows that were compared with a query.",
+            registry=self._registry,
+        )
+        self._registry.register(_Snapshots(worker))
+
+    def answered(self, response: SearchResponse, seconds: float) -> None:
+        self._searches.labels("answered").inc()
+        self._seconds.observe(seconds)
+        self._rows.inc(response.rows_scanned)
+
+    def refused(self, code: str) -> None:
+        self._searches.labels(code).inc()
+
+    def text(self) -> bytes:
+        """Prometheus' text format."""
+        return generate_latest(self._registry)
+
+
+class _Snapshots(Collector):
+    """Read at each scrape, so that a generation that is gone leaves no figure behind."""
+
+    def __init__(self, worker: SearchWorker) -> None:
+        self._worker = worker
+
+    def collect(self) -> Iterable[Metric]:
+        status = self._worker.status()
+        prefix = "placewise_search"
+        yield GaugeMetricFamily(
+            f"{prefix}_resident_bytes", "Bytes of descriptors in memory.", status.resident_bytes
+        )
+        yield GaugeMetricFamily(f"{prefix}_rows", "Rows that can be answered.", status.rows)
+        yield GaugeMetricFamily(
+            f"{prefix}_missing_chunks", "Chunks that can't be read.", len(status.missing)
+        )
+        version = GaugeMetricFamily(
+            f"{prefix}_snapshot_version", "The map's version that is served.", labels=["generation"]
+        )
+        for generation_id, number in status.versions.items():
+            version.add_metric([str(generation_id)], number)
+        yield version
+        behind = GaugeMetricFamily(
+            f"{prefix}_snapshot_lag_versions", "Versions behind the map.", labels=["generation"]
+        )
+        seconds = GaugeMetricFamily(
+            f"{prefix}_snapshot_lag_seconds",
+            "Seconds since the snapshot was last known to be level with its map.",
+            labels=["generation"],
+        )
+        for generation_id, lag in status.lags.items():
+            behind.add_metric([str(generation_id)], lag.versions)
+            seconds.add_metric([str(generation_id)], lag.seconds)
+        yield behind
+        yield seconds

@@ -1,0 +1,74 @@
+"""The search service: one worker that follows the catalog, registers and answers HTTP."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import uvicorn
+
+from services.http_server import http_server, listening, stopped_by_signals, url_of
+from services.parts import start_part
+from services.search.app import create_app
+from services.search.presence import Presence
+from services.search.worker import SearchWorker
+from shared.catalog.session import Catalog
+from shared.errors import Misconfigured
+from shared.objects import ObjectStore
+from shared.settings import Settings
+
+
+@dataclass(slots=True)
+class SearchService:
+    """A search worker at work; `serve` answers HTTP until the process is asked to stop."""
+
+    url: str
+    worker: SearchWorker
+    server: uvicorn.Server
+    listener: socket.socket
+    failed: threading.Event
+
+    def end(self) -> None:
+        """A part has died: stop the others."""
+        self.failed.set()
+        self.server.should_exit = True
+
+    def serve(self) -> None:
+        """Raises Misconfigured (`part_died`) when one of the parts has ended before its time."""
+        with stopped_by_signals(self.server):
+            self.server.run(sockets=[self.listener])
+        if self.failed.is_set():
+            raise Misconfigured("part_died", "A part of search died; the log above says why.")
+
+
+@contextlib.contextmanager
+def search_service(
+    settings: Settings, catalog: Catalog, store: ObjectStore
+) -> Iterator[SearchService]:
+    """Listen on HOST and PORT, follow the catalog with the shard that SEARCH_SHARD names, and
+    register. Raises Misconfigured (`address_in_use`)."""
+    with listening(settings.host, settings.port) as listener:
+        host, port = listener.getsockname()[:2]
+        worker = SearchWorker(catalog, store, settings, settings.shard)
+        url = url_of(host, port)
+        presence = Presence(catalog, worker, f"{socket.gethostname()}:{port}", url)
+        server = http_server(create_app(worker), access_log=settings.debug)
+        running = SearchService(url, worker, server, listener, threading.Event())
+        stop = threading.Event()
+        parts = [
+            start_part(name, part, stop, running.end)
+            for name, part in (
+                ("search", worker.run),
+                ("search of what is built", worker.run_building),
+                ("search's presence", presence.run),
+            )
+        ]
+        try:
+            yield running
+        finally:
+            stop.set()
+            for part in parts:
+                part.join()

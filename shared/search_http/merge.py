@@ -1,0 +1,66 @@
+"""One answer from the answers of the shards."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Iterable, Mapping, Sequence
+from uuid import UUID
+
+from shared.search_protocol import CERTIFICATES, Hit, SearchResponse, SearchStatus
+from shared.shards import Shard
+
+
+def merge(answers: Sequence[SearchResponse], k: int, away: Iterable[Shard] = ()) -> SearchResponse:
+    """The first `k` hits of all, and what has to be known of the way to them: the sums, the least
+    version, the weakest certificate. `away` are the shards that are missing, and are named."""
+    return SearchResponse(
+        hits=tuple(_first(k, answers)),
+        certificate=max((answer.certificate for answer in answers), key=_weakness),
+        rows_scanned=sum(answer.rows_scanned for answer in answers),
+        rows_reranked=sum(answer.rows_reranked for answer in answers),
+        snapshot_version=min(answer.snapshot_version for answer in answers),
+        missing=(
+            *(key for answer in answers for key in answer.missing),
+            *(shard.name for shard in sorted(away)),
+        ),
+    )
+
+
+def _first(k: int, answers: Sequence[SearchResponse]) -> list[Hit]:
+    """Each answer's hits are sorted already: by score, highest first, ties by photo id."""
+    merged = heapq.merge(*(a.hits for a in answers), key=lambda hit: (-hit.score, hit.photo_id))
+    found: dict[UUID, Hit] = {}
+    for hit in merged:
+        if len(found) == k:
+            break
+        # Two shards may be at two versions, between which a photo was described anew.
+        found.setdefault(hit.photo_id, hit)
+    return list(found.values())
+
+
+def _weakness(certificate: str) -> int:
+    """A name that this side does not know yet promises the least."""
+    known = certificate in CERTIFICATES
+    return CERTIFICATES.index(certificate) if known else len(CERTIFICATES)
+
+
+def merge_status(shards: Mapping[Shard, SearchStatus], away: Iterable[Shard] = ()) -> SearchStatus:
+    """What the shards hold together: a generation is there once every one of them has it."""
+    found = list(shards.values())
+    common = set.intersection(*(set(status.versions) for status in found)) if found else set()
+    lagging = {key for status in found for key in status.lags}
+    return SearchStatus(
+        rows=sum(status.rows for status in found),
+        resident_bytes=sum(status.resident_bytes for status in found),
+        versions={key: min(status.versions[key] for status in found) for key in common},
+        incomplete=tuple(sorted({key for status in found for key in status.incomplete})),
+        missing=tuple(key for status in found for key in status.missing),
+        lags={
+            key: max(
+                (status.lags[key] for status in found if key in status.lags),
+                key=lambda lag: lag.seconds,
+            )
+            for key in lagging
+        },
+        away=tuple(shard.name for shard in sorted(away)),
+    )

@@ -1,0 +1,153 @@
+"""The search port in front of many workers: one of each shard is asked, all shards at once."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from types import TracebackType
+from typing import Self
+
+import httpx2
+
+from shared.errors import Unavailable
+from shared.search_http.merge import merge, merge_status
+from shared.search_http.worker_call import WorkerAway, ask
+from shared.search_http.workers import LOOK_SECONDS, Workers
+from shared.search_protocol import SearchRequest, SearchResponse, SearchStatus
+from shared.shards import Shard
+
+log = logging.getLogger(__name__)
+
+CALLS_AT_ONCE = 64  # to all shards together; more wait for their turn
+LATE_SECONDS = 0.2  # for a call that ends at the deadline to say why
+PAUSE_SECONDS = 0.05  # before workers that are behind are asked again
+
+BEHIND, UNREADABLE = "search_behind", "chunk_unreadable"
+
+
+class HttpSearch:
+    """Every search worker behind one port; a context manager.
+
+    Of each shard one worker is asked, and the next one when that fails. A shard of which no worker
+    answers in time is named in the answer's `missing`, and the rest is answered. Raises what the
+    workers refuse with: Gone, NotFound, Unavailable (`chunk_unreadable`); Unavailable
+    (`search_behind`) when no shard reaches `min_version` in time, and (`search_unavailable`) when
+    no shard answers at all.
+    """
+
+    def __init__(self, urls: Sequence[str], timeout_seconds: float) -> None:
+        self._timeout_seconds = timeout_seconds
+        self._http = httpx2.Client(limits=httpx2.Limits(max_keepalive_connections=CALLS_AT_ONCE))
+        self._workers = Workers(urls, self._http)
+        self._calls = ThreadPoolExecutor(CALLS_AT_ONCE, thread_name_prefix="search-call")
+        self._stop = threading.Event()
+        self._following = threading.Thread(target=self._follow, name="search-workers", daemon=True)
+
+    def __enter__(self) -> Self:
+        self._workers.look()
+        self._following.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._stop.set()
+        self._following.join()
+        self._calls.shutdown(cancel_futures=True)
+        self._workers.close()
+        self._http.close()
+
+    def _follow(self) -> None:
+        while not self._stop.wait(LOOK_SECONDS):
+            self._workers.look()
+
+    def search(self, request: SearchRequest) -> SearchResponse:
+        deadline = time.monotonic() + self._timeout_seconds
+        layout = self._workers.layout(request.generation_id, request.min_version)
+        if not layout:  # no worker was ever seen
+            self._workers.look()
+            layout = self._workers.layout(request.generation_id, request.min_version)
+        calls = {
+            shard: self._calls.submit(self._ask_shard, shard, urls, request, deadline)
+            for shard, urls in layout.items()
+        }
+        wait(calls.values(), timeout=deadline + LATE_SECONDS - time.monotonic())
+        answers, away, behind = _collect(calls)
+        if not answers:
+            raise behind or Unavailable(
+                "search_unavailable", "No search worker answers. Ask again in a moment."
+            )
+        return merge(answers, request.k, away)
+
+    def status(self) -> SearchStatus:
+        """Of the workers as they are now; Unavailable (`search_unavailable`) when all are away."""
+        self._workers.look()
+        found, away = self._workers.statuses()
+        if not found:
+            raise Unavailable("search_unavailable", "No search worker answers.")
+        return merge_status(found, away)
+
+    def _ask_shard(
+        self, shard: Shard, urls: Sequence[str], request: SearchRequest, deadline: float
+    ) -> SearchResponse:
+        """The answer of one of the shard's workers. Workers that are behind are asked again until
+        the deadline; WorkerAway when there is none that answers."""
+        behind: Unavailable | None = None
+        while True:
+            again = False
+            unreadable: Unavailable | None = None
+            # A lone worker has a second chance: the connection that was kept may have been stale.
+            order = list(urls) if len(urls) != 1 else [urls[0], urls[0]]
+            for place, url in enumerate(order):
+                left = deadline - time.monotonic()
+                if left <= 0:
+                    break
+                # Who is not the last to be asked may not take all the time that there is.
+                seconds = left if url == order[-1] or place == len(order) - 1 else left / 2
+                try:
+                    return ask(self._http, url, request, seconds)
+                except WorkerAway as error:
+                    log.debug("%s: %s", shard.name, error)
+                    self._workers.failed(url)
+                except Unavailable as error:
+                    log.debug("%s: %s: %s", shard.name, url, error.detail)
+                    if error.code == BEHIND:
+                        behind, again = error, True
+                    elif error.code == UNREADABLE:
+                        unreadable = error
+            if unreadable is not None:
+                raise unreadable  # no other worker could read it, and this one has the last word
+            if not again or time.monotonic() + PAUSE_SECONDS > deadline:
+                # Who was behind and ran out of time at the next try is still behind.
+                raise behind or WorkerAway(shard.name, "no worker answers")
+            time.sleep(PAUSE_SECONDS)
+
+
+def _collect(
+    calls: dict[Shard, Future[SearchResponse]],
+) -> tuple[list[SearchResponse], list[Shard], Unavailable | None]:
+    """The answers, the shards without one, and why one of them is behind, if one is.
+
+    What a shard refuses for good is raised: it is about the query, not about the shard.
+    """
+    answers: list[SearchResponse] = []
+    away: list[Shard] = []
+    behind: Unavailable | None = None
+    for shard, call in calls.items():
+        try:
+            answers.append(call.result(timeout=0))
+        except (WorkerAway, TimeoutError):
+            call.cancel()
+            away.append(shard)
+        except Unavailable as error:
+            if error.code != BEHIND:
+                raise
+            behind = error
+            away.append(shard)
+    return answers, away, behind

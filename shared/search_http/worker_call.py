@@ -1,0 +1,69 @@
+"""One call to one search worker, and what its failures mean."""
+
+from __future__ import annotations
+
+from typing import TypeVar
+
+import httpx2
+from pydantic import BaseModel, ValidationError
+
+from shared.errors import PlacewiseError, refusal
+from shared.search_protocol import SearchRequest, SearchResponse, SearchStatus
+
+CONNECT_SECONDS = 1.0  # inside one network: who takes longer is away
+
+
+Message = TypeVar("Message", bound=BaseModel)
+
+
+class WorkerAway(Exception):
+    """The worker did not answer, or not as a search worker does. `silent`: it took the call, and
+    let its time run out."""
+
+    def __init__(self, url: str, reason: str, *, silent: bool = False) -> None:
+        super().__init__(f"{url}: {reason}")
+        self.silent = silent
+
+
+def ask(
+    http: httpx2.Client, url: str, request: SearchRequest, timeout_seconds: float
+) -> SearchResponse:
+    """The worker's answer. Raises WorkerAway, or the PlacewiseError that it answered with."""
+    body = _call(
+        http,
+        "POST",
+        f"{url}/search",
+        timeout_seconds,
+        content=request.model_dump_json(),
+        headers={"Content-Type": "application/json"},
+    )
+    return _read(SearchResponse, url, body)
+
+
+def read_status(http: httpx2.Client, url: str, timeout_seconds: float) -> SearchStatus:
+    """What the worker holds. Raises as `ask` does."""
+    return _read(SearchStatus, url, _call(http, "GET", f"{url}/status", timeout_seconds))
+
+
+def _read(kind: type[Message], url: str, body: bytes) -> Message:
+    try:
+        return kind.model_validate_json(body)
+    except ValidationError as error:
+        raise WorkerAway(url, f"no {kind.__name__} came back") from error
+
+
+def _call(
+    http: httpx2.Client, method: str, url: str, timeout_seconds: float, **options: object
+) -> bytes:
+    timeout = httpx2.Timeout(timeout_seconds, connect=min(CONNECT_SECONDS, timeout_seconds))
+    try:
+        answer = http.request(method, url, timeout=timeout, **options)  # type: ignore[arg-type]
+    except httpx2.TransportError as error:
+        silent = isinstance(error, httpx2.ReadTimeout)
+        raise WorkerAway(url, type(error).__name__, silent=silent) from error
+    if answer.is_success:
+        return answer.content
+    said = refusal(answer.status_code, answer.text)
+    if type(said) is PlacewiseError:  # a proxy's page, or the worker's own fault
+        raise WorkerAway(url, said.detail)
+    raise said

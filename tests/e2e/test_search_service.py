@@ -1,0 +1,127 @@
+"""`placewise search`: processes of their own that serve what an embedded Placewise has stored."""
+
+from __future__ import annotations
+
+import contextlib
+import re
+import signal
+import subprocess
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from uuid import UUID
+
+import httpx2
+import pytest
+
+from shared.catalog.chunks import descriptor_of
+from shared.catalog.generations import active_generation
+from shared.catalog.maps import get_map
+from shared.catalog.search_workers import RegisteredWorker
+from shared.catalog.session import Catalog
+from shared.search_http import HttpSearch
+from shared.search_protocol import SearchRequest, SearchResponse
+from tests.support.photos import photo_bytes
+from tests.support.server import PLACEWISE, START_SECONDS, ServerProcess, environment, run_command
+
+# One slot a photo, so that both shards have some.
+SETTINGS = {"slot_rows": 2, "batch_photos": 1}
+PHOTOS = 4
+
+
+@contextlib.contextmanager
+def search_process(home: Path, log: Path, **settings: Any) -> Iterator[tuple[Any, str]]:
+    """A running `placewise search` and its address."""
+    with log.open("wb") as said:
+        process = subprocess.Popen(
+            [PLACEWISE, "search"],
+            env=environment(home, **settings),
+            cwd=home.parent,
+            stdin=subprocess.DEVNULL,
+            stdout=said,
+            stderr=said,
+        )
+    try:
+        deadline = time.monotonic() + START_SECONDS
+        while not (match := re.search(r"on (http://\S+)", log.read_text())):
+            assert process.poll() is None, log.read_text()
+            assert time.monotonic() < deadline, log.read_text()
+            time.sleep(0.05)
+        yield process, match[1]
+    finally:
+        process.kill()
+        process.wait()
+
+
+def ask(port: HttpSearch, home: Path, file_id: str) -> SearchResponse:
+    """The photos most similar to a stored one, asked of the shards without a gateway."""
+    catalog = Catalog(f"sqlite:///{home / 'catalog.sqlite'}")
+    with catalog.read() as session:
+        map_ = get_map(session, "default")
+        generation = active_generation(session, map_.id)
+        assert generation is not None
+        found = descriptor_of(session, generation.id, UUID(file_id))
+        assert found is not None
+        request = SearchRequest(
+            map_id=map_.id,
+            generation_id=generation.id,
+            object_key=found[1].object_key,
+            row=found[0].row,
+            min_version=map_.version,
+            k=PHOTOS,
+        )
+    catalog.close()
+    return port.search(request)
+
+
+def names(home: Path) -> list[str]:
+    catalog = Catalog(f"sqlite:///{home / 'catalog.sqlite'}")
+    with catalog.read() as session:
+        found = [f"{w.shard}/{w.shards}" for w in session.query(RegisteredWorker)]
+    catalog.close()
+    return sorted(found)
+
+
+def test_two_search_processes_answer_what_the_embedded_one_answers(
+    server: ServerProcess, tmp_path: Path
+) -> None:
+    file_ids = [server.indexed(photo_bytes(number)) for number in range(1, PHOTOS)]
+    with (
+        search_process(server.home, tmp_path / "0.log", search_shard="0/2") as (first, first_url),
+        search_process(server.home, tmp_path / "1.log", search_shard="1/2") as (_, second_url),
+        HttpSearch([first_url, second_url], 10.0) as port,
+    ):
+        answer = ask(port, server.home, file_ids[0])
+        assert (len(answer.hits), answer.missing) == (PHOTOS, ())
+        rows = [httpx2.get(f"{url}/status").json()["rows"] for url in (first_url, second_url)]
+        assert sum(rows) == PHOTOS
+        assert min(rows) > 0
+        embedded = server.similar(file_ids[0], top_k=PHOTOS).json()["similar_images"]
+        others = [str(hit.photo_id) for hit in answer.hits if str(hit.photo_id) != file_ids[0]]
+        assert others == [image["image_id"] for image in embedded]
+        for url in (first_url, second_url):
+            deadline = time.monotonic() + START_SECONDS
+            while httpx2.get(f"{url}/readyz").status_code != 200:
+                assert time.monotonic() < deadline
+                time.sleep(0.05)
+        assert names(server.home) == ["0/1", "0/2", "1/2"]
+
+        # A model change is answered from by every process as soon as it is done.
+        job = server.client.post("/api/v1/generations", json={}).json()["job_id"]
+        assert server.finished(job)["state"] == "succeeded"
+        assert len(ask(port, server.home, file_ids[0]).hits) == PHOTOS
+
+        first.send_signal(signal.SIGTERM)
+        assert first.wait(timeout=30) == 0, (tmp_path / "0.log").read_text()
+        assert names(server.home) == ["0/1", "1/2"], "it has signed off"
+        assert ask(port, server.home, file_ids[0]).missing == ("shard 0/2",)
+
+
+@pytest.mark.parametrize("shard", ["2/2", "all"])
+def test_an_unfit_shard_is_refused_at_the_start(tmp_path: Path, shard: str) -> None:
+    env = environment(tmp_path / "home", search_shard=shard)
+    ended = run_command("search", env=env, cwd=tmp_path)
+    assert ended.returncode != 0
+    assert "SEARCH_SHARD" in ended.stderr
+    assert "is no shard" in ended.stderr

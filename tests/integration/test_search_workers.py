@@ -1,0 +1,320 @@
+"""Search workers in the catalog, and the switch that waits for them."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from uuid import UUID
+
+import pytest
+from sqlalchemy import select, update
+
+from services.search.presence import Presence
+from services.search.worker import SearchWorker
+from services.steward.search_workers import SLOW_SECONDS, remove_dead_workers
+from shared.catalog.base import db_now, db_now_plus
+from shared.catalog.generations import Generation, GenerationState
+from shared.catalog.maps import Map
+from shared.catalog.search_workers import DEAD_SECONDS, RegisteredWorker
+from shared.catalog.session import Catalog
+from shared.chunks import encode_rows
+from shared.jobs import JobState
+from shared.jobs.table import WaitingFor
+from shared.objects import FolderStore
+from shared.objects.keys import QUERIES
+from shared.search_protocol import SearchRequest
+from shared.settings import Settings
+from shared.shards import Shard
+from tests.integration.workplace import Workplace
+from tests.support.photos import photo_bytes
+
+PHOTOS = 5
+WAIT_SECONDS = 30.0
+
+
+class HaltingStore(FolderStore):
+    """Keeps whoever reads a chunk waiting until it is let go."""
+
+    def __init__(self, folder: FolderStore) -> None:
+        super().__init__(folder.root, alone=False)
+        self.go_on = threading.Event()
+        self.reached = threading.Event()
+
+    def get(self, key: str) -> bytes:
+        if key.startswith("chunks/"):
+            self.reached.set()
+            assert self.go_on.wait(WAIT_SECONDS)
+        return super().get(key)
+
+
+@dataclass(slots=True)
+class Registered:
+    """A search worker with its entry, which works when it is told to."""
+
+    worker: SearchWorker
+    presence: Presence
+
+    def catch_up(self) -> None:
+        self.worker.follow()
+        self.presence.tell()
+
+
+Register = Callable[..., Registered]
+
+
+@pytest.fixture
+def register(catalog: Catalog, store: FolderStore, settings: Settings) -> Register:
+    """A worker that is alive and has loaded what there is."""
+
+    def make(name: str, shard: str = "0/1", store: FolderStore = store) -> Registered:
+        worker = SearchWorker(catalog, store, settings, Shard.parse(shard))
+        made = Registered(worker, Presence(catalog, worker, name))
+        made.presence.tell()
+        return made
+
+    return make
+
+
+@pytest.fixture
+def fitted(vlads: Workplace) -> Workplace:
+    """A map with a vocabulary and PHOTOS described photos."""
+    vlads.upload(*range(PHOTOS))
+    assert vlads.fit().state == JobState.SUCCEEDED
+    return vlads
+
+
+def complete(workplace: Workplace) -> tuple[UUID, UUID]:
+    """A model change up to where all photos are described; its job and its generation."""
+    job_id, generation_id = workplace.build(seed=1)
+    for _ in range(3):
+        workplace.advance()
+        workplace.drain()
+    workplace.advance()
+    return job_id, generation_id
+
+
+def entries(catalog: Catalog) -> list[RegisteredWorker]:
+    with catalog.read() as session:
+        return list(session.scalars(select(RegisteredWorker).order_by(RegisteredWorker.name)))
+
+
+def age(catalog: Catalog, name: str, seconds: float) -> None:
+    """The worker was last heard of so long ago."""
+    with catalog.write() as session:
+        session.execute(
+            update(RegisteredWorker)
+            .where(RegisteredWorker.name == name)
+            .values(seen_at=db_now_plus(-seconds))
+            .execution_options(synchronize_session=False)
+        )
+
+
+def found(registered: Registered, workplace: Workplace, generation: Generation) -> set[UUID]:
+    """The photos that the worker answers for the generation."""
+    key = f"{QUERIES}{generation.id}.npy"
+    row = next(iter(workplace.rows(generation.id).values()))
+    workplace.store.put(key, encode_rows(row[None]))
+    with workplace.catalog.read() as session:
+        version = session.get_one(Map, workplace.map_id).version
+    request = SearchRequest(
+        map_id=workplace.map_id,
+        generation_id=generation.id,
+        object_key=key,
+        row=0,
+        min_version=version,
+        k=100,
+    )
+    return {hit.photo_id for hit in registered.worker.search(request).hits}
+
+
+# --- the switch ------------------------------------------------------------------------------
+
+
+def test_a_generation_is_switched_in_once_the_slow_worker_has_loaded_it_too(
+    fitted: Workplace, register: Register, store: FolderStore
+) -> None:
+    slow_store = HaltingStore(store)
+    slow_store.go_on.set()
+    quick, slow = register("quick"), register("slow", store=slow_store)
+    quick.catch_up()
+    slow.catch_up()
+    old = fitted.active()
+    slow_store.go_on.clear()
+    slow_store.reached.clear()
+
+    job_id, new_id = complete(fitted)
+    quick.catch_up()
+    loading = threading.Thread(target=slow.worker.follow)
+    loading.start()
+    try:
+        assert slow_store.reached.wait(WAIT_SECONDS), "it does not load what is built"
+        fitted.delete(next(iter(found(quick, fitted, old))))  # a change that both have to see
+        for _ in range(3):
+            slow.presence.tell()
+            fitted.advance()
+            job = fitted.job(job_id)
+            assert (job.waiting_for, job.stage) == (WaitingFor.SEARCH, "load")
+            assert job.progress_done < job.progress_total
+            assert fitted.active().id == old.id
+            for worker in (quick, slow):  # loading one generation does not hold up another
+                assert len(found(worker, fitted, old)) == PHOTOS - 1
+    finally:
+        slow_store.go_on.set()
+        loading.join()
+    fitted.advance()
+    assert fitted.active().id == old.id, "it has loaded, and has not said so yet"
+    slow.presence.tell()
+    fitted.advance()
+    job = fitted.job(job_id)
+    assert (job.state, job.waiting_for, job.awaited) == (JobState.SUCCEEDED, None, None)
+    assert fitted.active().id == new_id
+    for worker in (quick, slow):
+        assert len(found(worker, fitted, fitted.active())) == PHOTOS - 1
+
+
+def test_a_worker_that_dies_is_not_waited_for_for_ever(
+    fitted: Workplace, register: Register, catalog: Catalog
+) -> None:
+    living, dying = register("living"), register("dying")
+    job_id, new_id = complete(fitted)
+    living.catch_up()
+    fitted.advance()
+    assert fitted.job(job_id).waiting_for == WaitingFor.SEARCH
+    age(catalog, "dying", DEAD_SECONDS - 2)
+    fitted.advance()
+    assert fitted.job(job_id).waiting_for == WaitingFor.SEARCH, "it may only have paused"
+    age(catalog, "dying", DEAD_SECONDS + 1)
+    fitted.advance()
+    assert fitted.active().id == new_id
+    assert dying.worker.status().versions == {}
+
+
+def test_a_worker_that_lives_and_does_not_load_is_named_and_waited_for(
+    fitted: Workplace, register: Register, catalog: Catalog, caplog: pytest.LogCaptureFixture
+) -> None:
+    register("stuck-b")
+    register("stuck-a")
+    job_id, new_id = complete(fitted)
+    assert fitted.job(job_id).awaited is None, "not yet: loading takes its time"
+    with catalog.write() as session:
+        session.get_one(Generation, new_id).complete_at = session.scalar(
+            select(db_now_plus(-SLOW_SECONDS - 1))
+        )
+    with caplog.at_level(logging.WARNING):
+        for _ in range(3):
+            fitted.advance()
+    job = fitted.job(job_id)
+    assert (job.waiting_for, job.awaited) == (WaitingFor.SEARCH, ["stuck-a", "stuck-b"])
+    assert fitted.generation(new_id).state == GenerationState.BUILDING
+    told = [record.message for record in caplog.records if "stuck-a, stuck-b" in record.message]
+    assert len(told) == 1, "once, not at every look"
+    fitted.cancel(job_id)
+    assert (fitted.job(job_id).state, fitted.job(job_id).awaited) == (JobState.CANCELLED, None)
+
+
+def test_a_chunk_that_a_worker_can_not_read_is_not_loaded(
+    fitted: Workplace, register: Register
+) -> None:
+    worker = register("worker")
+    job_id, new_id = complete(fitted)
+    key = next(k for k in fitted.keys(f"chunks/{new_id}/") if k.endswith(".npy"))
+    whole = fitted.store.get(key)
+    fitted.store.put(key, whole[:-1])
+    worker.catch_up()
+    fitted.advance()
+    assert fitted.job(job_id).waiting_for == WaitingFor.SEARCH
+    fitted.store.put(key, whole)
+    worker.catch_up()
+    fitted.advance()
+    assert fitted.active().id == new_id
+
+
+def test_a_shard_without_a_row_of_it_is_not_waited_for(
+    fitted: Workplace, register: Register
+) -> None:
+    first = register("first", "0/2")  # every photo is in slot 0
+    register("second", "1/2")
+    job_id, new_id = complete(fitted)
+    assert fitted.job(job_id).waiting_for == WaitingFor.SEARCH
+    first.catch_up()
+    fitted.advance()
+    assert fitted.active().id == new_id
+
+
+def test_a_photo_that_comes_while_search_loads_is_described_before_the_switch(
+    fitted: Workplace, register: Register
+) -> None:
+    worker = register("worker")
+    job_id, new_id = complete(fitted)
+    assert fitted.job(job_id).waiting_for == WaitingFor.SEARCH
+    fitted.upload_bytes(photo_bytes(99))
+    fitted.drain()
+    fitted.advance()
+    assert fitted.job(job_id).waiting_for == WaitingFor.DESCRIPTORS
+    worker.catch_up()  # at the version at which it was complete for the first time, or later
+    fitted.drain()
+    fitted.advance()
+    assert fitted.active().id == new_id
+    assert fitted.job(job_id).state == JobState.SUCCEEDED
+    assert len(found(worker, fitted, fitted.active())) == PHOTOS + 1
+
+
+# --- the entries -----------------------------------------------------------------------------
+
+
+def test_a_worker_tells_that_it_lives_and_what_it_has_loaded(
+    fitted: Workplace, register: Register, catalog: Catalog
+) -> None:
+    worker = register("worker", "1/3")
+    (entry,) = entries(catalog)
+    assert (entry.name, entry.shard, entry.shards, entry.loaded) == ("worker", 1, 3, {})
+    worker.catch_up()
+    (entry,) = entries(catalog)
+    version = worker.worker.status().versions[fitted.active().id]
+    assert entry.loaded == {str(fitted.active().id): version}
+
+
+def test_a_running_worker_keeps_its_entry_fresh_and_removes_it_in_the_end(
+    register: Register, catalog: Catalog, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("services.search.presence.LOOK_SECONDS", 0.01)
+    monkeypatch.setattr("services.search.presence.HEARTBEAT_SECONDS", 0.02)
+    worker = register("worker")
+    stop = threading.Event()
+    running = threading.Thread(target=worker.presence.run, args=(stop,))
+    age(catalog, "worker", 100)
+    running.start()
+    try:
+        _wait_until(lambda: _seconds_ago(catalog) < 50)
+        with catalog.write() as session:  # by a steward that could not hear of it
+            session.delete(session.get_one(RegisteredWorker, worker.presence.id))
+        _wait_until(lambda: bool(entries(catalog)))
+    finally:
+        stop.set()
+        running.join()
+    assert entries(catalog) == []
+
+
+def _seconds_ago(catalog: Catalog) -> float:
+    with catalog.read() as session:
+        seen, now = session.execute(select(RegisteredWorker.seen_at, db_now())).one()
+        return float((now - seen).total_seconds())
+
+
+def _wait_until(true: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + WAIT_SECONDS
+    while not true():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+def test_the_steward_forgets_workers_that_are_dead(register: Register, catalog: Catalog) -> None:
+    register("living")
+    register("dead")
+    age(catalog, "living", DEAD_SECONDS - 5)
+    age(catalog, "dead", DEAD_SECONDS + 1)
+    remove_dead_workers(catalog)
+    assert [entry.name for entry in entries(catalog)] == ["living"]

@@ -1,0 +1,116 @@
+"""Real search servers in threads, shard by shard, with the client in front of them."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from collections.abc import Sequence
+from types import TracebackType
+from typing import Self
+
+import uvicorn
+
+from services.http_server import http_server, listening, url_of
+from services.search.app import create_app
+from services.search.worker import SearchWorker
+from shared.catalog.session import Catalog
+from shared.objects import ObjectStore
+from shared.search_http import HttpSearch
+from shared.settings import Settings
+from shared.shards import Shard
+
+START_SECONDS = 20.0
+
+
+class SearchServer:
+    """One worker behind HTTP; it may be stopped and started again on its port.
+
+    It follows the catalog only when a test asks its `worker` to.
+    """
+
+    def __init__(
+        self, catalog: Catalog, store: ObjectStore, settings: Settings, shard: Shard
+    ) -> None:
+        self._of = (catalog, store, settings, shard)
+        self._port = 0
+        self._running: tuple[uvicorn.Server, threading.Thread, contextlib.ExitStack] | None = None
+        self.url = ""
+        self.start()
+
+    def start(self) -> None:
+        """A new worker, which has to load everything anew."""
+        self.worker = SearchWorker(*self._of)
+        held = contextlib.ExitStack()
+        listener = held.enter_context(listening("127.0.0.1", self._port))
+        self._port = listener.getsockname()[1]
+        self.url = url_of("127.0.0.1", self._port)
+        server = http_server(create_app(self.worker), access_log=False)
+        thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
+        thread.start()
+        self._running = server, thread, held
+
+    def wait_until_started(self) -> None:
+        assert self._running is not None
+        deadline = time.monotonic() + START_SECONDS
+        while not self._running[0].started:
+            assert time.monotonic() < deadline, "a search server did not start"
+            time.sleep(0.005)
+
+    def ask_to_stop(self) -> None:
+        if self._running is not None:
+            self._running[0].should_exit = True
+
+    def stop(self) -> None:
+        """Calls are refused from now on."""
+        if self._running is not None:
+            self.ask_to_stop()
+            _, thread, held = self._running
+            thread.join()
+            held.close()
+            self._running = None
+
+
+class SearchTier:
+    """`replicas[i]` servers of shard i, and `port`, the client of them all."""
+
+    def __init__(
+        self,
+        catalog: Catalog,
+        store: ObjectStore,
+        settings: Settings,
+        replicas: Sequence[int] = (1,),
+    ) -> None:
+        shards = [Shard(index, len(replicas)) for index in range(len(replicas))]
+        self.servers = [
+            [SearchServer(catalog, store, settings, shard) for _ in range(count)]
+            for shard, count in zip(shards, replicas, strict=True)
+        ]
+        for server in self._all():
+            server.wait_until_started()
+        urls = [server.url for server in self._all()]
+        self.port = HttpSearch(urls, settings.search_timeout_seconds)
+
+    def __enter__(self) -> Self:
+        self.port.__enter__()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.port.__exit__(kind, error, trace)
+        for server in self._all():
+            server.ask_to_stop()
+        for server in self._all():
+            server.stop()
+
+    def _all(self) -> list[SearchServer]:
+        return [server for shard in self.servers for server in shard]
+
+    def follow(self) -> None:
+        """Every worker brings itself up to date."""
+        for server in self._all():
+            server.worker.follow()

@@ -1,0 +1,97 @@
+"""Merging the shards' answers: the order of one scan over all rows, and nothing glossed over."""
+
+from __future__ import annotations
+
+from typing import Any
+from uuid import UUID
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from shared.ids import new_id
+from shared.search_http.merge import merge, merge_status
+from shared.search_protocol import EXHAUSTIVE, Hit, Lag, SearchResponse, SearchStatus
+from shared.shards import Shard
+
+
+def answer(*hits: tuple[int, float], **changes: Any) -> SearchResponse:
+    """`hits` are (photo, score), in any order."""
+    ordered = sorted(hits, key=lambda hit: (-hit[1], hit[0]))
+    values: dict[str, Any] = {
+        "certificate": EXHAUSTIVE,
+        "rows_scanned": 10,
+        "rows_reranked": 2,
+        "snapshot_version": 7,
+    }
+    return SearchResponse(
+        hits=tuple(Hit(photo_id=UUID(int=number), score=score) for number, score in ordered),
+        **(values | changes),
+    )
+
+
+def ranked(response: SearchResponse) -> list[tuple[int, float]]:
+    return [(hit.photo_id.int, hit.score) for hit in response.hits]
+
+
+@given(
+    scores=st.lists(st.sampled_from([-1.0, 0.0, 0.25, 0.5, 1.0]), max_size=30),
+    of=st.integers(1, 5),
+    k=st.integers(1, 12),
+)
+def test_the_merged_order_is_that_of_one_list_also_for_equal_scores(
+    scores: list[float], of: int, k: int
+) -> None:
+    shards: list[list[tuple[int, float]]] = [[] for _ in range(of)]
+    for number, score in enumerate(scores):
+        shards[number * 7 % of].append((number, score))
+    merged = merge([answer(*hits) for hits in shards], k)
+    whole = sorted(enumerate(scores), key=lambda hit: (-hit[1], hit[0]))
+    assert ranked(merged) == whole[:k]
+
+
+def test_a_photo_that_two_shards_have_for_a_moment_is_answered_once() -> None:
+    merged = merge([answer((1, 0.9), (2, 0.8)), answer((1, 0.7), (3, 0.6))], k=3)
+    assert ranked(merged) == [(1, 0.9), (2, 0.8), (3, 0.6)]
+
+
+def test_the_sums_the_least_version_and_all_that_is_missing_are_told() -> None:
+    merged = merge(
+        [
+            answer(snapshot_version=9, rows_scanned=3, rows_reranked=1, missing=("chunks/a",)),
+            answer(snapshot_version=8, rows_scanned=4, rows_reranked=2, missing=("chunks/b",)),
+        ],
+        k=1,
+        away=[Shard(3, 4), Shard(1, 4)],
+    )
+    assert (merged.snapshot_version, merged.rows_scanned, merged.rows_reranked) == (8, 7, 3)
+    assert merged.missing == ("chunks/a", "chunks/b", "shard 1/4", "shard 3/4")
+
+
+def test_the_weakest_certificate_counts() -> None:
+    assert merge([answer(), answer()], 1).certificate == EXHAUSTIVE
+    assert merge([answer(), answer(certificate="of the future")], 1).certificate == "of the future"
+
+
+def test_a_generation_is_there_once_every_shard_has_it() -> None:
+    both, one = new_id(), new_id()
+    lag = Lag(versions=1, seconds=2.0, answers=True)
+    merged = merge_status(
+        {
+            Shard(0, 2): SearchStatus(
+                rows=3, resident_bytes=30, versions={both: 7, one: 1}, missing=("chunks/a",)
+            ),
+            Shard(1, 2): SearchStatus(
+                rows=4,
+                resident_bytes=40,
+                versions={both: 6},
+                incomplete=(both,),
+                missing=(),
+                lags={both: lag},
+            ),
+        }
+    )
+    assert (merged.rows, merged.resident_bytes, merged.missing) == (7, 70, ("chunks/a",))
+    assert merged.versions == {both: 6}
+    assert merged.incomplete == (both,)
+    assert merged.loaded == {}
+    assert merged.lags == {both: lag}
