@@ -19,6 +19,7 @@ import socket
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 
 import uvicorn
 
@@ -110,7 +111,7 @@ def standalone(settings: Settings, *, new_key: bool = False) -> Iterator[Standal
         search = SearchWorker(catalog, store, settings)
         name = f"embedded-{os.getpid()}"
         presence = Presence(catalog, search, name)
-        extractor = ExtractorWorker(catalog, store, hints, settings, name=name, only_worker=True)
+        extractor = ExtractorWorker(catalog, store, settings, name=name, only_worker=True)
         steward = Steward(catalog, store, hints, settings)
         evaluator = Evaluator(catalog, search, settings, name=name)
         gateway = Gateway(catalog, store, hints, search, settings, keys)
@@ -123,7 +124,7 @@ def standalone(settings: Settings, *, new_key: bool = False) -> Iterator[Standal
                 ("search", search.run),
                 ("search of what is built", search.run_building),
                 ("search's presence", presence.run),
-                ("extractor", extractor.run),
+                ("extractor", partial(extractor.run, hints=hints)),
                 ("steward", steward.run),
                 ("evaluator", evaluator.run),
             )

@@ -68,6 +68,10 @@ class Settings(BaseSettings):
         False, description="log every call and every refusal; answers stay the same"
     )
 
+    redis_url: SecretStr | None = Field(
+        None, description="Redis that carries hints between services; unset: one process"
+    )
+
     # What is accepted.
     max_file_size: int = Field(10_485_760, gt=0, description="bytes of one photo")
     max_image_pixels: int = Field(50_000_000, gt=0, description="width x height of one photo")
@@ -116,6 +120,12 @@ class Settings(BaseSettings):
 
     # How jobs are kept alive.
     lease_seconds: float = Field(60.0, gt=0, description="silence after which a worker is given up")
+    drain_seconds: float = Field(
+        10.0, gt=0, description="how long a worker goes on for one hint before it looks up"
+    )
+    visibility_seconds: int = Field(
+        900, ge=60, description="after which Redis delivers a silent worker's hint again"
+    )
     max_attempts: int = Field(3, ge=1, description="lone crashes before a job is failed")
     query_ttl_seconds: float = Field(3600.0, gt=0, description="life of an unstored query")
 

@@ -20,6 +20,7 @@ from services.cli import (
     serve,
     storage,
     vocabulary,
+    workers,
 )
 
 app = typer.Typer(
@@ -31,6 +32,7 @@ app = typer.Typer(
 )
 app.command("serve")(serve.serve)
 app.command("search")(search.search)
+app.command("extractor")(workers.extractor)
 app.command("index")(index.index)
 app.command("import-anyloc")(import_anyloc.import_anyloc)
 app.command("query")(ask.query)

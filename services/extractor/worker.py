@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import math
 import threading
 import time
 from collections import defaultdict
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
+from typing import Any
 from uuid import UUID
 
 import numpy as np
@@ -29,7 +31,7 @@ from shared.catalog.generations import active_generation
 from shared.catalog.maps import lock_map
 from shared.catalog.session import Catalog
 from shared.errors import Conflict, PlacewiseError, Unavailable
-from shared.jobs import Hints, Job, Priority, begin, claim, hold_lease
+from shared.jobs import InProcessHints, Job, Priority, begin, claim, hold_lease
 from shared.jobs.finish import fail, release
 from shared.jobs.leases import fallen, held
 from shared.jobs.model_changes import abandon_generation
@@ -53,6 +55,18 @@ class DrainResult:
     succeeded: int = 0
     failed: int = 0
     seconds: defaultdict[str, float] = field(default_factory=lambda: defaultdict(float))
+    more: bool = False
+    """It ended before the work did."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """For logs and for Flower."""
+        return {
+            "maps": sorted(self.maps),
+            "claimed": self.claimed,
+            "succeeded": self.succeeded,
+            "failed": self.failed,
+            "seconds": {stage: round(took, 3) for stage, took in self.seconds.items()},
+        }
 
 
 @dataclass(slots=True)
@@ -78,7 +92,6 @@ class ExtractorWorker:
         self,
         catalog: Catalog,
         store: ObjectStore,
-        hints: Hints,
         settings: Settings,
         name: str,
         *,
@@ -87,7 +100,6 @@ class ExtractorWorker:
         """`only_worker`: no other can be of another release, so this one renews what is old."""
         self._catalog = catalog
         self._store = store
-        self._hints = hints
         self._settings = settings
         self._name = name
         self._only_worker = only_worker
@@ -96,8 +108,8 @@ class ExtractorWorker:
         self._changes = ModelChanges(catalog, store, self._models, self._decoders, settings)
         self._ahead = ThreadPoolExecutor(max_workers=1, thread_name_prefix="prepare")
 
-    def run(self, stop: threading.Event) -> None:
-        """Drain whenever there is work, until `stop` is set."""
+    def warm_up(self) -> None:
+        """Load the extractor of new maps, so that the first photo does not wait for it."""
         try:
             self._models.extractor(self._settings.new_map_extractor)
         except PlacewiseError as error:
@@ -105,6 +117,10 @@ class ExtractorWorker:
             log.error("the extractor of new maps can't be loaded: %s", error.detail)
         if self._only_worker:
             renew_outdated_generations(self._catalog, self._models)
+
+    def run(self, stop: threading.Event, hints: InProcessHints) -> None:
+        """Drain whenever there is work, until `stop` is set: the embedded worker's life."""
+        self.warm_up()
         while not stop.is_set():
             try:
                 result = self.drain(stop)
@@ -113,30 +129,26 @@ class ExtractorWorker:
                 stop.wait(AWAY_SECONDS)
                 continue
             if result.claimed:
-                log.info(
-                    "drained: %d claimed, %d succeeded, %d failed (%s)",
-                    result.claimed,
-                    result.succeeded,
-                    result.failed,
-                    ", ".join(f"{stage} {took:.2f} s" for stage, took in result.seconds.items()),
-                )
+                log.info("drained: %s", result.as_dict())
             else:
-                self._hints.wait(IDLE_SECONDS)
+                hints.wait(IDLE_SECONDS)
 
     def close(self) -> None:
         """End the decoders; what is claimed comes back when its lease expires."""
         self._ahead.shutdown(wait=True, cancel_futures=True)
         self._decoders.close()
 
-    def drain(self, stop: threading.Event) -> DrainResult:
-        """Work until nothing is claimable or `stop` is set."""
+    def drain(self, stop: threading.Event, seconds: float = math.inf) -> DrainResult:
+        """Work until nothing is claimable, `stop` is set, or `seconds` have passed."""
         result = DrainResult()
+        until = time.monotonic() + seconds
         work: Work | None = None
         ahead = self._take(result)
         try:
             while ahead is not None:
-                if stop.is_set():
+                if stop.is_set() or time.monotonic() > until:
                     self._give_back(ahead)
+                    result.more = True
                     break
                 work = ahead
                 if work.jobs[0].priority < Priority.QUERY:

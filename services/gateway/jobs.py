@@ -18,6 +18,7 @@ from services.gateway.waiting import SLOWEST_LOOK_SECONDS, read_job, wait_for_jo
 from shared.catalog.maps import get_map
 from shared.jobs import Job, JobKind, JobState
 from shared.jobs.finish import cancel, retry
+from shared.jobs.hints import lane_of
 from shared.jobs.model_changes import cancel_model_change
 from shared.jobs.table import MODEL_CHANGES, UNFINISHED, get_job, list_jobs
 
@@ -106,7 +107,7 @@ def retry_job(gateway: GatewayDep, job_id: JobId, map_name: MapName = DEFAULT_MA
         session.flush()
         session.refresh(found)
         answer = JobAnswer.of(found)
-    gateway.hints.send()
+    gateway.hints.send(lane_of(found.priority))
     return answer
 
 

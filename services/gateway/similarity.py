@@ -35,6 +35,7 @@ from shared.catalog.maps import get_map
 from shared.errors import Conflict, Gone, PlacewiseError, Unprocessable, invalid_field
 from shared.ids import new_id
 from shared.jobs import Job, JobKind, JobState, Priority
+from shared.jobs.hints import Lane
 from shared.jobs.table import UNFINISHED, get_job
 from shared.objects.keys import query_key
 
@@ -152,7 +153,7 @@ def _queue(
     except PlacewiseError:
         gateway.store.delete(received.key)
         raise
-    gateway.hints.send()
+    gateway.hints.send(Lane.QUERY)
     return job
 
 

@@ -8,7 +8,8 @@ from sqlalchemy import exists, select
 
 from shared.catalog.session import Catalog
 from shared.jobs import Hints, free_expired_leases
-from shared.jobs.table import Job, claimable
+from shared.jobs.hints import Lane
+from shared.jobs.table import Job, Priority, claimable
 
 log = logging.getLogger(__name__)
 
@@ -25,6 +26,9 @@ def free_leases(catalog: Catalog, max_attempts: int, *, everyone: bool = False) 
 def resend_hints(catalog: Catalog, hints: Hints) -> None:
     """Wake a worker when there is work: the hint that was sent with it may be lost."""
     with catalog.read() as session:
-        waiting = session.scalar(select(exists(select(Job.id).where(claimable()))))
-    if waiting:
-        hints.send()
+        for lane, condition in (
+            (Lane.QUERY, Job.priority >= Priority.QUERY),
+            (Lane.BULK, Job.priority < Priority.QUERY),
+        ):
+            if session.scalar(select(exists(select(Job.id).where(claimable(), condition)))):
+                hints.send(lane)

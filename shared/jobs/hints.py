@@ -1,19 +1,34 @@
-"""Hints: "there may be work". Losing one costs a second, never a job."""
+"""Hints: "there may be work". Losing one costs seconds, never a job; two of one are harmless.
+
+There are two lanes, so that whoever serves queries first sees them first. What a woken worker does
+is decided by the job table alone.
+"""
 
 from __future__ import annotations
 
 import threading
+from enum import StrEnum
 from typing import Protocol
+
+from shared.jobs.table import Priority
+
+
+class Lane(StrEnum):
+    QUERY = "placewise.query"  # someone waits for the answer
+    BULK = "placewise.bulk"
+
+
+def lane_of(priority: int) -> Lane:
+    """The lane that a job of this priority is hinted on."""
+    return Lane.QUERY if priority >= Priority.QUERY else Lane.BULK
 
 
 class Hints(Protocol):
     """The port over which whoever queued a job wakes a worker."""
 
-    def send(self) -> None:
-        """Wake a worker. Never raises: the job is already committed and will be found anyway."""
-
-    def wait(self, seconds: float) -> bool:
-        """Sleep until a hint comes or the time is up; True when a hint came."""
+    def send(self, lane: Lane = Lane.BULK) -> None:
+        """Wake a worker. Never raises and never waits: the job is already committed and will be
+        found anyway."""
 
 
 class InProcessHints:
@@ -22,10 +37,11 @@ class InProcessHints:
     def __init__(self) -> None:
         self._event = threading.Event()
 
-    def send(self) -> None:
+    def send(self, lane: Lane = Lane.BULK) -> None:
         self._event.set()
 
     def wait(self, seconds: float) -> bool:
+        """Sleep until a hint comes or the time is up; True when a hint came."""
         came = self._event.wait(seconds)
         self._event.clear()
         return came

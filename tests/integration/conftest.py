@@ -14,7 +14,6 @@ from services.extractor.worker import ExtractorWorker
 from shared.catalog.maps import ensure_default_map
 from shared.catalog.session import Catalog
 from shared.errors import PlacewiseError
-from shared.jobs import InProcessHints
 from shared.objects import FolderStore
 from shared.settings import Settings
 from shared.vision.decode import Decoded
@@ -71,7 +70,7 @@ def make_worker(
     made: list[ExtractorWorker] = []
 
     def make() -> ExtractorWorker:
-        made.append(ExtractorWorker(catalog, store, InProcessHints(), small, f"worker-{len(made)}"))
+        made.append(ExtractorWorker(catalog, store, small, f"worker-{len(made)}"))
         return made[-1]
 
     yield make

@@ -1,0 +1,70 @@
+"""The extractor as a process of its own: a Celery worker that drains the job table when hinted.
+
+One process per GPU, `--pool=solo`: a forked child could not use CUDA. A drain lasts a few seconds,
+so that the worker answers `inspect` and Flower in between, and ends soon when it is asked to stop.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import socket
+import threading
+from typing import Any
+
+from celery import signals
+
+from services.extractor.worker import ExtractorWorker
+from shared.catalog.session import Catalog
+from shared.jobs.celery_app import DRAIN_TASK, make_celery
+from shared.jobs.celery_hints import CeleryHints
+from shared.jobs.hints import Lane
+from shared.objects import ObjectStore
+from shared.settings import Settings
+
+log = logging.getLogger(__name__)
+
+
+def serve_extractor(catalog: Catalog, store: ObjectStore, settings: Settings) -> None:
+    """Work until SIGTERM. What is claimed then goes back to the queue, unharmed."""
+    app = make_celery(settings)
+    hints = CeleryHints(app, settings)
+    name = f"extractor-{socket.gethostname()}-{os.getpid()}"
+    worker = ExtractorWorker(catalog, store, settings, name)
+    stop = threading.Event()
+
+    def drain() -> dict[str, Any]:
+        result = worker.drain(stop, settings.drain_seconds)
+        if result.more and not stop.is_set():
+            hints.send(Lane.BULK)
+        elif result.claimed:
+            log.info("drained: %s", result.as_dict())
+        return result.as_dict()
+
+    app.task(drain, name=DRAIN_TASK, ignore_result=True)
+
+    def on_shutdown(**_: object) -> None:
+        stop.set()
+
+    signals.worker_shutting_down.connect(on_shutdown, weak=False)
+    try:
+        worker.warm_up()
+        for lane in Lane:
+            hints.send(lane)  # what was queued before this worker came
+        app.worker_main(
+            [
+                "worker",
+                "--pool=solo",
+                "--concurrency=1",
+                f"--hostname={name}@%h",
+                f"--queues={','.join(Lane)}",
+                "--loglevel=INFO" if settings.debug else "--loglevel=WARNING",
+                "--without-gossip",
+                "--without-mingle",
+            ]
+        )
+    finally:
+        signals.worker_shutting_down.disconnect(on_shutdown)
+        stop.set()
+        worker.close()
+        hints.close()
