@@ -1,0 +1,195 @@
+"""Hints over Celery on a real Redis, and an extractor in a process of its own that they wake."""
+
+from __future__ import annotations
+
+import base64
+import json
+import subprocess
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from uuid import UUID
+
+import pytest
+from redis import Redis
+from sqlalchemy import func, select
+
+from services.steward.queue import resend_hints
+from shared.catalog.session import Catalog
+from shared.errors import Misconfigured
+from shared.jobs import Job, JobState
+from shared.jobs.celery_app import DRAIN_TASK, make_celery
+from shared.jobs.celery_hints import MOST_WAITING, CeleryHints
+from shared.jobs.hints import Lane
+from shared.objects import FolderStore
+from shared.settings import Settings
+from tests.support.catalog_rows import add_map, ask, upload
+from tests.support.photos import photo_bytes
+from tests.support.server import PLACEWISE, environment
+from tests.support.servers import PostgresServer, RedisServer, start_redis
+
+SECONDS = 60.0
+
+
+@pytest.fixture
+def own_redis() -> Iterator[RedisServer]:
+    """A Redis of the test's own, empty, which may be killed."""
+    with start_redis(own=True) as server:
+        yield server
+
+
+@pytest.fixture
+def hints(own_redis: RedisServer) -> Iterator[CeleryHints]:
+    settings = Settings(redis_url=own_redis.url)
+    made = CeleryHints(make_celery(settings), settings)
+    yield made
+    made.close()
+
+
+def waiting(server: RedisServer) -> dict[Lane, list[bytes]]:
+    with Redis.from_url(server.url) as client:
+        return {lane: list(client.lrange(lane, 0, -1)) for lane in Lane}
+
+
+def until(condition) -> None:  # type: ignore[no-untyped-def]
+    deadline = time.monotonic() + SECONDS
+    while not condition():
+        assert time.monotonic() < deadline, "it did not come to that"
+        time.sleep(0.05)
+
+
+def test_a_hint_is_json_that_names_no_job_in_the_lane_it_was_sent_on(
+    hints: CeleryHints, own_redis: RedisServer
+) -> None:
+    hints.send(Lane.QUERY)
+    until(lambda: waiting(own_redis)[Lane.QUERY])
+    found = waiting(own_redis)
+    assert (len(found[Lane.QUERY]), len(found[Lane.BULK])) == (1, 0)
+    message = json.loads(found[Lane.QUERY][0])
+    assert message["content-type"] == "application/json"
+    assert message["headers"]["task"] == DRAIN_TASK
+    arguments, named, _ = json.loads(base64.b64decode(message["body"]))
+    assert (arguments, named) == ([], {})
+
+
+def test_a_lane_holds_few_hints_however_many_are_sent(
+    hints: CeleryHints, own_redis: RedisServer
+) -> None:
+    for _ in range(3 * MOST_WAITING):
+        hints.send()
+        time.sleep(0.02)
+    until(lambda: len(waiting(own_redis)[Lane.BULK]) >= MOST_WAITING)
+    time.sleep(0.2)
+    assert len(waiting(own_redis)[Lane.BULK]) == MOST_WAITING
+
+
+def test_without_redis_a_hint_neither_waits_nor_raises_and_the_next_one_arrives(
+    hints: CeleryHints, own_redis: RedisServer
+) -> None:
+    assert own_redis.process is not None
+    own_redis.process.kill()
+    begun = time.monotonic()
+    for _ in range(100):
+        hints.send()
+    assert time.monotonic() - begun < 1.0
+    own_redis.process.start()
+
+    def arrived() -> bool:
+        hints.send()
+        return bool(waiting(own_redis)[Lane.BULK])
+
+    until(arrived)
+
+
+def test_services_without_redis_say_what_to_set() -> None:
+    with pytest.raises(Misconfigured, match="REDIS_URL") as caught:
+        make_celery(Settings())
+    assert caught.value.code == "redis_missing"
+
+
+class Extractor:
+    """`placewise extractor` on a PostgreSQL, a Redis and a folder."""
+
+    def __init__(self, home: Path, catalog: Catalog, redis: RedisServer) -> None:
+        self._home = home
+        url = catalog.url.render_as_string(hide_password=False)
+        self._environment = environment(home, database_url=url, redis_url=redis.url)
+        self.start()
+
+    def start(self) -> None:
+        with (self._home.parent / "extractor.log").open("ab") as log:
+            self.process = subprocess.Popen(
+                [PLACEWISE, "extractor"],
+                env=self._environment,
+                cwd=self._home.parent,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+            )
+
+
+@pytest.fixture
+def catalog_on_postgres(postgres: PostgresServer, migrated_postgres: str) -> Iterator[Catalog]:
+    opened = Catalog(postgres.new_database(migrated_postgres))
+    yield opened
+    opened.close()
+
+
+@pytest.fixture
+def map_id(catalog_on_postgres: Catalog) -> UUID:
+    with catalog_on_postgres.write() as session:
+        return add_map(session, "default", "test-tiny-avg").id
+
+
+@pytest.fixture
+def extractor(
+    tmp_path: Path, catalog_on_postgres: Catalog, own_redis: RedisServer, map_id: UUID
+) -> Iterator[Extractor]:
+    started = Extractor(tmp_path / "home", catalog_on_postgres, own_redis)
+    yield started
+    started.process.kill()
+    started.process.wait()
+
+
+def done(catalog: Catalog) -> dict[str, int]:
+    with catalog.read() as session:
+        found = session.execute(select(Job.state, func.count()).group_by(Job.state))
+        return {str(state): count for state, count in found}
+
+
+def test_an_extractor_does_what_is_queued_whatever_happens_to_the_hints(
+    tmp_path: Path,
+    catalog_on_postgres: Catalog,
+    map_id: UUID,
+    hints: CeleryHints,
+    own_redis: RedisServer,
+    extractor: Extractor,
+) -> None:
+    store = FolderStore(tmp_path / "home" / "objects", alone=False)
+    photos = iter(range(1000))
+
+    def put(count: int) -> None:
+        for _ in range(count):
+            upload(catalog_on_postgres, store, map_id, photo_bytes(next(photos)))
+
+    put(20)  # before the extractor came, or while it starts: no hint is sent
+    until(lambda: done(catalog_on_postgres) == {JobState.SUCCEEDED: 20})
+
+    put(20)
+    ask(catalog_on_postgres, store, map_id, photo_bytes(3))
+    for lane in Lane:
+        hints.send(lane)
+        hints.send(lane)  # two of one are harmless
+    until(lambda: done(catalog_on_postgres) == {JobState.SUCCEEDED: 41})
+
+    put(5)
+    with Redis.from_url(own_redis.url) as client:
+        client.flushall()
+    resend_hints(catalog_on_postgres, hints)  # the steward's duty
+    until(lambda: done(catalog_on_postgres) == {JobState.SUCCEEDED: 46})
+
+    extractor.process.terminate()
+    assert extractor.process.wait(timeout=30) == 0
+    put(5)
+    extractor.start()
+    until(lambda: done(catalog_on_postgres) == {JobState.SUCCEEDED: 51})
