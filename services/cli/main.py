@@ -16,11 +16,11 @@ from services.cli import (
     import_anyloc,
     index,
     maps,
+    processes,
     search,
     serve,
     storage,
     vocabulary,
-    workers,
 )
 
 app = typer.Typer(
@@ -32,7 +32,9 @@ app = typer.Typer(
 )
 app.command("serve")(serve.serve)
 app.command("search")(search.search)
-app.command("extractor")(workers.extractor)
+app.command("gateway")(processes.gateway)
+app.command("extractor")(processes.extractor)
+app.command("steward")(processes.steward)
 app.command("index")(index.index)
 app.command("import-anyloc")(import_anyloc.import_anyloc)
 app.command("query")(ask.query)

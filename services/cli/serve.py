@@ -41,7 +41,7 @@ def set_log_levels(debug: bool) -> None:
     logging.getLogger().setLevel(logging.INFO)
     for ours in ("services", "shared"):
         logging.getLogger(ours).setLevel(logging.DEBUG if debug else logging.INFO)
-    for others in ("alembic", "sqlalchemy"):
+    for others in ("alembic", "httpx2", "sqlalchemy"):
         logging.getLogger(others).setLevel(logging.WARNING)
 
 

@@ -6,8 +6,9 @@ import hmac
 import re
 from typing import Protocol
 
-from shared.admin_key import hash_key
-from shared.errors import Unauthorized
+from shared.admin_key import hash_key, is_loopback
+from shared.errors import Misconfigured, Unauthorized
+from shared.settings import Settings
 
 # RFC 6750 in one line; a scheme's name is written in any case (RFC 9110).
 BEARER = re.compile(r"bearer +(?P<key>[!-~]+) *", re.IGNORECASE)
@@ -48,3 +49,19 @@ def read_bearer(authorization: str | None) -> str:
     if found is None:
         raise Unauthorized("key_missing", f"This server wants its key: {HOW}.")
     return found["key"]
+
+
+def keys_of(settings: Settings) -> Keys:
+    """The keys of a gateway that keeps nothing: ADMIN_KEY, or none on loopback.
+
+    Raises Misconfigured (`admin_key_missing`) beyond loopback without one.
+    """
+    if settings.admin_key is not None:
+        return KnownKeys(hash_key(settings.admin_key.get_secret_value()))
+    if is_loopback(settings.host):
+        return NoKeys()
+    raise Misconfigured(
+        "admin_key_missing",
+        f"HOST is {settings.host}: others can reach this address, and every call needs a key. Set "
+        "ADMIN_KEY; this makes one: openssl rand -hex 24",
+    )

@@ -1,0 +1,124 @@
+"""`placewise gateway|extractor|steward`: services in processes of their own (`search` is beside).
+
+They share DATABASE_URL (PostgreSQL), REDIS_URL, the object store, and SEARCH_URLS.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import socket
+import threading
+from collections.abc import Iterator
+
+from services.cli.configuration import read_settings
+from services.cli.output import explained, messages
+from services.cli.serve import set_log_levels
+from services.http_server import http_server, listening, stopped_by_signals, url_of
+from services.parts import start_part
+from shared.catalog.maps import ensure_default_map
+from shared.catalog.session import Catalog
+from shared.errors import Misconfigured
+from shared.jobs.celery_app import make_celery
+from shared.jobs.celery_hints import CeleryHints
+from shared.objects.open_store import open_store
+from shared.search_http import HttpSearch
+from shared.settings import Settings
+
+
+def gateway() -> None:
+    """Answer the HTTP API (HOST, PORT). Beyond loopback it needs ADMIN_KEY."""
+    with _service() as (settings, catalog):
+        from services.gateway.app import create_app
+        from services.gateway.context import Gateway
+        from services.gateway.keys import keys_of
+
+        with (
+            listening(settings.host, settings.port) as listener,
+            _hints(settings) as hints,
+            _search(settings) as search,
+        ):
+            url = url_of(*listener.getsockname()[:2])
+            keys = keys_of(settings)
+            with catalog.write() as session:
+                ensure_default_map(session, settings.new_map_extractor)
+            store = open_store(settings, alone=False)
+            app = create_app(Gateway(catalog, store, hints, search, settings, keys))
+            server = http_server(app, access_log=settings.debug)
+            messages.print(f"Placewise gateway serves {url}", soft_wrap=True)
+            with stopped_by_signals(server):
+                server.run(sockets=[listener])
+
+
+def extractor() -> None:
+    """Describe photos: a Celery worker on REDIS_URL, DATABASE_URL and the object store."""
+    with _service() as (settings, catalog):
+        from services.extractor.service import serve_extractor  # brings torch
+
+        serve_extractor(catalog, open_store(settings, alone=False), settings)
+
+
+def steward() -> None:
+    """Keep the store healthy and evaluate maps; any number of them may run."""
+    with _service() as (settings, catalog):
+        from services.steward.evaluate import Evaluator
+        from services.steward.loop import Steward
+
+        stop, died = threading.Event(), threading.Event()
+
+        def on_death() -> None:
+            died.set()
+            stop.set()
+
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, lambda *_: stop.set())
+        with _hints(settings) as hints, _search(settings) as search:
+            store = open_store(settings, alone=False)
+            name = f"steward-{socket.gethostname()}-{os.getpid()}"
+            evaluator = Evaluator(catalog, search, settings, name)
+            duties = Steward(catalog, store, hints, settings)
+            parts = [
+                start_part("evaluator", evaluator.run, stop, on_death),
+                start_part("steward", duties.run, stop, on_death),
+            ]
+            messages.print("Placewise steward is at work")
+            for part in parts:
+                part.join()
+        if died.is_set():
+            raise Misconfigured("part_died", "A part of the steward died; the log above says why.")
+
+
+@contextlib.contextmanager
+def _service() -> Iterator[tuple[Settings, Catalog]]:
+    """The settings, and the migrated catalog."""
+    with explained(as_json=False):
+        settings = read_settings()
+        set_log_levels(settings.debug)
+        catalog = Catalog(settings.catalog_url())
+        try:
+            catalog.migrate()
+            yield settings, catalog
+        finally:
+            catalog.close()
+
+
+@contextlib.contextmanager
+def _hints(settings: Settings) -> Iterator[CeleryHints]:
+    hints = CeleryHints(make_celery(settings), settings)
+    try:
+        yield hints
+    finally:
+        hints.close()
+
+
+@contextlib.contextmanager
+def _search(settings: Settings) -> Iterator[HttpSearch]:
+    if not settings.search_addresses:
+        raise Misconfigured(
+            "search_missing",
+            "SEARCH_URLS is not set: name every search worker (placewise search), for example "
+            "http://search-1:8000,http://search-2:8000.",
+        )
+    with HttpSearch(settings.search_addresses, settings.search_timeout_seconds) as search:
+        yield search

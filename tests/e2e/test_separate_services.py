@@ -1,0 +1,181 @@
+"""Gateway, extractors, search and steward in processes of their own, on real servers."""
+
+from __future__ import annotations
+
+import contextlib
+import re
+import signal
+import subprocess
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx2
+import pytest
+
+from tests.support.photos import photo_bytes
+from tests.support.server import PLACEWISE, environment, run_command
+from tests.support.servers import PostgresServer, RedisServer, start_redis
+
+SECONDS = 90.0
+
+
+class Deployment:
+    """Starts `placewise NAME` processes that share a catalog, a Redis and a folder of objects."""
+
+    def __init__(self, root: Path, database_url: str, redis_url: str) -> None:
+        self.root = root
+        self.home = root / "home"
+        self.settings = {
+            "database_url": database_url,
+            "redis_url": redis_url,
+            "lease_seconds": 5,
+            "search_urls": "",
+        }
+        self._processes: list[subprocess.Popen[bytes]] = []
+
+    def start(self, service: str, **settings: Any) -> subprocess.Popen[bytes]:
+        log = self.root / f"{service}-{len(self._processes)}.log"
+        with log.open("wb") as out:
+            process = subprocess.Popen(
+                [PLACEWISE, service],
+                env=environment(self.home, **{**self.settings, **settings}),
+                cwd=self.root,
+                stdin=subprocess.DEVNULL,
+                stdout=out,
+                stderr=out,
+            )
+        self._processes.append(process)
+        return process
+
+    def address(self, service: str, number: int) -> str:
+        """Where the process started as the `number`th says that it serves."""
+        log = self.root / f"{service}-{number}.log"
+        deadline = time.monotonic() + SECONDS
+        while time.monotonic() < deadline:
+            found = re.search(r"(?:serves|on) (http://127\.0\.0\.1:\d+)", log.read_text())
+            if found:
+                return found[1]
+            assert self._processes[number].poll() is None, log.read_text()
+            time.sleep(0.05)
+        raise AssertionError(log.read_text())
+
+    def logs(self) -> str:
+        return "\n".join(
+            f"{log.name}: {log.read_text()[-2000:]}" for log in self.root.glob("*.log")
+        )
+
+    def close(self) -> None:
+        for process in self._processes:
+            if process.poll() is None:
+                process.kill()
+            process.wait()
+
+
+@pytest.fixture
+def deployment(tmp_path: Path, postgres: PostgresServer) -> Iterator[Deployment]:
+    with start_redis(own=True) as redis:
+        made = Deployment(tmp_path, postgres.new_database(), redis.url)
+        try:
+            yield made
+        finally:
+            made.close()
+
+
+def until(what: Any) -> Any:
+    deadline = time.monotonic() + SECONDS
+    while True:
+        with contextlib.suppress(httpx2.TransportError):
+            found = what()
+            if found:
+                return found
+        assert time.monotonic() < deadline, "it did not come to that"
+        time.sleep(0.1)
+
+
+def test_services_in_processes_of_their_own_do_what_the_embedded_one_does(
+    deployment: Deployment,
+) -> None:
+    deployment.start("search", search_shard="0/2")
+    deployment.start("search", search_shard="1/2")
+    urls = [deployment.address("search", number) for number in (0, 1)]
+    deployment.settings["search_urls"] = ",".join(urls)
+    deployment.start("gateway")
+    extractors = [deployment.start("extractor") for _ in range(2)]
+    stewards = [deployment.start("steward") for _ in range(2)]
+    with httpx2.Client(base_url=deployment.address("gateway", 2), timeout=60) as client:
+        until(lambda: client.get("/readyz").is_success)
+
+        def put(number: int) -> dict[str, Any]:
+            answer = client.post(
+                "/api/v1/upload",
+                files={"file": (f"{number}.jpg", photo_bytes(number))},
+                data={"latitude": str(45 + number / 100), "longitude": "7"},
+            )
+            assert answer.status_code == 202, answer.text
+            found: dict[str, Any] = answer.json()
+            return found
+
+        def ended(job_id: str) -> bool:
+            job = client.get(f"/api/v1/jobs/{job_id}", params={"wait": 20}).json()
+            assert job["state"] != "failed", job
+            return bool(job["state"] == "succeeded")
+
+        def first_match(photo: bytes) -> Any:
+            answer = client.post(
+                "/api/v1/similarity",
+                params={"top_k": 1},
+                files={"file": ("query.jpg", photo)},
+                headers={"Prefer": "wait=30"},
+            )
+            assert answer.status_code == 200, answer.text
+            body = answer.json()
+            assert body["missing"] == []
+            return body["similar_images"][0]["original_filename"]
+
+        for upload in [put(number) for number in range(24)]:
+            until(lambda upload=upload: ended(upload["job_id"]))
+        assert first_match(photo_bytes(5)) == "5.jpg"
+
+        # One extractor and one steward die in the middle of work; the others go on.
+        uploads = [put(number) for number in range(24, 64)]
+        extractors[0].send_signal(signal.SIGKILL)
+        stewards[0].send_signal(signal.SIGKILL)
+        for upload in uploads:
+            until(lambda upload=upload: ended(upload["job_id"]))
+        assert first_match(photo_bytes(60)) == "60.jpg"
+        stats = client.get("/api/v1/database/stats").json()
+        assert (stats["total_images"], stats["searchable_images"]) == (64, 64)
+
+        evaluation = client.post("/api/v1/evaluations", json={"sample": 30}).json()
+        until(lambda: ended(evaluation["job_id"]))
+        assert client.get("/api/v1/evaluations").json()["evaluations"]
+
+        for process in (extractors[1], stewards[1]):
+            process.terminate()
+        assert [p.wait(timeout=30) for p in (extractors[1], stewards[1])] == [0, 0]
+    assert "Traceback" not in deployment.logs()
+
+
+@pytest.mark.parametrize(
+    ("service", "settings", "code"),
+    [
+        ("gateway", {"redis_url": ""}, "redis_missing"),
+        ("gateway", {}, "search_missing"),
+        ("steward", {}, "search_missing"),
+        ("extractor", {"redis_url": ""}, "redis_missing"),
+        (
+            "gateway",
+            {"search_urls": "http://127.0.0.1:9", "host": "0.0.0.0"},
+            "admin_key_missing",
+        ),
+    ],
+)
+def test_what_a_service_lacks_is_one_line(
+    service: str, settings: dict[str, str], code: str, tmp_path: Path, redis: RedisServer
+) -> None:
+    env = environment(tmp_path / "home", **{"redis_url": redis.url, **settings})
+    ended = run_command(service, env=env, cwd=tmp_path)
+    assert ended.returncode == 1
+    assert ended.stderr.splitlines()[-1].startswith(f"{code}: ")
