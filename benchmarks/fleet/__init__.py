@@ -1,0 +1,15 @@
+"""A whole Placewise on this machine: real servers, every service in processes of its own.
+
+    with start_servers() as servers, Fleet(folder, servers, extractors=3) as fleet:
+        fleet.start()
+        fleet["extractor-1"].kill()
+
+The benchmarks and the fault suite run on it. It needs a checkout with the dev extra: the servers
+are those of the tests.
+"""
+
+from benchmarks.fleet.fleet import Fleet
+from benchmarks.fleet.servers import Servers, start_servers
+from benchmarks.fleet.service import Service
+
+__all__ = ["Fleet", "Servers", "Service", "start_servers"]

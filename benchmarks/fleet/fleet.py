@@ -1,0 +1,144 @@
+"""Every service of a Placewise, started on real servers and kept alive."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from benchmarks.fleet.servers import Servers
+from benchmarks.fleet.service import Service
+from shared.catalog.session import Catalog
+from shared.objects import ObjectStore
+from shared.objects.s3 import S3Store
+from tests.support.server import environment
+from tests.support.servers.daemon import free_ports
+
+PLACEWISE = str(Path(sys.executable).with_name("placewise"))
+LOOK_SECONDS = 0.2
+
+
+class Fleet:
+    """`gateway-0..`, `extractor-0..`, `search-SHARD-REPLICA` and `steward-0..` by name.
+
+    Settings are those of `shared.settings`; the tiny test extractor unless they say otherwise.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        servers: Servers,
+        *,
+        gateways: int = 1,
+        extractors: int = 1,
+        shards: int = 1,
+        replicas: int = 1,
+        stewards: int = 1,
+        **settings: Any,
+    ) -> None:
+        self.servers = servers
+        bucket = servers.s3.new_bucket()
+        self.database_url = servers.postgres.new_database()
+        self.catalog = Catalog(self.database_url)
+        self.store: ObjectStore = S3Store(bucket)  # past the proxy
+        ports = iter(free_ports(gateways + shards * replicas))
+        searches = {
+            (shard, replica): next(ports)
+            for shard, replica in itertools.product(range(shards), range(replicas))
+        }
+        self._folder = folder
+        self._settings = {
+            "database_url": self.database_url,
+            "redis_url": servers.redis.url,
+            "search_urls": ",".join(f"http://127.0.0.1:{port}" for port in searches.values()),
+            **servers.s3_proxied.variables(bucket.name),
+            **settings,
+        }
+        self.services: dict[str, Service] = {}
+        for (shard, replica), port in searches.items():
+            self._add(f"search-{shard}-{replica}", port, search_shard=f"{shard}/{shards}")
+        self.gateway_urls: list[str] = []
+        for number in range(gateways):
+            port = next(ports)
+            self.gateway_urls.append(f"http://127.0.0.1:{port}")
+            self._add(f"gateway-{number}", port)
+        for number in range(extractors):
+            self._add(f"extractor-{number}", None)
+        for number in range(stewards):
+            self._add(f"steward-{number}", None)
+        self._stop = threading.Event()
+        self._supervisor = threading.Thread(target=self._supervise, name="supervisor", daemon=True)
+        self.fell: list[str] = []
+        """Services that ended although nobody had killed them, in order."""
+
+    def _add(self, name: str, port: int | None, **settings: Any) -> None:
+        service = name.partition("-")[0]
+        own = {**self._settings, **settings, **({"port": port} if port else {})}
+        self.services[name] = Service(
+            name,
+            [PLACEWISE, service],
+            environment(self._folder / "home", **own),
+            self._folder / f"{name}.log",
+            f"http://127.0.0.1:{port}/readyz" if port else None,
+        )
+
+    def __getitem__(self, name: str) -> Service:
+        return self.services[name]
+
+    def __enter__(self) -> Self:
+        self.catalog.migrate()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._stop.set()
+        if self._supervisor.is_alive():
+            self._supervisor.join()
+        for service in self.services.values():
+            service.kill()
+        self.catalog.close()
+
+    def start(self, *names: str) -> None:
+        """The named services, or all; returns when they are ready."""
+        chosen = [self.services[name] for name in names] or list(self.services.values())
+        for service in chosen:
+            service.start()
+        for service in chosen:
+            service.wait_until_ready()
+        if not self._supervisor.is_alive():
+            self._supervisor.start()
+
+    def _supervise(self) -> None:
+        while not self._stop.wait(LOOK_SECONDS):
+            for service in self.services.values():
+                if service.start_if_ended():
+                    self.fell.append(service.name)
+
+    @contextlib.contextmanager
+    def without(self, name: str) -> Iterator[None]:
+        """The service is killed; when the block ends it is started again."""
+        self[name].kill()
+        try:
+            yield
+        finally:
+            self.start(name)
+
+    def cpu_seconds(self) -> dict[str, float]:
+        """CPU time so far of each service that runs."""
+        return {
+            name: service.cpu_seconds()
+            for name, service in self.services.items()
+            if service.running
+        }
+
+    def logs(self) -> str:
+        return "\n".join(f"--- {name}\n{one.log()}" for name, one in self.services.items())

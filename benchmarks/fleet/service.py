@@ -1,0 +1,132 @@
+"""One `placewise NAME` in a process of its own, which may be killed, paused and started again."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import subprocess
+import threading
+import time
+from collections.abc import Mapping
+from pathlib import Path
+
+import httpx2
+import psutil
+
+START_SECONDS = 120.0
+STOP_SECONDS = 60.0
+
+
+class Service:
+    """`ready_url` answers 200 when it is at work; None for what serves no HTTP.
+
+    While it is `wanted`, a supervisor starts it again (`start_if_ended`), as an orchestrator would.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        command: list[str],
+        environment: Mapping[str, str],
+        log: Path,
+        ready_url: str | None,
+    ) -> None:
+        self.name = name
+        self.environment = dict(environment)
+        self.log_path = log
+        self.ready_url = ready_url
+        self.wanted = False
+        self.starts = 0
+        self._command = command
+        self._process: subprocess.Popen[bytes] | None = None
+        self._lock = threading.Lock()
+
+    @property
+    def running(self) -> bool:
+        return self._process is not None and self._process.poll() is None
+
+    @property
+    def process(self) -> psutil.Process:
+        assert self._process is not None, f"{self.name} was not started"
+        return psutil.Process(self._process.pid)
+
+    def start(self) -> None:
+        with self._lock:
+            self.wanted = True
+            self._start()
+
+    def start_if_ended(self) -> bool:
+        """Start it again if it ought to run and doesn't; whether that was so."""
+        with self._lock:
+            if not self.wanted or self.running:
+                return False
+            self._start()
+            return True
+
+    def _start(self) -> None:
+        with self.log_path.open("ab") as log:
+            self._process = subprocess.Popen(  # noqa: S603
+                self._command,
+                env=self.environment,
+                cwd=self.log_path.parent,  # where no developer's .env lies
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+            )
+        self.starts += 1
+
+    def kill(self) -> None:
+        """SIGKILL, and nobody starts it again."""
+        with self._lock:
+            self.wanted = False
+            if self._process is not None:
+                if self.running:
+                    # One that is stopped would not be continued by anybody else.
+                    self._process.send_signal(signal.SIGCONT)
+                self._process.kill()
+                self._process.wait()
+
+    def stop(self) -> int:
+        """SIGTERM, and wait; the exit code."""
+        with self._lock:
+            self.wanted = False
+            assert self._process is not None
+            self._process.terminate()
+            return self._process.wait(timeout=STOP_SECONDS)
+
+    def pause(self) -> None:
+        self._signal(signal.SIGSTOP)
+
+    def resume(self) -> None:
+        self._signal(signal.SIGCONT)
+
+    def _signal(self, number: signal.Signals) -> None:
+        assert self._process is not None
+        self._process.send_signal(number)
+
+    def wait_until_ready(self) -> None:
+        """AssertionError with the end of its log where it does not come to that."""
+        deadline = time.monotonic() + START_SECONDS
+        while not self._ready():
+            assert time.monotonic() < deadline, f"{self.name} is not ready: {self.log()}"
+            time.sleep(0.1)
+
+    def _ready(self) -> bool:
+        if self.ready_url is None:
+            return self.running
+        with contextlib.suppress(httpx2.TransportError):
+            return httpx2.get(self.ready_url, timeout=5).is_success
+        return False
+
+    def cpu_seconds(self) -> float:
+        """User and system time of the process and its children so far."""
+        total = 0.0
+        process = self.process
+        for one in (process, *process.children(recursive=True)):
+            with contextlib.suppress(psutil.NoSuchProcess):
+                times = one.cpu_times()
+                total += times.user + times.system
+        return total
+
+    def log(self) -> str:
+        return self.log_path.read_text(errors="replace")[-3000:]
