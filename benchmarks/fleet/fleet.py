@@ -59,6 +59,7 @@ class Fleet:
             **servers.s3_proxied.variables(bucket.name),
             **settings,
         }
+        self.lease_seconds = float(settings.get("lease_seconds", 60.0))
         self.services: dict[str, Service] = {}
         for (shard, replica), port in searches.items():
             self._add(f"search-{shard}-{replica}", port, search_shard=f"{shard}/{shards}")

@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import subprocess
+import sys
 from collections.abc import Callable
+from datetime import UTC, datetime
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -20,6 +24,7 @@ from shared.objects.open_store import open_store
 from shared.objects.s3 import Bucket, S3Store, create_bucket
 from shared.objects.s3.writer import PART_BYTES
 from shared.settings import Settings
+from tests.support.clock import clock_off_by
 from tests.support.servers import S3Server
 
 
@@ -287,3 +292,38 @@ def test_the_doctor_looks_at_the_bucket(s3: S3Server, bucket: Bucket) -> None:
 def test_the_client_needs_its_settings(settings: Settings) -> None:
     with pytest.raises(Misconfigured, match="S3_ACCESS_KEY"):
         Bucket.of(settings)
+
+
+USE = """
+from datetime import UTC, datetime
+from shared.errors import NotFound
+from shared.objects.s3 import Bucket, S3Store
+from shared.settings import Settings
+store = S3Store(Bucket.of(Settings()))
+assert store.head("never") is None
+store.put("a", b"x")
+assert store.get("a") == b"x"
+assert [info.key for info in store.list("")] == ["a"]
+store.delete("a")
+print(datetime.now(UTC).isoformat())
+"""
+
+
+@pytest.mark.parametrize("seconds", [3600, -3600])
+def test_a_machine_whose_clock_is_an_hour_off_still_reaches_the_store(
+    s3: S3Server, bucket: Bucket, tmp_path: Path, seconds: int
+) -> None:
+    variables = {name.upper(): str(value) for name, value in s3.variables(bucket.name).items()}
+    used = subprocess.run(
+        [sys.executable, "-c", USE],
+        env={**os.environ, **variables, **clock_off_by(seconds)},
+        cwd=Path(__file__).parents[2],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert used.returncode == 0, used.stderr
+    thought = datetime.fromisoformat(used.stdout.strip())
+    assert abs((thought - datetime.now(UTC)).total_seconds()) > 3000, "the clock was off"
+    assert "requests are signed by the store's" in used.stderr

@@ -11,7 +11,6 @@ from typing import Self
 from xml.etree.ElementTree import ParseError
 
 import urllib3
-from minio import Minio
 from minio.error import MinioException, S3Error
 from urllib3.connectionpool import ConnectionPool
 from urllib3.exceptions import (
@@ -25,6 +24,7 @@ from urllib3.exceptions import (
 from urllib3.response import BaseHTTPResponse
 
 from shared.errors import Misconfigured, NotFound, PlacewiseError, Unavailable
+from shared.objects.s3.client import S3Client
 from shared.settings import Settings
 
 log = logging.getLogger(__name__)
@@ -65,7 +65,7 @@ class OneMoreTry(urllib3.Retry):
 class Bucket:
     """One bucket on one server. The client in it may be used by many threads."""
 
-    client: Minio
+    client: S3Client
     name: str
     endpoint: str
 
@@ -95,7 +95,7 @@ class Bucket:
             ),
             cert_reqs="CERT_REQUIRED",  # against the system's authorities, or SSL_CERT_FILE
         )
-        client = Minio(
+        client = S3Client(
             settings.s3_endpoint,
             settings.s3_access_key,
             settings.s3_secret_key.get_secret_value(),

@@ -1,0 +1,155 @@
+"""What goes wrong. Each fault is a block: inside it, something is broken."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+
+from redis import Redis
+
+from benchmarks.fleet import Fleet
+from benchmarks.fleet.doubler import Doubler
+from benchmarks.fleet.proxy import Mode
+from tests.support.clock import clock_off_by
+from tests.support.servers.handle import Handle
+
+GATEWAYS, EXTRACTORS, SHARDS, STEWARDS = 2, 3, 2, 1
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """`broken(fleet, seconds)` is a block that breaks something when it begins and ends with it
+    repaired. What it breaks stays broken for `seconds` where the fault has a length."""
+
+    name: str
+    broken: Callable[[Fleet, float], AbstractContextManager[None]]
+
+
+def every_fault() -> list[Fault]:
+    """In the order of the documentation; a run shuffles them."""
+    return [
+        *(Fault(f"kill -9 of {name}", _killed(name)) for name in _ONE_OF_EACH),
+        Fault("kill -9 of every service at once", _all_killed),
+        Fault("an extractor stands still beyond its lease", _paused("extractor-0")),
+        Fault("an extractor's clock an hour ahead", _clock("extractor-0", 3600)),
+        Fault("an extractor's clock an hour behind", _clock("extractor-1", -3600)),
+        Fault("a gateway's clock an hour ahead", _clock("gateway-0", 3600)),
+        Fault("the steward's clock an hour ahead", _clock("steward-0", 3600)),
+        Fault("FLUSHALL", _flushed),
+        Fault("Redis stopped", _stopped(lambda fleet: fleet.servers.redis.process)),
+        Fault("every message doubled", _doubled),
+        Fault("PostgreSQL killed and started", _postgres_restarted),
+        Fault("PostgreSQL stopped", _stopped(lambda fleet: fleet.servers.postgres.process)),
+        Fault("the S3 store killed", _stopped(lambda fleet: fleet.servers.s3.process)),
+        Fault("the S3 store full (507)", _store(Mode.FULL)),
+        Fault("connections to the S3 store refused", _store(Mode.REFUSE)),
+        Fault("connections to the S3 store cut", _store(Mode.CUT)),
+        Fault("connections to the S3 store slow", _store(Mode.SLOW)),
+    ]
+
+
+_ONE_OF_EACH = ("gateway-0", "extractor-0", "search-0-0", "search-1-0", "steward-0")
+_Broken = Callable[[Fleet, float], AbstractContextManager[None]]
+
+
+def _killed(name: str) -> _Broken:
+    @contextlib.contextmanager
+    def broken(fleet: Fleet, _seconds: float) -> Iterator[None]:
+        with fleet.without(name):
+            yield
+
+    return broken
+
+
+@contextlib.contextmanager
+def _all_killed(fleet: Fleet, _seconds: float) -> Iterator[None]:
+    for service in fleet.services.values():
+        service.kill()
+    yield
+    fleet.start()
+
+
+def _paused(name: str) -> _Broken:
+    @contextlib.contextmanager
+    def broken(fleet: Fleet, _seconds: float) -> Iterator[None]:
+        fleet[name].pause()
+        try:
+            yield
+            time.sleep(2 * fleet.lease_seconds)
+        finally:
+            fleet[name].resume()
+
+    return broken
+
+
+def _clock(name: str, seconds_ahead: int) -> _Broken:
+    """The service runs with another idea of the time of day; its monotonic clock is right."""
+
+    @contextlib.contextmanager
+    def broken(fleet: Fleet, seconds: float) -> Iterator[None]:
+        service = fleet[name]
+        before = dict(service.environment)
+        service.kill()
+        service.environment.update(clock_off_by(seconds_ahead))
+        fleet.start(name)
+        try:
+            yield
+            time.sleep(seconds)
+        finally:
+            service.kill()
+            service.environment = before
+            fleet.start(name)
+
+    return broken
+
+
+@contextlib.contextmanager
+def _flushed(fleet: Fleet, _seconds: float) -> Iterator[None]:
+    with Redis.from_url(fleet.servers.redis.url) as client:
+        client.flushall()
+        yield
+        client.flushall()
+
+
+@contextlib.contextmanager
+def _doubled(fleet: Fleet, seconds: float) -> Iterator[None]:
+    with Doubler(fleet.servers.redis.url).at_work():
+        yield
+        time.sleep(seconds)
+
+
+def _stopped(choose: Callable[[Fleet], Handle | None]) -> _Broken:
+    @contextlib.contextmanager
+    def broken(fleet: Fleet, seconds: float) -> Iterator[None]:
+        server = choose(fleet)
+        assert server is not None, "a server of its own was started"
+        server.kill()
+        try:
+            yield
+            time.sleep(seconds)
+        finally:
+            server.start()
+
+    return broken
+
+
+@contextlib.contextmanager
+def _postgres_restarted(fleet: Fleet, _seconds: float) -> Iterator[None]:
+    server = fleet.servers.postgres.process
+    assert server is not None
+    server.kill()
+    server.start()
+    yield
+
+
+def _store(mode: Mode) -> _Broken:
+    @contextlib.contextmanager
+    def broken(fleet: Fleet, seconds: float) -> Iterator[None]:
+        with fleet.servers.s3_proxy.misbehaving(mode):
+            yield
+            time.sleep(seconds)
+
+    return broken

@@ -1,0 +1,159 @@
+"""One fault after the other, and the counts after each."""
+
+from __future__ import annotations
+
+import random
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from benchmarks.chaos.audit import Counts, audit, unfinished
+from benchmarks.chaos.faults import EXTRACTORS, GATEWAYS, SHARDS, STEWARDS, Fault, every_fault
+from benchmarks.chaos.traffic import Traffic
+from benchmarks.fleet import Fleet, start_servers
+
+RECOVERY_SECONDS = 180.0  # what has not recovered by then is counted as stuck
+LEASE_SECONDS = 3.0
+LOOK_SECONDS = 0.1
+ASKED = 10  # known photos that are asked for after each fault, beside those asked for meanwhile
+BEFORE_SECONDS = 0.5  # at most: how long the fault waits for uploads to be under way
+
+
+@dataclass(slots=True)
+class Outcome:
+    """After one fault. Everything but `refused` and `recovery_seconds` has to be zero."""
+
+    fault: str
+    counts: Counts
+    wrong: int
+    """Answers that did not begin with the photo that was asked with, or had one twice."""
+    unexpected: int
+    """Answers that were neither a result nor a request to try again, and calls without one."""
+    fell: list[str]
+    """Services that ended although the fault did not kill them."""
+    refused: int
+    """Calls that had to be repeated."""
+    recovery_seconds: float
+    """From the repair until everything acknowledged was searchable."""
+
+    @property
+    def good(self) -> bool:
+        return self.counts.all_zero and not self.wrong and not self.unexpected
+
+
+@dataclass(slots=True)
+class Report:
+    seed: int
+    photos: int
+    asked: int = 0
+    """Answers that were compared with what they had to be."""
+    seconds: float = 0.0
+    outcomes: list[Outcome] = field(default_factory=list)
+    details: list[str] = field(default_factory=list)
+
+    @property
+    def good(self) -> bool:
+        return all(outcome.good for outcome in self.outcomes)
+
+    def as_dict(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+def run_chaos(
+    folder: Path,
+    *,
+    photos: int,
+    fault_seconds: float,
+    seed: int,
+    faults: Sequence[Fault] | None = None,
+    on_outcome: Callable[[Outcome], object] = lambda outcome: None,
+) -> Report:
+    """Upload `photos` in equal parts, one for each fault, in an order that the seed decides.
+
+    Faults that have a length last `fault_seconds`. Ends at the first fault after which something
+    is not as it has to be, with the services' logs in the report.
+    """
+    moments = random.Random(seed)  # noqa: S311
+    chosen = list(faults or every_fault())
+    moments.shuffle(chosen)
+    begun = time.monotonic()
+    report = Report(seed, photos)
+    with (
+        start_servers() as servers,
+        Fleet(
+            folder,
+            servers,
+            gateways=GATEWAYS,
+            extractors=EXTRACTORS,
+            shards=SHARDS,
+            stewards=STEWARDS,
+            lease_seconds=LEASE_SECONDS,
+            batch_photos=8,
+            compact_chunks=3,
+            slot_rows=50,
+            superseded_grace_seconds=5,
+        ) as fleet,
+    ):
+        fleet.start()
+        with Traffic(fleet.gateway_urls, seed) as traffic:
+            for number, fault in enumerate(chosen):
+                upload = _thirds(traffic, photos, number, len(chosen))
+                outcome = _do(fleet, traffic, fault, fault_seconds, moments, upload)
+                report.outcomes.append(outcome)
+                on_outcome(outcome)
+                if not outcome.good:
+                    report.details += [*traffic.details, *outcome.counts.details, fleet.logs()]
+                    break
+            report.asked = traffic.answers["right"] + traffic.answers["wrong"]
+    report.seconds = time.monotonic() - begun
+    return report
+
+
+def _thirds(traffic: Traffic, photos: int, place: int, faults: int) -> Callable[[int], None]:
+    """Releases the first, second or third third of the part of the fault at `place`."""
+
+    def upload(third: int) -> None:
+        traffic.release((3 * place + third) * photos // (3 * faults))
+
+    return upload
+
+
+def _do(
+    fleet: Fleet,
+    traffic: Traffic,
+    fault: Fault,
+    seconds: float,
+    moments: random.Random,
+    upload: Callable[[int], None],
+) -> Outcome:
+    """Photos are uploaded before the fault, while it lasts, and after it; then all is counted."""
+    before = traffic.answers.copy()
+    fell = len(fleet.fell)
+    upload(1)
+    time.sleep(moments.uniform(0, BEFORE_SECONDS))
+    with fault.broken(fleet, seconds):
+        upload(2)
+    repaired = time.monotonic()
+    upload(3)
+    settled = False
+    while not settled and time.monotonic() < repaired + RECOVERY_SECONDS:
+        time.sleep(LOOK_SECONDS)
+        settled = traffic.all_acknowledged and not unfinished(fleet.catalog, of_photos=True)
+    recovery_seconds = time.monotonic() - repaired
+    traffic.remember()
+    with traffic.nobody_asks():
+        counts = audit(fleet.catalog, fleet.store, traffic.acknowledged)
+    for known in moments.sample(traffic.known, min(ASKED, len(traffic.known))):
+        traffic.ask(known)
+    change = traffic.answers - before
+    return Outcome(
+        fault=fault.name,
+        counts=counts,
+        wrong=change["wrong"],
+        unexpected=change["unexpected"],
+        fell=fleet.fell[fell:],
+        refused=change["away"],
+        recovery_seconds=recovery_seconds,
+    )

@@ -1,0 +1,172 @@
+"""Callers of the fleet: they upload until each photo is acknowledged, and ask where photos are."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import random
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from types import TracebackType
+from typing import Any, Self
+from uuid import UUID
+
+import httpx2
+
+from tests.support.photos import photo_bytes
+
+UPLOADERS = 4
+CALL_SECONDS = 30.0
+AGAIN_SECONDS = 0.1
+SELF_SCORE = 0.9999
+# What a caller is told to try again: anything else that is not an answer is a fault of ours.
+AWAY = (429, 503, 507)
+
+
+class Traffic:
+    """Uploads the photos 0, 1, 2... as far as they are released, and asks for those that are known.
+
+    A call that fails is repeated at the next gateway.
+    """
+
+    def __init__(self, urls: Sequence[str], seed: int) -> None:
+        self._urls = urls
+        self._random = random.Random(seed)  # noqa: S311
+        self._clients = [httpx2.Client(base_url=url, timeout=CALL_SECONDS) for url in urls]
+        self._lock = threading.Lock()
+        self._released = 0
+        self._next = 0
+        self._stop = threading.Event()
+        self._asking = threading.Lock()
+        self._numbers: dict[UUID, int] = {}
+        self.acknowledged: dict[str, UUID] = {}
+        self.known: list[int] = []
+        """Numbers of photos that were searchable when all was well: an answer has to know them."""
+        self.answers: Counter[str] = Counter()
+        """How calls went: `acknowledged`, `right`, `wrong`, `unexpected`, `away`."""
+        self.details: list[str] = []
+        self._threads = [
+            threading.Thread(target=self._upload, args=(caller,), name="uploader", daemon=True)
+            for caller in range(UPLOADERS)
+        ]
+        self._threads.append(threading.Thread(target=self._ask_on, name="asker", daemon=True))
+
+    def __enter__(self) -> Self:
+        for thread in self._threads:
+            thread.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._stop.set()
+        for thread in self._threads:
+            thread.join()
+        for client in self._clients:
+            client.close()
+
+    def release(self, photos: int) -> None:
+        """Let so many photos be uploaded in all."""
+        self._released = photos
+
+    @property
+    def all_acknowledged(self) -> bool:
+        return len(self.acknowledged) >= self._released
+
+    def remember(self) -> None:
+        """All is well: from now on every answer has to know what is acknowledged."""
+        with self._lock:
+            self.known = sorted(self._numbers.values())
+
+    @contextlib.contextmanager
+    def nobody_asks(self) -> Iterator[None]:
+        """No question is under way while the block runs."""
+        with self._asking:
+            yield
+
+    def _upload(self, caller: int) -> None:
+        while not self._stop.is_set():
+            with self._lock:
+                number = self._next if self._next < self._released else None
+                if number is not None:
+                    self._next += 1
+            if number is None:
+                self._stop.wait(0.02)
+                continue
+            data = photo_bytes(number)
+            tries = caller
+            while not self._stop.is_set():
+                body = self._call(
+                    tries, "/api/v1/upload", (200, 202), files={"file": (f"{number}.jpg", data)}
+                )
+                if body is not None:
+                    photo_id = UUID(body["file_id"])
+                    with self._lock:
+                        self.acknowledged[hashlib.sha256(data).hexdigest()] = photo_id
+                        self._numbers[photo_id] = number
+                    self.answers["acknowledged"] += 1
+                    break
+                tries += 1
+                self._stop.wait(AGAIN_SECONDS)
+
+    def _ask_on(self) -> None:
+        while not self._stop.wait(AGAIN_SECONDS):
+            with self._lock:
+                number = self._random.choice(self.known) if self.known else None
+            if number is not None:
+                with self._asking:
+                    self.ask(number)
+
+    def ask(self, number: int) -> None:
+        """Ask with the bytes of a known photo, and look whether the answer is right."""
+        body = self._call(
+            self._random.randrange(len(self._clients)),
+            "/api/v1/similarity",
+            (200, 202),
+            files={"file": ("query.jpg", photo_bytes(number))},
+            params={"top_k": 5},
+            headers={"Prefer": "wait=10"},
+        )
+        if body is None or "similar_images" not in body or body["missing"]:
+            return  # away, not ready in time, or an answer that says that it is not whole
+        found = body["similar_images"]
+        ids = [photo["image_id"] for photo in found]
+        right = (
+            bool(found)
+            and self._numbers.get(UUID(ids[0])) == number
+            and found[0]["similarity_score"] > SELF_SCORE
+            and len(set(ids)) == len(ids)
+        )
+        self.answers["right" if right else "wrong"] += 1
+        if not right:
+            self.details.append(f"asked with photo {number}, answered {found[:2]}")
+
+    def _call(
+        self, caller: int, path: str, wanted: Sequence[int], **options: Any
+    ) -> dict[str, Any] | None:
+        """The answer's body; None when the caller should try again."""
+        number = caller % len(self._clients)
+        begun = time.monotonic()
+        try:
+            answer = self._clients[number].post(path, **options)
+        except httpx2.TransportError as error:
+            self.answers["away"] += 1
+            if isinstance(error, httpx2.ReadTimeout):
+                self.answers["unexpected"] += 1
+                seconds = time.monotonic() - begun
+                self.details.append(f"{path} did not answer in {seconds:.0f} s")
+            return None
+        if answer.status_code in wanted:
+            body: dict[str, Any] = answer.json()
+            return body
+        if answer.status_code in AWAY:
+            self.answers["away"] += 1
+        else:
+            self.answers["unexpected"] += 1
+            self.details.append(f"{path} answered {answer.status_code}: {answer.text[:500]}")
+        return None
