@@ -42,10 +42,10 @@ class Counts:
         return not (self.lost or self.twice or self.stuck or self.failed or self.torn)
 
 
-def unfinished(catalog: Catalog, *, of_photos: bool = False) -> int:
-    """Jobs that have not ended yet; `of_photos`: without those of questions."""
+def unfinished(catalog: Catalog, *, photos: bool = False) -> int:
+    """Jobs that have not ended yet; `photos`: without those of questions."""
     wanted: list[ColumnElement[bool]] = [Job.state.in_(UNFINISHED)]
-    if of_photos:
+    if photos:
         wanted.append(Job.kind != JobKind.DESCRIBE)
     with catalog.read() as session:
         return session.scalar(select(func.count()).select_from(Job).where(*wanted)) or 0

@@ -13,10 +13,16 @@ from redis import Redis
 from benchmarks.fleet import Fleet
 from benchmarks.fleet.doubler import Doubler
 from benchmarks.fleet.proxy import Mode
-from tests.support.clock import clock_off_by
 from tests.support.servers.handle import Handle
 
-GATEWAYS, EXTRACTORS, SHARDS, STEWARDS = 2, 3, 2, 1
+# From beginning to end these have another idea of the time of day, by so many seconds.
+CLOCKS_OFF = {
+    "gateway-1": 3600,
+    "extractor-1": 3600,
+    "extractor-2": -3600,
+    "search-1-0": -3600,
+    "steward-0": 3600,
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,20 +40,18 @@ def every_fault() -> list[Fault]:
         *(Fault(f"kill -9 of {name}", _killed(name)) for name in _ONE_OF_EACH),
         Fault("kill -9 of every service at once", _all_killed),
         Fault("an extractor stands still beyond its lease", _paused("extractor-0")),
-        Fault("an extractor's clock an hour ahead", _clock("extractor-0", 3600)),
-        Fault("an extractor's clock an hour behind", _clock("extractor-1", -3600)),
-        Fault("a gateway's clock an hour ahead", _clock("gateway-0", 3600)),
-        Fault("the steward's clock an hour ahead", _clock("steward-0", 3600)),
         Fault("FLUSHALL", _flushed),
         Fault("Redis stopped", _stopped(lambda fleet: fleet.servers.redis.process)),
         Fault("every message doubled", _doubled),
         Fault("PostgreSQL killed and started", _postgres_restarted),
         Fault("PostgreSQL stopped", _stopped(lambda fleet: fleet.servers.postgres.process)),
         Fault("the S3 store killed", _stopped(lambda fleet: fleet.servers.s3.process)),
-        Fault("the S3 store full (507)", _store(Mode.FULL)),
-        Fault("connections to the S3 store refused", _store(Mode.REFUSE)),
-        Fault("connections to the S3 store cut", _store(Mode.CUT)),
-        Fault("connections to the S3 store slow", _store(Mode.SLOW)),
+        Fault("the S3 store full (507)", _connections("the S3 store", Mode.FULL)),
+        *(
+            Fault(f"connections to {server} {mode.name.lower()}", _connections(server, mode))
+            for server in ("PostgreSQL", "Redis", "the S3 store")
+            for mode in (Mode.REFUSED, Mode.CUT, Mode.SLOW)
+        ),
     ]
 
 
@@ -81,27 +85,6 @@ def _paused(name: str) -> _Broken:
             time.sleep(2 * fleet.lease_seconds)
         finally:
             fleet[name].resume()
-
-    return broken
-
-
-def _clock(name: str, seconds_ahead: int) -> _Broken:
-    """The service runs with another idea of the time of day; its monotonic clock is right."""
-
-    @contextlib.contextmanager
-    def broken(fleet: Fleet, seconds: float) -> Iterator[None]:
-        service = fleet[name]
-        before = dict(service.environment)
-        service.kill()
-        service.environment.update(clock_off_by(seconds_ahead))
-        fleet.start(name)
-        try:
-            yield
-            time.sleep(seconds)
-        finally:
-            service.kill()
-            service.environment = before
-            fleet.start(name)
 
     return broken
 
@@ -145,10 +128,16 @@ def _postgres_restarted(fleet: Fleet, _seconds: float) -> Iterator[None]:
     yield
 
 
-def _store(mode: Mode) -> _Broken:
+def _connections(server: str, mode: Mode) -> _Broken:
     @contextlib.contextmanager
     def broken(fleet: Fleet, seconds: float) -> Iterator[None]:
-        with fleet.servers.s3_proxy.misbehaving(mode):
+        servers = fleet.servers
+        proxy = {
+            "PostgreSQL": servers.postgres_proxy,
+            "Redis": servers.redis_proxy,
+            "the S3 store": servers.s3_proxy,
+        }[server]
+        with proxy.misbehaving(mode):
             yield
             time.sleep(seconds)
 

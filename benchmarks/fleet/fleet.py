@@ -43,9 +43,10 @@ class Fleet:
     ) -> None:
         self.servers = servers
         bucket = servers.s3.new_bucket()
-        self.database_url = servers.postgres.new_database()
-        self.catalog = Catalog(self.database_url)
-        self.store: ObjectStore = S3Store(bucket)  # past the proxy
+        database_url = servers.postgres.new_database()
+        # Ours go past the proxies.
+        self.catalog = Catalog(database_url)
+        self.store: ObjectStore = S3Store(bucket)
         ports = iter(free_ports(gateways + shards * replicas))
         searches = {
             (shard, replica): next(ports)
@@ -53,10 +54,10 @@ class Fleet:
         }
         self._folder = folder
         self._settings = {
-            "database_url": self.database_url,
-            "redis_url": servers.redis.url,
+            "database_url": servers.proxied_database(database_url),
+            "redis_url": servers.proxied_redis_url,
             "search_urls": ",".join(f"http://127.0.0.1:{port}" for port in searches.values()),
-            **servers.s3_proxied.variables(bucket.name),
+            **servers.proxied_s3.variables(bucket.name),
             **settings,
         }
         self.lease_seconds = float(settings.get("lease_seconds", 60.0))

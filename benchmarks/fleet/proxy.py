@@ -26,7 +26,7 @@ class Mode(enum.Enum):
     """How connections fare. A change of it ends those that stand."""
 
     OPEN = "everything passes"
-    REFUSE = "every connection ends at once"
+    REFUSED = "every connection ends at once"
     CUT = "every connection ends within its first request"
     SLOW = "every connection crawls"
     FULL = "HTTP: what would write is answered with 507, the rest passes"
@@ -106,7 +106,7 @@ class FaultProxy:
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         mode = self._mode
-        if mode is Mode.REFUSE:
+        if mode is Mode.REFUSED:
             return
         head = b""
         if mode is Mode.FULL:
@@ -115,7 +115,9 @@ class FaultProxy:
                 await self._refuse_as_full(head, reader, writer)
                 return
             # One request on this connection: the next one may be a write.
-            head = head[:-2] + b"Connection: close\r\n\r\n"
+            head = (
+                re.sub(rb"(?i)\r\nconnection:[^\r]*", b"", head)[:-2] + b"Connection: close\r\n\r\n"
+            )
         async with self._upstream() as (up_reader, up_writer):
             up_writer.write(head)
             both = [

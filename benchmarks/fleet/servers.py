@@ -7,6 +7,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from urllib.parse import urlsplit
 
+from sqlalchemy.engine import make_url
+
 from benchmarks.fleet.proxy import FaultProxy
 from tests.support.servers import (
     PostgresServer,
@@ -17,30 +19,32 @@ from tests.support.servers import (
     start_s3,
 )
 from tests.support.servers.daemon import free_ports
-from tests.support.servers.handle import Handle
 
 
 @dataclass(frozen=True, slots=True)
 class Servers:
-    """Started, and each may be killed; the store is reached through a proxy that can fail."""
+    """Started, and each may be killed. Services reach them through proxies, which can fail."""
 
     postgres: PostgresServer
     redis: RedisServer
     s3: S3Server
+    postgres_proxy: FaultProxy
+    redis_proxy: FaultProxy
     s3_proxy: FaultProxy
 
-    @property
-    def processes(self) -> dict[str, Handle]:
-        """The servers themselves by name."""
-        found = {
-            "PostgreSQL": self.postgres.process,
-            "Redis": self.redis.process,
-            "the S3 store": self.s3.process,
-        }
-        return {name: process for name, process in found.items() if process is not None}
+    def proxied_database(self, url: str) -> str:
+        """The URL of a database of `postgres` as the services see it."""
+        proxied = make_url(url).set(port=self.postgres_proxy.port)
+        return proxied.render_as_string(hide_password=False)
 
     @property
-    def s3_proxied(self) -> S3Server:
+    def proxied_redis_url(self) -> str:
+        """Redis as the services see it."""
+        proxied = make_url(self.redis.url).set(port=self.redis_proxy.port)
+        return proxied.render_as_string(hide_password=False)
+
+    @property
+    def proxied_s3(self) -> S3Server:
         """The store as the services see it."""
         return S3Server(
             f"127.0.0.1:{self.s3_proxy.port}",
@@ -58,8 +62,13 @@ def start_servers() -> Iterator[Servers]:
         start_postgres(own=True) as postgres,
         start_redis(own=True) as redis,
         start_s3(own=True) as s3,
+        _proxy(postgres.admin.port) as postgres_proxy,
+        _proxy(urlsplit(redis.url).port) as redis_proxy,
+        _proxy(urlsplit(f"//{s3.endpoint}").port) as s3_proxy,
     ):
-        target = urlsplit(f"//{s3.endpoint}").port
-        assert target is not None
-        with FaultProxy(free_ports(1)[0], target) as proxy:
-            yield Servers(postgres, redis, s3, proxy)
+        yield Servers(postgres, redis, s3, postgres_proxy, redis_proxy, s3_proxy)
+
+
+def _proxy(target: int | None) -> FaultProxy:
+    assert target is not None, "servers of our own have a port"
+    return FaultProxy(free_ports(1)[0], target)

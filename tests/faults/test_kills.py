@@ -6,21 +6,14 @@ import hashlib
 import random
 import threading
 import time
-from collections import Counter
 from pathlib import Path
 from uuid import UUID
 
 import httpx2
 import psutil
-from sqlalchemy import select
 
-from shared.catalog.chunks import Chunk, Descriptor
-from shared.catalog.generations import Generation, GenerationState
-from shared.catalog.photos import Photo
+from benchmarks.chaos.audit import audit, unfinished
 from shared.catalog.session import Catalog
-from shared.chunks import manifest_key
-from shared.jobs import Job
-from shared.jobs.table import UNFINISHED
 from shared.objects import FolderStore
 from tests.support.photos import photo_bytes
 from tests.support.server import ServerProcess
@@ -86,8 +79,12 @@ def test_after_ten_kills_every_acknowledged_photo_is_searchable_exactly_once(
 
         catalog = Catalog(f"sqlite:///{server.home / 'catalog.sqlite'}")
         wait_until_nothing_is_left_to_do(catalog)
-        assert_every_photo_is_there_exactly_once(catalog, uploader.acknowledged)
-        assert_no_chunk_is_torn(catalog, FolderStore(server.home / "objects"))
+        expected = {
+            hashlib.sha256(photo_bytes(number)).hexdigest(): UUID(file_id)
+            for number, file_id in uploader.acknowledged.items()
+        }
+        counts = audit(catalog, FolderStore(server.home / "objects"), expected)
+        assert counts.all_zero, counts
         catalog.close()
         assert_each_finds_itself(server, uploader.acknowledged)
 
@@ -122,45 +119,9 @@ def test_decoding_children_end_with_a_killed_server(tmp_path: Path) -> None:
 
 def wait_until_nothing_is_left_to_do(catalog: Catalog) -> None:
     deadline = time.monotonic() + 60
-    while True:
-        with catalog.read() as session:
-            left = session.scalars(select(Job).where(Job.state.in_(UNFINISHED))).all()
-        if not left:
-            return
-        assert time.monotonic() < deadline, f"{len(left)} jobs are stuck: {left[0].__dict__}"
+    while left := unfinished(catalog):
+        assert time.monotonic() < deadline, f"{left} jobs are stuck"
         time.sleep(0.1)
-
-
-def assert_every_photo_is_there_exactly_once(
-    catalog: Catalog, acknowledged: dict[int, str]
-) -> None:
-    with catalog.read() as session:
-        photos = session.scalars(select(Photo)).all()
-        rows = session.execute(
-            select(Descriptor.photo_id)
-            .join(Generation, Generation.id == Descriptor.generation_id)
-            .where(Generation.state == GenerationState.ACTIVE)
-        ).scalars()
-        by_photo = Counter(rows)
-        failed = session.scalars(select(Job.error).where(Job.error.is_not(None))).all()
-    expected = {
-        hashlib.sha256(photo_bytes(number)).hexdigest(): UUID(file_id)
-        for number, file_id in acknowledged.items()
-    }
-    assert {photo.sha256: photo.id for photo in photos} == expected
-    assert by_photo == dict.fromkeys(expected.values(), 1)
-    assert not failed
-
-
-def assert_no_chunk_is_torn(catalog: Catalog, store: FolderStore) -> None:
-    """Every live chunk and its manifest are whole, and their hashes are the catalog's."""
-    with catalog.read() as session:
-        chunks = session.scalars(select(Chunk).where(Chunk.superseded_at.is_(None))).all()
-    assert chunks
-    for chunk in chunks:
-        data = store.get(chunk.object_key)
-        assert hashlib.sha256(data).hexdigest() == chunk.sha256
-        assert chunk.sha256.encode() in store.get(manifest_key(chunk.object_key))
 
 
 def assert_each_finds_itself(server: ServerProcess, acknowledged: dict[int, str]) -> None:

@@ -1,0 +1,20 @@
+"""The short form of `placewise bench chaos`: every fault once, then the counts."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from benchmarks.chaos import run_chaos
+from benchmarks.chaos.faults import every_fault
+
+
+@pytest.mark.timeout(900)
+def test_whatever_dies_no_photo_is_lost_doubled_or_stuck_and_no_answer_is_wrong(
+    tmp_path: Path,
+) -> None:
+    report = run_chaos(tmp_path, photos=200, fault_seconds=1.0, seed=20_261_121)
+    assert report.good, "\n".join([*map(str, report.outcomes), *report.details])
+    assert len(report.outcomes) == len(every_fault())
+    assert report.asked >= len(report.outcomes), "questions were compared with what is right"

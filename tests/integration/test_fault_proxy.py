@@ -1,0 +1,113 @@
+"""The instruments of the fault suite do what they are named after."""
+
+from __future__ import annotations
+
+import contextlib
+import http.server
+import threading
+from collections.abc import Iterator
+
+import httpx2
+import pytest
+from redis import Redis
+
+from benchmarks.fleet.doubler import Doubler
+from benchmarks.fleet.proxy import FaultProxy, Mode
+from shared.jobs.hints import Lane
+from tests.support.servers import start_redis
+from tests.support.servers.daemon import free_ports
+
+BODY = bytes(range(256)) * 40
+
+
+class Echo(http.server.BaseHTTPRequestHandler):
+    """Answers with what it was sent."""
+
+    protocol_version = "HTTP/1.1"
+
+    def do_PUT(self) -> None:
+        body = self.rfile.read(int(self.headers["Content-Length"]))
+        self.send_response(200)
+        self.send_header("Content-Length", str(len(body)))
+        self.end_headers()
+        self.wfile.write(body)
+
+    def do_GET(self) -> None:
+        self.send_response(200)
+        self.send_header("Content-Length", str(len(BODY)))
+        self.end_headers()
+        self.wfile.write(BODY)
+
+    def log_message(self, *_: object) -> None: ...
+
+
+@pytest.fixture
+def proxy() -> Iterator[FaultProxy]:
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Echo) as server:
+        server.daemon_threads = True
+        serving = threading.Thread(target=server.serve_forever)
+        serving.start()
+        with FaultProxy(free_ports(1)[0], server.server_port) as started:
+            yield started
+        server.shutdown()
+        serving.join()
+
+
+@pytest.fixture
+def client(proxy: FaultProxy) -> Iterator[httpx2.Client]:
+    with httpx2.Client(base_url=f"http://127.0.0.1:{proxy.port}", timeout=20) as client:
+        yield client
+
+
+def test_everything_passes_before_and_after_a_fault(
+    proxy: FaultProxy, client: httpx2.Client
+) -> None:
+    assert client.put("/", content=BODY).content == BODY
+    with proxy.misbehaving(Mode.REFUSED), pytest.raises(httpx2.TransportError):
+        client.get("/")
+    assert client.put("/", content=BODY).content == BODY
+
+
+def test_a_cut_connection_ends_within_the_request(proxy: FaultProxy, client: httpx2.Client) -> None:
+    with proxy.misbehaving(Mode.CUT):
+        with pytest.raises(httpx2.TransportError):
+            client.put("/", content=BODY)
+        with pytest.raises(httpx2.TransportError):
+            client.get("/")
+
+
+def test_a_connection_that_stands_is_cut_when_the_fault_begins(
+    proxy: FaultProxy, client: httpx2.Client
+) -> None:
+    assert client.get("/").is_success
+    with proxy.misbehaving(Mode.REFUSED), contextlib.suppress(httpx2.TransportError):
+        pytest.fail(f"the connection still stood: {client.get('/')}")
+
+
+def test_a_slow_connection_brings_everything_in_the_end(
+    proxy: FaultProxy, client: httpx2.Client
+) -> None:
+    with proxy.misbehaving(Mode.SLOW):
+        assert client.put("/", content=BODY).content == BODY
+
+
+def test_a_full_store_refuses_writes_and_answers_reads(
+    proxy: FaultProxy, client: httpx2.Client
+) -> None:
+    with proxy.misbehaving(Mode.FULL):
+        for _ in range(2):
+            assert client.get("/").content == BODY
+            assert client.put("/", content=BODY).status_code == 507
+
+
+def test_every_message_is_there_twice() -> None:
+    with start_redis(own=True) as server, Redis.from_url(server.url) as redis:
+        doubler = Doubler(server.url)
+        with doubler.at_work():
+            for number in range(10):
+                redis.lpush(Lane.BULK, f'{{"body": "{number}"}}')
+            while int(redis.llen(Lane.BULK)) < 20:
+                pass
+            redis.lpush("another list", "x")
+        assert doubler.doubled == 10
+        assert redis.llen("another list") == 1
