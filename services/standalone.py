@@ -83,9 +83,17 @@ def standalone(settings: Settings, *, new_key: bool = False) -> Iterator[Standal
 
     Beyond loopback, or with an ADMIN_KEY, every call needs a key; `new_key` replaces the one that
     an earlier start has made. Raises Misconfigured: `home_in_use` for a folder that another server
-    has, `address_in_use`, `no_key_needed` for a new key on loopback, and those of `admin_key`,
-    `open_store` and `claim_bucket`; Unavailable for a bucket that can't be used.
+    has, `address_in_use`, `separate_services` where SEARCH_URLS is set, `no_key_needed` for a new
+    key on loopback, and those of `admin_key`, `open_store` and `claim_bucket`; Unavailable for a
+    bucket that can't be used.
     """
+    if settings.search_addresses:
+        raise Misconfigured(
+            "separate_services",
+            "SEARCH_URLS names search workers, and the embedded Placewise asks none: it searches "
+            "in its own process, and takes every lease for a dead worker's. Unset SEARCH_URLS, or "
+            "run placewise gateway, extractor and steward.",
+        )
     home = settings.placewise_home
     with contextlib.ExitStack() as held:
         held.enter_context(lock_home(home))

@@ -40,6 +40,7 @@ def every_fault() -> list[Fault]:
         *(Fault(f"kill -9 of {name}", _killed(name)) for name in _ONE_OF_EACH),
         Fault("kill -9 of every service at once", _all_killed),
         Fault("an extractor stands still beyond its lease", _paused("extractor-0")),
+        Fault("a search worker stands still", _paused("search-0-0")),
         Fault("FLUSHALL", _flushed),
         Fault("Redis stopped", _stopped(lambda fleet: fleet.servers.redis.process)),
         Fault("every message doubled", _doubled),

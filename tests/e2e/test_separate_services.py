@@ -161,6 +161,7 @@ def test_services_in_processes_of_their_own_do_what_the_embedded_one_does(
 @pytest.mark.parametrize(
     ("service", "settings", "code"),
     [
+        ("serve", {"search_urls": "http://127.0.0.1:9"}, "separate_services"),
         ("gateway", {"redis_url": ""}, "redis_missing"),
         ("gateway", {}, "search_missing"),
         ("steward", {}, "search_missing"),
