@@ -39,24 +39,28 @@ class Fleet:
         shards: int = 1,
         replicas: int = 1,
         stewards: int = 1,
+        through_proxy: bool = True,
         **settings: Any,
     ) -> None:
+        """`through_proxy`: reach the store as if it could fail; straight, where time counts."""
         self.servers = servers
         bucket = servers.s3.new_bucket()
         self.database_url = servers.postgres.new_database()
         self.catalog = Catalog(self.database_url)
         self.store: ObjectStore = S3Store(bucket)  # past the proxy
+        s3 = servers.s3_proxied if through_proxy else servers.s3
         ports = iter(free_ports(gateways + shards * replicas))
         searches = {
             (shard, replica): next(ports)
             for shard, replica in itertools.product(range(shards), range(replicas))
         }
+        self.search_urls = [f"http://127.0.0.1:{port}" for port in searches.values()]
         self._folder = folder
         self._settings = {
             "database_url": self.database_url,
             "redis_url": servers.redis.url,
-            "search_urls": ",".join(f"http://127.0.0.1:{port}" for port in searches.values()),
-            **servers.s3_proxied.variables(bucket.name),
+            "search_urls": ",".join(self.search_urls),
+            **s3.variables(bucket.name),
             **settings,
         }
         self.services: dict[str, Service] = {}
@@ -85,6 +89,7 @@ class Fleet:
             environment(self._folder / "home", **own),
             self._folder / f"{name}.log",
             f"http://127.0.0.1:{port}/readyz" if port else None,
+            f"Placewise {service} is at work",
         )
 
     def __getitem__(self, name: str) -> Service:
@@ -139,6 +144,10 @@ class Fleet:
             for name, service in self.services.items()
             if service.running
         }
+
+    def server_cpu_seconds(self) -> dict[str, float]:
+        """CPU time so far of each server."""
+        return {name: one.cpu_seconds() for name, one in self.servers.processes.items()}
 
     def logs(self) -> str:
         return "\n".join(f"--- {name}\n{one.log()}" for name, one in self.services.items())

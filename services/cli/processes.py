@@ -56,7 +56,12 @@ def extractor() -> None:
     with _service() as (settings, catalog):
         from services.extractor.service import serve_extractor  # brings torch
 
-        serve_extractor(catalog, open_store(settings, alone=False), settings)
+        serve_extractor(
+            catalog,
+            open_store(settings, alone=False),
+            settings,
+            lambda: messages.print("Placewise extractor is at work"),
+        )
 
 
 def steward() -> None:
