@@ -24,7 +24,7 @@ def described(store: ObjectStore) -> Counter[UUID]:
 
     A worker writes its chunk, with a manifest that names the photos, before it asks whether it may
     commit: work that was done twice shows here although only one of the two was let in. That holds
-    while the steward merges nothing (COMPACT_CHUNKS).
+    while the steward merges nothing (COMPACT_CHUNKS, SLOT_ROWS).
     """
     found: Counter[UUID] = Counter()
     for info in store.list("chunks/"):

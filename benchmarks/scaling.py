@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 WANTED_OF_LINEAR = 0.9
 CLIENTS = 4
 WARM_UPS = 10
-NO_MERGING = 1_000_000
+NO_MERGING = 1_000_000  # chunks stay as the extractors wrote them
 SECONDS = 900.0  # for one round
 
 
@@ -49,6 +49,7 @@ def measure(
             extractor=f"test-slow-avg:milliseconds={milliseconds},width=16",
             batch_photos=batch,
             compact_chunks=NO_MERGING,
+            slot_rows=NO_MERGING,
         ) as fleet,
     ):
         fleet.start("search-0-0", "gateway-0", "steward-0")

@@ -14,6 +14,9 @@ from fastapi import FastAPI
 from shared.errors import Misconfigured
 
 BACKLOG = 2048  # connections that wait to be accepted
+# Of a connection without a request. Longer than clients and balancers keep theirs (mostly 60 s): who
+# closes first must not be the one that may be sent a request at the same moment.
+KEEP_ALIVE_SECONDS = 75
 GRACEFUL_SECONDS = 10  # for requests under way when the server is asked to stop
 
 
@@ -24,6 +27,7 @@ def http_server(app: FastAPI, *, access_log: bool) -> uvicorn.Server:
             app,
             log_config=None,
             access_log=access_log,
+            timeout_keep_alive=KEEP_ALIVE_SECONDS,
             timeout_graceful_shutdown=GRACEFUL_SECONDS,
         )
     )
