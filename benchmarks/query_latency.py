@@ -10,6 +10,7 @@ import random
 import statistics
 import tempfile
 import time
+from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -72,6 +73,7 @@ def measure(
             progress.update(bar, completed=seconds - left)
             time.sleep(moments.uniform(0, pause))
             took.append(_ask(caller, moments.choice(photos)))
+        stages = _stages(fleet, took)
         periods = _batch_seconds(fleet, begun, batch)
         report.add("uploads still waiting at the end", _waiting(fleet), at_least=1)
         report.add("services that fell", len(fleet.fell), at_most=0)
@@ -83,7 +85,11 @@ def measure(
     report.add(
         "query, worst", 1000 * spread.worst, "ms", at_most=batch_ms + WANTED_ABOVE_A_BATCH_MS
     )
-    report.details = {"seconds": took, "batch_seconds": periods}
+    for stage, found in stages.items():
+        spread = Spread.of(found)
+        report.add(f"{stage}, median", 1000 * spread.median, "ms")
+        report.add(f"{stage}, worst", 1000 * spread.worst, "ms")
+    report.details = {"seconds": took, "stages": stages, "batch_seconds": periods}
     return report
 
 
@@ -170,6 +176,24 @@ def _batch_seconds(fleet: Fleet, begun: datetime, batch: int) -> list[float]:
         if not any(at is not None and before < at < after for at in queries)
     ]
     assert found, "no batch came without a query between: ask less often"
+    return found
+
+
+def _stages(fleet: Fleet, took: Sequence[float]) -> dict[str, list[float]]:
+    """Where the time of each query went, by the job table."""
+    with fleet.catalog.read() as session:
+        jobs = session.scalars(
+            select(Job).where(Job.kind == JobKind.DESCRIBE).order_by(Job.id.desc()).limit(len(took))
+        ).all()
+    found: dict[str, list[float]] = {"waiting for a worker": [], "at the worker": [], "around": []}
+    for job, seconds in zip(reversed(jobs), took, strict=True):
+        assert job.started_at is not None
+        assert job.finished_at is not None
+        waited = (job.started_at - job.created_at).total_seconds()
+        worked = (job.finished_at - job.started_at).total_seconds()
+        found["waiting for a worker"].append(waited)
+        found["at the worker"].append(worked)
+        found["around"].append(seconds - waited - worked)
     return found
 
 

@@ -33,7 +33,7 @@ EVERYTHING = (
     *("gateway-0", "gateway-1", "extractor-0", "extractor-1"),
     *("search-0-0", "search-0-1", "steward-0", "steward-1"),
 )
-PAUSE_SECONDS = 0.02  # of a client between two requests
+PAUSE_SECONDS = 0.1  # of a client between two requests: a load, not a race for the processors
 SECONDS = 120.0
 BATCH = 4
 TEXTURES = 16

@@ -14,8 +14,8 @@ from fastapi import FastAPI
 from shared.errors import Misconfigured
 
 BACKLOG = 2048  # connections that wait to be accepted
-# Of a connection without a request. Longer than clients and balancers keep theirs (mostly 60 s): who
-# closes first must not be the one that may be sent a request at the same moment.
+# Of a connection without a request. Longer than clients and balancers keep theirs (mostly 60 s):
+# who closes first must not be the one that may be sent a request at the same moment.
 KEEP_ALIVE_SECONDS = 75
 GRACEFUL_SECONDS = 10  # for requests under way when the server is asked to stop
 

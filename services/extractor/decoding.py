@@ -128,4 +128,4 @@ def _prepare_child(limit_bytes: int) -> None:
     resource.setrlimit(resource.RLIMIT_AS, (limit_bytes, limit_bytes))
     # Otherwise the memory of each picture comes page by page from the system, and goes back: that
     # took almost half of the time of decoding one.
-    Image.core.set_blocks_max(KEPT_BLOCKS)
+    Image.core.set_blocks_max(KEPT_BLOCKS)  # type: ignore[attr-defined]
