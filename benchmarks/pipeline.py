@@ -21,7 +21,7 @@ from sqlalchemy import select
 from benchmarks.described import wait_for_jobs
 from benchmarks.fleet import Fleet, Servers, Service, start_servers
 from benchmarks.report import Report
-from benchmarks.traffic import Caller, form_of, photos_of, upload_all
+from benchmarks.traffic import form_of, photos_of, upload_all
 from shared.catalog.maps import Map
 from shared.recipes import get_recipe
 from shared.search_http import HttpSearch
@@ -122,7 +122,7 @@ def _cpu(
 def _index(fleet: Fleet, made: Sequence[bytes], photos: int, on_left: object) -> None:
     """Upload, and wait until all of it can be found."""
     forms = [form_of(made[number % len(made)]) for number in range(photos)]
-    upload_all(Caller(fleet.gateway_urls[0]), forms, CLIENTS)
+    upload_all(fleet.gateway_urls[0], forms, CLIENTS)
     wait_for_jobs(fleet.catalog, SECONDS, on_left)  # type: ignore[arg-type]
     with fleet.catalog.read() as session:
         wanted = session.scalars(select(Map.version)).one()
@@ -155,17 +155,17 @@ def _uploads(
     """No extractor runs: each server has the machine, the store and the clients to itself."""
     rates: dict[str, list[float]] = {"gateway": [], "bare": []}
     with _bare(fleet) as bare:
-        callers = {
-            "gateway": (Caller(fleet.gateway_urls[0]), "/api/v1/upload"),
-            "bare": (Caller(bare), "/upload"),
+        targets = {
+            "gateway": (fleet.gateway_urls[0], "/api/v1/upload"),
+            "bare": (bare, "/upload"),
         }
-        for caller, path in callers.values():
-            upload_all(caller, [form_of(made[0]) for _ in range(20)], CLIENTS, path=path)
+        for url, path in targets.values():
+            upload_all(url, [form_of(made[0]) for _ in range(20)], CLIENTS, path=path)
         for _ in range(rounds):
-            for name, (caller, path) in callers.items():
+            for name, (url, path) in targets.items():
                 forms = [form_of(made[number % len(made)]) for number in range(photos)]
                 begun = time.perf_counter()
-                upload_all(caller, forms, CLIENTS, path=path, on_done=on_done)  # type: ignore[arg-type]
+                upload_all(url, forms, CLIENTS, path=path, on_done=on_done)  # type: ignore[arg-type]
                 rates[name].append(photos / (time.perf_counter() - begun))
     for name, found in rates.items():
         report.add(

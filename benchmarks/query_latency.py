@@ -5,6 +5,7 @@ A batch that is on the model can't be interrupted, so a query may wait for one; 
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import random
 import statistics
@@ -56,10 +57,11 @@ def measure(
             extractor=f"test-slow-avg:milliseconds={milliseconds},width={WIDTH}",
             batch_photos=batch,
         ) as fleet,
+        contextlib.ExitStack() as stack,
     ):
         fleet.start()
-        caller = Caller(fleet.gateway_urls[0])
-        first = upload_all(caller, [form_of(photo) for photo in photos], 4)
+        caller = stack.enter_context(Caller(fleet.gateway_urls[0]))
+        first = upload_all(caller.url, [form_of(photo) for photo in photos], 4)
         wait_for_jobs(fleet.catalog, SECONDS)
         _ask(caller, photos[0])  # connections, and the query's own way
         _queue(fleet, UUID(first[0]["file_id"]), backlog)

@@ -15,7 +15,7 @@ from uuid import UUID
 from benchmarks.described import described, jobs_of, wait_for_jobs
 from benchmarks.fleet import Fleet, Service, start_servers
 from benchmarks.report import Report
-from benchmarks.traffic import Caller, form_of, photos_of, upload_all
+from benchmarks.traffic import form_of, photos_of, upload_all
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -104,7 +104,7 @@ def _warm_up(fleet: Fleet, extractors: Sequence[Service], photos: int) -> int:
 def _upload(fleet: Fleet, photos: int) -> list[Any]:
     small = photos_of(8, (64, 48), 1500)
     forms = [form_of(small[number % len(small)]) for number in range(photos)]
-    return upload_all(Caller(fleet.gateway_urls[0]), forms, CLIENTS)
+    return upload_all(fleet.gateway_urls[0], forms, CLIENTS)
 
 
 def _rate(fleet: Fleet, extractors: Sequence[Service], photos: int, on_left: Any) -> float:

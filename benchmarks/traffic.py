@@ -10,11 +10,12 @@ import io
 import itertools
 import json
 import threading
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from http.client import HTTPConnection, HTTPException
-from typing import Any
+from types import TracebackType
+from typing import Any, Self
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -39,7 +40,7 @@ class Answer:
 
 
 class Caller:
-    """Calls one server over a connection of each thread's own."""
+    """Calls one server over a connection of each thread's own; a context manager."""
 
     def __init__(self, url: str) -> None:
         parts = urlsplit(url)
@@ -47,6 +48,23 @@ class Caller:
         self.url = url
         self._address = parts.hostname, parts.port
         self._own = threading.local()
+        self._connections: list[HTTPConnection] = []
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """When the threads that use it have ended."""
+        for connection in self._connections:
+            connection.close()
 
     def call(self, method: str, path: str, body: bytes | None = None, **headers: str) -> Answer:
         """The answer, whatever its status; OSError or HTTPException when there is none."""
@@ -54,6 +72,7 @@ class Caller:
         if connection is None:
             connection = HTTPConnection(*self._address, timeout=TIMEOUT_SECONDS)
             self._own.connection = connection
+            self._connections.append(connection)
         try:
             connection.request(method, path, body, headers)
             answer = connection.getresponse()
@@ -115,7 +134,7 @@ def form_of(photo: bytes, filename: str = "photo.jpg") -> bytes:
 
 
 def upload_all(
-    caller: Caller,
+    url: str,
     forms: Sequence[bytes],
     clients: int,
     *,
@@ -124,16 +143,13 @@ def upload_all(
 ) -> list[Any]:
     """Upload each from one of `clients` threads; the answers' JSON. AssertionError when one is
     not accepted."""
+    with Caller(url) as caller:
 
-    def upload(form: bytes) -> Any:
-        answer = caller.post_form(path, form)
-        assert answer.status < 300, answer.body
-        on_done()
-        return answer.json()
+        def upload(form: bytes) -> Any:
+            answer = caller.post_form(path, form)
+            assert answer.status < 300, answer.body
+            on_done()
+            return answer.json()
 
-    return _at_once(upload, forms, clients)
-
-
-def _at_once(call: Callable[[bytes], Any], forms: Iterable[bytes], clients: int) -> list[Any]:
-    with ThreadPoolExecutor(clients, thread_name_prefix="client") as pool:
-        return list(pool.map(call, forms))
+        with ThreadPoolExecutor(clients, thread_name_prefix="client") as pool:
+            return list(pool.map(upload, forms))

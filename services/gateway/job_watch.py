@@ -7,6 +7,8 @@ an answer does not lie there for long.
 from __future__ import annotations
 
 import asyncio
+import math
+import time
 from collections import Counter
 from uuid import UUID
 
@@ -18,6 +20,8 @@ from shared.jobs import Job
 from shared.jobs.table import UNFINISHED
 
 LOOK_SECONDS = 0.02
+# Of a server that stops: most queries end within it, and the others still get an answer.
+LAST_SECONDS = 5.0
 
 
 class JobWatch:
@@ -27,17 +31,21 @@ class JobWatch:
         self._catalog = catalog
         self._awaited: Counter[UUID] = Counter()
         self._look: asyncio.Future[set[UUID]] | None = None
+        self._last_moment = math.inf
+
+    def end_soon(self) -> None:
+        """The server stops: nobody waits for longer than LAST_SECONDS from now."""
+        self._last_moment = time.monotonic() + LAST_SECONDS
 
     async def wait_for_end(self, job_id: UUID, seconds: float) -> None:
         """Returns when the job has ended or is gone, at the latest after so many seconds.
 
         Raises what the catalog raises while it is away.
         """
-        loop = asyncio.get_running_loop()
-        deadline = loop.time() + seconds
+        deadline = time.monotonic() + seconds
         self._awaited[job_id] += 1
         try:
-            while (left := deadline - loop.time()) > 0:
+            while (left := min(deadline, self._last_moment) - time.monotonic()) > 0:
                 await asyncio.sleep(min(LOOK_SECONDS, left))
                 if job_id in await self._ended():
                     return

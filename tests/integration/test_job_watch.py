@@ -59,6 +59,21 @@ def test_waiting_ends_when_the_time_is_up(catalog: Catalog, jobs: list[UUID]) ->
     asyncio.run(JobWatch(catalog).wait_for_end(jobs[0], 0.05))
 
 
+def test_stopping_server_lets_nobody_wait_for_long(
+    catalog: Catalog, jobs: list[UUID], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(job_watch, "LAST_SECONDS", 0.0)
+
+    async def scenario() -> None:
+        watch = JobWatch(catalog)
+        wait = asyncio.create_task(watch.wait_for_end(jobs[0], 10 * LONG))
+        await started(wait)
+        watch.end_soon()
+        await asyncio.wait_for(wait, LONG)
+
+    asyncio.run(scenario())
+
+
 def test_all_that_wait_share_one_look(
     catalog: Catalog, jobs: list[UUID], monkeypatch: pytest.MonkeyPatch
 ) -> None:
