@@ -6,7 +6,7 @@ import contextlib
 import signal
 import socket
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import uvicorn
 from fastapi import FastAPI
@@ -14,19 +14,38 @@ from fastapi import FastAPI
 from shared.errors import Misconfigured
 
 BACKLOG = 2048  # connections that wait to be accepted
+# Of a connection without a request. Longer than clients and balancers keep theirs (mostly 60 s):
+# who closes first must not be the one that may be sent a request at the same moment.
+KEEP_ALIVE_SECONDS = 75
 GRACEFUL_SECONDS = 10  # for requests under way when the server is asked to stop
 
 
-def http_server(app: FastAPI, *, access_log: bool) -> uvicorn.Server:
-    """A server of the application, not started yet."""
-    return uvicorn.Server(
+class Server(uvicorn.Server):
+    """uvicorn's, that says when it begins to stop: requests under way may then come to an end."""
+
+    on_stop: Callable[[], object]
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        self.on_stop()
+        await super().shutdown(sockets)
+
+
+def http_server(
+    app: FastAPI, *, access_log: bool, on_stop: Callable[[], object] = lambda: None
+) -> Server:
+    """A server of the application, not started yet. `on_stop` is called on its event loop when it
+    takes no more requests; it answers those that it has for GRACEFUL_SECONDS."""
+    server = Server(
         uvicorn.Config(
             app,
             log_config=None,
             access_log=access_log,
+            timeout_keep_alive=KEEP_ALIVE_SECONDS,
             timeout_graceful_shutdown=GRACEFUL_SECONDS,
         )
     )
+    server.on_stop = on_stop
+    return server
 
 
 @contextlib.contextmanager

@@ -123,7 +123,9 @@ def standalone(settings: Settings, *, new_key: bool = False) -> Iterator[Standal
         steward = Steward(catalog, store, hints, settings)
         evaluator = Evaluator(catalog, search, settings, name=name)
         gateway = Gateway(catalog, store, hints, search, settings, keys)
-        server = http_server(create_app(gateway), access_log=settings.debug)
+        server = http_server(
+            create_app(gateway), access_log=settings.debug, on_stop=gateway.job_watch.end_soon
+        )
         running = Standalone(url, server, listener, key, local_key, threading.Event())
         stop = threading.Event()
         parts = [

@@ -20,6 +20,9 @@ from shared.errors import Misconfigured
 
 FACETS = ("query", "key", "value", "token")
 MOST_CLUSTERS = 4096
+SLOW = "test-slow"  # the backbone whose width and time are options
+MOST_WIDTH = 131_072
+MOST_MILLISECONDS = 60_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +54,8 @@ class Recipe:
     answers with it at once, whatever `clusters` says about later fits.
     """
     for_tests: bool = False
+    milliseconds: int = 0
+    """Time that a photo takes, slept, of an extractor for tests."""
 
     @property
     def needs_vocabulary(self) -> bool:
@@ -62,9 +67,9 @@ class Recipe:
         return self.width * (self.clusters if self.needs_vocabulary else 1)
 
     @property
-    def local_features(self) -> tuple[str, int | None, str | None]:
+    def local_features(self) -> tuple[int | str | None, ...]:
         """Recipes that agree in this can share one loaded backbone."""
-        return (self.backbone, self.layer, self.facet)
+        return (self.backbone, self.width, self.layer, self.facet, self.milliseconds)
 
 
 def _anyloc(size: str, *, depth: int, width: int, layer: int, parameters: int) -> Recipe:
@@ -118,6 +123,15 @@ RECIPES = {
             preprocessing="square32",
             aggregator="vlad",
             clusters=8,
+            for_tests=True,
+        ),
+        Recipe(
+            name="test-slow-avg",
+            backbone=SLOW,
+            width=7168,
+            parameters=1_000,
+            preprocessing="square224",  # so that what is around it does its real work
+            aggregator="avg",
             for_tests=True,
         ),
     )
@@ -191,6 +205,12 @@ def _allowed_options(recipe: Recipe) -> dict[str, tuple[Callable[[str], int | st
             _whole(0, last),
             f"a whole number from 0 to {last} ({recipe.backbone} has {recipe.depth} blocks)",
         )
+    if recipe.backbone == SLOW:
+        allowed["milliseconds"] = (
+            _whole(0, MOST_MILLISECONDS),
+            f"a whole number from 0 to {MOST_MILLISECONDS}, for each photo",
+        )
+        allowed["width"] = (_whole(16, MOST_WIDTH), f"a whole number from 16 to {MOST_WIDTH}")
     return allowed
 
 

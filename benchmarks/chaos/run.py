@@ -76,7 +76,7 @@ def run_chaos(
     Faults that have a length last `fault_seconds`. Ends at the first fault after which something
     is not as it has to be, with the services' logs in the report.
     """
-    moments = random.Random(seed)  # noqa: S311
+    moments = random.Random(seed)
     chosen = list(faults or every_fault())
     moments.shuffle(chosen)
     begun = time.monotonic()
@@ -89,6 +89,7 @@ def run_chaos(
             gateways=2,
             extractors=3,
             shards=2,
+            through_proxies=True,
             lease_seconds=LEASE_SECONDS,
             batch_photos=8,
             compact_chunks=3,

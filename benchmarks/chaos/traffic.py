@@ -33,7 +33,7 @@ class Traffic:
 
     def __init__(self, urls: Sequence[str], seed: int) -> None:
         self._urls = urls
-        self._random = random.Random(seed)  # noqa: S311
+        self._random = random.Random(seed)
         self._clients = [httpx2.Client(base_url=url, timeout=CALL_SECONDS) for url in urls]
         self._lock = threading.Lock()
         self._released = 0

@@ -39,25 +39,32 @@ class Fleet:
         shards: int = 1,
         replicas: int = 1,
         stewards: int = 1,
+        through_proxies: bool = False,
         **settings: Any,
     ) -> None:
+        """`through_proxies`: reach the servers so that they can be made to fail, and slower."""
         self.servers = servers
         bucket = servers.s3.new_bucket()
         database_url = servers.postgres.new_database()
         # Ours go past the proxies.
         self.catalog = Catalog(database_url)
         self.store: ObjectStore = S3Store(bucket)
+        redis_url, s3 = servers.redis.url, servers.s3
+        if through_proxies:
+            database_url = servers.proxied_database(database_url)
+            redis_url, s3 = servers.proxied_redis_url, servers.proxied_s3
         ports = iter(free_ports(gateways + shards * replicas))
         searches = {
             (shard, replica): next(ports)
             for shard, replica in itertools.product(range(shards), range(replicas))
         }
+        self.search_urls = [f"http://127.0.0.1:{port}" for port in searches.values()]
         self._folder = folder
         self._settings = {
-            "database_url": servers.proxied_database(database_url),
-            "redis_url": servers.proxied_redis_url,
-            "search_urls": ",".join(f"http://127.0.0.1:{port}" for port in searches.values()),
-            **servers.proxied_s3.variables(bucket.name),
+            "database_url": database_url,
+            "redis_url": redis_url,
+            "search_urls": ",".join(self.search_urls),
+            **s3.variables(bucket.name),
             **settings,
         }
         self.lease_seconds = float(settings.get("lease_seconds", 60.0))
@@ -87,6 +94,7 @@ class Fleet:
             environment(self._folder / "home", **own),
             self._folder / f"{name}.log",
             f"http://127.0.0.1:{port}/readyz" if port else None,
+            f"Placewise {service} is at work",
         )
 
     def __getitem__(self, name: str) -> Service:
@@ -141,6 +149,10 @@ class Fleet:
             for name, service in self.services.items()
             if service.running
         }
+
+    def server_cpu_seconds(self) -> dict[str, float]:
+        """CPU time so far of each server."""
+        return {name: one.cpu_seconds() for name, one in self.servers.processes.items()}
 
     def logs(self) -> str:
         return "\n".join(f"--- {name}\n{one.log()}" for name, one in self.services.items())

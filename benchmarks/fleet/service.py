@@ -13,12 +13,14 @@ from pathlib import Path
 import httpx2
 import psutil
 
+from tests.support.servers.daemon import cpu_seconds_of
+
 START_SECONDS = 120.0
 STOP_SECONDS = 60.0
 
 
 class Service:
-    """`ready_url` answers 200 when it is at work; None for what serves no HTTP.
+    """`ready_url` answers 200 when it is at work; what serves no HTTP writes `ready_line` then.
 
     While it is `wanted`, a supervisor starts it again (`start_if_ended`), as an orchestrator would.
     """
@@ -30,16 +32,19 @@ class Service:
         environment: Mapping[str, str],
         log: Path,
         ready_url: str | None,
+        ready_line: str = "",
     ) -> None:
         self.name = name
         self.environment = dict(environment)
         self.log_path = log
         self.ready_url = ready_url
+        self.ready_line = ready_line.encode()
         self.wanted = False
         self.starts = 0
         self._command = command
         self._process: subprocess.Popen[bytes] | None = None
         self._lock = threading.Lock()
+        self._log_begin = 0  # where the log of this start begins
 
     @property
     def running(self) -> bool:
@@ -65,6 +70,7 @@ class Service:
 
     def _start(self) -> None:
         with self.log_path.open("ab") as log:
+            self._log_begin = log.tell()
             self._process = subprocess.Popen(  # noqa: S603
                 self._command,
                 env=self.environment,
@@ -113,20 +119,19 @@ class Service:
 
     def _ready(self) -> bool:
         if self.ready_url is None:
-            return self.running
+            return self.running and self.ready_line in self._own_log()
         with contextlib.suppress(httpx2.TransportError):
             return httpx2.get(self.ready_url, timeout=5).is_success
         return False
 
     def cpu_seconds(self) -> float:
         """User and system time of the process and its children so far."""
-        total = 0.0
-        process = self.process
-        for one in (process, *process.children(recursive=True)):
-            with contextlib.suppress(psutil.NoSuchProcess):
-                times = one.cpu_times()
-                total += times.user + times.system
-        return total
+        return cpu_seconds_of(self.process.pid)
+
+    def _own_log(self) -> bytes:
+        with self.log_path.open("rb") as log:
+            log.seek(self._log_begin)
+            return log.read()
 
     def log(self) -> str:
         return self.log_path.read_text(errors="replace")[-3000:]

@@ -1,138 +1,113 @@
-"""`placewise bench`: timings of the main job, on this machine."""
+"""`placewise bench`: what this machine does, and whether it is what is wanted.
+
+The measuring programs lie in `benchmarks/` of a checkout: they start PostgreSQL, Redis and an S3
+store of their own. One that misses a wanted figure ends with exit code 1.
+"""
 
 from __future__ import annotations
 
-import contextlib
-import io
+import importlib
 import os
-import statistics
-import subprocess
-import sys
-import tempfile
-import time
-from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
-import numpy as np
 import typer
-from PIL import Image
-from rich.table import Table
 
 from services.cli.output import JsonOption, answers, explained, print_json, progress_bar
-from shared.client import Client, Json, retry_while_away
-from shared.errors import Unavailable
-from shared.home import RunningServer, running_server
+from shared.errors import Misconfigured
 
-START_SECONDS = 60.0
+app = typer.Typer(help="Measure this machine.", no_args_is_help=True)
 
-app = typer.Typer(help="Timings on this machine.", no_args_is_help=True)
+OF_DEV = ("benchmarks", "tests", "psutil", "pytest", "testcontainers")
 
 
-@app.callback()
-def _bench() -> None:
-    """A group, so that each benchmark has its own name."""
-
-
-@app.command("spine")
-def spine(
-    photos: Annotated[int, typer.Option(min=2)] = 200,
-    queries: Annotated[int, typer.Option(min=1)] = 50,
+@app.command("scaling")
+def scaling(
+    workers: Annotated[str, typer.Option(help="Numbers of extractors.")] = "1,2,4,8",
+    photos: Annotated[int, typer.Option(min=1, help="For each extractor.")] = 60,
+    milliseconds: Annotated[int, typer.Option(min=0, help="Slept for each photo.")] = 500,
+    batch: Annotated[int, typer.Option(min=1, help="Most photos in one batch.")] = 4,
     as_json: JsonOption = False,
 ) -> None:
-    """Upload, describe, search by stored photo and by new photo, on an empty embedded server.
+    """Do more extractors describe as many more photos, and none of them twice?"""
+    numbers = _numbers(workers)
+    _measure(
+        "scaling", as_json, workers=numbers, photos=photos, milliseconds=milliseconds, batch=batch
+    )
 
-    The photos are random textures of 320 x 240 pixels: timings need no places.
-    """
-    with explained(as_json), tempfile.TemporaryDirectory() as folder, progress_bar() as progress:
-        made = _make_photos(Path(folder, "photos"), photos)
-        with (
-            _server(Path(folder, "home")) as running,
-            Client(running.url, key=running.key) as client,
-        ):
-            figures = _measure(client, made, queries, progress)
+
+@app.command("pipeline")
+def pipeline(
+    widths: Annotated[str, typer.Option(help="Dimensions of the descriptors.")] = "7168,98304",
+    photos: Annotated[int, typer.Option(min=1)] = 320,
+    batch: Annotated[int, typer.Option(min=1, help="Most photos in one batch.")] = 32,
+    rounds: Annotated[int, typer.Option(min=1, help="Of uploads to either gateway.")] = 5,
+    as_json: JsonOption = False,
+) -> None:
+    """How much CPU time does a photo take around the model, and how fast are uploads?"""
+    _measure(
+        "pipeline", as_json, widths=_numbers(widths), photos=photos, batch=batch, rounds=rounds
+    )
+
+
+@app.command("query-latency")
+def query_latency(
+    backlog: Annotated[int, typer.Option(min=1, help="Uploads that wait.")] = 5000,
+    seconds: Annotated[float, typer.Option(min=1, help="How long queries are asked.")] = 60,
+    milliseconds: Annotated[int, typer.Option(min=0, help="Slept for each photo.")] = 50,
+    batch: Annotated[int, typer.Option(min=1, help="Most photos in one batch.")] = 16,
+    as_json: JsonOption = False,
+) -> None:
+    """How long does a query photo take while thousands of uploads wait?"""
+    _measure(
+        "query_latency",
+        as_json,
+        backlog=backlog,
+        seconds=seconds,
+        milliseconds=milliseconds,
+        batch=batch,
+    )
+
+
+@app.command("rolling")
+def rolling(as_json: JsonOption = False) -> None:
+    """Is a request refused or a job lost while every service is restarted, one after the other?"""
+    _measure("rolling", as_json)
+
+
+def _measure(name: str, as_json: bool, **options: Any) -> None:
+    # As the command does before torch is loaded; see services/cli/__init__.py.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    with explained(as_json):
+        program = _program(name)
+        with progress_bar() as progress:
+            report = program.measure(progress, **options)
     if as_json:
-        print_json(figures)
-        return
-    table = Table("what", "median", "p95", "rate")
-    for name, value in figures["timings"].items():
-        table.add_row(
-            name,
-            f"{value['median_ms']:.1f} ms",
-            f"{value['p95_ms']:.1f} ms",
-            f"{value['per_second']:.1f} /s",
-        )
-    answers.print(table)
-    answers.print(f"{photos} photos, searchable {figures['searchable_after_seconds']:.1f} s in all")
+        print_json(report.as_json())
+    else:
+        answers.print(report.table())
+    if report.missed:
+        raise typer.Exit(1)
 
 
-@contextlib.contextmanager
-def _server(home: Path) -> Iterator[RunningServer]:
-    """A server in a process of its own: in ours it would share the interpreter with the client."""
-    command = [str(Path(sys.executable).with_name("placewise")), "serve"]
-    environment = {**os.environ, "PLACEWISE_HOME": str(home), "HOST": "127.0.0.1", "PORT": "0"}
-    with subprocess.Popen(command, env=environment, stderr=subprocess.DEVNULL) as server:  # noqa: S603
-        try:
-            deadline = time.monotonic() + START_SECONDS
-            while (running := running_server(home)) is None:
-                if server.poll() is not None or time.monotonic() > deadline:
-                    raise Unavailable("server_unreachable", "The server did not start.")
-                time.sleep(0.1)
-            retry_while_away(lambda: Client(running.url, key=running.key).stats(), START_SECONDS)
-            yield running
-        finally:
-            server.terminate()
+def _program(name: str) -> Any:
+    """The module `benchmarks.NAME`. Misconfigured (`no_benchmarks`) where it can't be loaded."""
+    try:
+        return importlib.import_module(f"benchmarks.{name}")
+    except ModuleNotFoundError as error:
+        if (error.name or "").partition(".")[0] not in OF_DEV:
+            raise
+        raise Misconfigured(
+            "no_benchmarks",
+            f"`placewise bench {name}` needs a checkout of Placewise with the dev extra: {error}. "
+            "In the checkout: make setup, then .venv/bin/placewise bench.",
+        ) from error
 
 
-def _measure(client: Client, photos: list[Path], queries: int, progress) -> Json:  # type: ignore[no-untyped-def]
-    bar = progress.add_task("photos", total=len(photos) + 2 * queries)
-
-    def timed(call) -> tuple[float, Json]:  # type: ignore[no-untyped-def]
-        started = time.perf_counter()
-        answer = call()
-        progress.advance(bar)
-        return time.perf_counter() - started, answer
-
-    begun = time.perf_counter()
-    with ThreadPoolExecutor(4) as pool:
-        uploads = list(pool.map(lambda photo: timed(lambda: client.upload(photo)), photos))
-    uploaded = time.perf_counter() - begun
-    for _, answer in uploads:
-        client.wait_for(answer["job_id"])
-    searchable = time.perf_counter() - begun
-    stored = [
-        timed(lambda a=answer: client.similar_to(a["file_id"])) for _, answer in uploads[:queries]
-    ]
-    new = [timed(lambda p=photo: client.similar_to_file(p)) for photo in photos[:queries]]
-    return {
-        "photos": len(photos),
-        "searchable_after_seconds": searchable,
-        "timings": {
-            "upload, 4 at once": _figures([s for s, _ in uploads], uploaded),
-            "query by stored photo": _figures([s for s, _ in stored]),
-            "query by new photo": _figures([s for s, _ in new]),
-        },
-    }
-
-
-def _figures(seconds: list[float], wall_seconds: float | None = None) -> Json:
-    ordered = sorted(seconds)
-    return {
-        "median_ms": statistics.median(ordered) * 1000,
-        "p95_ms": ordered[min(len(ordered) - 1, int(0.95 * len(ordered)))] * 1000,
-        "per_second": len(ordered) / (wall_seconds or sum(ordered)),
-    }
-
-
-def _make_photos(folder: Path, count: int) -> list[Path]:
-    folder.mkdir()
-    rng = np.random.default_rng(0)
-    made = []
-    for number in range(count):
-        coarse = Image.fromarray(rng.integers(0, 256, (15, 20, 3), dtype=np.uint8))
-        buffer = io.BytesIO()
-        coarse.resize((320, 240), Image.Resampling.BICUBIC).save(buffer, "JPEG", quality=90)
-        made.append(folder / f"{number:05d}.jpg")
-        made[-1].write_bytes(buffer.getvalue())
-    return made
+def _numbers(text: str) -> list[int]:
+    try:
+        found = sorted({int(part) for part in text.split(",")})
+    except ValueError:
+        raise typer.BadParameter(f"{text!r} is no list such as 1,2,4") from None
+    if found[0] < 1:
+        raise typer.BadParameter("numbers from 1 up")
+    return found

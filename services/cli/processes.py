@@ -44,8 +44,12 @@ def gateway() -> None:
             with catalog.write() as session:
                 ensure_default_map(session, settings.new_map_extractor)
             store = open_store(settings, alone=False)
-            app = create_app(Gateway(catalog, store, hints, search, settings, keys))
-            server = http_server(app, access_log=settings.debug)
+            context = Gateway(catalog, store, hints, search, settings, keys)
+            server = http_server(
+                create_app(context),
+                access_log=settings.debug,
+                on_stop=context.job_watch.end_soon,
+            )
             messages.print(f"Placewise gateway serves {url}", soft_wrap=True)
             with stopped_by_signals(server):
                 server.run(sockets=[listener])
@@ -56,7 +60,12 @@ def extractor() -> None:
     with _service() as (settings, catalog):
         from services.extractor.service import serve_extractor  # brings torch
 
-        serve_extractor(catalog, open_store(settings, alone=False), settings)
+        serve_extractor(
+            catalog,
+            open_store(settings, alone=False),
+            settings,
+            lambda: messages.print("Placewise extractor is at work"),
+        )
 
 
 def steward() -> None:

@@ -17,7 +17,7 @@ from shared.catalog.session import Catalog
 from shared.errors import NotFound, PlacewiseError
 from shared.jobs import Job, JobKind
 from shared.objects import ObjectStore
-from shared.objects.keys import query_key
+from shared.objects.keys import query_key, thumbnail_key
 from shared.vision.decode import Decoded
 
 
@@ -59,7 +59,7 @@ def prepare(
     jobs: list[Job],
     target: Target,
 ) -> Batch:
-    """Read and decode the photos of the claimed jobs."""
+    """Read and decode the photos of the claimed jobs, and store their thumbnails."""
     batch = Batch(jobs=jobs, target=target)
     started = time.perf_counter()
     keys = _object_keys(catalog, jobs)
@@ -85,7 +85,19 @@ def prepare(
             batch.ready.append(job)
             batch.decoded.append(outcome)
     batch.seconds["decode"] = time.perf_counter() - started
+
+    if batch.kind == JobKind.INDEX:
+        # Here and not with the chunk: the model is busy with the batch before.
+        started = time.perf_counter()
+        for job, decoded in zip(batch.ready, batch.decoded, strict=True):
+            store.put(thumbnail_key(photo_of(job)), decoded.thumbnail)
+        batch.seconds["thumbnails"] = time.perf_counter() - started
     return batch
+
+
+def photo_of(job: Job) -> UUID:
+    assert job.photo_id is not None, "index and reindex jobs name a photo"
+    return job.photo_id
 
 
 def _object_keys(catalog: Catalog, jobs: list[Job]) -> dict[UUID, str]:

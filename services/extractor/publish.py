@@ -14,7 +14,7 @@ import numpy as np
 from sqlalchemy import insert, select
 from sqlalchemy.orm import Session
 
-from services.extractor.prepare import Batch
+from services.extractor.prepare import Batch, photo_of
 from shared.catalog.chunks import Chunk, Descriptor, take_slot
 from shared.catalog.generations import GenerationState, lock_generation
 from shared.catalog.maps import bump_version, lock_map
@@ -22,11 +22,11 @@ from shared.catalog.photos import live_photos
 from shared.catalog.session import Catalog
 from shared.chunks import Rows, encode_rows, write_chunk
 from shared.ids import new_id
-from shared.jobs import Job, JobKind
+from shared.jobs import JobKind
 from shared.jobs.finish import cancel, fail, release, succeed
 from shared.jobs.leases import held
 from shared.objects import ObjectStore
-from shared.objects.keys import query_vector_key, thumbnail_key
+from shared.objects.keys import query_vector_key
 
 
 @dataclass(slots=True)
@@ -57,15 +57,12 @@ def _publish_photos(
     chunk_id = new_id()
     written = None
     if len(rows):
-        if batch.kind == JobKind.INDEX:
-            for job, decoded in zip(batch.ready, batch.decoded, strict=True):
-                store.put(thumbnail_key(_photo_id(job)), decoded.thumbnail)
         written = write_chunk(
             store,
             generation_id=generation_id,
             chunk_id=chunk_id,
             rows=rows,
-            photo_ids=[_photo_id(job) for job in batch.ready],
+            photo_ids=[photo_of(job) for job in batch.ready],
             spec=batch.target.generation.spec,
         )
     outcome = Published()
@@ -78,7 +75,7 @@ def _publish_photos(
             for job in mine.values():
                 cancel(job) if batch.kind == JobKind.REINDEX else release(job)
             return outcome
-        live = live_photos(session, [_photo_id(job) for job in mine.values()])
+        live = live_photos(session, [photo_of(job) for job in mine.values()])
         done = _described(session, generation_id, list(live))
         for job in mine.values():
             if job.photo_id not in live:
@@ -156,8 +153,3 @@ def _described(session: Session, generation_id: UUID, photo_ids: list[UUID]) -> 
             )
         )
     )
-
-
-def _photo_id(job: Job) -> UUID:
-    assert job.photo_id is not None, "index and reindex jobs name a photo"
-    return job.photo_id

@@ -10,6 +10,7 @@ import logging
 import os
 import socket
 import threading
+from collections.abc import Callable
 from typing import Any
 
 from celery import signals
@@ -25,8 +26,16 @@ from shared.settings import Settings
 log = logging.getLogger(__name__)
 
 
-def serve_extractor(catalog: Catalog, store: ObjectStore, settings: Settings) -> None:
-    """Work until SIGTERM. What is claimed then goes back to the queue, unharmed."""
+def serve_extractor(
+    catalog: Catalog,
+    store: ObjectStore,
+    settings: Settings,
+    on_ready: Callable[[], object] = lambda: None,
+) -> None:
+    """Work until SIGTERM. What is claimed then goes back to the queue, unharmed.
+
+    `on_ready` is called when the model is loaded and hints are listened for.
+    """
     app = make_celery(settings)
     hints = CeleryHints(app, settings)
     name = f"extractor-{socket.gethostname()}-{os.getpid()}"
@@ -46,7 +55,11 @@ def serve_extractor(catalog: Catalog, store: ObjectStore, settings: Settings) ->
     def on_shutdown(**_: object) -> None:
         stop.set()
 
+    def on_worker_ready(**_: object) -> None:
+        on_ready()
+
     signals.worker_shutting_down.connect(on_shutdown, weak=False)
+    signals.worker_ready.connect(on_worker_ready, weak=False)
     try:
         worker.warm_up()
         for lane in Lane:
@@ -65,6 +78,7 @@ def serve_extractor(catalog: Catalog, store: ObjectStore, settings: Settings) ->
         )
     finally:
         signals.worker_shutting_down.disconnect(on_shutdown)
+        signals.worker_ready.disconnect(on_worker_ready)
         stop.set()
         worker.close()
         hints.close()

@@ -106,7 +106,8 @@ class ExtractorWorker:
         self._models = LoadedModels(store, settings)
         self._decoders = DecoderPool(settings)
         self._changes = ModelChanges(catalog, store, self._models, self._decoders, settings)
-        self._ahead = ThreadPoolExecutor(max_workers=1, thread_name_prefix="prepare")
+        # Two: a query's photo does not wait until those of the next batch are read.
+        self._ahead = ThreadPoolExecutor(max_workers=2, thread_name_prefix="prepare")
 
     def warm_up(self) -> None:
         """Load the extractor of new maps, so that the first photo does not wait for it."""

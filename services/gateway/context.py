@@ -10,6 +10,7 @@ from uuid import UUID
 from fastapi import Depends, Query, Request
 from pydantic import BeforeValidator
 
+from services.gateway.job_watch import JobWatch
 from services.gateway.keys import Keys
 from shared.catalog.maps import DEFAULT_MAP
 from shared.catalog.session import Catalog
@@ -34,6 +35,10 @@ class Gateway:
     settings: Settings
     keys: Keys
     started: float = field(default_factory=time.monotonic)
+    job_watch: JobWatch = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "job_watch", JobWatch(self.catalog))
 
 
 def get_gateway(request: Request) -> Gateway:

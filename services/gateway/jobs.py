@@ -14,7 +14,7 @@ from starlette.concurrency import run_in_threadpool
 
 from services.gateway.context import DEFAULT_MAP, Gateway, GatewayDep, JobId, MapName, read_cursor
 from services.gateway.schemas import JobAnswer, JobsAnswer
-from services.gateway.waiting import SLOWEST_LOOK_SECONDS, read_job, wait_for_job
+from services.gateway.waiting import read_job, wait_for_job
 from shared.catalog.maps import get_map
 from shared.jobs import Job, JobKind, JobState
 from shared.jobs.finish import cancel, retry
@@ -24,6 +24,7 @@ from shared.jobs.table import MODEL_CHANGES, UNFINISHED, get_job, list_jobs
 
 router = APIRouter(tags=["jobs"])
 
+LOOK_SECONDS = 0.25  # of a stream of events
 HEARTBEAT_SECONDS = 15.0  # a comment line, so that proxies keep a silent stream open
 
 
@@ -132,4 +133,4 @@ async def _events(request: Request, gateway: Gateway, job_id: UUID) -> AsyncIter
         if time.monotonic() - spoken > HEARTBEAT_SECONDS:
             spoken = time.monotonic()
             yield ": still here\n\n"
-        await asyncio.sleep(SLOWEST_LOOK_SECONDS)
+        await asyncio.sleep(LOOK_SECONDS)

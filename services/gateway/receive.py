@@ -7,10 +7,11 @@ photo, is refused as soon as that is seen, without reading the rest.
 from __future__ import annotations
 
 import hashlib
+import io
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import PurePosixPath, PureWindowsPath
-from typing import Any
+from typing import Any, BinaryIO
 
 from fastapi import Request
 from python_multipart.exceptions import MultipartParseError
@@ -25,6 +26,8 @@ FILE_FIELD = "file"
 MAX_FIELDS_BYTES = 256 * 1024  # all text fields together
 # What a body may hold beside the file: boundaries, part headers and the text fields.
 OVERHEAD_BYTES = MAX_FIELDS_BYTES + 64 * 1024
+# What is handed to the store at once: each time costs a change of thread.
+WRITE_BYTES = 512 * 1024
 
 
 @dataclass(slots=True)
@@ -38,6 +41,12 @@ class Received:
     begin: bytes
     """The file's first bytes, as many as tell its format."""
     fields: dict[str, str] = field(default_factory=dict)
+    whole: bytes | None = None
+    """All of its bytes where they are few (WRITE_BYTES)."""
+
+    def open(self, store: ObjectStore) -> BinaryIO:
+        """The file, from memory or from the store."""
+        return store.open(self.key) if self.whole is None else io.BytesIO(self.whole)
 
 
 async def receive_file(
@@ -61,17 +70,20 @@ async def receive_file(
     try:
         async for piece in request.stream():
             form.feed(piece)
-            if data := form.take():
+            if form.pending_bytes >= WRITE_BYTES:
                 if writer is None:
                     writer = await run_in_threadpool(store.writer, key)
-                await run_in_threadpool(writer.write, data)
+                await run_in_threadpool(writer.write, form.take())
         form.finish()
-        if writer is None:
+        rest = form.take()
+        whole = rest if writer is None else None
+        if whole == b"":
             raise InvalidRequest("empty_file", f"The file in the field {FILE_FIELD!r} is empty.")
-        await run_in_threadpool(writer.commit)
-    finally:
+        await run_in_threadpool(_finish, store, key, writer, rest)
+    except BaseException:
         if writer is not None:
             await run_in_threadpool(writer.abort)
+        raise
     return Received(
         key=key,
         filename=form.filename,
@@ -79,7 +91,17 @@ async def receive_file(
         sha256=form.hash.hexdigest(),
         begin=form.begin,
         fields=form.fields,
+        whole=whole,
     )
+
+
+def _finish(store: ObjectStore, key: str, writer: ObjectWriter | None, rest: bytes) -> None:
+    """Write what is left, and make the object visible."""
+    if writer is None:
+        store.put(key, rest)
+        return
+    writer.write(rest)
+    writer.commit()
 
 
 def describe_form(file: str, **fields: dict[str, Any]) -> dict[str, Any]:
@@ -120,6 +142,7 @@ class _Form:
         self._check_begin = check_begin
         self._checked = False
         self._file_seen = False
+        self.pending_bytes = 0
         self._pending: list[bytes] = []
         self._body_bytes = 0
         self._fields_bytes = 0
@@ -157,6 +180,7 @@ class _Form:
         """The file's bytes since the last call."""
         data = b"".join(self._pending)
         self._pending.clear()
+        self.pending_bytes = 0
         return data
 
     def finish(self) -> None:
@@ -220,6 +244,7 @@ class _Form:
             self._check()
         self.hash.update(piece)
         self._pending.append(piece)
+        self.pending_bytes += len(piece)
 
     def _on_part_end(self) -> None:
         if self._field is not None:

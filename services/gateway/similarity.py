@@ -138,7 +138,7 @@ def _queue(
         check_photo_begin(received.begin)
         for name in received.fields:
             raise invalid_field(name, "is unknown here; filters belong into the address")
-        with gateway.store.open(received.key) as file:
+        with received.open(gateway.store) as file:
             read_photo_header(file, gateway.settings.max_image_pixels)
         with gateway.catalog.write() as session:
             job = Job(

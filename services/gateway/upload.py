@@ -109,7 +109,7 @@ def _store(gateway: Gateway, map_name: str, received: Received) -> Stored:
     try:
         media_type = check_photo_begin(received.begin)
         fields = read_form_fields(received.fields)
-        with gateway.store.open(received.key) as file:
+        with received.open(gateway.store) as file:
             header = read_photo_header(file, gateway.settings.max_image_pixels)
         incoming = Incoming(received, media_type, header, fields)
         stored = store_photo(gateway, map_name, incoming)

@@ -54,6 +54,7 @@ def make_celery(settings: Settings) -> Celery:
         worker_soft_shutdown_timeout=settings.drain_seconds,
         worker_enable_soft_shutdown_on_idle=True,
         worker_hijack_root_logger=False,
+        worker_redirect_stdouts=False,
         broker_connection_retry_on_startup=True,
         broker_connection_max_retries=None,
         broker_connection_timeout=BROKER_TIMEOUT_SECONDS,

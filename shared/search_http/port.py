@@ -113,7 +113,9 @@ class HttpSearch:
                 try:
                     return ask(self._http, url, request, seconds)
                 except WorkerAway as error:
-                    log.debug("%s: %s", shard.name, error)
+                    log.info(
+                        "a call for %s failed, the next worker is asked: %s", shard.name, error
+                    )
                     self._workers.failed(url)
                 except Unavailable as error:
                     log.debug("%s: %s: %s", shard.name, url, error.detail)

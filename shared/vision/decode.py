@@ -92,7 +92,8 @@ def _to_rgb(image: Image.Image) -> Image.Image:
 
 def _thumbnail(rgb: Image.Image) -> bytes:
     small = rgb.copy()
-    small.thumbnail((THUMBNAIL_PIXELS, THUMBNAIL_PIXELS))
+    # Averaged over whole pixels first: a fifth of the time, and no one sees it at this size.
+    small.thumbnail((THUMBNAIL_PIXELS, THUMBNAIL_PIXELS), reducing_gap=1.0)
     small.info.clear()  # what the camera wrote (where, when, whose) stays with the original
     buffer = io.BytesIO()
     small.save(buffer, "JPEG", quality=85)

@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 from torch.nn.functional import normalize
 
 from shared.errors import Misconfigured
-from shared.recipes import Recipe
+from shared.recipes import SLOW, Recipe
 from shared.vision.backbones import Backbone
 from shared.vision.backbones.dinov2 import SHAPES, Dinov2
 from shared.vision.backbones.efficientnet_lite0 import EfficientNetLite0
+from shared.vision.backbones.slow import SlowBackbone
 from shared.vision.backbones.tiny import TinyBackbone
 from shared.vision.decode import DECODER
 from shared.vision.preprocessing import Preprocessing, get_preprocessing
@@ -36,6 +37,9 @@ def _dinov2(recipe: Recipe, device: torch.device, weights: Path | None) -> Backb
 
 BACKBONES: dict[str, Callable[[Recipe, torch.device, Path | None], Backbone]] = {
     "efficientnet-lite0": lambda _recipe, device, _weights: EfficientNetLite0(device),
+    SLOW: lambda recipe, device, _weights: SlowBackbone(
+        recipe.width, recipe.milliseconds / 1000, device
+    ),
     "test-tiny": lambda _recipe, device, _weights: TinyBackbone(device),
     **{f"dinov2-{size}": _dinov2 for size in SHAPES},
 }

@@ -14,6 +14,7 @@ from starlette.types import Message
 from services.gateway.receive import (
     MAX_FIELDS_BYTES,
     OVERHEAD_BYTES,
+    WRITE_BYTES,
     Received,
     check_photo_begin,
     receive_file,
@@ -106,6 +107,20 @@ def assert_nothing_left(store: FolderStore) -> None:
     assert [path for path in Path(store.root).rglob("*") if path.is_file()] == []
 
 
+@pytest.mark.parametrize("beyond", [-1, 0, 1, 2 * WRITE_BYTES + 1])
+@pytest.mark.parametrize("piece", [65_536, 10**9])
+def test_file_of_any_size_is_stored_and_opened_whole(
+    store: FolderStore, beyond: int, piece: int
+) -> None:
+    data = (PHOTO + bytes(range(256)) * 10_000)[: WRITE_BYTES + beyond]
+    received = receive(store, Body(in_pieces(file(data) + END, piece)), max_bytes=10 * WRITE_BYTES)
+    assert store.get(KEY) == data
+    assert received.sha256 == hashlib.sha256(data).hexdigest()
+    with received.open(store) as opened:
+        assert opened.read() == data
+    assert (received.whole is None) == (beyond >= 0), "no more of it is kept in memory"
+
+
 @pytest.mark.parametrize("size", [1, 2, 3, 7, 64, 1000, 10**9])
 def test_pieces_of_any_size_give_the_same_file_and_fields(store: FolderStore, size: int) -> None:
     body = field("latitude", "45.07") + file() + field("place", "Café") + field("tags", "") + END
@@ -118,6 +133,7 @@ def test_pieces_of_any_size_give_the_same_file_and_fields(store: FolderStore, si
         sha256=hashlib.sha256(PHOTO).hexdigest(),
         begin=PHOTO[:16],
         fields={"latitude": "45.07", "place": "Café", "tags": ""},
+        whole=PHOTO,
     )
 
 

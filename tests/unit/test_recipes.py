@@ -23,7 +23,7 @@ def refusal(name: str, code: str) -> str:
     return caught.value.detail
 
 
-@pytest.mark.parametrize("name", ["test-tiny-avg", "test-tiny-vlad"])
+@pytest.mark.parametrize("name", ["test-tiny-avg", "test-tiny-vlad", "test-slow-avg"])
 def test_test_extractors_are_refused_unless_allowed(name: str) -> None:
     assert "ALLOW_TEST_EXTRACTORS" in refusal(name, "test_extractor")
     refusal(f"{name}:clusters=3", "test_extractor")
@@ -114,6 +114,21 @@ def test_bad_options_are_named_with_what_is_allowed(name: str, said: list[str]) 
 def test_an_extractor_without_a_vocabulary_has_no_clusters() -> None:
     with pytest.raises(Misconfigured, match=r"no option 'clusters'.*It has none"):
         get_recipe("test-tiny-avg:clusters=3", allow_test_extractors=True)
+
+
+def test_slow_extractor_takes_its_time_and_width_from_its_name() -> None:
+    found = get_recipe("test-slow-avg:width=98304,milliseconds=500", allow_test_extractors=True)
+    assert found.name == "test-slow-avg:milliseconds=500,width=98304"
+    assert (found.milliseconds, found.dimension) == (500, 98_304)
+    for other in ("test-slow-avg", "test-slow-avg:width=98304", "test-slow-avg:milliseconds=500"):
+        recipe = get_recipe(other, allow_test_extractors=True)
+        assert recipe.local_features != found.local_features
+
+
+@pytest.mark.parametrize("option", ["width=15", "width=131073", "milliseconds=60001"])
+def test_slow_extractor_says_what_it_can_do(option: str) -> None:
+    with pytest.raises(Misconfigured, match="a whole number from"):
+        get_recipe(f"test-slow-avg:{option}", allow_test_extractors=True)
 
 
 def test_shipped_vocabulary_begins_a_map_whatever_number_later_fits_make() -> None:

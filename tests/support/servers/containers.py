@@ -72,6 +72,10 @@ class Container:
     def resume(self) -> None:
         self._container.unpause()
 
+    def cpu_seconds(self) -> float:
+        used: int = self._container.stats(stream=False)["cpu_stats"]["cpu_usage"]["total_usage"]
+        return used / 1e9
+
     def close(self) -> None:
         self._close()
 

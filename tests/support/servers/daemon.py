@@ -62,6 +62,17 @@ def as_nobody() -> list[str]:
     return [*setpriv, "--inh-caps=+dac_override", "--ambient-caps=+dac_override"]
 
 
+def cpu_seconds_of(pid: int) -> float:
+    """User and system time so far of a process, its children, and those of them that have ended."""
+    total = 0.0
+    first = psutil.Process(pid)
+    for one in (first, *first.children(recursive=True)):
+        with contextlib.suppress(psutil.NoSuchProcess):
+            times = one.cpu_times()
+            total += times.user + times.system + times.children_user + times.children_system
+    return total
+
+
 @dataclass
 class Daemon:
     """One server. `folder` is its own, and goes with it."""
@@ -121,6 +132,9 @@ class Daemon:
     def resume(self) -> None:
         for process in self._family():
             process.resume()
+
+    def cpu_seconds(self) -> float:
+        return cpu_seconds_of(self._running().pid)
 
     def close(self) -> None:
         if self._process is not None:

@@ -24,6 +24,9 @@ class Handle(Protocol):
 
     def resume(self) -> None: ...
 
+    def cpu_seconds(self) -> float:
+        """User and system time so far, of all its processes."""
+
     def close(self) -> None:
         """End it for good, and remove its data."""
 

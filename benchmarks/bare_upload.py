@@ -1,0 +1,42 @@
+"""The least that an upload can be: a form's file, into the S3 store, an answer.
+
+    python -m benchmarks.bare_upload PORT    (with the S3_ settings in the environment)
+
+What `bench pipeline` compares the gateway with. Nothing is checked, counted, hashed or remembered.
+"""
+
+from __future__ import annotations
+
+import io
+import sys
+
+import uvicorn
+from fastapi import FastAPI, UploadFile
+from starlette.concurrency import run_in_threadpool
+
+from shared.ids import new_id
+from shared.objects.s3 import Bucket
+from shared.settings import Settings
+
+
+def create_app(bucket: Bucket) -> FastAPI:
+    app = FastAPI()
+
+    @app.post("/upload")
+    async def upload(file: UploadFile) -> dict[str, str]:
+        data = await file.read()
+        key = f"bare/{new_id()}"
+        await run_in_threadpool(
+            bucket.client.put_object, bucket.name, key, io.BytesIO(data), len(data)
+        )
+        return {"key": key}
+
+    @app.get("/readyz")
+    async def readyz() -> dict[str, str]:
+        return {"status": "ready"}
+
+    return app
+
+
+if __name__ == "__main__":
+    uvicorn.run(create_app(Bucket.of(Settings())), port=int(sys.argv[1]), log_level="warning")

@@ -1,0 +1,194 @@
+"""What everything around the model costs: CPU time of a photo from its upload until it is found.
+
+And how many uploads a gateway takes beside a bare FastAPI that only stores the file.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import statistics
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from sqlalchemy import select
+
+from benchmarks.described import wait_for_jobs
+from benchmarks.fleet import Fleet, Servers, Service, start_servers
+from benchmarks.report import Report
+from benchmarks.traffic import form_of, photos_of, upload_all
+from shared.catalog.maps import Map
+from shared.recipes import get_recipe
+from shared.search_http import HttpSearch
+from shared.vision.extractors import Extractor
+from tests.support.servers.daemon import free_ports
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
+
+WANTED_MILLISECONDS = 30.0
+WANTED_OF_BARE = 0.5
+SIZE, SIZE_BYTES = (1024, 768), 100_000
+TEXTURES = 32
+CLIENTS = 4
+SECONDS = 900.0
+SERVICES = ("gateway", "extractor", "search", "steward")
+
+
+def measure(
+    progress: Progress, *, widths: Sequence[int], photos: int, batch: int, rounds: int
+) -> Report:
+    """`photos` of 100 kB at each width of descriptors, `batch` at once; then `rounds` of uploads
+    to the gateway and to the bare one in turn."""
+    report = Report("Around the model, for each photo")
+    made = photos_of(TEXTURES, SIZE, SIZE_BYTES)
+    with start_servers() as servers:
+        for width in widths:
+            with _fleet(servers, width, batch) as fleet:
+                fleet.start()
+                bar = progress.add_task(f"{width:,} dimensions", total=photos)
+                _cpu(report, fleet, made, width, photos, batch, progress, bar)
+        with _fleet(servers, widths[0], batch) as fleet:
+            bar = progress.add_task("gateway beside a bare one", total=2 * rounds * photos)
+            fleet.start("search-0-0", "gateway-0")
+            _uploads(report, fleet, made, photos, rounds, lambda: progress.advance(bar))
+    report.details = {
+        "photo_bytes": statistics.mean(len(photo) for photo in made),
+        "photos": photos,
+        "batch": batch,
+    }
+    return report
+
+
+@contextlib.contextmanager
+def _fleet(servers: Servers, width: int, batch: int) -> Iterator[Fleet]:
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        Fleet(
+            Path(folder),
+            servers,
+            extractor=_recipe(width),
+            batch_photos=batch,
+        ) as fleet,
+    ):
+        yield fleet
+
+
+def _recipe(width: int) -> str:
+    return f"test-slow-avg:milliseconds=0,width={width}"
+
+
+def _cpu(
+    report: Report,
+    fleet: Fleet,
+    made: Sequence[bytes],
+    width: int,
+    photos: int,
+    batch: int,
+    progress: Progress,
+    bar: object,
+) -> None:
+    _index(fleet, made, 2 * batch, lambda left: None)  # models, decoders, connections
+    before, servers_before = fleet.cpu_seconds(), fleet.server_cpu_seconds()
+    _index(fleet, made, photos, lambda left: progress.update(bar, completed=photos - left))  # type: ignore[arg-type]
+    after, servers_after = fleet.cpu_seconds(), fleet.server_cpu_seconds()
+    assert not fleet.fell, fleet.logs()
+    ours = {
+        service: sum(
+            1000 * (after[name] - before[name]) / photos
+            for name in after
+            if name.startswith(service)
+        )
+        for service in SERVICES
+    }
+    model = _model_milliseconds(width, batch)
+    ours["extractor"] -= model
+    at = f"at {width:,} dimensions"
+    for service, milliseconds in ours.items():
+        report.add(f"{service} {at}", milliseconds, "ms")
+    report.add(f"ours {at}", sum(ours.values()), "ms", at_most=WANTED_MILLISECONDS)
+    report.add(f"(the model's own, taken off) {at}", model, "ms")
+    for name, seconds in servers_after.items():
+        used = 1000 * (seconds - servers_before[name]) / photos
+        report.add(f"{name} {at}", used, "ms")
+
+
+def _index(fleet: Fleet, made: Sequence[bytes], photos: int, on_left: object) -> None:
+    """Upload, and wait until all of it can be found."""
+    forms = [form_of(made[number % len(made)]) for number in range(photos)]
+    upload_all(fleet.gateway_urls[0], forms, CLIENTS)
+    wait_for_jobs(fleet.catalog, SECONDS, on_left)  # type: ignore[arg-type]
+    with fleet.catalog.read() as session:
+        wanted = session.scalars(select(Map.version)).one()
+    with HttpSearch(fleet.search_urls, timeout_seconds=10) as search:
+        while min(search.status().versions.values(), default=0) < wanted:
+            time.sleep(0.2)
+
+
+def _model_milliseconds(width: int, batch: int) -> float:
+    """CPU time that the backbone itself takes of a photo: it only picks pixels, but not for
+    nothing."""
+    recipe = get_recipe(_recipe(width), allow_test_extractors=True)
+    extractor = Extractor(recipe, torch.device("cpu"))
+    pixels = np.zeros((batch, 224, 224, 3), np.uint8)
+    extractor.describe(pixels, None)
+    begun = time.process_time()
+    for _ in range(10):
+        extractor.describe(pixels, None)
+    return 1000 * (time.process_time() - begun) / 10 / batch
+
+
+def _uploads(
+    report: Report,
+    fleet: Fleet,
+    made: Sequence[bytes],
+    photos: int,
+    rounds: int,
+    on_done: object,
+) -> None:
+    """No extractor runs: each server has the machine, the store and the clients to itself."""
+    rates: dict[str, list[float]] = {"gateway": [], "bare": []}
+    with _bare(fleet) as bare:
+        targets = {
+            "gateway": (fleet.gateway_urls[0], "/api/v1/upload"),
+            "bare": (bare, "/upload"),
+        }
+        for url, path in targets.values():
+            upload_all(url, [form_of(made[0]) for _ in range(20)], CLIENTS, path=path)
+        for _ in range(rounds):
+            for name, (url, path) in targets.items():
+                forms = [form_of(made[number % len(made)]) for number in range(photos)]
+                begun = time.perf_counter()
+                upload_all(url, forms, CLIENTS, path=path, on_done=on_done)  # type: ignore[arg-type]
+                rates[name].append(photos / (time.perf_counter() - begun))
+    for name, found in rates.items():
+        report.add(
+            f"uploads to the {name} server" if name == "bare" else f"uploads to the {name}",
+            statistics.median(found),
+            "/s",
+        )
+    ratios = [ours / theirs for ours, theirs in zip(rates["gateway"], rates["bare"], strict=True)]
+    report.add("gateway, of bare", statistics.median(ratios), at_least=WANTED_OF_BARE)
+
+
+@contextlib.contextmanager
+def _bare(fleet: Fleet) -> Iterator[str]:
+    port = free_ports(1)[0]
+    service = Service(
+        "bare",
+        [sys.executable, "-m", "benchmarks.bare_upload", str(port)],
+        fleet["gateway-0"].environment | {"PYTHONPATH": str(Path(__file__).parents[1])},
+        fleet["gateway-0"].log_path.with_name("bare.log"),
+        f"http://127.0.0.1:{port}/readyz",
+    )
+    service.start()
+    try:
+        service.wait_until_ready()
+        yield f"http://127.0.0.1:{port}"
+    finally:
+        service.kill()

@@ -1,0 +1,210 @@
+"""How long does a query photo take while thousands of uploads wait to be described?
+
+A batch that is on the model can't be interrupted, so a query may wait for one; not for two.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import random
+import statistics
+import tempfile
+import time
+from collections.abc import Sequence
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING
+from uuid import UUID
+
+from sqlalchemy import func, insert, select
+
+from benchmarks.described import wait_for_jobs
+from benchmarks.fleet import Fleet, start_servers
+from benchmarks.report import Report, Spread
+from benchmarks.traffic import Caller, form_of, photos_of, upload_all
+from shared.catalog.chunks import Chunk
+from shared.catalog.photos import Photo
+from shared.ids import new_id
+from shared.jobs import Job, JobKind, JobState, Priority
+from shared.jobs.table import UNFINISHED
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
+
+WANTED_ABOVE_A_BATCH_MS = 100.0
+SIZE, SIZE_BYTES = (1024, 768), 100_000
+WIDTH = 7168
+TEXTURES = 16
+SECONDS = 120.0
+SEED = 20_261_121
+
+
+def measure(
+    progress: Progress, *, backlog: int, seconds: float, milliseconds: int, batch: int
+) -> Report:
+    """Queries one after the other at random moments for `seconds`, while of `backlog` photos
+    `batch` at once are described in `milliseconds` each."""
+    report = Report(f"Query photos while {backlog:,} uploads wait")
+    photos = photos_of(TEXTURES, SIZE, SIZE_BYTES)
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        start_servers() as servers,
+        Fleet(
+            Path(folder),
+            servers,
+            extractor=f"test-slow-avg:milliseconds={milliseconds},width={WIDTH}",
+            batch_photos=batch,
+        ) as fleet,
+        contextlib.ExitStack() as stack,
+    ):
+        fleet.start()
+        caller = stack.enter_context(Caller(fleet.gateway_urls[0]))
+        first = upload_all(caller.url, [form_of(photo) for photo in photos], 4)
+        wait_for_jobs(fleet.catalog, SECONDS)
+        _ask(caller, photos[0])  # connections, and the query's own way
+        _queue(fleet, UUID(first[0]["file_id"]), backlog)
+        begun = _wait_for_chunks(fleet, 3)
+        bar = progress.add_task("asking", total=seconds)
+        moments = random.Random(SEED)
+        pause = 2 * milliseconds * batch / 1000
+        took: list[float] = []
+        until = time.monotonic() + seconds
+        while (left := until - time.monotonic()) > 0:
+            progress.update(bar, completed=seconds - left)
+            time.sleep(moments.uniform(0, pause))
+            took.append(_ask(caller, moments.choice(photos)))
+        stages = _stages(fleet, took)
+        periods = _batch_seconds(fleet, begun, batch)
+        report.add("uploads still waiting at the end", _waiting(fleet), at_least=1)
+        report.add("services that fell", len(fleet.fell), at_most=0)
+    spread, batch_ms = Spread.of(took), 1000 * statistics.median(periods)
+    report.add("queries", len(took))
+    report.add("a batch, median", batch_ms, "ms")
+    report.add("query, median", 1000 * spread.median, "ms")
+    report.add("query, p95", 1000 * spread.p95, "ms")
+    report.add(
+        "query, worst", 1000 * spread.worst, "ms", at_most=batch_ms + WANTED_ABOVE_A_BATCH_MS
+    )
+    for stage, found in stages.items():
+        spread = Spread.of(found)
+        report.add(f"{stage}, median", 1000 * spread.median, "ms")
+        report.add(f"{stage}, worst", 1000 * spread.worst, "ms")
+    report.details = {"seconds": took, "stages": stages, "batch_seconds": periods}
+    return report
+
+
+def _ask(caller: Caller, photo: bytes) -> float:
+    """Seconds until the answer; AssertionError where there is none."""
+    form = form_of(photo)
+    begun = time.perf_counter()
+    answer = caller.post_form("/api/v1/similarity?top_k=1", form, Prefer="wait=30")
+    took = time.perf_counter() - begun
+    assert answer.status == 200, answer.body
+    return took
+
+
+def _queue(fleet: Fleet, photo_id: UUID, count: int) -> None:
+    """Photos that were uploaded, all with the bytes of one: sending thousands takes long and shows
+    nothing more."""
+    with fleet.catalog.write() as session:
+        known = session.get_one(Photo, photo_id)
+        shared = {
+            column: getattr(known, column)
+            for column in ("map_id", "object_key", "filename", "media_type", "size_bytes")
+        }
+        ids = [(new_id(), new_id()) for _ in range(count)]
+        session.execute(
+            insert(Photo),
+            [
+                {
+                    **shared,
+                    "id": photo,
+                    "job_id": job,
+                    "sha256": f"{number:064d}",
+                    "width": SIZE[0],
+                    "height": SIZE[1],
+                }
+                for number, (photo, job) in enumerate(ids)
+            ],
+        )
+        session.execute(
+            insert(Job),
+            [
+                {
+                    "id": job,
+                    "map_id": known.map_id,
+                    "kind": JobKind.INDEX,
+                    "priority": Priority.UPLOAD,
+                    "photo_id": photo,
+                }
+                for photo, job in ids
+            ],
+        )
+
+
+def _wait_for_chunks(fleet: Fleet, count: int) -> datetime:
+    """Until the extractor is in its stride; the database's time then."""
+    deadline = time.monotonic() + SECONDS
+    with fleet.catalog.read() as session:
+        before = session.scalar(select(func.count()).select_from(Chunk)) or 0
+    while True:
+        with fleet.catalog.read() as session:
+            chunks = session.scalar(select(func.count()).select_from(Chunk)) or 0
+            newest = session.scalars(select(Chunk.created_at).order_by(Chunk.id.desc())).first()
+        if chunks >= before + count and newest is not None:
+            return newest
+        assert time.monotonic() < deadline, f"no batch is described: {fleet.logs()}"
+        time.sleep(0.1)
+
+
+def _batch_seconds(fleet: Fleet, begun: datetime, batch: int) -> list[float]:
+    """Time from one batch's commit to the next, where no query came between."""
+    with fleet.catalog.read() as session:
+        commits = session.scalars(
+            select(Chunk.created_at)
+            .where(Chunk.created_at >= begun, Chunk.rows == batch)  # the steward's have more
+            .order_by(Chunk.created_at)
+        ).all()
+        queries = session.scalars(
+            select(Job.finished_at).where(
+                Job.kind == JobKind.DESCRIBE, Job.state == JobState.SUCCEEDED
+            )
+        ).all()
+    found = [
+        (after - before).total_seconds()
+        for before, after in itertools.pairwise(commits)
+        if not any(at is not None and before < at < after for at in queries)
+    ]
+    assert found, "no batch came without a query between: ask less often"
+    return found
+
+
+def _stages(fleet: Fleet, took: Sequence[float]) -> dict[str, list[float]]:
+    """Where the time of each query went, by the job table."""
+    with fleet.catalog.read() as session:
+        jobs = session.scalars(
+            select(Job).where(Job.kind == JobKind.DESCRIBE).order_by(Job.id.desc()).limit(len(took))
+        ).all()
+    found: dict[str, list[float]] = {"waiting for a worker": [], "at the worker": [], "around": []}
+    for job, seconds in zip(reversed(jobs), took, strict=True):
+        assert job.started_at is not None
+        assert job.finished_at is not None
+        waited = (job.started_at - job.created_at).total_seconds()
+        worked = (job.finished_at - job.started_at).total_seconds()
+        found["waiting for a worker"].append(waited)
+        found["at the worker"].append(worked)
+        found["around"].append(seconds - waited - worked)
+    return found
+
+
+def _waiting(fleet: Fleet) -> int:
+    with fleet.catalog.read() as session:
+        return (
+            session.scalar(
+                select(func.count())
+                .select_from(Job)
+                .where(Job.kind == JobKind.INDEX, Job.state.in_(UNFINISHED))
+            )
+            or 0
+        )

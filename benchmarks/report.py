@@ -1,0 +1,113 @@
+"""What a measurement has found, and whether that is what was wanted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from statistics import median
+
+from rich.table import Table
+
+from shared.client import Json
+
+
+@dataclass(frozen=True, slots=True)
+class Figure:
+    """One number. `wanted` is its bound: a least one with `at_least`, else a largest one."""
+
+    what: str
+    measured: float
+    unit: str = ""
+    wanted: float | None = None
+    at_least: bool = False
+
+    @property
+    def missed(self) -> bool:
+        if self.wanted is None:
+            return False
+        return self.measured < self.wanted if self.at_least else self.measured > self.wanted
+
+    @property
+    def bound(self) -> str:
+        if self.wanted is None:
+            return ""
+        return (
+            f"at {'least' if self.at_least else 'most'} {_number(self.wanted)} {self.unit}".strip()
+        )
+
+
+@dataclass(slots=True)
+class Report:
+    """All figures of a measurement, in the order in which they are shown."""
+
+    title: str
+    figures: list[Figure] = field(default_factory=list)
+    details: Json = field(default_factory=dict)
+    """What else a program may want to read; not shown in the table."""
+
+    def add(
+        self,
+        what: str,
+        measured: float,
+        unit: str = "",
+        *,
+        at_most: float | None = None,
+        at_least: float | None = None,
+    ) -> None:
+        wanted = at_most if at_least is None else at_least
+        self.figures.append(Figure(what, measured, unit, wanted, at_least is not None))
+
+    @property
+    def missed(self) -> bool:
+        """Whether any figure is not as wanted."""
+        return any(figure.missed for figure in self.figures)
+
+    def as_json(self) -> Json:
+        return {
+            "title": self.title,
+            "missed": self.missed,
+            "figures": [
+                {
+                    "what": figure.what,
+                    "measured": figure.measured,
+                    "unit": figure.unit,
+                    "wanted": figure.bound or None,
+                    "missed": figure.missed,
+                }
+                for figure in self.figures
+            ],
+            **self.details,
+        }
+
+    def table(self) -> Table:
+        table = Table("what", "measured", "wanted", "", title=self.title)
+        for figure in self.figures:
+            verdict = "" if figure.wanted is None else "missed" if figure.missed else "met"
+            measured = f"{_number(figure.measured)} {figure.unit}".strip()
+            table.add_row(
+                figure.what, measured, figure.bound, verdict, style="red" if figure.missed else None
+            )
+        return table
+
+
+@dataclass(frozen=True, slots=True)
+class Spread:
+    """Seconds of many calls."""
+
+    median: float
+    p95: float
+    worst: float
+
+    @classmethod
+    def of(cls, seconds: list[float]) -> Spread:
+        """ValueError for none."""
+        if not seconds:
+            raise ValueError("nothing was timed")
+        ordered = sorted(seconds)
+        last = len(ordered) - 1
+        return cls(median(ordered), ordered[min(last, int(0.95 * len(ordered)))], ordered[-1])
+
+
+def _number(value: float) -> str:
+    if value == int(value) and abs(value) < 1e9:
+        return f"{value:,.0f}"
+    return f"{value:,.1f}" if abs(value) >= 10 else f"{value:.3g}"

@@ -1,0 +1,126 @@
+"""Do twice as many extractors describe twice as many photos, and none of them twice?
+
+The extractors sleep instead of computing, so that many of them fit on one machine and what is left
+is what the job table, the hints and publishing cost.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from uuid import UUID
+
+from benchmarks.described import described, jobs_of, wait_for_jobs
+from benchmarks.fleet import Fleet, Service, start_servers
+from benchmarks.report import Report
+from benchmarks.traffic import form_of, photos_of, upload_all
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
+
+WANTED_OF_LINEAR = 0.9
+CLIENTS = 4
+WARM_UPS = 10
+NO_MERGING = 1_000_000  # chunks stay as the extractors wrote them
+SECONDS = 900.0  # for one round
+
+
+def measure(
+    progress: Progress,
+    *,
+    workers: Sequence[int],
+    photos: int,
+    milliseconds: int,
+    batch: int,
+) -> Report:
+    """Throughput of each number of `workers`, with `photos` for each of them, which sleep
+    `milliseconds` a photo and take `batch` at once."""
+    report = Report("Extractors that sleep")
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        start_servers() as servers,
+        Fleet(
+            Path(folder),
+            servers,
+            extractors=max(workers),
+            extractor=f"test-slow-avg:milliseconds={milliseconds},width=16",
+            batch_photos=batch,
+            compact_chunks=NO_MERGING,
+            slot_rows=NO_MERGING,
+        ) as fleet,
+    ):
+        fleet.start("search-0-0", "gateway-0", "steward-0")
+        sent = 0
+        rates: dict[int, float] = {}
+        for count in sorted(workers):
+            extractors = [fleet[f"extractor-{number}"] for number in range(count)]
+            fleet.start(*(one.name for one in extractors if not one.running))
+            sent += _warm_up(fleet, extractors, 2 * count * batch)
+            bar = progress.add_task(f"{count} extractors", total=photos * count)
+            rates[count] = _rate(
+                fleet,
+                extractors,
+                photos * count,
+                lambda left, bar=bar, total=photos * count: progress.update(
+                    bar, completed=total - left
+                ),
+            )
+            sent += photos * count
+        least = min(rates)
+        for count, rate in rates.items():
+            report.add(f"{count} extractors", rate, "photos/s")
+        for count, rate in rates.items():
+            if count > least:
+                report.add(
+                    f"{count} extractors, of linear",
+                    rate / (rates[least] * count / least),
+                    at_least=WANTED_OF_LINEAR,
+                )
+        times = described(fleet.store)
+        report.add("photos described more than once", sum(n > 1 for n in times.values()), at_most=0)
+        report.add("photos stored and not described", sent - len(times), at_most=0)
+        report.add("services that fell", len(fleet.fell), at_most=0)
+    report.details = {"milliseconds": milliseconds, "batch": batch, "photos_each": photos}
+    return report
+
+
+def _warm_up(fleet: Fleet, extractors: Sequence[Service], photos: int) -> int:
+    """Until every extractor has described a batch, and has its decoders; how many it took."""
+    wanted = {str(extractor.process.pid) for extractor in extractors}
+    served: set[str] = set()
+    for round_ in range(WARM_UPS):
+        answers = _upload(fleet, photos)
+        wait_for_jobs(fleet.catalog, SECONDS)
+        jobs = jobs_of(fleet.catalog, [UUID(answer["job_id"]) for answer in answers])
+        served |= {(job.worker or "").rpartition("-")[2] for job in jobs}
+        if wanted <= served:
+            return photos * (round_ + 1)
+    raise AssertionError(f"{len(wanted - served)} extractors take no work: {fleet.logs()}")
+
+
+def _upload(fleet: Fleet, photos: int) -> list[Any]:
+    small = photos_of(8, (64, 48), 1500)
+    forms = [form_of(small[number % len(small)]) for number in range(photos)]
+    return upload_all(fleet.gateway_urls[0], forms, CLIENTS)
+
+
+def _rate(fleet: Fleet, extractors: Sequence[Service], photos: int, on_left: Any) -> float:
+    """Photos per second, from the first claim to the last commit by the database's clock.
+
+    All photos wait before the first is claimed: the extractors stand still meanwhile.
+    """
+    for extractor in extractors:
+        extractor.pause()
+    try:
+        answers = _upload(fleet, photos)
+    finally:
+        for extractor in extractors:
+            extractor.resume()
+    wait_for_jobs(fleet.catalog, SECONDS, on_left)
+    jobs = jobs_of(fleet.catalog, [UUID(answer["job_id"]) for answer in answers])
+    started = [job.started_at for job in jobs if job.started_at]
+    finished = [job.finished_at for job in jobs if job.finished_at]
+    assert len(jobs) == len(started) == len(finished) == photos
+    return photos / (max(finished) - min(started)).total_seconds()

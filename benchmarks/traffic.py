@@ -1,0 +1,155 @@
+"""Photos as clients send them, and a client that costs next to nothing itself.
+
+What is measured shares the machine with who measures: bodies are built before the clock starts, and
+are sent over kept connections without a framework.
+"""
+
+from __future__ import annotations
+
+import io
+import itertools
+import json
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from http.client import HTTPConnection, HTTPException
+from types import TracebackType
+from typing import Any, Self
+from urllib.parse import urlsplit
+
+import numpy as np
+from PIL import Image
+
+BOUNDARY = "placewise-bench"
+CONTENT_TYPE = {"Content-Type": f"multipart/form-data; boundary={BOUNDARY}"}
+TIMEOUT_SECONDS = 60.0
+SHARPEST, ROUGHEST = 95, 5  # JPEG qualities
+
+_numbers = itertools.count()
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    status: int
+    headers: dict[str, str]
+    body: bytes
+
+    def json(self) -> Any:
+        return json.loads(self.body)
+
+
+class Caller:
+    """Calls one server over a connection of each thread's own; a context manager."""
+
+    def __init__(self, url: str) -> None:
+        parts = urlsplit(url)
+        assert parts.hostname is not None
+        self.url = url
+        self._address = parts.hostname, parts.port
+        self._own = threading.local()
+        self._connections: list[HTTPConnection] = []
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """When the threads that use it have ended."""
+        for connection in self._connections:
+            connection.close()
+
+    def call(self, method: str, path: str, body: bytes | None = None, **headers: str) -> Answer:
+        """The answer, whatever its status; OSError or HTTPException when there is none."""
+        connection: HTTPConnection | None = getattr(self._own, "connection", None)
+        if connection is None:
+            connection = HTTPConnection(*self._address, timeout=TIMEOUT_SECONDS)
+            self._own.connection = connection
+            self._connections.append(connection)
+        try:
+            connection.request(method, path, body, headers)
+            answer = connection.getresponse()
+            return Answer(answer.status, dict(answer.getheaders()), answer.read())
+        except (OSError, HTTPException):
+            connection.close()
+            raise
+
+    def post_form(self, path: str, form: bytes, **headers: str) -> Answer:
+        return self.call("POST", path, form, **CONTENT_TYPE, **headers)
+
+
+def photos_of(count: int, size: tuple[int, int], size_bytes: int) -> list[bytes]:
+    """JPEGs of about `size_bytes`, each of another texture."""
+    rng = np.random.default_rng(0)
+    return [_photo(rng, size, size_bytes) for _ in range(count)]
+
+
+def _photo(rng: np.random.Generator, size: tuple[int, int], size_bytes: int) -> bytes:
+    """The coarse half makes photos differ, the fine half fills the file as a street does."""
+    width, height = size
+    coarse = Image.fromarray(rng.integers(0, 256, (12, 16, 3), dtype=np.uint8))
+    fine = Image.fromarray(rng.integers(0, 256, (height // 4, width // 4, 3), dtype=np.uint8))
+    image = Image.blend(
+        coarse.resize(size, Image.Resampling.BICUBIC),
+        fine.resize(size, Image.Resampling.BICUBIC),
+        0.35,
+    )
+    rough, sharp = ROUGHEST, SHARPEST
+    while sharp - rough > 1:
+        middle = (rough + sharp) // 2
+        rough, sharp = (
+            (middle, sharp) if len(_jpeg(image, middle)) <= size_bytes else (rough, middle)
+        )
+    return _jpeg(image, rough)
+
+
+def _jpeg(image: Image.Image, quality: int) -> bytes:
+    buffer = io.BytesIO()
+    image.save(buffer, "JPEG", quality=quality)
+    return buffer.getvalue()
+
+
+def form_of(photo: bytes, filename: str = "photo.jpg") -> bytes:
+    """A multipart form with the photo, as a file that was never sent before: what follows a JPEG's
+    end changes its hash and no pixel."""
+    head = (
+        f'--{BOUNDARY}\r\nContent-Disposition: form-data; name="file"; filename="{filename}"\r\n'
+        "Content-Type: image/jpeg\r\n\r\n"
+    )
+    return b"".join(
+        (
+            head.encode(),
+            photo,
+            f"{next(_numbers):020d}".encode(),
+            f"\r\n--{BOUNDARY}--\r\n".encode(),
+        )
+    )
+
+
+def upload_all(
+    url: str,
+    forms: Sequence[bytes],
+    clients: int,
+    *,
+    path: str = "/api/v1/upload",
+    on_done: Callable[[], object] = lambda: None,
+) -> list[Any]:
+    """Upload each from one of `clients` threads; the answers' JSON. AssertionError when one is
+    not accepted."""
+    with Caller(url) as caller:
+
+        def upload(form: bytes) -> Any:
+            answer = caller.post_form(path, form)
+            assert answer.status < 300, answer.body
+            on_done()
+            return answer.json()
+
+        with ThreadPoolExecutor(clients, thread_name_prefix="client") as pool:
+            return list(pool.map(upload, forms))

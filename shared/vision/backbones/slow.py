@@ -1,0 +1,46 @@
+"""A deterministic backbone that takes time without taking CPU, for measuring what is around it.
+
+A photo's one feature is a fixed choice of its pixels, as many as are asked for: two photos are as
+near as their pixels are.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from typing import Any
+
+import numpy as np
+import torch
+from torch.nn.functional import normalize
+
+from shared.recipes import SLOW
+
+SEED = 20_241
+
+
+class SlowBackbone:
+    name = SLOW
+    licence = "MIT"
+    layer = "pixels"
+    facet: str | None = None
+
+    def __init__(self, width: int, seconds: float, device: torch.device) -> None:
+        """`seconds` are slept for each photo."""
+        places = np.random.default_rng(SEED).random(width, dtype=np.float32)
+        self.fingerprint = hashlib.sha256(places.tobytes()).hexdigest()
+        self.card: dict[str, Any] = {"made": "a fixed choice of pixels, no training"}
+        self.width = width
+        self.device = device
+        self._seconds = seconds
+        self._places = torch.from_numpy(places).to(device)
+
+    @torch.inference_mode()
+    def features(self, pixels: torch.Tensor) -> torch.Tensor:
+        time.sleep(self._seconds * len(pixels))
+        flat = pixels.to(self.device).flatten(1)
+        # A share below 1 may still be rounded up to the whole length.
+        chosen = (self._places * flat.shape[1]).long().clamp(max=flat.shape[1] - 1)
+        # The middle of the range is no pixel's value: every photo has a direction.
+        values = flat[:, chosen].to(torch.float32) - 127.5
+        return normalize(values, dim=-1).unsqueeze(1)

@@ -1,0 +1,115 @@
+"""Waiting for jobs: many requests share one look at the table, and none is answered too early."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+from uuid import UUID
+
+import pytest
+
+from services.gateway import job_watch
+from services.gateway.job_watch import JobWatch
+from shared.catalog.session import Catalog
+from shared.ids import new_id
+from shared.jobs import JobState
+from tests.support.catalog_rows import add_job, add_map, set_columns
+
+LONG = 30.0
+
+
+@pytest.fixture
+def catalog(tmp_path: Path) -> Catalog:
+    made = Catalog(f"sqlite:///{tmp_path / 'catalog.sqlite'}")
+    made.migrate()
+    return made
+
+
+@pytest.fixture
+def jobs(catalog: Catalog) -> list[UUID]:
+    with catalog.write() as session:
+        map_id = add_map(session).id
+        return [add_job(session, map_id).id for _ in range(3)]
+
+
+async def started(*waits: asyncio.Task[None]) -> None:
+    """Returns when they have looked at least once."""
+    await asyncio.sleep(5 * job_watch.LOOK_SECONDS)
+    assert not any(wait.done() for wait in waits)
+
+
+def test_each_waits_until_its_own_job_has_ended(catalog: Catalog, jobs: list[UUID]) -> None:
+    async def scenario() -> None:
+        watch = JobWatch(catalog)
+        waits = [asyncio.create_task(watch.wait_for_end(job, LONG)) for job in jobs]
+        await started(*waits)
+        for job, wait in zip(jobs, waits, strict=True):
+            assert not wait.done()
+            set_columns(catalog, job, state=JobState.FAILED)
+            await asyncio.wait_for(wait, LONG)
+
+    asyncio.run(scenario())
+
+
+def test_job_that_is_gone_is_not_waited_for(catalog: Catalog) -> None:
+    asyncio.run(JobWatch(catalog).wait_for_end(new_id(), LONG))
+
+
+def test_waiting_ends_when_the_time_is_up(catalog: Catalog, jobs: list[UUID]) -> None:
+    asyncio.run(JobWatch(catalog).wait_for_end(jobs[0], 0.05))
+
+
+def test_stopping_server_lets_nobody_wait_for_long(
+    catalog: Catalog, jobs: list[UUID], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(job_watch, "LAST_SECONDS", 0.0)
+
+    async def scenario() -> None:
+        watch = JobWatch(catalog)
+        wait = asyncio.create_task(watch.wait_for_end(jobs[0], 10 * LONG))
+        await started(wait)
+        watch.end_soon()
+        await asyncio.wait_for(wait, LONG)
+
+    asyncio.run(scenario())
+
+
+def test_all_that_wait_share_one_look(
+    catalog: Catalog, jobs: list[UUID], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    looks: list[set[UUID]] = []
+    real = job_watch._ended
+
+    def counted(catalog: Catalog, job_ids: set[UUID]) -> set[UUID]:
+        looks.append(job_ids)
+        return real(catalog, job_ids)
+
+    monkeypatch.setattr(job_watch, "_ended", counted)
+
+    async def scenario() -> None:
+        watch = JobWatch(catalog)
+        waits = [asyncio.create_task(watch.wait_for_end(jobs[n % 3], LONG)) for n in range(60)]
+        await started(*waits)
+        before = len(looks)
+        assert before <= 6, "one look serves all sixty"
+        assert looks[-1] == set(jobs)
+        for job in jobs:
+            set_columns(catalog, job, state=JobState.SUCCEEDED)
+        await asyncio.wait_for(asyncio.gather(*waits), LONG)
+        after = len(looks)
+        await asyncio.sleep(5 * job_watch.LOOK_SECONDS)
+        assert len(looks) == after, "nobody waits, nobody looks"
+
+    asyncio.run(scenario())
+
+
+def test_who_goes_away_takes_no_others_answer_along(catalog: Catalog, jobs: list[UUID]) -> None:
+    async def scenario() -> None:
+        watch = JobWatch(catalog)
+        goes, stays = (asyncio.create_task(watch.wait_for_end(jobs[0], LONG)) for _ in range(2))
+        await started(goes, stays)
+        goes.cancel()
+        set_columns(catalog, jobs[0], state=JobState.SUCCEEDED)
+        await asyncio.wait_for(stays, LONG)
+
+    asyncio.run(scenario())

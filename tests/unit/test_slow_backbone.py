@@ -1,0 +1,67 @@
+"""The backbone that takes time: as long as its name says, and its descriptors tell photos apart."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from shared.recipes import get_recipe
+from shared.vision.extractors import Extractor
+from tests.support.photos import photo_image
+
+WIDTHS = (16, 7168, 98_304)
+
+
+def extractor(options: str) -> Extractor:
+    recipe = get_recipe(f"test-slow-avg:{options}", allow_test_extractors=True)
+    return Extractor(recipe, torch.device("cpu"))
+
+
+def pixels_of(made: Extractor, numbers: range) -> NDArray[np.uint8]:
+    return np.stack(
+        [np.asarray(made.preprocessing.apply(photo_image(number))) for number in numbers]
+    )
+
+
+@pytest.mark.parametrize("width", WIDTHS)
+def test_descriptors_are_unit_rows_of_the_width_that_is_asked_for(width: int) -> None:
+    made = extractor(f"width={width}")
+    rows = made.describe(pixels_of(made, range(4)), None)
+    assert rows.shape == (4, width)
+    assert made.dimension(None) == width
+    np.testing.assert_allclose(np.linalg.norm(rows.astype(float), axis=1), 1.0, atol=1e-4)
+
+
+@pytest.mark.parametrize("width", WIDTHS[1:])
+def test_photos_are_told_apart(width: int) -> None:
+    made = extractor(f"width={width}")
+    rows = made.describe(pixels_of(made, range(50)), None)
+    between = rows @ rows.T - np.eye(len(rows))
+    assert between.max() < 0.8
+
+
+def test_another_process_makes_the_same_descriptors() -> None:
+    one, other = extractor("width=7168"), extractor("width=7168,milliseconds=1")
+    pixels = pixels_of(one, range(3))
+    assert np.array_equal(one.describe(pixels, None), other.describe(pixels, None))
+    assert one.backbone.fingerprint == other.backbone.fingerprint
+    assert one.backbone.fingerprint != extractor("width=98304").backbone.fingerprint
+
+
+@pytest.mark.parametrize("grey", [0, 127, 128, 255])
+def test_photo_of_one_colour_has_a_direction(grey: int) -> None:
+    made = extractor("width=7168")
+    rows = made.describe(np.full((1, 224, 224, 3), grey, np.uint8), None)
+    assert np.linalg.norm(rows.astype(float)) == pytest.approx(1.0, abs=1e-4)
+
+
+def test_it_sleeps_for_every_photo(monkeypatch: pytest.MonkeyPatch) -> None:
+    slept: list[float] = []
+    monkeypatch.setattr(time, "sleep", slept.append)
+    made = extractor("milliseconds=250")
+    made.describe(pixels_of(made, range(4)), None)
+    assert slept == [1.0]
