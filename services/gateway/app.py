@@ -6,6 +6,7 @@ from fastapi import Depends, FastAPI, Security
 from fastapi.security import HTTPBearer
 
 from services.gateway import (
+    direct_upload,
     evaluations,
     figures,
     health,
@@ -20,6 +21,7 @@ from services.gateway import (
 from services.gateway.body_limit import BodyLimit
 from services.gateway.context import API, Gateway
 from services.gateway.key_check import KeyCheck
+from services.gateway.once import Replay, answer_again
 from services.gateway.parameters import no_unknown_parameters
 from shared.problems import PROBLEM_RESPONSES, install_problem_handlers
 
@@ -46,9 +48,11 @@ def create_app(gateway: Gateway) -> FastAPI:
     app.add_middleware(BodyLimit)
     app.add_middleware(KeyCheck, keys=gateway.keys)  # the last one added is the first one asked
     install_problem_handlers(app)
+    app.add_exception_handler(Replay, answer_again)
     for module in (
         maps,
         upload,
+        direct_upload,
         jobs,
         similarity,
         photos,

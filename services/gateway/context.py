@@ -72,6 +72,7 @@ MapName = Annotated[
     ),
 ]
 FileId = Annotated[UUID, _known_shape("photo")]
+UploadId = Annotated[UUID, _known_shape("upload")]
 JobId = Annotated[UUID, _known_shape("job")]
 TopK = Annotated[int, Query(ge=1, le=100, description="How many photos to answer.")]
 MinScore = Annotated[
@@ -90,5 +91,6 @@ __all__ = [
     "MapName",
     "MinScore",
     "TopK",
+    "UploadId",
     "read_cursor",
 ]

@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from starlette.concurrency import run_in_threadpool
 
 from services.gateway.context import DEFAULT_MAP, Gateway, GatewayDep, MapName
+from services.gateway.once import Once, OnceDep, OnceFormDep
 from services.gateway.receive import describe_form, receive_file
 from services.gateway.schemas import (
     GenerationAnswer,
@@ -64,6 +65,7 @@ class SwitchRequest(BaseModel):
 def fit_vocabulary(
     gateway: GatewayDep,
     response: Response,
+    once: OnceDep,
     wanted: FitRequest | None = None,
     map_name: MapName = DEFAULT_MAP,
 ) -> JobStarted:
@@ -78,6 +80,7 @@ def fit_vocabulary(
         if count_live(session, map_id, PhotoRole.DATABASE) == 0:
             raise Conflict("no_photos", "The map has no photos to learn from. Upload some first.")
         job = start_model_change(session, map_id, JobKind.FIT, params)
+        once.keep_job(session, job)
     return _started(gateway, response, job)
 
 
@@ -92,6 +95,7 @@ async def import_vocabulary(
     request: Request,
     response: Response,
     gateway: GatewayDep,
+    once: OnceFormDep,
     map_name: MapName = DEFAULT_MAP,
 ) -> JobStarted:
     """Bring a vocabulary, a `.npy` file of (clusters, dimension) floats, and switch to it.
@@ -104,8 +108,9 @@ async def import_vocabulary(
         new_vocabulary_key(),
         gateway.settings.max_vocabulary_bytes,
     )
+    await once.begin_form(gateway.store, received)
     params = {"object_key": received.key, "filename": received.filename}
-    job = await run_in_threadpool(_queue_import, gateway, map_name, params)
+    job = await run_in_threadpool(_queue_import, gateway, map_name, params, once)
     return _started(gateway, response, job)
 
 
@@ -144,6 +149,7 @@ def generations(gateway: GatewayDep, map_name: MapName = DEFAULT_MAP) -> list[Ge
 def start_generation(
     gateway: GatewayDep,
     response: Response,
+    once: OnceDep,
     wanted: Annotated[SwitchRequest, Field()],
     map_name: MapName = DEFAULT_MAP,
 ) -> JobStarted:
@@ -155,14 +161,17 @@ def start_generation(
             vocabulary = get_vocabulary(session, map_id, wanted.vocabulary_id)
             params["vocabulary_id"] = str(vocabulary.id)
         job = start_model_change(session, map_id, JobKind.SWITCH, params)
+        once.keep_job(session, job)
     return _started(gateway, response, job)
 
 
-def _queue_import(gateway: Gateway, map_name: str, params: dict[str, Any]) -> Job:
+def _queue_import(gateway: Gateway, map_name: str, params: dict[str, Any], once: Once) -> Job:
     try:
         with gateway.catalog.write() as session:
             map_id = get_map(session, map_name).id
-            return start_model_change(session, map_id, JobKind.IMPORT, params)
+            job = start_model_change(session, map_id, JobKind.IMPORT, params)
+            once.keep_job(session, job)
+            return job
     except PlacewiseError:
         gateway.store.delete(params["object_key"])
         raise

@@ -13,6 +13,7 @@ from xml.etree.ElementTree import ParseError
 import urllib3
 from minio import Minio
 from minio.error import MinioException, S3Error
+from minio.helpers import BaseURL
 from urllib3.connectionpool import ConnectionPool
 from urllib3.exceptions import (
     ConnectTimeoutError,
@@ -68,6 +69,9 @@ class Bucket:
     client: Minio
     name: str
     endpoint: str
+    region: str
+    public: BaseURL
+    """The server as callers reach it."""
 
     @classmethod
     def of(cls, settings: Settings) -> Bucket:
@@ -103,7 +107,16 @@ class Bucket:
             region=settings.s3_region,  # left out, the client asks the server for it first
             http_client=connections,
         )
-        return cls(client, settings.s3_bucket, settings.s3_endpoint)
+        public = settings.s3_public_endpoint or (
+            f"{'https' if settings.s3_secure else 'http'}://{settings.s3_endpoint}"
+        )
+        return cls(
+            client,
+            settings.s3_bucket,
+            settings.s3_endpoint,
+            settings.s3_region,
+            BaseURL(public, settings.s3_region),
+        )
 
     @contextlib.contextmanager
     def explained(self, key: str | None = None) -> Iterator[None]:
