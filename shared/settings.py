@@ -86,6 +86,25 @@ class Settings(BaseSettings):
     )
     max_wait_seconds: int = Field(60, ge=0, description="longest `Prefer: wait` and `?wait=`")
 
+    # What is refused before anything fills up.
+    max_queued_jobs: int = Field(
+        200_000, ge=1, description="waiting jobs from which calls that make more are refused"
+    )
+    max_queued_jobs_per_map: int = Field(
+        100_000, ge=1, description="the same for the jobs of one map"
+    )
+    max_queued_queries: int = Field(
+        1000, ge=1, description="waiting query photos; uploads do not count"
+    )
+    max_concurrent_uploads: int = Field(
+        32, ge=1, description="files that one gateway receives at once, and as many query photos"
+    )
+    min_free_bytes: int = Field(
+        500_000_000,
+        ge=0,
+        description="of the disks of PLACEWISE_HOME and UPLOAD_DIR; with less, nothing is taken",
+    )
+
     # How photos are described.
     extractor: str = Field(
         "efficientnet-lite0-vlad",

@@ -37,6 +37,7 @@ from services.gateway.photo_fields import PhotoFields, check_pair
 from services.gateway.photo_header import read_photo_header
 from services.gateway.photos import PhotoPatch
 from services.gateway.receive import Received, base_name, check_photo_begin, too_large
+from services.gateway.room import ROOM_FOR_JOBS, Kind, RoomDep
 from services.gateway.schemas import Answer, UploadAnswer
 from services.gateway.store_photo import Incoming, Stored, store_photo
 from services.gateway.upload import UPLOAD_ANSWERS, Said, answer_upload
@@ -85,6 +86,7 @@ class PresignAnswer(Answer):
     operation_id="presign_upload",
     status_code=201,
     response_model=PresignAnswer,
+    dependencies=[ROOM_FOR_JOBS],
 )
 def presign(
     gateway: GatewayDep, wanted: PresignRequest, once: OnceDep, map_name: MapName = DEFAULT_MAP
@@ -138,18 +140,21 @@ def presign(
     status_code=202,
     response_model=UploadAnswer,
     responses=UPLOAD_ANSWERS,
+    dependencies=[ROOM_FOR_JOBS],
 )
 async def complete(
     request: Request,
     response: Response,
     gateway: GatewayDep,
+    room: RoomDep,
     upload_id: Annotated[UploadId, PathParameter(description="as presigning answered it")],
     map_name: MapName = DEFAULT_MAP,
 ) -> UploadAnswer:
     """The bytes were sent: check and store the photo. Answers as `POST /upload` does; completed
     again, it answers the same again."""
     key = new_original_key()
-    stored = await run_in_threadpool(_complete, gateway, map_name, upload_id, key)
+    with room.receiving(Kind.UPLOAD):
+        stored = await run_in_threadpool(_complete, gateway, map_name, upload_id, key)
 
     def replace(said: Said) -> None:
         with gateway.catalog.write() as session:

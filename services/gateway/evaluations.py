@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from services.gateway.context import DEFAULT_MAP, GatewayDep, MapName, read_cursor
 from services.gateway.once import OnceDep
+from services.gateway.room import ROOM_FOR_JOBS
 from services.gateway.schemas import Answer, JobStarted, job_started
 from shared.catalog.chunks import count_located
 from shared.catalog.evaluations import Evaluation, list_evaluations
@@ -64,7 +65,13 @@ class EvaluationsAnswer(Answer):
     next_cursor: str | None
 
 
-@router.post("/evaluations", operation_id="evaluate", status_code=202, response_model=JobStarted)
+@router.post(
+    "/evaluations",
+    operation_id="evaluate",
+    status_code=202,
+    response_model=JobStarted,
+    dependencies=[ROOM_FOR_JOBS],
+)
 def evaluate(
     gateway: GatewayDep,
     response: Response,

@@ -14,6 +14,7 @@ from starlette.concurrency import run_in_threadpool
 
 from services.gateway.context import DEFAULT_MAP, Gateway, GatewayDep, JobId, MapName, read_cursor
 from services.gateway.once import OnceDep
+from services.gateway.room import ROOM_FOR_JOBS
 from services.gateway.schemas import JobAnswer, JobsAnswer
 from services.gateway.waiting import SLOWEST_LOOK_SECONDS, read_job, wait_for_job
 from shared.catalog.maps import get_map
@@ -103,7 +104,12 @@ def cancel_job(
     return answer
 
 
-@router.post("/jobs/{job_id}/retry", operation_id="retry_job", response_model=JobAnswer)
+@router.post(
+    "/jobs/{job_id}/retry",
+    operation_id="retry_job",
+    response_model=JobAnswer,
+    dependencies=[ROOM_FOR_JOBS],
+)
 def retry_job(
     gateway: GatewayDep, job_id: JobId, once: OnceDep, map_name: MapName = DEFAULT_MAP
 ) -> JobAnswer:

@@ -12,6 +12,7 @@ from starlette.concurrency import run_in_threadpool
 from services.gateway.context import DEFAULT_MAP, Gateway, GatewayDep, MapName
 from services.gateway.once import Once, OnceDep, OnceFormDep
 from services.gateway.receive import describe_form, receive_file
+from services.gateway.room import ROOM_FOR_JOBS, Kind, RoomDep
 from services.gateway.schemas import (
     GenerationAnswer,
     JobStarted,
@@ -61,6 +62,7 @@ class SwitchRequest(BaseModel):
     operation_id="fit_vocabulary",
     status_code=202,
     response_model=JobStarted,
+    dependencies=[ROOM_FOR_JOBS],
 )
 def fit_vocabulary(
     gateway: GatewayDep,
@@ -90,24 +92,27 @@ def fit_vocabulary(
     status_code=202,
     response_model=JobStarted,
     openapi_extra=describe_form("a `.npy` file of (clusters, dimension) floats"),
+    dependencies=[ROOM_FOR_JOBS],
 )
 async def import_vocabulary(
     request: Request,
     response: Response,
     gateway: GatewayDep,
     once: OnceFormDep,
+    room: RoomDep,
     map_name: MapName = DEFAULT_MAP,
 ) -> JobStarted:
     """Bring a vocabulary, a `.npy` file of (clusters, dimension) floats, and switch to it.
 
     The extractor checks it; one that does not fit ends the job as `failed` with the reason.
     """
-    received = await receive_file(
-        request,
-        gateway.store,
-        new_vocabulary_key(),
-        gateway.settings.max_vocabulary_bytes,
-    )
+    with room.receiving(Kind.UPLOAD):
+        received = await receive_file(
+            request,
+            gateway.store,
+            new_vocabulary_key(),
+            gateway.settings.max_vocabulary_bytes,
+        )
     await once.begin_form(gateway.store, received)
     params = {"object_key": received.key, "filename": received.filename}
     job = await run_in_threadpool(_queue_import, gateway, map_name, params, once)
@@ -145,6 +150,7 @@ def generations(gateway: GatewayDep, map_name: MapName = DEFAULT_MAP) -> list[Ge
     operation_id="start_generation",
     status_code=202,
     response_model=JobStarted,
+    dependencies=[ROOM_FOR_JOBS],
 )
 def start_generation(
     gateway: GatewayDep,

@@ -30,6 +30,7 @@ from services.gateway.receive import (
     describe_form,
     receive_file,
 )
+from services.gateway.room import ROOM_FOR_QUERIES, Kind, RoomDep
 from services.gateway.schemas import JobStarted, SimilarityAnswer, job_started
 from services.gateway.waiting import preferred_wait, wait_for_job
 from shared.catalog.maps import get_map
@@ -67,12 +68,14 @@ def similar_to_stored(
     response_model=SimilarityAnswer,
     responses={202: {"model": JobStarted, "description": "Being described; poll, then fetch."}},
     openapi_extra=describe_form("the photo to ask with"),
+    dependencies=[ROOM_FOR_QUERIES],
 )
 async def similar_to_upload(
     request: Request,
     response: Response,
     gateway: GatewayDep,
     once: OnceFormDep,
+    room: RoomDep,
     photos: FilterDep,
     top_k: TopK = 10,
     min_score: MinScore = None,
@@ -86,9 +89,10 @@ async def similar_to_upload(
     """
     job_id = new_id()
     key = query_key(job_id)
-    received = await receive_file(
-        request, gateway.store, key, gateway.settings.max_file_size, check_photo_begin
-    )
+    with room.receiving(Kind.QUERY):
+        received = await receive_file(
+            request, gateway.store, key, gateway.settings.max_file_size, check_photo_begin
+        )
     await once.begin_form(gateway.store, received, life_seconds=gateway.settings.query_ttl_seconds)
     wanted = Wanted(top_k=top_k, min_score=min_score, photos=photos)
     params = {"filename": received.filename, "wanted": wanted.model_dump(mode="json")}

@@ -20,6 +20,7 @@ from services.gateway.receive import (
     describe_form,
     receive_file,
 )
+from services.gateway.room import ROOM_FOR_JOBS, Kind, RoomDep
 from services.gateway.schemas import UploadAnswer, job_url
 from services.gateway.store_photo import Incoming, Keep, Stored, store_photo
 from services.gateway.waiting import preferred_wait, wait_for_job
@@ -61,12 +62,14 @@ UPLOAD_ANSWERS: dict[int | str, dict[str, Any]] = {
     response_model=UploadAnswer,
     responses=UPLOAD_ANSWERS,
     openapi_extra=FORM,
+    dependencies=[ROOM_FOR_JOBS],
 )
 async def upload(
     request: Request,
     response: Response,
     gateway: GatewayDep,
     once: OnceFormDep,
+    room: RoomDep,
     map_name: MapName = DEFAULT_MAP,
 ) -> UploadAnswer:
     """Store a photo and queue its description. EXIF fills what the form leaves out.
@@ -74,13 +77,14 @@ async def upload(
     202 with the job to poll; with `Prefer: wait=N`, 201 once the photo is searchable. The same
     bytes again give the existing photo (200), or queue it again after a failed job (202).
     """
-    received = await receive_file(
-        request,
-        gateway.store,
-        new_original_key(),
-        gateway.settings.max_file_size,
-        check_photo_begin,
-    )
+    with room.receiving(Kind.UPLOAD):
+        received = await receive_file(
+            request,
+            gateway.store,
+            new_original_key(),
+            gateway.settings.max_file_size,
+            check_photo_begin,
+        )
     await once.begin_form(gateway.store, received)
 
     def keep(session: Session, stored: Stored) -> Stored:

@@ -49,7 +49,9 @@ class ObjectStore(Protocol):
 
     `get` and `open` raise NotFound (`object_not_found`) for a missing key. Everything raises
     Unavailable while a store on another machine can't be used: `object_store_unavailable`,
-    `object_store_refused`, `bucket_not_found`. So does reading from what `open` has given.
+    `object_store_busy`, `object_store_refused`, `bucket_not_found`; writing raises its kind
+    StorageFull (`object_store_full`, `disk_full`) when there is no room. Reading from what `open`
+    has given raises so, too.
     """
 
     def writer(self, key: str) -> ObjectWriter: ...

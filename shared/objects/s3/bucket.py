@@ -25,7 +25,7 @@ from urllib3.exceptions import (
 )
 from urllib3.response import BaseHTTPResponse
 
-from shared.errors import Misconfigured, NotFound, PlacewiseError, Unavailable
+from shared.errors import Misconfigured, NotFound, PlacewiseError, StorageFull, Unavailable
 from shared.settings import Settings
 
 log = logging.getLogger(__name__)
@@ -40,6 +40,16 @@ REFUSED = {"AccessDenied", "AllAccessDisabled", "AccountProblem", "MethodNotAllo
 WRONG_REGION = {"AuthorizationHeaderMalformed", "PermanentRedirect", "Redirect"}
 WRONG_CLOCK = {"RequestTimeTooSkewed"}
 CHANGED = {"PreconditionFailed"}
+BUSY = {"SlowDown", "ServiceUnavailable", "Throttling", "ThrottlingException", "RequestTimeout"}
+FULL = {
+    "InsufficientStorage",
+    "QuotaExceeded",
+    "XMinioStorageFull",
+    "XMinioAdminBucketQuotaExceeded",
+}
+FULL_STATUS = 507
+BUSY_RETRY_SECONDS = 5
+FULL_RETRY_SECONDS = 60
 
 
 class OneMoreTry(urllib3.Retry):
@@ -121,8 +131,9 @@ class Bucket:
     @contextlib.contextmanager
     def explained(self, key: str | None = None) -> Iterator[None]:
         """Turns whatever the client raises inside into NotFound (`object_not_found`, only with a
-        `key`) or Unavailable (`object_store_unavailable`, `object_store_refused`,
-        `bucket_not_found`, `object_changed`).
+        `key`) or Unavailable (`object_store_unavailable`, `object_store_busy`,
+        `object_store_refused`, `bucket_not_found`, `object_changed`, and StorageFull:
+        `object_store_full`).
 
         Keys and buckets can be put right while jobs wait, so a wrong one is Unavailable as well:
         a job that meets it is tried again and not failed for good.
@@ -151,6 +162,19 @@ class Bucket:
         log.warning("the object store at %s refused: %s", self.endpoint, error)
         if code in CHANGED:
             return Unavailable("object_changed", f"{key!r} was written anew while it was read.")
+        if code in FULL or error.response.status == FULL_STATUS:
+            return StorageFull(
+                "object_store_full",
+                f"The object store at {self.endpoint} has no room left ({code}). Give it more, or "
+                "delete photos or maps.",
+                retry_after_seconds=FULL_RETRY_SECONDS,
+            )
+        if code in BUSY:
+            return Unavailable(
+                "object_store_busy",
+                f"The object store at {self.endpoint} is asked too much ({code}). Try again.",
+                retry_after_seconds=BUSY_RETRY_SECONDS,
+            )
         advice = _advice(code, self.name)
         if advice is None:
             return Unavailable(
