@@ -158,16 +158,24 @@ _BY_STATUS: dict[int, type[PlacewiseError]] = {
 }
 
 
+_BY_PROXYS_STATUS: dict[int, type[PlacewiseError]] = {
+    429: TooManyRequests,
+    **dict.fromkeys((502, 503, 504, 507), Unavailable),
+}
+
+
 def refusal(status: int, body: str) -> PlacewiseError:
     """The error that a server answered with, made from its problem document.
 
-    PlacewiseError (`bad_answer`) for whatever is no problem document: a proxy's page, say.
+    A code of `bad_answer` for whatever is no problem document: a proxy's page, say. Of the proxy's
+    word that the server is away or busy, too, the kind of error is what it means.
     """
     try:
         problem: dict[str, Any] = json.loads(body)
         code, detail = problem.pop("code"), problem.pop("detail")
     except (ValueError, KeyError, TypeError, AttributeError):
-        return PlacewiseError("bad_answer", f"HTTP {status}: {body[:200]}")
+        kind = _BY_PROXYS_STATUS.get(status, PlacewiseError)
+        return kind("bad_answer", f"HTTP {status}: {body[:200]}")
     for member in ("type", "title", "status", "instance"):
         problem.pop(member, None)
     return _BY_STATUS.get(status, PlacewiseError)(code, detail, **problem)

@@ -21,7 +21,7 @@ from PIL import Image
 from rich.table import Table
 
 from services.cli.output import JsonOption, answers, explained, print_json, progress_bar
-from shared.client import Client, Json, retry_while_away
+from shared.client import Client, Json
 from shared.errors import Unavailable
 from shared.home import RunningServer, running_server
 
@@ -79,7 +79,8 @@ def _server(home: Path) -> Iterator[RunningServer]:
                 if server.poll() is not None or time.monotonic() > deadline:
                     raise Unavailable("server_unreachable", "The server did not start.")
                 time.sleep(0.1)
-            retry_while_away(lambda: Client(running.url, key=running.key).stats(), START_SECONDS)
+            with Client(running.url, key=running.key, patience_seconds=START_SECONDS) as client:
+                client.stats()
             yield running
         finally:
             server.terminate()
