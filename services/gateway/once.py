@@ -47,7 +47,7 @@ from shared.problems import problem_response
 HEADER = "Idempotency-Key"
 REPLAYED = "Idempotent-Replayed"
 KEY = r"[!-~]{1,255}"
-LEASE_SECONDS = 30.0  # from a whole request to its committed effect; a killed gateway's are waited
+LEASE_SECONDS = 30.0  # more than passes between a whole request and its committed effect
 NOT_KEPT = (401, 403, 408, 429)
 
 KeyHeader = Annotated[

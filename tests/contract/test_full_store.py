@@ -38,7 +38,7 @@ class FullS3(ThreadingHTTPServer):
     def __init__(self, status: int, code: str) -> None:
         super().__init__(("127.0.0.1", 0), Refuses)
         self.status = status
-        self.body = f"<?xml version='1.0'?><Error><Code>{code}</Code><Message>No.</Message></Error>".encode()
+        self.body = f"<Error><Code>{code}</Code><Message>No.</Message></Error>".encode()
 
     def store(self) -> S3Store:
         endpoint = f"127.0.0.1:{self.server_address[1]}"
