@@ -7,36 +7,70 @@
 
 Answers are the API's JSON. Whatever it refuses is raised as the error that the server raised, with
 its status and `code`; a server that can't be reached is Unavailable (`server_unreachable`).
+
+A patient client (`Client(url, patience_seconds=60)`) repeats a call that met a server which is away
+or busy. What makes a job or a record is repeated under one Idempotency-Key, so that it is done once
+whatever answers were lost.
 """
 
 from __future__ import annotations
 
+import contextlib
+import copy
+import hashlib
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, BinaryIO, Self, TypeVar
 from urllib.parse import quote
 from uuid import UUID
 
 import httpx2
 
-from shared.errors import InvalidRequest, Unavailable, refusal
+from shared.errors import (
+    Conflict,
+    InvalidRequest,
+    PlacewiseError,
+    TooManyRequests,
+    Unavailable,
+    refusal,
+)
+from shared.ids import new_id
 
 API = "/api/v1"
+IDEMPOTENCY_KEY = "Idempotency-Key"
 FINISHED = ("succeeded", "failed", "cancelled")
 POLL_SECONDS = 20.0  # one long poll
 TIMEOUT_SECONDS = 90.0  # of one call: longer than the longest wait that a server grants
+READ_BYTES = 256 * 1024
+RETRY_SECONDS = 0.5  # where the server has not said how long
+MOST_RETRY_SECONDS = 300.0  # whatever it says
 
 Json = dict[str, Any]
+Answer = TypeVar("Answer")
+OnWait = Callable[[PlacewiseError, float], object]
+"""Told of each wait before it begins: why, and how many seconds."""
 
 
 class Client:
     """One server and one map. Thread-safe; close it, or use it as a context manager."""
 
-    def __init__(self, url: str, map_name: str | None = None, key: str | None = None) -> None:
+    def __init__(
+        self,
+        url: str,
+        map_name: str | None = None,
+        key: str | None = None,
+        *,
+        patience_seconds: float = 0.0,
+        on_wait: OnWait = lambda error, seconds: None,
+    ) -> None:
         """`key` is what a server beyond loopback wants; others don't look at it.
+
+        A call is repeated for `patience_seconds` while the server is away or can't do it (503,
+        507). One that says when to come again (429) is obeyed for as long as it says so: it works,
+        and has too much to do. 0 repeats nothing.
 
         Raises InvalidRequest (`bad_key`) for a key that no header can carry.
         """
@@ -47,6 +81,8 @@ class Client:
                 "bad_address", f"{url!r} is no address such as http://127.0.0.1:8000."
             )
         self.url = url.rstrip("/")
+        self._patience_seconds = patience_seconds
+        self._on_wait = on_wait
         self._http = httpx2.Client(
             base_url=self.url,
             timeout=TIMEOUT_SECONDS,
@@ -68,6 +104,12 @@ class Client:
     def close(self) -> None:
         self._http.close()
 
+    def patient(self, patience_seconds: float, on_wait: OnWait) -> Client:
+        """The same client with more patience, over the same connections."""
+        other = copy.copy(self)
+        other._patience_seconds, other._on_wait = patience_seconds, on_wait
+        return other
+
     def upload(self, photo: Path, filename: str | None = None, **fields: Any) -> Json:
         """Store a photo; `fields` are the form's (`latitude`, `longitude`, `place`, ...).
 
@@ -75,6 +117,25 @@ class Client:
         """
         said = {name: str(value) for name, value in fields.items() if value is not None}
         return self._send_file("/upload", photo, filename, data=said)
+
+    def upload_direct(self, photo: Path, filename: str | None = None, **fields: Any) -> Json:
+        """`upload` past the server, straight to its bucket; `fields` as JSON values.
+
+        Raises Conflict (`no_direct_uploads`) where the server keeps photos in a folder.
+        """
+        with _opened(photo) as file:
+            digest, size = hashlib.sha256(), 0
+            while piece := file.read(READ_BYTES):
+                digest.update(piece)
+                size += len(piece)
+            about = {
+                "filename": filename or _name_of(photo),
+                "file_size": size,
+                "sha256": digest.hexdigest(),
+            }
+            begun = self._call("POST", "/uploads/presign", json={**about, **_given(**fields)})
+            self._repeat(lambda: self._put(begun, file))
+        return self._call("POST", begun["complete_url"].removeprefix(API))
 
     def similar_to_file(
         self,
@@ -187,39 +248,84 @@ class Client:
         return self._call("GET", "/database/stats")
 
     def _send_file(self, path: str, file: Path, called: str | None = None, **options: Any) -> Json:
-        try:
-            with file.open("rb") as opened:
-                name = called or os.fsencode(file.name).decode("utf-8", "replace")
-                return self._call("POST", path, files={"file": (name, opened)}, **options)
-        except OSError as error:
-            raise InvalidRequest(
-                "unreadable_file", f"Can't read {file}: {error.strerror}"
-            ) from error
+        with _opened(file) as opened:
+            files = {"file": (called or _name_of(file), opened)}
+            return self._call("POST", path, opened, files=files, **options)
 
-    def _call(self, method: str, path: str, **options: Any) -> Json:
+    def _call(self, method: str, path: str, body: BinaryIO | None = None, **options: Any) -> Json:
+        """One call of the API, repeated as patience allows; `body` is read from its begin."""
+        if method == "POST" and self._patience_seconds:
+            key = {IDEMPOTENCY_KEY: str(new_id())}
+            options["headers"] = {**options.get("headers", {}), **key}
+
+        def once() -> Json:
+            if body is not None:
+                body.seek(0)
+            answer = self._ask(self._http, method, f"{API}{path}", **options)
+            found: Json = answer.json()
+            return found
+
+        return self._repeat(once)
+
+    def _put(self, begun: Json, file: BinaryIO) -> None:
+        """Send a direct upload's bytes to where the server has said: no key of ours goes there."""
+        file.seek(0)
+        with httpx2.Client(timeout=TIMEOUT_SECONDS) as http:
+            self._ask(http, begun["method"], begun["url"], content=file, headers=begun["headers"])
+
+    def _ask(self, http: httpx2.Client, method: str, url: str, **options: Any) -> httpx2.Response:
+        """A successful answer; anything else as the error that it means."""
         try:
-            answer = self._http.request(method, f"{API}{path}", **options)
+            answer = http.request(method, url, **options)
         except httpx2.TransportError as error:
+            host = self.url if url.startswith("/") else httpx2.URL(url).host
             raise Unavailable(
                 "server_unreachable",
-                f"No Placewise answers at {self.url} ({type(error).__name__}). Is it running?",
+                f"No Placewise answers at {host} ({type(error).__name__}). Is it running?",
             ) from error
         if answer.is_success:
-            body: Json = answer.json()
-            return body
-        raise refusal(answer.status_code, answer.text)
+            return answer
+        refused = refusal(answer.status_code, answer.text)
+        after = answer.headers.get("retry-after", "")
+        if after.isdigit():  # a proxy may be the one who says it
+            refused.extra.setdefault("retry_after_seconds", int(after))
+        raise refused
+
+    def _repeat(self, call: Callable[[], Answer]) -> Answer:
+        deadline = time.monotonic() + self._patience_seconds
+        while True:
+            try:
+                return call()
+            except (Unavailable, TooManyRequests, Conflict) as error:
+                late = time.monotonic() >= deadline
+                if not self._patience_seconds or not _passes(error, late):
+                    raise
+                seconds = float(error.extra.get("retry_after_seconds", RETRY_SECONDS))
+                seconds = min(max(seconds, RETRY_SECONDS), MOST_RETRY_SECONDS)
+                self._on_wait(error, seconds)
+                time.sleep(seconds)
 
 
-def retry_while_away(call: Callable[[], Json], seconds: float) -> Json:
-    """`call`, tried again while the server is away or busy, for up to `seconds`."""
-    deadline = time.monotonic() + seconds
-    while True:
-        try:
-            return call()
-        except Unavailable:
-            if time.monotonic() > deadline:
-                raise
-            time.sleep(0.5)
+def _passes(error: PlacewiseError, late: bool) -> bool:
+    """Is it worth waiting for what the error speaks of to pass?"""
+    if isinstance(error, TooManyRequests):
+        return True
+    if isinstance(error, Conflict):  # our own call, whose answer was lost, is still under way
+        return error.code == "idempotency_key_in_use" and not late
+    return not late
+
+
+@contextlib.contextmanager
+def _opened(file: Path) -> Iterator[BinaryIO]:
+    try:
+        with file.open("rb") as opened:
+            yield opened
+    except OSError as error:
+        raise InvalidRequest("unreadable_file", f"Can't read {file}: {error.strerror}") from error
+
+
+def _name_of(file: Path) -> str:
+    return os.fsencode(file.name).decode("utf-8", "replace")
 
 
 def _given(**params: Any) -> Json:

@@ -9,8 +9,10 @@ PlacewiseError
 ├── TooLarge 413                file_too_large
 ├── UnsupportedMedia 415        unsupported_photo, unsupported_body
 ├── Unprocessable 422           invalid_field, undecodable_photo, too_many_pixels, ...
+├── TooManyRequests 429         queue_full, too_many_uploads (come again after `Retry-After`)
 ├── Unavailable 503             search_behind, chunk_unreadable, ... (may be tried again)
-│                           object_store_unavailable, bucket_not_found, ...
+│   │                       object_store_unavailable, bucket_not_found, ...
+│   └── StorageFull 507         disk_full, object_store_full
 └── Misconfigured 500           weights_missing, home_in_use, ... (an operator must act)
 
 `shared.errors` knows nothing of HTTP libraries: the gateway turns these into RFC 9457 problems,
@@ -27,7 +29,8 @@ class PlacewiseError(Exception):
     """Something that can be explained to whoever asked.
 
     `detail` says what is wrong with which thing and what to do next. `extra` holds members that a
-    program can read (they become extension members of the problem document).
+    program can read (they become extension members of the problem document). One of them,
+    `retry_after_seconds`, becomes the header `Retry-After` as well.
     """
 
     status: ClassVar[int] = 500
@@ -103,11 +106,25 @@ class Unprocessable(PlacewiseError):
     title = "The content can't be used"
 
 
+class TooManyRequests(PlacewiseError):
+    """Nothing was done; the same call is welcome after `retry_after_seconds`, which it needs."""
+
+    status = 429
+    title = "Too much at once"
+
+
 class Unavailable(PlacewiseError):
     """The same call may work a little later: the gateway adds `Retry-After`."""
 
     status = 503
     title = "Not available right now"
+
+
+class StorageFull(Unavailable):
+    """No room for more bytes until someone makes some; nothing was stored."""
+
+    status = 507
+    title = "No room left"
 
 
 class Misconfigured(PlacewiseError):
@@ -134,21 +151,31 @@ _BY_STATUS: dict[int, type[PlacewiseError]] = {
         TooLarge,
         UnsupportedMedia,
         Unprocessable,
+        TooManyRequests,
         Unavailable,
+        StorageFull,
     )
+}
+
+
+_BY_PROXYS_STATUS: dict[int, type[PlacewiseError]] = {
+    429: TooManyRequests,
+    **dict.fromkeys((502, 503, 504, 507), Unavailable),
 }
 
 
 def refusal(status: int, body: str) -> PlacewiseError:
     """The error that a server answered with, made from its problem document.
 
-    PlacewiseError (`bad_answer`) for whatever is no problem document: a proxy's page, say.
+    A code of `bad_answer` for whatever is no problem document: a proxy's page, say. Of the proxy's
+    word that the server is away or busy, too, the kind of error is what it means.
     """
     try:
         problem: dict[str, Any] = json.loads(body)
         code, detail = problem.pop("code"), problem.pop("detail")
     except (ValueError, KeyError, TypeError, AttributeError):
-        return PlacewiseError("bad_answer", f"HTTP {status}: {body[:200]}")
+        kind = _BY_PROXYS_STATUS.get(status, PlacewiseError)
+        return kind("bad_answer", f"HTTP {status}: {body[:200]}")
     for member in ("type", "title", "status", "instance"):
         problem.pop(member, None)
     return _BY_STATUS.get(status, PlacewiseError)(code, detail, **problem)

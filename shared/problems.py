@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from typing import Any
 
 from fastapi import FastAPI, Request
@@ -16,7 +17,7 @@ from shared.errors import InvalidRequest, PlacewiseError, Unavailable, Unprocess
 
 log = logging.getLogger(__name__)
 
-RETRY_AFTER_SECONDS = "2"
+RETRY_AFTER_SECONDS = 2  # of a 503 that knows no better
 HTTP_CODES = {400: "malformed_body", 404: "path_not_found", 405: "method_not_allowed"}
 
 
@@ -58,8 +59,11 @@ def problem_response(error: PlacewiseError, request: Request) -> JSONResponse:
     headers = {}
     if error.status == 401:
         headers["WWW-Authenticate"] = "Bearer"
-    if error.status == 503:
-        headers["Retry-After"] = RETRY_AFTER_SECONDS
+    wait = error.extra.get("retry_after_seconds")
+    if wait is None and error.status == 503:
+        wait = RETRY_AFTER_SECONDS
+    if wait is not None:
+        headers["Retry-After"] = str(math.ceil(wait))
     if error.status == 413:
         headers["Connection"] = "close"  # the rest of the body stays unread
     return JSONResponse(

@@ -57,6 +57,11 @@ class Settings(BaseSettings):
     )
     s3_access_key: str | None = Field(None, description="who asks S3_ENDPOINT")
     s3_secret_key: SecretStr | None = Field(None, description="the secret of S3_ACCESS_KEY")
+    s3_public_endpoint: str | None = Field(
+        None,
+        description="address of S3_ENDPOINT as callers reach it, who send photos straight there: "
+        "https://photos.example.com; unset: S3_ENDPOINT itself",
+    )
     s3_bucket: str = Field("placewise", description="a bucket that belongs to this Placewise alone")
     s3_secure: bool = Field(True, description="speak HTTPS with S3_ENDPOINT")
     s3_region: str = Field("us-east-1", description="the region of S3_BUCKET")
@@ -76,7 +81,29 @@ class Settings(BaseSettings):
     max_file_size: int = Field(10_485_760, gt=0, description="bytes of one photo")
     max_image_pixels: int = Field(50_000_000, gt=0, description="width x height of one photo")
     max_vocabulary_bytes: int = Field(64_000_000, gt=0, description="bytes of an imported one")
+    presign_seconds: int = Field(
+        900, ge=1, le=604_800, description="time to send and complete a direct upload"
+    )
     max_wait_seconds: int = Field(60, ge=0, description="longest `Prefer: wait` and `?wait=`")
+
+    # What is refused before anything fills up.
+    max_queued_jobs: int = Field(
+        200_000, ge=1, description="waiting jobs from which calls that make more are refused"
+    )
+    max_queued_jobs_per_map: int = Field(
+        100_000, ge=1, description="the same for the jobs of one map"
+    )
+    max_queued_queries: int = Field(
+        1000, ge=1, description="waiting query photos; uploads do not count"
+    )
+    max_concurrent_uploads: int = Field(
+        32, ge=1, description="files that one gateway receives at once, and as many query photos"
+    )
+    min_free_bytes: int = Field(
+        500_000_000,
+        ge=0,
+        description="of the disks of PLACEWISE_HOME and UPLOAD_DIR; with less, nothing is taken",
+    )
 
     # How photos are described.
     extractor: str = Field(
@@ -128,6 +155,9 @@ class Settings(BaseSettings):
     )
     max_attempts: int = Field(3, ge=1, description="lone crashes before a job is failed")
     query_ttl_seconds: float = Field(3600.0, gt=0, description="life of an unstored query")
+    idempotency_key_seconds: float = Field(
+        86_400.0, gt=0, description="how long a call repeated under its Idempotency-Key is known"
+    )
 
     # How the store is kept healthy.
     slot_rows: int = Field(1000, ge=2, description="rows of a sealed chunk")
@@ -226,6 +256,13 @@ class Settings(BaseSettings):
                 "S3_SECURE says whether it is HTTPS"
             )
         return value
+
+    @field_validator("s3_public_endpoint")
+    @classmethod
+    def _an_address_without_a_path(cls, value: str | None) -> str | None:
+        if value is not None and not re.fullmatch(r"https?://[^\s/?#@]+/?", value):
+            raise ValueError("is an address without a path, such as https://photos.example.com")
+        return value and value.rstrip("/")
 
     @field_validator("s3_bucket")
     @classmethod

@@ -19,6 +19,7 @@ from tests.support.servers import (
     start_s3,
 )
 from tests.support.servers.daemon import free_ports
+from tests.support.servers.handle import Handle
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,6 +32,16 @@ class Servers:
     postgres_proxy: FaultProxy
     redis_proxy: FaultProxy
     s3_proxy: FaultProxy
+
+    @property
+    def processes(self) -> dict[str, Handle]:
+        """The servers themselves by name."""
+        found = {
+            "PostgreSQL": self.postgres.process,
+            "Redis": self.redis.process,
+            "the S3 store": self.s3.process,
+        }
+        return {name: process for name, process in found.items() if process is not None}
 
     def proxied_database(self, url: str) -> str:
         """The URL of a database of `postgres` as the services see it."""

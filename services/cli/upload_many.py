@@ -15,12 +15,12 @@ from rich.progress import Progress, TaskID
 from services.cli.output import messages, shown
 from services.cli.photo_places import FoundPhoto
 from services.cli.vocabulary import fit_and_wait
-from shared.client import FINISHED, Client, Json, retry_while_away
+from shared.client import FINISHED, Client, Json
 from shared.errors import Conflict, PlacewiseError
 
 FIT_FROM_PHOTOS = 50
 UPLOADS_AT_ONCE = 4
-AWAY_SECONDS = 60.0
+AWAY_SECONDS = 60.0  # for which a server that is away is waited for; a busy one as long as it says
 LOOK_SECONDS = 1.0  # a job that begins to wait for a vocabulary is not seen by a longer poll
 
 FitOption = Annotated[
@@ -62,8 +62,17 @@ def upload_many(
     failed: list[Json] = []
     pending: Pending = []
     uploading = progress.add_task("uploading", total=len(photos))
-    for photo, outcome in _upload_all(client, photos, update):
-        progress.advance(uploading)
+
+    def show_wait(error: PlacewiseError, seconds: float) -> None:
+        progress.update(uploading, description=f"uploading (waits {seconds:.0f} s: {error.code})")
+        if error.code not in waited_for:
+            waited_for.add(error.code)
+            messages.print(f"Waiting, then going on: {escape(error.detail)}", soft_wrap=True)
+
+    waited_for: set[str] = set()
+    patient = client.patient(AWAY_SECONDS, show_wait)
+    for photo, outcome in _upload_all(patient, photos, update):
+        progress.update(uploading, advance=1, description="uploading")
         if isinstance(outcome, PlacewiseError):
             refused.append(_fault(photo, outcome.detail))
             continue
@@ -119,12 +128,12 @@ def _upload_all(
 
         try:
             try:
-                return retry_while_away(send, AWAY_SECONDS)
+                return send()
             except Conflict as error:
                 if error.code != "photo_differs" or not update:
                     raise
                 client.patch_photo(error.extra["file_id"], **_as_json(photo.fields))
-                return retry_while_away(send, AWAY_SECONDS)
+                return send()
         except PlacewiseError as error:
             return error
 

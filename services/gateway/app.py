@@ -6,6 +6,7 @@ from fastapi import Depends, FastAPI, Security
 from fastapi.security import HTTPBearer
 
 from services.gateway import (
+    direct_upload,
     evaluations,
     figures,
     health,
@@ -20,7 +21,9 @@ from services.gateway import (
 from services.gateway.body_limit import BodyLimit
 from services.gateway.context import API, Gateway
 from services.gateway.key_check import KeyCheck
+from services.gateway.once import Replay, answer_again
 from services.gateway.parameters import no_unknown_parameters
+from services.gateway.room import Room
 from shared.problems import PROBLEM_RESPONSES, install_problem_handlers
 
 DESCRIPTION = """Photo in, place out. Upload geotagged photos, poll their jobs, and ask which known
@@ -43,12 +46,15 @@ def create_app(gateway: Gateway) -> FastAPI:
         responses=PROBLEM_RESPONSES,
     )
     app.state.gateway = gateway
+    app.state.room = Room(gateway.catalog, gateway.settings)
     app.add_middleware(BodyLimit)
     app.add_middleware(KeyCheck, keys=gateway.keys)  # the last one added is the first one asked
     install_problem_handlers(app)
+    app.add_exception_handler(Replay, answer_again)
     for module in (
         maps,
         upload,
+        direct_upload,
         jobs,
         similarity,
         photos,

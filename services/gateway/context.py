@@ -77,6 +77,7 @@ MapName = Annotated[
     ),
 ]
 FileId = Annotated[UUID, _known_shape("photo")]
+UploadId = Annotated[UUID, _known_shape("upload")]
 JobId = Annotated[UUID, _known_shape("job")]
 TopK = Annotated[int, Query(ge=1, le=100, description="How many photos to answer.")]
 MinScore = Annotated[
@@ -95,5 +96,6 @@ __all__ = [
     "MapName",
     "MinScore",
     "TopK",
+    "UploadId",
     "read_cursor",
 ]

@@ -10,6 +10,8 @@ from fastapi import APIRouter, Query, Response
 from pydantic import BaseModel, ConfigDict, Field
 
 from services.gateway.context import DEFAULT_MAP, GatewayDep, MapName, read_cursor
+from services.gateway.once import OnceDep
+from services.gateway.room import ROOM_FOR_JOBS
 from services.gateway.schemas import Answer, JobStarted, job_started
 from shared.catalog.chunks import count_located
 from shared.catalog.evaluations import Evaluation, list_evaluations
@@ -63,10 +65,17 @@ class EvaluationsAnswer(Answer):
     next_cursor: str | None
 
 
-@router.post("/evaluations", operation_id="evaluate", status_code=202, response_model=JobStarted)
+@router.post(
+    "/evaluations",
+    operation_id="evaluate",
+    status_code=202,
+    response_model=JobStarted,
+    dependencies=[ROOM_FOR_JOBS],
+)
 def evaluate(
     gateway: GatewayDep,
     response: Response,
+    once: OnceDep,
     wanted: EvaluationRequest | None = None,
     map_name: MapName = DEFAULT_MAP,
 ) -> JobStarted:
@@ -91,6 +100,7 @@ def evaluate(
         )
         session.add(job)
         session.flush()
+        once.keep_job(session, job)
     answer = job_started(job)
     response.headers["Location"] = answer.status_url
     response.headers["Retry-After"] = "1"

@@ -6,13 +6,16 @@ import time
 from importlib.metadata import version
 
 from fastapi import APIRouter, Response
+from pydantic import Field
 from sqlalchemy import select
 from sqlalchemy.exc import SQLAlchemyError
 
 from services.gateway.context import Gateway, GatewayDep
+from services.gateway.room import Kind, Room, RoomDep
 from services.gateway.schemas import Answer
 from shared.catalog.maps import Map
 from shared.errors import PlacewiseError
+from shared.settings import Settings
 
 probes = APIRouter(tags=["operations"])
 router = APIRouter(tags=["operations"])
@@ -42,11 +45,27 @@ class PartAnswer(Answer):
     detail: str | None = None
 
 
+class LoadAnswer(Answer):
+    """How full things are; a full one is refused more (429, 507), and is not unhealthy."""
+
+    waiting_jobs: int = Field(description="without queries, and what a model change queued")
+    max_queued_jobs: int
+    waiting_queries: int
+    max_queued_queries: int
+    finished_per_second: float = Field(description="photos, over the last minute")
+    receiving_uploads: int = Field(description="by this gateway, now")
+    receiving_queries: int
+    max_concurrent_uploads: int
+    free_bytes: int | None = Field(description="of this machine's disk; null: nothing lies there")
+    min_free_bytes: int
+
+
 class HealthAnswer(Answer):
     status: str
     version: str
     uptime_seconds: float
     parts: dict[str, PartAnswer]
+    load: LoadAnswer | None = Field(description="null while the catalog is away")
 
 
 @probes.head("/", include_in_schema=False)
@@ -84,7 +103,7 @@ def readyz(gateway: GatewayDep, response: Response) -> ProbeAnswer:
 
 @router.head("/health", include_in_schema=False)
 @router.get("/health", operation_id="health", response_model=HealthAnswer)
-def health(gateway: GatewayDep, response: Response) -> HealthAnswer:
+def health(gateway: GatewayDep, room: RoomDep, response: Response) -> HealthAnswer:
     """The state of each part; 503 when one is away, or `degraded`: a part of it is away."""
     parts = _parts(gateway)
     states = {part.status for part in parts.values()}
@@ -94,6 +113,23 @@ def health(gateway: GatewayDep, response: Response) -> HealthAnswer:
         version=VERSION,
         uptime_seconds=time.monotonic() - gateway.started,
         parts=parts,
+        load=_load(gateway.settings, room) if parts["catalog"].status == "healthy" else None,
+    )
+
+
+def _load(settings: Settings, room: Room) -> LoadAnswer:
+    waiting = room.look()
+    return LoadAnswer(
+        waiting_jobs=waiting.jobs,
+        max_queued_jobs=settings.max_queued_jobs,
+        waiting_queries=waiting.queries,
+        max_queued_queries=settings.max_queued_queries,
+        finished_per_second=waiting.finished_per_second,
+        receiving_uploads=room.being_received(Kind.UPLOAD),
+        receiving_queries=room.being_received(Kind.QUERY),
+        max_concurrent_uploads=settings.max_concurrent_uploads,
+        free_bytes=room.free_bytes(),
+        min_free_bytes=settings.min_free_bytes,
     )
 
 

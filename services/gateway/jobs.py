@@ -13,6 +13,8 @@ from fastapi.responses import StreamingResponse
 from starlette.concurrency import run_in_threadpool
 
 from services.gateway.context import DEFAULT_MAP, Gateway, GatewayDep, JobId, MapName, read_cursor
+from services.gateway.once import OnceDep
+from services.gateway.room import ROOM_FOR_JOBS
 from services.gateway.schemas import JobAnswer, JobsAnswer
 from services.gateway.waiting import read_job, wait_for_job
 from shared.catalog.maps import get_map
@@ -86,7 +88,9 @@ async def job_events(
 
 
 @router.post("/jobs/{job_id}/cancel", operation_id="cancel_job", response_model=JobAnswer)
-def cancel_job(gateway: GatewayDep, job_id: JobId, map_name: MapName = DEFAULT_MAP) -> JobAnswer:
+def cancel_job(
+    gateway: GatewayDep, job_id: JobId, once: OnceDep, map_name: MapName = DEFAULT_MAP
+) -> JobAnswer:
     """End a job at once; what a worker computes for it meanwhile is thrown away."""
     with gateway.catalog.write() as session:
         found = get_job(session, get_map(session, map_name).id, job_id, lock=True)
@@ -96,11 +100,20 @@ def cancel_job(gateway: GatewayDep, job_id: JobId, map_name: MapName = DEFAULT_M
             cancel(found)
         session.flush()
         session.refresh(found)
-        return JobAnswer.of(found)
+        answer = JobAnswer.of(found)
+        once.keep(session, 200, answer)
+    return answer
 
 
-@router.post("/jobs/{job_id}/retry", operation_id="retry_job", response_model=JobAnswer)
-def retry_job(gateway: GatewayDep, job_id: JobId, map_name: MapName = DEFAULT_MAP) -> JobAnswer:
+@router.post(
+    "/jobs/{job_id}/retry",
+    operation_id="retry_job",
+    response_model=JobAnswer,
+    dependencies=[ROOM_FOR_JOBS],
+)
+def retry_job(
+    gateway: GatewayDep, job_id: JobId, once: OnceDep, map_name: MapName = DEFAULT_MAP
+) -> JobAnswer:
     """Queue a failed or cancelled job again."""
     with gateway.catalog.write() as session:
         found = get_job(session, get_map(session, map_name).id, job_id, lock=True)
@@ -108,6 +121,7 @@ def retry_job(gateway: GatewayDep, job_id: JobId, map_name: MapName = DEFAULT_MA
         session.flush()
         session.refresh(found)
         answer = JobAnswer.of(found)
+        once.keep(session, 200, answer)
     gateway.hints.send(lane_of(found.priority))
     return answer
 

@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 from sqlalchemy.orm import Session
 
 from services.gateway.context import DEFAULT_MAP, NO_NUL, GatewayDep
+from services.gateway.once import OnceDep
 from services.gateway.schemas import Answer
 from shared.catalog.chunks import count_searchable
 from shared.catalog.generations import active_generation
@@ -84,7 +85,7 @@ def maps(gateway: GatewayDep) -> list[MapAnswer]:
 
 
 @router.post("/maps", operation_id="create_map", status_code=201, response_model=MapAnswer)
-def new_map(gateway: GatewayDep, wanted: NewMap) -> MapAnswer:
+def new_map(gateway: GatewayDep, wanted: NewMap, once: OnceDep) -> MapAnswer:
     """Make an empty map; 409 when the name is taken."""
     settings = gateway.settings
     try:
@@ -95,7 +96,9 @@ def new_map(gateway: GatewayDep, wanted: NewMap) -> MapAnswer:
     except Misconfigured as error:
         raise invalid_field("extractor", error.detail) from None
     with gateway.catalog.write() as session:
-        return _answer(session, create_map(session, wanted.name, extractor))
+        answer = _answer(session, create_map(session, wanted.name, extractor))
+        once.keep(session, 201, answer)
+    return answer
 
 
 @router.get("/maps/{name}", operation_id="get_map", response_model=MapAnswer)

@@ -10,7 +10,9 @@ from pydantic import BaseModel, ConfigDict, Field
 from starlette.concurrency import run_in_threadpool
 
 from services.gateway.context import DEFAULT_MAP, Gateway, GatewayDep, MapName
+from services.gateway.once import Once, OnceDep, OnceFormDep
 from services.gateway.receive import describe_form, receive_file
+from services.gateway.room import ROOM_FOR_JOBS, Kind, RoomDep
 from services.gateway.schemas import (
     GenerationAnswer,
     JobStarted,
@@ -60,10 +62,12 @@ class SwitchRequest(BaseModel):
     operation_id="fit_vocabulary",
     status_code=202,
     response_model=JobStarted,
+    dependencies=[ROOM_FOR_JOBS],
 )
 def fit_vocabulary(
     gateway: GatewayDep,
     response: Response,
+    once: OnceDep,
     wanted: FitRequest | None = None,
     map_name: MapName = DEFAULT_MAP,
 ) -> JobStarted:
@@ -78,6 +82,7 @@ def fit_vocabulary(
         if count_live(session, map_id, PhotoRole.DATABASE) == 0:
             raise Conflict("no_photos", "The map has no photos to learn from. Upload some first.")
         job = start_model_change(session, map_id, JobKind.FIT, params)
+        once.keep_job(session, job)
     return _started(gateway, response, job)
 
 
@@ -87,25 +92,30 @@ def fit_vocabulary(
     status_code=202,
     response_model=JobStarted,
     openapi_extra=describe_form("a `.npy` file of (clusters, dimension) floats"),
+    dependencies=[ROOM_FOR_JOBS],
 )
 async def import_vocabulary(
     request: Request,
     response: Response,
     gateway: GatewayDep,
+    once: OnceFormDep,
+    room: RoomDep,
     map_name: MapName = DEFAULT_MAP,
 ) -> JobStarted:
     """Bring a vocabulary, a `.npy` file of (clusters, dimension) floats, and switch to it.
 
     The extractor checks it; one that does not fit ends the job as `failed` with the reason.
     """
-    received = await receive_file(
-        request,
-        gateway.store,
-        new_vocabulary_key(),
-        gateway.settings.max_vocabulary_bytes,
-    )
+    with room.receiving(Kind.UPLOAD):
+        received = await receive_file(
+            request,
+            gateway.store,
+            new_vocabulary_key(),
+            gateway.settings.max_vocabulary_bytes,
+        )
+    await once.begin_form(gateway.store, received)
     params = {"object_key": received.key, "filename": received.filename}
-    job = await run_in_threadpool(_queue_import, gateway, map_name, params)
+    job = await run_in_threadpool(_queue_import, gateway, map_name, params, once)
     return _started(gateway, response, job)
 
 
@@ -140,10 +150,12 @@ def generations(gateway: GatewayDep, map_name: MapName = DEFAULT_MAP) -> list[Ge
     operation_id="start_generation",
     status_code=202,
     response_model=JobStarted,
+    dependencies=[ROOM_FOR_JOBS],
 )
 def start_generation(
     gateway: GatewayDep,
     response: Response,
+    once: OnceDep,
     wanted: Annotated[SwitchRequest, Field()],
     map_name: MapName = DEFAULT_MAP,
 ) -> JobStarted:
@@ -155,14 +167,17 @@ def start_generation(
             vocabulary = get_vocabulary(session, map_id, wanted.vocabulary_id)
             params["vocabulary_id"] = str(vocabulary.id)
         job = start_model_change(session, map_id, JobKind.SWITCH, params)
+        once.keep_job(session, job)
     return _started(gateway, response, job)
 
 
-def _queue_import(gateway: Gateway, map_name: str, params: dict[str, Any]) -> Job:
+def _queue_import(gateway: Gateway, map_name: str, params: dict[str, Any], once: Once) -> Job:
     try:
         with gateway.catalog.write() as session:
             map_id = get_map(session, map_name).id
-            return start_model_change(session, map_id, JobKind.IMPORT, params)
+            job = start_model_change(session, map_id, JobKind.IMPORT, params)
+            once.keep_job(session, job)
+            return job
     except PlacewiseError:
         gateway.store.delete(params["object_key"])
         raise

@@ -65,7 +65,7 @@ async def receive_file(
     form = _Form(_boundary(request), max_bytes, check_begin)
     declared = request.headers.get("content-length", "")
     if declared.isdigit() and int(declared) > max_bytes + OVERHEAD_BYTES:
-        raise _too_large(max_bytes)
+        raise too_large(max_bytes)
     writer: ObjectWriter | None = None
     try:
         async for piece in request.stream():
@@ -170,7 +170,7 @@ class _Form:
         # Part headers and what follows the form count, too: no body goes on for ever.
         self._body_bytes += len(piece)
         if self._body_bytes > self._max_bytes + OVERHEAD_BYTES:
-            raise _too_large(self._max_bytes)
+            raise too_large(self._max_bytes)
         try:
             self._parser.write(piece)
         except MultipartParseError as error:
@@ -225,7 +225,7 @@ class _Form:
         if self._file_seen:
             raise InvalidRequest("several_files", "This call takes one file; several came.")
         self._file_seen = True
-        self.filename = _base_name(options[b"filename"].decode("utf-8", "replace"))
+        self.filename = base_name(options[b"filename"].decode("utf-8", "replace"))
 
     def _on_part_data(self, data: bytes, start: int, end: int) -> None:
         piece = data[start:end]
@@ -237,7 +237,7 @@ class _Form:
             return
         self.size_bytes += len(piece)
         if self.size_bytes > self._max_bytes:
-            raise _too_large(self._max_bytes)
+            raise too_large(self._max_bytes)
         if len(self.begin) < SNIFFED_BYTES:
             self.begin = (self.begin + piece)[:SNIFFED_BYTES]
         if not self._checked and len(self.begin) == SNIFFED_BYTES:
@@ -279,7 +279,7 @@ def _boundary(request: Request) -> bytes:
     return boundary
 
 
-def _base_name(filename: str) -> str:
+def base_name(filename: str) -> str:
     """The last part of what the client calls the file, on either kind of system."""
     name = PurePosixPath(PureWindowsPath(filename).name).name
     return "".join(c for c in name if c.isprintable())[:255] or "photo"
@@ -289,7 +289,7 @@ def _malformed(reason: str) -> PlacewiseError:
     return InvalidRequest("malformed_body", f"The multipart body can't be read: {reason}.")
 
 
-def _too_large(max_bytes: int) -> PlacewiseError:
+def too_large(max_bytes: int) -> PlacewiseError:
     return TooLarge(
         "file_too_large",
         f"The file is larger than {max_bytes} bytes (MAX_FILE_SIZE).",

@@ -22,6 +22,7 @@ from services.gateway.context import (
 )
 from services.gateway.filters import FilterDep
 from services.gateway.find_similar import Wanted, find_similar, query_by_job, query_by_photo
+from services.gateway.once import Once, OnceFormDep
 from services.gateway.photo_header import read_photo_header
 from services.gateway.receive import (
     Received,
@@ -29,6 +30,7 @@ from services.gateway.receive import (
     describe_form,
     receive_file,
 )
+from services.gateway.room import ROOM_FOR_QUERIES, Kind, RoomDep
 from services.gateway.schemas import JobStarted, SimilarityAnswer, job_started
 from services.gateway.waiting import preferred_wait, wait_for_job
 from shared.catalog.maps import get_map
@@ -66,11 +68,14 @@ def similar_to_stored(
     response_model=SimilarityAnswer,
     responses={202: {"model": JobStarted, "description": "Being described; poll, then fetch."}},
     openapi_extra=describe_form("the photo to ask with"),
+    dependencies=[ROOM_FOR_QUERIES],
 )
 async def similar_to_upload(
     request: Request,
     response: Response,
     gateway: GatewayDep,
+    once: OnceFormDep,
+    room: RoomDep,
     photos: FilterDep,
     top_k: TopK = 10,
     min_score: MinScore = None,
@@ -79,16 +84,21 @@ async def similar_to_upload(
     """The photos most similar to one that is not stored.
 
     202 with a job: poll `status_url`, then GET `result_url`. With `Prefer: wait=N` the answer
-    itself (200) when it takes no longer than N seconds.
+    itself (200) when it takes no longer than N seconds. Repeated under an `Idempotency-Key`, it is
+    answered with the 202 of its job.
     """
     job_id = new_id()
     key = query_key(job_id)
-    received = await receive_file(
-        request, gateway.store, key, gateway.settings.max_file_size, check_photo_begin
-    )
+    with room.receiving(Kind.QUERY):
+        received = await receive_file(
+            request, gateway.store, key, gateway.settings.max_file_size, check_photo_begin
+        )
+    await once.begin_form(gateway.store, received, life_seconds=gateway.settings.query_ttl_seconds)
     wanted = Wanted(top_k=top_k, min_score=min_score, photos=photos)
     params = {"filename": received.filename, "wanted": wanted.model_dump(mode="json")}
-    job: Job | None = await run_in_threadpool(_queue, gateway, map_name, job_id, received, params)
+    job: Job | None = await run_in_threadpool(
+        _queue, gateway, map_name, job_id, received, params, once
+    )
     wait = preferred_wait(request, gateway.settings.max_wait_seconds)
     if wait:
         response.headers["Preference-Applied"] = f"wait={wait:g}"
@@ -133,6 +143,7 @@ def _queue(
     job_id: UUID,
     received: Received,
     params: dict[str, Any],
+    once: Once,
 ) -> Job:
     try:
         check_photo_begin(received.begin)
@@ -150,6 +161,7 @@ def _queue(
             )
             session.add(job)
             session.flush()
+            once.keep_job(session, job)
     except PlacewiseError:
         gateway.store.delete(received.key)
         raise

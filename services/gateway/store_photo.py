@@ -6,6 +6,7 @@ already there, or loses the race for them, deletes its own object.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -44,28 +45,32 @@ class Incoming:
     fields: PhotoFields
 
 
-def store_photo(gateway: Gateway, map_name: str, incoming: Incoming) -> Stored:
+Keep = Callable[[Session, Stored], Stored]
+"""Writes down what was stored in the transaction that stores it, and hands it on."""
+
+
+def store_photo(gateway: Gateway, map_name: str, incoming: Incoming, keep: Keep) -> Stored:
     """Acknowledge the photo, or the one with the same bytes that the map has already.
 
     Raises Conflict (`photo_differs`) when something else was said of that one.
     """
     try:
-        stored = _store(gateway, map_name, incoming)
+        stored = _store(gateway, map_name, incoming, keep)
     except IntegrityError:
         # The same bytes were committed between our look and our insert: look again.
-        stored = _store(gateway, map_name, incoming)
+        stored = _store(gateway, map_name, incoming, keep)
     if stored.queued:
         gateway.hints.send()
     return stored
 
 
-def _store(gateway: Gateway, map_name: str, incoming: Incoming) -> Stored:
+def _store(gateway: Gateway, map_name: str, incoming: Incoming, keep: Keep) -> Stored:
     received, header, fields = incoming.received, incoming.header, incoming.fields
     with gateway.catalog.write() as session:
         map_ = get_map(session, map_name)
         existing = find_live_by_sha256(session, map_.id, received.sha256)
         if existing is not None:
-            return _same_again(session, existing, fields)
+            return keep(session, _same_again(session, existing, fields))
         photo_id, job_id = new_id(), new_id()
         said_where = fields.latitude is not None
         photo = Photo(
@@ -99,7 +104,7 @@ def _store(gateway: Gateway, map_name: str, incoming: Incoming) -> Stored:
         )
         session.add(job)
         session.flush()
-        return Stored(photo, job, queued=True)
+        return keep(session, Stored(photo, job, queued=True))
 
 
 def _same_again(session: Session, photo: Photo, fields: PhotoFields) -> Stored:

@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
 from fastapi import APIRouter, Request, Response
+from sqlalchemy.orm import Session
 from starlette.concurrency import run_in_threadpool
 
 from services.gateway.context import DEFAULT_MAP, Gateway, GatewayDep, MapName
+from services.gateway.once import OnceFormDep
 from services.gateway.photo_fields import read_form_fields
 from services.gateway.photo_header import read_photo_header
 from services.gateway.receive import (
@@ -14,8 +20,9 @@ from services.gateway.receive import (
     describe_form,
     receive_file,
 )
+from services.gateway.room import ROOM_FOR_JOBS, Kind, RoomDep
 from services.gateway.schemas import UploadAnswer, job_url
-from services.gateway.store_photo import Incoming, Stored, store_photo
+from services.gateway.store_photo import Incoming, Keep, Stored, store_photo
 from services.gateway.waiting import preferred_wait, wait_for_job
 from shared.catalog.photos import PhotoRole
 from shared.errors import PlacewiseError
@@ -42,25 +49,27 @@ FORM = describe_form(
     },
 )
 
+UPLOAD_ANSWERS: dict[int | str, dict[str, Any]] = {
+    200: {"model": UploadAnswer, "description": "The map has these bytes already."},
+    201: {"model": UploadAnswer, "description": "Searchable (with `Prefer: wait=N`)."},
+}
+
 
 @router.post(
     "/upload",
     operation_id="upload",
     status_code=202,
     response_model=UploadAnswer,
-    responses={
-        200: {"model": UploadAnswer, "description": "The map has these bytes already."},
-        201: {
-            "model": UploadAnswer,
-            "description": "Searchable (with `Prefer: wait=N`).",
-        },
-    },
+    responses=UPLOAD_ANSWERS,
     openapi_extra=FORM,
+    dependencies=[ROOM_FOR_JOBS],
 )
 async def upload(
     request: Request,
     response: Response,
     gateway: GatewayDep,
+    once: OnceFormDep,
+    room: RoomDep,
     map_name: MapName = DEFAULT_MAP,
 ) -> UploadAnswer:
     """Store a photo and queue its description. EXIF fills what the form leaves out.
@@ -68,43 +77,86 @@ async def upload(
     202 with the job to poll; with `Prefer: wait=N`, 201 once the photo is searchable. The same
     bytes again give the existing photo (200), or queue it again after a failed job (202).
     """
-    received = await receive_file(
-        request,
-        gateway.store,
-        new_original_key(),
-        gateway.settings.max_file_size,
-        check_photo_begin,
-    )
-    stored = await run_in_threadpool(_store, gateway, map_name, received)
+    with room.receiving(Kind.UPLOAD):
+        received = await receive_file(
+            request,
+            gateway.store,
+            new_original_key(),
+            gateway.settings.max_file_size,
+            check_photo_begin,
+        )
+    await once.begin_form(gateway.store, received)
+
+    def keep(session: Session, stored: Stored) -> Stored:
+        said = Said.of(stored, stored.job, received.key)
+        once.keep(session, said.status, said.answer, said.headers)
+        return stored
+
+    stored = await run_in_threadpool(_store, gateway, map_name, received, keep)
+
+    def replace(said: Said) -> None:
+        once.replace(said.status, said.answer, said.headers)
+
+    return await answer_upload(request, response, gateway, stored, received.key, replace)
+
+
+@dataclass(frozen=True, slots=True)
+class Said:
+    """What an upload is answered."""
+
+    status: int
+    headers: dict[str, str]
+    answer: UploadAnswer
+
+    @classmethod
+    def of(cls, stored: Stored, job: Job | None, key: str) -> Said:
+        """`job` as it is now, and the `key` of the bytes that came."""
+        status_url = job_url(job.id) if job else f"/api/v1/uploads/{stored.photo.id}"
+        answer = UploadAnswer(
+            file_id=stored.photo.id,
+            job_id=job.id if job else None,
+            filename=stored.photo.filename,
+            file_size=stored.photo.size_bytes,
+            upload_time=stored.photo.uploaded_at,
+            status=JobState(job.state) if job else JobState.SUCCEEDED,
+            status_url=status_url,
+            already_there=stored.photo.object_key != key,
+            message=_message(stored, job),
+        )
+        if not stored.queued or job is None:
+            return cls(200, {"Location": status_url}, answer)
+        if job.state == JobState.SUCCEEDED:
+            return cls(201, {"Location": status_url}, answer)
+        return cls(202, {"Location": status_url, "Retry-After": "1"}, answer)
+
+
+async def answer_upload(
+    request: Request,
+    response: Response,
+    gateway: Gateway,
+    stored: Stored,
+    key: str,
+    replace: Callable[[Said], None],
+) -> UploadAnswer:
+    """What is answered to an upload that was kept, after the wait that the request prefers.
+
+    `key` is that of the bytes that came; `replace` is told when the photo was described meanwhile,
+    to answer so again.
+    """
     job = stored.job
-    if stored.queued and job is not None:
-        response.status_code = 202
-        wait = preferred_wait(request, gateway.settings.max_wait_seconds)
-        if wait:
-            response.headers["Preference-Applied"] = f"wait={wait:g}"
-            job = await wait_for_job(gateway, job.id, wait)
-            if job is not None and job.state == JobState.SUCCEEDED:
-                response.status_code = 201
-    else:
-        response.status_code = 200
-    status_url = job_url(job.id) if job else f"/api/v1/uploads/{stored.photo.id}"
-    response.headers["Location"] = status_url
-    if response.status_code == 202:
-        response.headers["Retry-After"] = "1"
-    return UploadAnswer(
-        file_id=stored.photo.id,
-        job_id=job.id if job else None,
-        filename=stored.photo.filename,
-        file_size=stored.photo.size_bytes,
-        upload_time=stored.photo.uploaded_at,
-        status=JobState(job.state) if job else JobState.SUCCEEDED,
-        status_url=status_url,
-        already_there=stored.photo.object_key != received.key,
-        message=_message(stored, job),
-    )
+    wait = preferred_wait(request, gateway.settings.max_wait_seconds)
+    if wait and stored.queued and job is not None:
+        response.headers["Preference-Applied"] = f"wait={wait:g}"
+        job = await wait_for_job(gateway, job.id, wait)
+    said = Said.of(stored, job, key)
+    if said.status == 201:
+        await run_in_threadpool(replace, said)
+    response.status_code = said.status
+    response.headers.update(said.headers)
+    return said.answer
 
 
-def _store(gateway: Gateway, map_name: str, received: Received) -> Stored:
+def _store(gateway: Gateway, map_name: str, received: Received, keep: Keep) -> Stored:
     """Check what came and acknowledge it; whatever is not kept leaves no bytes behind."""
     try:
         media_type = check_photo_begin(received.begin)
@@ -112,7 +164,7 @@ def _store(gateway: Gateway, map_name: str, received: Received) -> Stored:
         with received.open(gateway.store) as file:
             header = read_photo_header(file, gateway.settings.max_image_pixels)
         incoming = Incoming(received, media_type, header, fields)
-        stored = store_photo(gateway, map_name, incoming)
+        stored = store_photo(gateway, map_name, incoming, keep)
     except PlacewiseError:
         # Only what is certainly refused: after a lost connection the row may be committed.
         gateway.store.delete(received.key)

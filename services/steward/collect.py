@@ -12,11 +12,12 @@ from collections.abc import Callable, Iterable
 from datetime import timedelta
 from uuid import UUID
 
-from sqlalchemy import delete, select, update
+from sqlalchemy import and_, delete, or_, select, update
 from sqlalchemy.orm import Session
 
 from shared.catalog.base import db_now, db_now_plus
 from shared.catalog.chunks import Chunk, Descriptor
+from shared.catalog.direct_uploads import DirectUpload
 from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.maps import bump_version, lock_map
 from shared.catalog.photos import Photo
@@ -26,11 +27,13 @@ from shared.chunks import delete_chunk
 from shared.jobs.table import MODEL_CHANGES, UNFINISHED, Job, JobKind
 from shared.objects import ObjectStore
 from shared.objects.keys import (
+    INCOMING,
     ORIGINALS,
     QUERIES,
     THUMBNAILS,
     VOCABULARIES,
     WORK,
+    incoming_key,
     is_original_key,
     query_key,
     query_vector_key,
@@ -41,6 +44,7 @@ from shared.settings import Settings
 log = logging.getLogger(__name__)
 
 AT_ONCE = 500  # rows looked at in one transaction
+COMPLETED_SECONDS = 86_400.0  # for which a completed direct upload is remembered
 
 
 def collect_superseded_chunks(catalog: Catalog, store: ObjectStore, grace_seconds: float) -> None:
@@ -145,6 +149,25 @@ def collect_queries(catalog: Catalog, store: ObjectStore, ttl_seconds: float) ->
             session.execute(delete(Job).where(Job.id.in_(job_ids)))
 
 
+def collect_direct_uploads(catalog: Catalog, store: ObjectStore) -> None:
+    """Direct uploads that were not completed in time, with what was sent for them; completed ones
+    after a day more, in which completing them again gives the same answer."""
+    gone = or_(
+        and_(DirectUpload.answer.is_(None), DirectUpload.expires_at < db_now()),
+        DirectUpload.expires_at < db_now_plus(-COMPLETED_SECONDS),
+    )
+    with catalog.read() as session:
+        upload_ids = session.scalars(select(DirectUpload.id).where(gone).limit(AT_ONCE)).all()
+    for upload_id in upload_ids:
+        store.delete(incoming_key(upload_id))
+    if upload_ids:
+        with catalog.write() as session:
+            session.execute(
+                # Looked at again: it may have been completed at the last moment.
+                delete(DirectUpload).where(DirectUpload.id.in_(upload_ids), gone)
+            )
+
+
 def collect_work(catalog: Catalog, store: ObjectStore) -> None:
     """What model changes kept between their slices, once they have ended or need it no more."""
     keys = [info.key for info in store.list(WORK)]
@@ -192,12 +215,24 @@ def collect(catalog: Catalog, store: ObjectStore, settings: Settings) -> None:
     collect_deleted_photos(catalog, store, settings.retired_grace_seconds)
     collect_queries(catalog, store, settings.query_ttl_seconds)
     collect_work(catalog, store)
+    collect_direct_uploads(catalog, store)
 
 
 def _known_originals(session: Session, keys: list[str]) -> Iterable[str]:
     """Those of photos, and whatever Placewise has not put there: that is not ours to remove."""
     stored = session.scalars(select(Photo.object_key).where(Photo.object_key.in_(keys)))
     return [*stored, *(key for key in keys if not is_original_key(key))]
+
+
+def _known_incoming(session: Session, keys: list[str]) -> Iterable[str]:
+    """Those of uploads that are not completed; of others, a URL that was still good sent more."""
+    upload_ids = _ids(key.removeprefix(INCOMING) for key in keys)
+    waiting = session.scalars(
+        select(DirectUpload.id).where(
+            DirectUpload.id.in_(upload_ids), DirectUpload.answer.is_(None)
+        )
+    )
+    return [incoming_key(upload_id) for upload_id in waiting]
 
 
 def _known_thumbnails(session: Session, keys: list[str]) -> Iterable[str]:
@@ -238,6 +273,7 @@ def _ids(names: Iterable[str]) -> set[UUID]:
 
 
 REFERENCED: dict[str, Callable[[Session, list[str]], Iterable[str]]] = {
+    INCOMING: _known_incoming,
     ORIGINALS: _known_originals,
     THUMBNAILS: _known_thumbnails,
     "chunks/": _known_chunks,

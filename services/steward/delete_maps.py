@@ -13,6 +13,7 @@ from uuid import UUID
 from sqlalchemy import delete, select
 
 from shared.catalog.chunks import Chunk, Descriptor
+from shared.catalog.direct_uploads import DirectUpload
 from shared.catalog.evaluations import Evaluation
 from shared.catalog.generations import Generation
 from shared.catalog.maps import Map
@@ -24,7 +25,7 @@ from shared.chunks import delete_chunk
 from shared.jobs.finish import cancel_all
 from shared.jobs.table import Job, JobKind
 from shared.objects import ObjectStore
-from shared.objects.keys import query_key, query_vector_key, thumbnail_key
+from shared.objects.keys import incoming_key, query_key, query_vector_key, thumbnail_key
 
 log = logging.getLogger(__name__)
 
@@ -47,7 +48,7 @@ def _step(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
     """Remove the next rows of the map with their objects; True when the map is gone."""
     with catalog.write() as session:
         cancel_all(session, Job.map_id == map_id)
-    for some_were_left in (_chunks, _queries, _photos):
+    for some_were_left in (_chunks, _queries, _photos, _direct_uploads):
         if some_were_left(catalog, store, map_id):
             return False
     _vocabularies(catalog, store, map_id)
@@ -107,6 +108,19 @@ def _photos(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
             session.execute(delete(Descriptor).where(Descriptor.photo_id.in_(ids)))
             session.execute(delete(Job).where(Job.photo_id.in_(ids)))
             session.execute(delete(Photo).where(Photo.id.in_(ids)))
+    return bool(ids)
+
+
+def _direct_uploads(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
+    with catalog.read() as session:
+        ids = session.scalars(
+            select(DirectUpload.id).where(DirectUpload.map_id == map_id).limit(AT_ONCE)
+        ).all()
+    for upload_id in ids:
+        store.delete(incoming_key(upload_id))
+    if ids:
+        with catalog.write() as session:
+            session.execute(delete(DirectUpload).where(DirectUpload.id.in_(ids)))
     return bool(ids)
 
 

@@ -14,7 +14,7 @@ from services.steward.compact import compact
 from services.steward.delete_maps import delete_maps
 from services.steward.model_changes import advance_model_changes, fit_maps_that_wait
 from services.steward.queue import free_leases, resend_hints
-from services.steward.retention import forget_old_jobs, forget_old_searches
+from services.steward.retention import forget_old_jobs, forget_old_keys, forget_old_searches
 from services.steward.search_workers import remove_dead_workers
 from shared.catalog.session import Catalog
 from shared.jobs import Hints
@@ -67,6 +67,7 @@ class Steward:
                 10.0,
                 lambda: forget_old_searches(catalog, settings.search_history_days),
             ),
+            Duty("forget old keys", 10.0, lambda: forget_old_keys(catalog)),
             Duty(
                 "evaluate changed maps",
                 2.0,

@@ -1,10 +1,11 @@
-"""What is kept for a while only: finished jobs and the history of searches."""
+"""What is kept for a while only: finished jobs, the history of searches, idempotency keys."""
 
 from __future__ import annotations
 
 from sqlalchemy import delete, exists, or_, select
 
-from shared.catalog.base import db_now_plus
+from shared.catalog.base import db_now, db_now_plus
+from shared.catalog.idempotency import KeyedCall
 from shared.catalog.photos import Photo
 from shared.catalog.searches import Search
 from shared.catalog.session import Catalog
@@ -40,3 +41,15 @@ def forget_old_searches(catalog: Catalog, history_days: float) -> None:
     )
     with catalog.write() as session:
         session.execute(delete(Search).where(Search.id.in_(session.scalars(old).all())))
+
+
+def forget_old_keys(catalog: Catalog) -> None:
+    """Idempotency keys whose time is over."""
+    old = (
+        select(KeyedCall.id)
+        .where(KeyedCall.expires_at <= db_now())
+        .limit(AT_ONCE)
+        .with_for_update(skip_locked=True)
+    )
+    with catalog.write() as session:
+        session.execute(delete(KeyedCall).where(KeyedCall.id.in_(session.scalars(old).all())))

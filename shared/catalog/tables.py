@@ -1,8 +1,10 @@
 """Every table, imported: what Alembic compares the database with."""
 
 from shared.catalog.chunks import Chunk, Descriptor
+from shared.catalog.direct_uploads import DirectUpload
 from shared.catalog.evaluations import Evaluation
 from shared.catalog.generations import Generation
+from shared.catalog.idempotency import KeyedCall
 from shared.catalog.maps import Map
 from shared.catalog.models import Model
 from shared.catalog.photos import Photo
@@ -14,9 +16,11 @@ from shared.jobs.table import Job
 __all__ = [
     "Chunk",
     "Descriptor",
+    "DirectUpload",
     "Evaluation",
     "Generation",
     "Job",
+    "KeyedCall",
     "Map",
     "Model",
     "Photo",

@@ -5,6 +5,7 @@
 | keys | what lies there |
 |---|---|
 | `originals/<uuid>` | an uploaded photo |
+| `incoming/<upload>` | what a caller sent straight to the bucket, until the upload is completed |
 | `thumbnails/<photo>` | its thumbnail, JPEG |
 | `chunks/<generation>/<chunk>.npy`, `.json` | descriptor rows, and what they are |
 | `vocabularies/<uuid>.npy` | VLAD centres |
@@ -13,6 +14,13 @@
 """
 
 from shared.objects.folder import FolderStore
-from shared.objects.port import ObjectInfo, ObjectStore, ObjectWriter
+from shared.objects.port import DirectStore, ObjectInfo, ObjectStore, ObjectWriter, PresignedPut
 
-__all__ = ["FolderStore", "ObjectInfo", "ObjectStore", "ObjectWriter"]
+__all__ = [
+    "DirectStore",
+    "FolderStore",
+    "ObjectInfo",
+    "ObjectStore",
+    "ObjectWriter",
+    "PresignedPut",
+]

@@ -7,6 +7,7 @@ may be on another disk.
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import stat
 from collections.abc import Iterator, Mapping, Sequence
@@ -14,7 +15,7 @@ from datetime import UTC, datetime
 from pathlib import Path, PurePosixPath
 from typing import BinaryIO
 
-from shared.errors import NotFound, Unavailable
+from shared.errors import NotFound, StorageFull, Unavailable
 from shared.ids import new_id
 from shared.objects.keys import check_key, is_key
 from shared.objects.port import ObjectInfo
@@ -24,6 +25,7 @@ MISSING = (FileNotFoundError, NotADirectoryError, IsADirectoryError)
 PARTIAL = ".partial"  # the folder of files being written: same file system, so rename is atomic
 MARK = ".placewise"  # the file that says whose folder it is (`shared.objects.upload_dir`)
 RESERVED = (PARTIAL, MARK)
+FULL_RETRY_SECONDS = 60
 
 
 class FolderStore:
@@ -135,19 +137,39 @@ class FolderStore:
                     yield _info(key, path.stat())
 
 
+@contextlib.contextmanager
+def _room() -> Iterator[None]:
+    """StorageFull (`disk_full`) for a disk, or a quota, that takes no more."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+            raise
+        raise StorageFull(
+            "disk_full",
+            "The disk of the object store is full: make room on it, or delete photos or maps.",
+            retry_after_seconds=FULL_RETRY_SECONDS,
+        ) from error
+
+
 class FolderWriter:
     """Writes beside the target and renames on `commit`."""
 
+    @_room()
     def __init__(self, target: Path, partial: Path) -> None:
         self._target = target
         self._partial = partial
-        self._file = partial.open("wb")
+        # Unbuffered: what a full disk did not take is not tried again by closing the file.
+        self._file = partial.open("wb", buffering=0)
 
+    @_room()
     def write(self, data: bytes) -> None:
-        self._file.write(data)
+        left = memoryview(data)
+        while left:
+            left = left[self._file.write(left) :]
 
+    @_room()
     def commit(self) -> None:
-        self._file.flush()
         os.fsync(self._file.fileno())
         self._file.close()
         # The rename has to survive a power cut, too, and so has every folder made for it.

@@ -6,6 +6,7 @@ from uuid import UUID
 
 from shared.ids import new_id
 
+INCOMING = "incoming/"
 ORIGINALS = "originals/"
 QUERIES = "queries/"
 THUMBNAILS = "thumbnails/"
@@ -31,6 +32,11 @@ def check_key(key: str) -> str:
 def new_original_key() -> str:
     """A fresh key for an upload; user file names never become keys."""
     return f"{ORIGINALS}{new_id()}"
+
+
+def incoming_key(upload_id: UUID) -> str:
+    """Where a caller puts the bytes of a direct upload; completing it copies them."""
+    return f"{INCOMING}{upload_id}"
 
 
 def is_original_key(key: str) -> bool:

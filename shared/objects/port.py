@@ -16,6 +16,15 @@ class ObjectInfo:
     """When it was written, by the store's clock, UTC."""
 
 
+@dataclass(frozen=True, slots=True)
+class PresignedPut:
+    """An address at which one object may be put, without keys."""
+
+    url: str
+    headers: dict[str, str]
+    """To be sent with it, as they stand: they are part of the signature."""
+
+
 class ObjectWriter(Protocol):
     """Writes one object piece by piece; nothing is visible before `commit`."""
 
@@ -40,7 +49,9 @@ class ObjectStore(Protocol):
 
     `get` and `open` raise NotFound (`object_not_found`) for a missing key. Everything raises
     Unavailable while a store on another machine can't be used: `object_store_unavailable`,
-    `object_store_refused`, `bucket_not_found`. So does reading from what `open` has given.
+    `object_store_busy`, `object_store_refused`, `bucket_not_found`; writing raises its kind
+    StorageFull (`object_store_full`, `disk_full`) when there is no room. Reading from what `open`
+    has given raises so, too.
     """
 
     def writer(self, key: str) -> ObjectWriter: ...
@@ -62,3 +73,15 @@ class ObjectStore(Protocol):
 
     def check(self) -> None:
         """Raise Unavailable when objects can't be written now."""
+
+
+class DirectStore(ObjectStore, Protocol):
+    """A store that callers may send objects to themselves: a bucket."""
+
+    def presign_put(
+        self, key: str, *, size_bytes: int, sha256: str, expires_seconds: int
+    ) -> PresignedPut:
+        """An address for an object of this size and SHA-256 (hexadecimal), good for so long."""
+
+    def copy(self, source: str, target: str) -> None:
+        """`target` is what `source` is now, and stays so. NotFound where there is no `source`."""

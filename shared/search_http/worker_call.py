@@ -64,6 +64,7 @@ def _call(
     if answer.is_success:
         return answer.content
     said = refusal(answer.status_code, answer.text)
-    if type(said) is PlacewiseError:  # a proxy's page, or the worker's own fault
+    # A proxy's page, or the worker's own fault.
+    if said.code == "bad_answer" or type(said) is PlacewiseError:
         raise WorkerAway(url, said.detail)
     raise said

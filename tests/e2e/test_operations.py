@@ -25,6 +25,8 @@ CALLS = {
     f"GET {API}/jobs/{{job_id}}/result",
     f"POST {API}/jobs/{{job_id}}/cancel",
     f"POST {API}/jobs/{{job_id}}/retry",
+    f"POST {API}/uploads/presign",
+    f"POST {API}/uploads/presign/{{upload_id}}/complete",
     f"POST {API}/similarity",
     f"POST {API}/similarity/{{file_id}}",
     f"GET {API}/search",

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import hashlib
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import urllib3
 
+from shared.client import Client
 from shared.objects.s3 import Bucket, S3Store
 from tests.support.photos import photo_bytes
 from tests.support.problems import problem
@@ -15,6 +18,7 @@ from tests.support.server import ServerProcess, environment, run_command
 from tests.support.servers import S3Server
 
 GONE_SECONDS = 30.0  # the steward's round, and some
+PRESIGN_SECONDS = 10
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +31,8 @@ def server(
     s3: S3Server, bucket: Bucket, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[ServerProcess]:
     home = tmp_path_factory.mktemp("server") / "home"
-    with ServerProcess(home, **s3.variables(bucket.name)) as started:
+    settings = {**s3.variables(bucket.name), "presign_seconds": PRESIGN_SECONDS}
+    with ServerProcess(home, **settings) as started:
         yield started
 
 
@@ -88,3 +93,38 @@ def test_placewise_does_not_start_without_its_object_store(tmp_path: Path) -> No
     assert said, ended.stderr
     assert nobody.endpoint in said[0]
     assert "Traceback" not in ended.stderr
+
+
+def test_a_photo_sent_straight_to_the_bucket_is_found(
+    server: ServerProcess, bucket: Bucket, tmp_path: Path
+) -> None:
+    photo = tmp_path / "straight.jpg"
+    photo.write_bytes(photo_bytes(20))
+    with Client(str(server.client.base_url)) as client:
+        stored = client.upload_direct(photo, latitude=45.5, longitude=7.5, tags=["direct"])
+        assert client.wait_for(stored["job_id"])["state"] == "succeeded"
+        found = client.photo(stored["file_id"])
+    assert (found["original_filename"], found["tags"]) == ("straight.jpg", ["direct"])
+    assert server.ask(photo_bytes(20)).json()["similar_images"][0]["image_id"] == found["image_id"]
+    assert keys(bucket, "incoming/") == set()
+
+
+def test_a_photo_that_was_sent_and_never_completed_is_removed(
+    server: ServerProcess, bucket: Bucket
+) -> None:
+    data = photo_bytes(21)
+    about = {
+        "filename": "forgotten.jpg",
+        "file_size": len(data),
+        "sha256": hashlib.sha256(data).hexdigest(),
+    }
+    begun = server.client.post("/api/v1/uploads/presign", json=about)
+    assert begun.status_code == 201, begun.text
+    put = urllib3.request("PUT", begun.json()["url"], body=data, headers=begun.json()["headers"])
+    assert put.status == 200
+    assert keys(bucket, "incoming/") == {f"incoming/{begun.json()['upload_id']}"}
+    deadline = time.monotonic() + PRESIGN_SECONDS + GONE_SECONDS
+    while keys(bucket, "incoming/"):
+        assert time.monotonic() < deadline, server.log()
+        time.sleep(0.2)
+    problem(server.client.post(begun.json()["complete_url"]), 404, "upload_not_found")

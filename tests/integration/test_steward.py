@@ -29,7 +29,9 @@ from services.steward.loop import Duty, Steward
 from services.steward.queue import resend_hints
 from shared.catalog.base import db_now_plus
 from shared.catalog.chunks import Chunk, Descriptor, count_searchable, live_chunks
+from shared.catalog.direct_uploads import DirectUpload
 from shared.catalog.generations import Generation, GenerationState
+from shared.catalog.idempotency import CallMade, KeyedCall, claim_key
 from shared.catalog.maps import Map
 from shared.catalog.photos import Photo, get_photo
 from shared.catalog.session import Catalog
@@ -39,6 +41,7 @@ from shared.ids import new_id
 from shared.jobs import InProcessHints, Job, JobKind, JobState
 from shared.objects import FolderStore
 from shared.objects.keys import (
+    incoming_key,
     new_original_key,
     new_vocabulary_key,
     query_key,
@@ -620,15 +623,31 @@ def test_each_duty_is_done_by_the_loop(
     house.change(Job, lost, lease_until=db_now_plus(-1))
     house.store.put(new_original_key(), b"orphan")
     house.age(house.objects("originals/"), 60)
+    with house.catalog.write() as session:
+        made = CallMade("someone", "key", "POST /api/v1/maps", "0" * 64)
+        claim_key(session, made, lease_seconds=1, life_seconds=-1)
+        forgotten = DirectUpload(
+            map_id=house.map_id,
+            filename="a.jpg",
+            size_bytes=1,
+            sha256="0" * 64,
+            expires_at=db_now_plus(-1),
+        )
+        session.add(forgotten)
+        session.flush()
+    house.store.put(incoming_key(forgotten.id), b"never completed")
     steward = Steward(house.catalog, house.store, hints, soon)
     stop = threading.Event()
     steward.duties.append(Duty("stop", 0.0, stop.set))
     steward.run(stop)
     assert house.live() == [(0, 2)]
     assert house.objects("originals/") == set()
+    assert house.objects("incoming/") == set()
     assert hints.wait(0)
     house.check_rows(kept)
     with house.catalog.read() as session:
+        assert session.scalars(select(KeyedCall.id)).all() == []
+        assert session.scalars(select(DirectUpload.id)).all() == []
         assert session.get_one(Job, lost).state == JobState.QUEUED
         fit = session.scalars(select(Job).where(Job.kind == JobKind.FIT)).one()
         assert fit.map_id == other

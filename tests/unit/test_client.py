@@ -2,24 +2,28 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import socket
 import threading
 from collections.abc import Iterator
+from email.message import Message
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from shared.client import Client, retry_while_away
+from shared.client import Client
 from shared.errors import (
     Conflict,
     Gone,
     InvalidRequest,
     NotFound,
     PlacewiseError,
+    StorageFull,
     TooLarge,
+    TooManyRequests,
     Unauthorized,
     Unavailable,
     Unprocessable,
@@ -32,16 +36,17 @@ class FakeServer(HTTPServer):
 
     def __init__(self) -> None:
         super().__init__(("127.0.0.1", 0), Handler)
-        self.answers: list[tuple[int, bytes]] = []
+        self.answers: list[tuple[int, bytes, dict[str, str]]] = []
+        self.headers: list[Message] = []
         self.asked: list[tuple[str, str, bytes]] = []
 
     @property
     def url(self) -> str:
         return f"http://127.0.0.1:{self.server_address[1]}"
 
-    def will_answer(self, status: int, body: Any) -> None:
+    def will_answer(self, status: int, body: Any, **headers: str) -> None:
         data = body if isinstance(body, bytes) else json.dumps(body).encode()
-        self.answers.append((status, data))
+        self.answers.append((status, data, headers))
 
 
 class Handler(BaseHTTPRequestHandler):
@@ -50,13 +55,16 @@ class Handler(BaseHTTPRequestHandler):
     def answer(self) -> None:
         body = self.rfile.read(int(self.headers.get("Content-Length") or 0))
         self.server.asked.append((self.command, self.path, body))
-        status, data = self.server.answers.pop(0)
+        self.server.headers.append(self.headers)
+        status, data, headers = self.server.answers.pop(0)
         self.send_response(status)
+        for name, value in headers.items():
+            self.send_header(name, value)
         self.send_header("Content-Length", str(len(data)))
         self.end_headers()
         self.wfile.write(data)
 
-    do_GET = do_POST = answer  # noqa: N815
+    do_GET = do_POST = do_PUT = do_DELETE = answer  # noqa: N815
 
     def log_message(self, format: str, *args: Any) -> None:  # noqa: A002
         """Keep the test's output clean."""
@@ -91,7 +99,8 @@ def client(server: FakeServer) -> Iterator[Client]:
         (422, Unprocessable),
         (503, Unavailable),
         (500, PlacewiseError),
-        (429, PlacewiseError),
+        (429, TooManyRequests),
+        (507, StorageFull),
     ],
 )
 def test_refusals_come_back_as_the_errors_that_they_were(
@@ -203,22 +212,160 @@ def test_query_that_takes_longer_is_fetched_when_its_job_has_ended(
     ]
 
 
-def test_retrying_gives_up_with_the_last_error() -> None:
-    def away() -> dict[str, Any]:
-        raise Unavailable("server_unreachable", "No one there.")
-
-    with pytest.raises(Unavailable):
-        retry_while_away(away, seconds=-1)
-    assert retry_while_away(lambda: {"here": True}, seconds=0) == {"here": True}
+# --- patience --------------------------------------------------------------------------------
 
 
-def test_retrying_stops_at_errors_that_waiting_does_not_cure() -> None:
-    calls: list[int] = []
+@pytest.fixture
+def slept(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """The waits, which take no time: the clock is moved instead."""
+    waits: list[float] = []
+    clock = [1000.0]
 
-    def refused() -> dict[str, Any]:
-        calls.append(1)
-        raise NotFound("photo_not_found", "None.")
+    def sleep(seconds: float) -> None:
+        waits.append(seconds)
+        clock[0] += seconds
 
-    with pytest.raises(NotFound):
-        retry_while_away(refused, seconds=60)
-    assert len(calls) == 1
+    monkeypatch.setattr("shared.client.time.sleep", sleep)
+    monkeypatch.setattr("shared.client.time.monotonic", lambda: clock[0])
+    return waits
+
+
+@pytest.fixture
+def photo(tmp_path: Path) -> Path:
+    path = tmp_path / "street.jpg"
+    path.write_bytes(b"the photo's bytes" * 1000)
+    return path
+
+
+def refuse(server: FakeServer, error: PlacewiseError, **headers: str) -> None:
+    server.will_answer(error.status, error.as_problem(), **headers)
+
+
+AWAY = Unavailable("search_behind", "Away.")
+
+
+def test_a_repeated_upload_sends_the_same_key_and_all_its_bytes_again(
+    server: FakeServer, photo: Path, slept: list[float]
+) -> None:
+    refuse(server, AWAY)
+    refuse(server, StorageFull("disk_full", "Full.", retry_after_seconds=7))
+    refuse(server, Conflict("idempotency_key_in_use", "Under way.", retry_after_seconds=1))
+    server.will_answer(202, {"file_id": "abc"})
+    with Client(server.url, patience_seconds=60) as client:
+        assert client.upload(photo) == {"file_id": "abc"}
+    assert [photo.read_bytes() in body for _, _, body in server.asked] == [True] * 4
+    keys = [headers.get("Idempotency-Key") for headers in server.headers]
+    assert keys[0] is not None
+    assert len(set(keys)) == 1
+    assert slept == [0.5, 7, 1]
+
+
+def test_each_call_has_a_key_of_its_own_and_only_what_makes_something_has_one(
+    server: FakeServer, slept: list[float]
+) -> None:
+    for _ in range(4):
+        server.will_answer(200, {})
+    with Client(server.url, patience_seconds=60) as client:
+        client.evaluate()
+        client.evaluate()
+        client.stats()
+        client.delete_photo("abc")
+    keys = [headers.get("Idempotency-Key") for headers in server.headers]
+    assert keys[0] != keys[1]
+    assert keys[2:] == [None, None]
+
+
+def test_a_client_without_patience_repeats_nothing_and_sends_no_key(
+    server: FakeServer, client: Client, photo: Path, slept: list[float]
+) -> None:
+    for error in (AWAY, TooManyRequests("queue_full", "Full.", retry_after_seconds=3)):
+        refuse(server, error)
+        with pytest.raises(type(error)):
+            client.upload(photo)
+    assert len(server.asked) == 2
+    assert [headers.get("Idempotency-Key") for headers in server.headers] == [None, None]
+    assert slept == []
+
+
+def test_patience_ends_with_the_last_error(server: FakeServer, slept: list[float]) -> None:
+    for _ in range(5):
+        refuse(server, AWAY)
+    with Client(server.url, patience_seconds=2) as client, pytest.raises(Unavailable) as caught:
+        client.stats()
+    assert caught.value.code == "search_behind"
+    assert slept == [0.5] * 4
+
+
+def test_a_server_that_says_when_to_come_again_is_obeyed_however_long(
+    server: FakeServer, slept: list[float]
+) -> None:
+    seen: list[tuple[str, float]] = []
+    for seconds in (30, 60, 4000):
+        refuse(server, TooManyRequests("queue_full", "Full.", retry_after_seconds=seconds))
+    server.will_answer(200, {"here": True})
+    with Client(server.url) as client:
+        patient = client.patient(1, lambda error, seconds: seen.append((error.code, seconds)))
+        assert patient.stats() == {"here": True}
+    assert slept == [30, 60, 300]
+    assert seen == [("queue_full", seconds) for seconds in slept]
+
+
+def test_a_proxys_retry_after_is_obeyed_too(server: FakeServer, slept: list[float]) -> None:
+    refuse(server, AWAY, **{"Retry-After": "9"})
+    server.will_answer(200, {})
+    with Client(server.url, patience_seconds=60) as client:
+        client.stats()
+    assert slept == [9]
+
+
+@pytest.mark.parametrize(
+    "error",
+    [NotFound("photo_not_found", "None."), Conflict("photo_differs", "Other."), ValueError()],
+    ids=lambda error: type(error).__name__,
+)
+def test_what_waiting_does_not_cure_is_not_repeated(
+    server: FakeServer, slept: list[float], error: Exception
+) -> None:
+    if isinstance(error, PlacewiseError):
+        refuse(server, error)
+    else:
+        server.will_answer(500, b"broken")
+    with Client(server.url, patience_seconds=60) as client, pytest.raises(PlacewiseError):
+        client.stats()
+    assert len(server.asked) == 1
+    assert slept == []
+
+
+def test_a_direct_upload_announces_sends_and_completes(
+    server: FakeServer, photo: Path, slept: list[float]
+) -> None:
+    """The bytes go where the server says, without the key that only the server may see."""
+    server.will_answer(
+        201,
+        {
+            "method": "PUT",
+            "url": f"{server.url}/bucket/incoming/1?X-Amz-Signature=abc",
+            "headers": {"Content-Length": str(photo.stat().st_size), "x-amz-checksum-sha256": "="},
+            "complete_url": "/api/v1/uploads/presign/1/complete",
+        },
+    )
+    server.will_answer(503, b"<Error><Code>SlowDown</Code></Error>")
+    server.will_answer(200, b"")
+    server.will_answer(202, {"file_id": "abc"})
+    with Client(server.url, map_name="lab", key="secret", patience_seconds=60) as client:
+        assert client.upload_direct(photo, latitude=45.5, place=None) == {"file_id": "abc"}
+    announced, *sent, completed = server.asked
+    assert announced[1] == "/api/v1/uploads/presign?map=lab"
+    assert json.loads(announced[2]) == {
+        "filename": "street.jpg",
+        "file_size": photo.stat().st_size,
+        "sha256": hashlib.sha256(photo.read_bytes()).hexdigest(),
+        "latitude": 45.5,
+    }
+    for (method, path, body), headers in zip(sent, server.headers[1:3], strict=True):
+        assert (method, path) == ("PUT", "/bucket/incoming/1?X-Amz-Signature=abc")
+        assert body == photo.read_bytes()
+        assert headers["x-amz-checksum-sha256"] == "="
+        assert headers.get("Authorization") is None
+    assert completed[:2] == ("POST", "/api/v1/uploads/presign/1/complete?map=lab")
+    assert len(slept) == 1

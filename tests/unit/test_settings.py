@@ -81,6 +81,10 @@ def test_password_of_the_database_is_not_shown(monkeypatch: pytest.MonkeyPatch) 
         ("BATCH_PHOTOS", "many"),
         ("DECODE_MEMORY_BYTES", "1000"),
         ("MAX_ATTEMPTS", "0"),
+        ("MAX_QUEUED_JOBS", "0"),
+        ("MAX_CONCURRENT_UPLOADS", "0"),
+        ("MIN_FREE_BYTES", "-1"),
+        ("PRESIGN_SECONDS", "604801"),
     ],
 )
 def test_values_out_of_range_are_refused_by_name(
@@ -114,6 +118,9 @@ def test_s3_speaks_https_with_a_bucket_of_its_own_unless_told_otherwise(
         ({"S3_ENDPOINT": "http://s3:8333"}, "S3_SECURE says whether it is HTTPS"),
         ({"S3_ENDPOINT": "s3:8333/placewise"}, "without a scheme"),
         ({"S3_BUCKET": "Photos"}, "small letters"),
+        ({"S3_PUBLIC_ENDPOINT": "photos.example.com"}, "https://photos.example.com"),
+        ({"S3_PUBLIC_ENDPOINT": "https://photos.example.com/bucket"}, "without a path"),
+        ({"S3_PUBLIC_ENDPOINT": "https://key@photos.example.com"}, "without a path"),
         ({"S3_TIMEOUT_SECONDS": "0"}, "S3_TIMEOUT_SECONDS"),
         ({"UPLOAD_DIR": "./uploads"}, "Unset one of the two"),
     ],

@@ -12,6 +12,7 @@ from xml.etree.ElementTree import ParseError
 
 import urllib3
 from minio.error import MinioException, S3Error
+from minio.helpers import BaseURL
 from urllib3.connectionpool import ConnectionPool
 from urllib3.exceptions import (
     ConnectTimeoutError,
@@ -23,7 +24,7 @@ from urllib3.exceptions import (
 )
 from urllib3.response import BaseHTTPResponse
 
-from shared.errors import Misconfigured, NotFound, PlacewiseError, Unavailable
+from shared.errors import Misconfigured, NotFound, PlacewiseError, StorageFull, Unavailable
 from shared.objects.s3.client import S3Client
 from shared.settings import Settings
 
@@ -39,6 +40,16 @@ REFUSED = {"AccessDenied", "AllAccessDisabled", "AccountProblem", "MethodNotAllo
 WRONG_REGION = {"AuthorizationHeaderMalformed", "PermanentRedirect", "Redirect"}
 WRONG_CLOCK = {"RequestTimeTooSkewed"}
 CHANGED = {"PreconditionFailed"}
+BUSY = {"SlowDown", "ServiceUnavailable", "Throttling", "ThrottlingException", "RequestTimeout"}
+FULL = {
+    "InsufficientStorage",
+    "QuotaExceeded",
+    "XMinioStorageFull",
+    "XMinioAdminBucketQuotaExceeded",
+}
+FULL_STATUS = 507
+BUSY_RETRY_SECONDS = 5
+FULL_RETRY_SECONDS = 60
 
 
 class OneMoreTry(urllib3.Retry):
@@ -68,6 +79,9 @@ class Bucket:
     client: S3Client
     name: str
     endpoint: str
+    region: str
+    public: BaseURL
+    """The server as callers reach it."""
 
     @classmethod
     def of(cls, settings: Settings) -> Bucket:
@@ -103,13 +117,23 @@ class Bucket:
             region=settings.s3_region,  # left out, the client asks the server for it first
             http_client=connections,
         )
-        return cls(client, settings.s3_bucket, settings.s3_endpoint)
+        public = settings.s3_public_endpoint or (
+            f"{'https' if settings.s3_secure else 'http'}://{settings.s3_endpoint}"
+        )
+        return cls(
+            client,
+            settings.s3_bucket,
+            settings.s3_endpoint,
+            settings.s3_region,
+            BaseURL(public, settings.s3_region),
+        )
 
     @contextlib.contextmanager
     def explained(self, key: str | None = None) -> Iterator[None]:
         """Turns whatever the client raises inside into NotFound (`object_not_found`, only with a
-        `key`) or Unavailable (`object_store_unavailable`, `object_store_refused`,
-        `bucket_not_found`, `object_changed`).
+        `key`) or Unavailable (`object_store_unavailable`, `object_store_busy`,
+        `object_store_refused`, `bucket_not_found`, `object_changed`, and StorageFull:
+        `object_store_full`).
 
         Keys and buckets can be put right while jobs wait, so a wrong one is Unavailable as well:
         a job that meets it is tried again and not failed for good.
@@ -138,6 +162,19 @@ class Bucket:
         log.warning("the object store at %s refused: %s", self.endpoint, error)
         if code in CHANGED:
             return Unavailable("object_changed", f"{key!r} was written anew while it was read.")
+        if code in FULL or error.response.status == FULL_STATUS:
+            return StorageFull(
+                "object_store_full",
+                f"The object store at {self.endpoint} has no room left ({code}). Give it more, or "
+                "delete photos or maps.",
+                retry_after_seconds=FULL_RETRY_SECONDS,
+            )
+        if code in BUSY:
+            return Unavailable(
+                "object_store_busy",
+                f"The object store at {self.endpoint} is asked too much ({code}). Try again.",
+                retry_after_seconds=BUSY_RETRY_SECONDS,
+            )
         advice = _advice(code, self.name)
         if advice is None:
             return Unavailable(

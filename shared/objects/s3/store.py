@@ -6,12 +6,14 @@ from collections.abc import Iterator
 from datetime import UTC
 from typing import BinaryIO
 
+from minio.commonconfig import REPLACE, CopySource
 from minio.error import S3Error
 
 from shared.errors import NotFound
 from shared.objects.keys import check_key
-from shared.objects.port import ObjectInfo
+from shared.objects.port import ObjectInfo, PresignedPut
 from shared.objects.s3.bucket import NO_KEY, Bucket
+from shared.objects.s3.presign import presign_put
 from shared.objects.s3.reader import S3Reader, open_object
 from shared.objects.s3.writer import S3Writer
 
@@ -78,6 +80,28 @@ class S3Store:
                 # A HEAD tells whole seconds, and the two have to agree.
                 at = found.last_modified.astimezone(UTC).replace(microsecond=0)
                 yield ObjectInfo(key, found.size or 0, at)
+
+    def presign_put(
+        self, key: str, *, size_bytes: int, sha256: str, expires_seconds: int
+    ) -> PresignedPut:
+        return presign_put(
+            self.bucket,
+            check_key(key),
+            size_bytes=size_bytes,
+            sha256=sha256,
+            expires_seconds=expires_seconds,
+        )
+
+    def copy(self, source: str, target: str) -> None:
+        client, bucket = self.bucket.client, self.bucket.name
+        with self.bucket.explained(check_key(source)):
+            # What the sender said of the bytes (a type, an encoding) is not taken over.
+            client.copy_object(
+                bucket,
+                check_key(target),
+                CopySource(bucket, source),
+                metadata_directive=REPLACE,
+            )
 
     def check(self) -> None:
         """Asks whether the bucket is there and may be written to. A full disk shows only when

@@ -1,0 +1,192 @@
+"""Refusing work before anything fills up: the queue, the disk, this process's memory.
+
+A route that makes jobs names what it needs room for, which is asked before its body is read:
+
+    @router.post("/evaluations", dependencies=[ROOM_FOR_JOBS])
+
+and one that receives a file does it `with room.receiving(Kind.UPLOAD):`. Query photos have limits
+of their own: however many uploads wait, a query is asked.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import shutil
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterator
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+from fastapi import Depends, Request
+
+from services.gateway.context import DEFAULT_MAP, MapName
+from shared.catalog.session import Catalog
+from shared.errors import StorageFull, TooManyRequests
+from shared.jobs.waiting import Waiting, look_at_queue
+from shared.settings import Settings
+
+LOOK_SECONDS = 1.0
+LOOK_SHARE = 20  # a look that takes long is taken seldom: one part in so many of the time
+RELIEF = 0.9  # of a limit: come again when the queue has shrunk to this
+MOST_RETRY_SECONDS = 60
+DISK_RETRY_SECONDS = 60
+RECEIVING_RETRY_SECONDS = 1
+
+
+class Kind(StrEnum):
+    UPLOAD = "uploads"
+    QUERY = "query photos"
+
+
+class Room:
+    """What one gateway still takes. Thread-safe."""
+
+    def __init__(self, catalog: Catalog, settings: Settings) -> None:
+        self._catalog = catalog
+        self._settings = settings
+        self._folders = _local_folders(settings)
+        self._looking = threading.Lock()
+        self._seen: Waiting | None = None
+        self._next_look = 0.0
+        self._taken: Counter[str | None] = Counter()  # since the last look; None: queries
+        self._receiving: Counter[Kind] = Counter()
+
+    def take_job(self, map_name: str) -> None:
+        """Room for one more job of the map, and for what it stores.
+
+        Raises TooManyRequests (`queue_full`) and StorageFull (`disk_full`).
+        """
+        self.check_disk()
+        seen, settings = self.look(), self._settings
+        taken = sum(count for name, count in self._taken.items() if name is not None)
+        for what, waiting, most in (
+            ("", seen.jobs + taken, settings.max_queued_jobs),
+            (
+                f" of the map {map_name!r}",
+                seen.of_maps.get(map_name, 0) + self._taken[map_name],
+                settings.max_queued_jobs_per_map,
+            ),
+        ):
+            if waiting >= most:
+                raise _queue_full(f"jobs{what}", waiting, most, seen.finished_per_second)
+        self._taken[map_name] += 1
+
+    def take_query(self) -> None:
+        """Room for one more query photo; raises as `take_job` does."""
+        self.check_disk()
+        seen, most = self.look(), self._settings.max_queued_queries
+        waiting = seen.queries + self._taken[None]
+        if waiting >= most:
+            raise _queue_full("query photos", waiting, most, seen.finished_per_second)
+        self._taken[None] += 1
+
+    @contextlib.contextmanager
+    def receiving(self, kind: Kind) -> Iterator[None]:
+        """While a file is received. TooManyRequests (`too_many_uploads`) when enough are already:
+        each holds a part of its file in memory. On the event loop only."""
+        most = self._settings.max_concurrent_uploads
+        if self._receiving[kind] >= most:
+            raise TooManyRequests(
+                "too_many_uploads",
+                f"{most} {kind} are being received already (MAX_CONCURRENT_UPLOADS). Send this one "
+                "again in a moment.",
+                retry_after_seconds=RECEIVING_RETRY_SECONDS,
+            )
+        self._receiving[kind] += 1
+        try:
+            yield
+        finally:
+            self._receiving[kind] -= 1
+
+    def being_received(self, kind: Kind) -> int:
+        return self._receiving[kind]
+
+    def check_disk(self) -> None:
+        """StorageFull (`disk_full`) when the disk has less free than MIN_FREE_BYTES."""
+        free, least = self.free_bytes(), self._settings.min_free_bytes
+        if free is not None and free < least:
+            raise StorageFull(
+                "disk_full",
+                f"The server's disk has {free // 1_000_000} MB free, and keeps "
+                f"{least // 1_000_000} MB (MIN_FREE_BYTES). Make room, or delete photos or maps.",
+                retry_after_seconds=DISK_RETRY_SECONDS,
+                free_bytes=free,
+            )
+
+    def free_bytes(self) -> int | None:
+        """Of the disks that this Placewise writes to itself, the least; None where it does not."""
+        return min((shutil.disk_usage(_existing(f)).free for f in self._folders), default=None)
+
+    def look(self) -> Waiting:
+        """The queue as it was a moment ago."""
+        # Whoever finds another one looking goes on with what was seen before.
+        due = self._seen is None or time.monotonic() >= self._next_look
+        if due and self._looking.acquire(blocking=self._seen is None):
+            try:
+                self._look_anew()
+            finally:
+                self._looking.release()
+        assert self._seen is not None
+        return self._seen
+
+    def _look_anew(self) -> None:
+        began = time.monotonic()
+        if self._seen is not None and began < self._next_look:
+            return  # someone looked while we waited
+        most = max(self._settings.max_queued_jobs, self._settings.max_queued_queries)
+        self._taken.clear()  # before the look: what comes meanwhile is rather counted twice
+        with self._catalog.read() as session:
+            self._seen = look_at_queue(session, most)
+        took = time.monotonic() - began
+        self._next_look = began + max(LOOK_SECONDS, LOOK_SHARE * took)
+
+
+def get_room(request: Request) -> Room:
+    room: Room = request.app.state.room
+    return room
+
+
+RoomDep = Annotated[Room, Depends(get_room)]
+
+
+def _room_for_jobs(room: RoomDep, map_name: MapName = DEFAULT_MAP) -> None:
+    room.take_job(map_name)
+
+
+def _room_for_queries(room: RoomDep) -> None:
+    room.take_query()
+
+
+ROOM_FOR_JOBS = Depends(_room_for_jobs)
+ROOM_FOR_QUERIES = Depends(_room_for_queries)
+
+
+def _queue_full(what: str, waiting: int, most: int, per_second: float) -> TooManyRequests:
+    excess = waiting - RELIEF * most
+    seconds = excess / per_second if per_second > 0 else MOST_RETRY_SECONDS
+    return TooManyRequests(
+        "queue_full",
+        f"{waiting} {what} wait already, and {most} may. Come again after the time in Retry-After; "
+        "more extractors make it shorter.",
+        retry_after_seconds=math.ceil(min(max(seconds, 1), MOST_RETRY_SECONDS)),
+        waiting=waiting,
+        limit=most,
+    )
+
+
+def _local_folders(settings: Settings) -> list[Path]:
+    folders = [settings.upload_dir] if settings.upload_dir else []
+    if settings.s3_endpoint is None or settings.database_url is None:
+        folders.append(settings.placewise_home)
+    return folders
+
+
+def _existing(folder: Path) -> Path:
+    """The folder, or the one above it that it will be made in."""
+    while not folder.exists():
+        folder = folder.parent
+    return folder
