@@ -1,0 +1,149 @@
+"""From a received file to an acknowledged photo: its row and its job in one transaction.
+
+The bytes lie in the object store before the transaction begins. Whoever finds the same bytes
+already there, or loses the race for them, deletes its own object.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, TypeVar
+from uuid import UUID
+
+from sqlalchemy.exc import IntegrityError
+from sqlalchemy.orm import Session
+
+from shared.catalog.maps import get_map
+from shared.catalog.photos import Photo, PhotoRole, find_live_by_sha256
+from shared.catalog.session import Catalog
+from shared.errors import Conflict
+from shared.ids import new_id
+from shared.intake.incoming import Incoming
+from shared.intake.photo_fields import PhotoFields
+from shared.jobs import Hints, Job, JobKind, JobState, Priority
+from shared.jobs.finish import requeue
+
+SAME_DEGREES = 1e-7  # about a centimetre
+
+Result = TypeVar("Result")
+
+
+@dataclass(frozen=True, slots=True)
+class Stored:
+    photo: Photo
+    job: Job | None
+    queued: bool
+    """False: the same bytes were there already and need no work."""
+
+
+def store_photo(catalog: Catalog, hints: Hints, map_name: str, incoming: Incoming) -> Stored:
+    """Acknowledge the photo, or the one with the same bytes that the map has already.
+
+    Raises NotFound (`map_not_found`), and Conflict (`photo_differs`) when something else was said
+    of that one.
+    """
+    stored = try_again_once(lambda: _store(catalog, map_name, incoming))
+    if stored.queued:
+        hints.send()
+    return stored
+
+
+def try_again_once(store: Callable[[], Result]) -> Result:
+    """`store`, a transaction with `put_photo`; once more when it lost the race for its bytes."""
+    try:
+        return store()
+    except IntegrityError:
+        # The same bytes were committed between our look and our insert: look again.
+        return store()
+
+
+def put_photo(
+    session: Session, map_id: UUID, incoming: Incoming, priority: Priority = Priority.UPLOAD
+) -> Stored:
+    """The photo's row and its job's, in the caller's transaction.
+
+    Raises Conflict (`photo_differs`), and IntegrityError when the same bytes were committed since
+    the transaction has looked for them.
+    """
+    received, header, fields = incoming.received, incoming.header, incoming.fields
+    existing = find_live_by_sha256(session, map_id, received.sha256)
+    if existing is not None:
+        return _same_again(session, existing, fields)
+    photo_id, job_id = new_id(), new_id()
+    said_where = fields.latitude is not None
+    photo = Photo(
+        id=photo_id,
+        map_id=map_id,
+        job_id=job_id,
+        sha256=received.sha256,
+        object_key=received.key,
+        filename=received.filename,
+        media_type=incoming.media_type,
+        size_bytes=received.size_bytes,
+        width=header.width,
+        height=header.height,
+        latitude=fields.latitude if said_where else header.latitude,
+        longitude=fields.longitude if said_where else header.longitude,
+        heading=fields.heading if fields.heading is not None else header.heading,
+        captured_at=fields.captured_at or header.captured_at,
+        place=fields.place,
+        tags=fields.tags or [],
+        attributes=fields.metadata or {},
+        role=fields.role or PhotoRole.DATABASE,
+    )
+    session.add(photo)
+    session.flush()
+    job = Job(id=job_id, map_id=map_id, kind=JobKind.INDEX, priority=priority, photo_id=photo_id)
+    session.add(job)
+    session.flush()
+    return Stored(photo, job, queued=True)
+
+
+def _store(catalog: Catalog, map_name: str, incoming: Incoming) -> Stored:
+    with catalog.write() as session:
+        return put_photo(session, get_map(session, map_name).id, incoming)
+
+
+def _same_again(session: Session, photo: Photo, fields: PhotoFields) -> Stored:
+    differing = _differing(photo, fields)
+    if differing:
+        raise Conflict(
+            "photo_differs",
+            "The map has a photo with the same bytes of which something else was said: "
+            f"{', '.join(differing)}. To change that: PATCH /api/v1/uploads/{photo.id}, or "
+            "`placewise index --update`.",
+            file_id=str(photo.id),
+            differing=differing,
+        )
+    job = session.get(Job, photo.job_id, with_for_update=True) if photo.job_id else None
+    if job is not None and job.state in (JobState.FAILED, JobState.CANCELLED):
+        requeue(job)
+        return Stored(photo, job, queued=True)
+    return Stored(photo, job, queued=False)
+
+
+def _differing(photo: Photo, fields: PhotoFields) -> list[str]:
+    """The fields that say something else of the photo than is stored."""
+    stored = {
+        "latitude": photo.latitude,
+        "longitude": photo.longitude,
+        "heading": photo.heading,
+        "captured_at": photo.captured_at,
+        "place": photo.place,
+        "tags": photo.tags,
+        "metadata": photo.attributes,
+        "role": photo.role,
+    }
+    said = {name: getattr(fields, name) for name in stored}
+    return [
+        name
+        for name, value in said.items()
+        if value is not None and not _alike(value, stored[name])
+    ]
+
+
+def _alike(said: Any, stored: Any) -> bool:
+    if isinstance(said, float) and isinstance(stored, float):
+        return abs(said - stored) <= SAME_DEGREES
+    return bool(said == stored)
