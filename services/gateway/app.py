@@ -6,6 +6,7 @@ from fastapi import Depends, FastAPI, Security
 from fastapi.security import HTTPBearer
 
 from services.gateway import (
+    batches,
     evaluations,
     figures,
     health,
@@ -43,12 +44,13 @@ def create_app(gateway: Gateway) -> FastAPI:
         responses=PROBLEM_RESPONSES,
     )
     app.state.gateway = gateway
-    app.add_middleware(BodyLimit)
+    app.add_middleware(BodyLimit, streamed={f"{API}{batches.PATH}"})
     app.add_middleware(KeyCheck, keys=gateway.keys)  # the last one added is the first one asked
     install_problem_handlers(app)
     for module in (
         maps,
         upload,
+        batches,
         jobs,
         similarity,
         photos,

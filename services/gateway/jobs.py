@@ -17,6 +17,7 @@ from services.gateway.schemas import JobAnswer, JobsAnswer
 from services.gateway.waiting import SLOWEST_LOOK_SECONDS, read_job, wait_for_job
 from shared.catalog.maps import get_map
 from shared.jobs import Job, JobKind, JobState
+from shared.jobs.batches import cancel_batch, retry_batch
 from shared.jobs.finish import cancel, retry
 from shared.jobs.hints import lane_of
 from shared.jobs.model_changes import cancel_model_change
@@ -91,6 +92,8 @@ def cancel_job(gateway: GatewayDep, job_id: JobId, map_name: MapName = DEFAULT_M
         found = get_job(session, get_map(session, map_name).id, job_id, lock=True)
         if found.kind in MODEL_CHANGES:
             cancel_model_change(session, found)
+        elif found.kind == JobKind.BATCH:
+            cancel_batch(session, found)
         else:
             cancel(found)
         session.flush()
@@ -100,10 +103,13 @@ def cancel_job(gateway: GatewayDep, job_id: JobId, map_name: MapName = DEFAULT_M
 
 @router.post("/jobs/{job_id}/retry", operation_id="retry_job", response_model=JobAnswer)
 def retry_job(gateway: GatewayDep, job_id: JobId, map_name: MapName = DEFAULT_MAP) -> JobAnswer:
-    """Queue a failed or cancelled job again."""
+    """Queue a failed or cancelled job again; of a batch, the items that have failed."""
     with gateway.catalog.write() as session:
         found = get_job(session, get_map(session, map_name).id, job_id, lock=True)
-        retry(session, found)
+        if found.kind == JobKind.BATCH:
+            retry_batch(session, found)
+        else:
+            retry(session, found)
         session.flush()
         session.refresh(found)
         answer = JobAnswer.of(found)

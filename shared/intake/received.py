@@ -31,12 +31,20 @@ class PassingFile:
     """Counts, hashes and checks a file of which only a piece is there at a time."""
 
     def __init__(
-        self, max_bytes: int, check_begin: Callable[[bytes], object] = lambda begin: None
+        self,
+        max_bytes: int,
+        check_begin: Callable[[bytes], object] = lambda begin: None,
+        *,
+        begin_bytes: int = SNIFFED_BYTES,
+        too_large: Callable[[int], PlacewiseError] | None = None,
     ) -> None:
-        """`check_begin` sees the first bytes as soon as they are there, and may raise."""
+        """`check_begin` sees the first `begin_bytes` as soon as they are there, and may raise;
+        `too_large` makes the refusal of more than `max_bytes`."""
         self.size_bytes = 0
         self.begin = b""
         self._max_bytes = max_bytes
+        self._begin_bytes = begin_bytes
+        self._too_large = too_large or file_too_large
         self._check_begin = check_begin
         self._checked = False
         self._hash = hashlib.sha256()
@@ -47,13 +55,14 @@ class PassingFile:
         return self._hash.hexdigest()
 
     def add(self, piece: bytes) -> None:
-        """The next bytes. Raises TooLarge (`file_too_large`) and what `check_begin` raises."""
+        """The next bytes. Raises TooLarge (`file_too_large`, unless another refusal was
+        given) and what `check_begin` raises."""
         self.size_bytes += len(piece)
         if self.size_bytes > self._max_bytes:
-            raise file_too_large(self._max_bytes)
-        if len(self.begin) < SNIFFED_BYTES:
-            self.begin = (self.begin + piece)[:SNIFFED_BYTES]
-        if not self._checked and len(self.begin) == SNIFFED_BYTES:
+            raise self._too_large(self._max_bytes)
+        if len(self.begin) < self._begin_bytes:
+            self.begin = (self.begin + piece)[: self._begin_bytes]
+        if not self._checked and len(self.begin) == self._begin_bytes:
             self._check()
         self._hash.update(piece)
 

@@ -15,6 +15,7 @@ from sqlalchemy.orm import Session
 
 from shared.catalog.base import db_now, db_now_plus, rowcount
 from shared.catalog.session import Catalog
+from shared.jobs.batches import cancel_items
 from shared.jobs.finish import fail, release
 from shared.jobs.model_changes import abandon_generation
 from shared.jobs.table import Job, locked_under
@@ -99,6 +100,7 @@ def fallen(session: Session, job: Job, max_attempts: int, *, cause: str | None) 
     if job.attempts >= max_attempts:
         fail(job, _fallen_problem(job, cause))
         abandon_generation(session, job)
+        cancel_items(session, job)
         return
     job.alone = job.alone or not fell_alone
     release(job)
