@@ -140,6 +140,12 @@ def list_batch(session: Session, job: Job, items: Iterable[dict[str, Any]]) -> N
     job.params = {**job.params, "listed": True}
     job.progress_total = total
     job.stage = "store"
+    job.attempts = 0
+
+
+def is_listed_batch(job: Job) -> bool:
+    """Is it a batch that has its items?"""
+    return job.kind == JobKind.BATCH and bool(job.params["listed"])
 
 
 def queued_items(session: Session, job_id: UUID, limit: int) -> list[BatchItem]:

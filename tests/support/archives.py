@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import tarfile
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 Members = Mapping[str, bytes] | Sequence[tuple[str, bytes]]
 
@@ -44,7 +44,7 @@ def tar_with(*infos: tuple[tarfile.TarInfo, bytes]) -> bytes:
     return buffer.getvalue()
 
 
-PACKED = {
+PACKED: dict[str, Callable[[Members], bytes]] = {
     "zip": zip_of,
     "stored zip": lambda members: zip_of(members, zipfile.ZIP_STORED),
     "tar": tar_of,

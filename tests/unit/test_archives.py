@@ -263,15 +263,12 @@ def test_a_directory_that_says_it_is_short_is_counted_all_the_same(store: Folder
     assert refused(store, lying).code == "too_many_photos"
 
 
-@pytest.mark.parametrize("offset", [0, 0x1000_0000, 0xFFFF_FFFE])
+@pytest.mark.parametrize("offset", [1, 0x1000_0000, 0xFFFF_FFFE])
 def test_a_member_that_is_not_where_it_should_be_is_damaged(
     store: FolderStore, offset: int
 ) -> None:
     archive = zip_of({"a.jpg": b"x" * 100})
-    moved = edited(archive, 0, b"XXXX")
-    lying = edited(
-        moved if offset == 0 else archive, entry_of(archive) + 42, struct.pack("<L", offset)
-    )
+    lying = edited(archive, entry_of(archive) + 42, struct.pack("<L", offset))
     assert only(store, lying).code == "damaged_member"
 
 

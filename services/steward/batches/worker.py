@@ -67,7 +67,7 @@ class BatchWorker:
         until = time.monotonic() + SLICE_SECONDS
         if not job.params["listed"]:
             self._list(job)
-        if 0 < job.attempts >= self._settings.max_attempts - 1:
+        elif job.attempts >= self._settings.max_attempts:
             self._give_up_next(job)
         while time.monotonic() < until and (items := self._next_items(job)):
             for item in items:
@@ -93,16 +93,17 @@ class BatchWorker:
 
     def _give_up_next(self, job: Job) -> None:
         """Several workers have died since the last photo came in: the next one may be to blame."""
+        error = PlacewiseError(
+            "worker_fell",
+            f"The steward died {job.attempts} times while it brought this photo in. If the photo "
+            "is fine, look at the steward's log and memory, then upload it again.",
+        )
         with self._catalog.read() as session:
             suspects = queued_items(session, job.id, 1)
-        for item in suspects:
-            log.error("item %d of the batch %s has killed its workers", item.number, job.id)
-            error = PlacewiseError(
-                "worker_fell",
-                f"The steward died {job.attempts} times while it brought this photo in. If the "
-                "photo is fine, look at the steward's log and memory, then upload it again.",
-            )
-            self._bring_in.fail(job, item, error.as_problem())
+        if not suspects:
+            raise error
+        log.error("item %d of the batch %s has killed its workers", suspects[0].number, job.id)
+        self._bring_in.fail(job, suspects[0], error.as_problem())
 
     def _next_items(self, job: Job) -> list[BatchItem]:
         """The next queued items, as many as the extractors have room for."""
