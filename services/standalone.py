@@ -31,6 +31,7 @@ from services.http_server import http_server, listening, stopped_by_signals, url
 from services.parts import start_part
 from services.search.presence import Presence
 from services.search.worker import SearchWorker
+from services.steward.batches.worker import BatchWorker
 from services.steward.evaluate import Evaluator
 from services.steward.loop import Steward
 from services.steward.queue import free_leases
@@ -122,6 +123,7 @@ def standalone(settings: Settings, *, new_key: bool = False) -> Iterator[Standal
         extractor = ExtractorWorker(catalog, store, settings, name=name, only_worker=True)
         steward = Steward(catalog, store, hints, settings)
         evaluator = Evaluator(catalog, search, settings, name=name)
+        batches = BatchWorker(catalog, store, hints, settings, name=name)
         gateway = Gateway(catalog, store, hints, search, settings, keys)
         server = http_server(
             create_app(gateway), access_log=settings.debug, on_stop=gateway.job_watch.end_soon
@@ -137,6 +139,7 @@ def standalone(settings: Settings, *, new_key: bool = False) -> Iterator[Standal
                 ("extractor", partial(extractor.run, hints=hints)),
                 ("steward", steward.run),
                 ("evaluator", evaluator.run),
+                ("batches", batches.run),
             )
         ]
         try:

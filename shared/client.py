@@ -18,9 +18,11 @@ from __future__ import annotations
 import contextlib
 import copy
 import hashlib
+import io
+import json
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, BinaryIO, Self, TypeVar
@@ -136,6 +138,49 @@ class Client:
             begun = self._call("POST", "/uploads/presign", json={**about, **_given(**fields)})
             self._repeat(lambda: self._put(begun, file))
         return self._call("POST", begun["complete_url"].removeprefix(API))
+
+    def upload_archive(
+        self, archive: Path, on_sent: Callable[[int], object] = lambda sent_bytes: None
+    ) -> Json:
+        """Start a batch with the photos of a zip or tar; `on_sent` sees the bytes sent so far."""
+        try:
+            with _Watched(archive.open("rb"), on_sent) as opened:
+                name = os.fsencode(archive.name).decode("utf-8", "replace")
+                return self._call("POST", "/upload/batch", files={"archive": (name, opened)})
+        except OSError as error:
+            raise _unreadable(archive, error) from error
+
+    def upload_files(self, photos: Sequence[Path], manifest: Sequence[Json] = ()) -> Json:
+        """Start a batch with these photos; each line of the manifest has a `filename` and the
+        form's fields."""
+        with contextlib.ExitStack() as opened:
+            files: list[tuple[str, Any]] = []
+            for photo in photos:
+                try:
+                    file = opened.enter_context(photo.open("rb"))
+                except OSError as error:
+                    raise _unreadable(photo, error) from error
+                files.append(("file", (photo.name, file)))
+            if manifest:
+                files.append(("manifest", ("manifest.jsonl", _as_lines(manifest))))
+            return self._call("POST", "/upload/batch", files=files)
+
+    def import_objects(self, manifest: Sequence[Json]) -> Json:
+        """Start a batch with objects of the server's store; each line has a `key` and the form's
+        fields."""
+        headers = {"Content-Type": "application/x-ndjson"}
+        return self._call("POST", "/upload/batch", content=_as_lines(manifest), headers=headers)
+
+    def batch_items(self, job_id: UUID | str, *states: str) -> Iterator[Json]:
+        """The photos of a batch that are in one of the states, or all of them."""
+        cursor: str | None = None
+        while True:
+            params = _given(state=list(states) or None, cursor=cursor, limit=1000)
+            page = self._call("GET", f"/jobs/{job_id}/items", params=params)
+            yield from page["items"]
+            cursor = page["next_cursor"]
+            if cursor is None:
+                return
 
     def similar_to_file(
         self,
@@ -328,5 +373,39 @@ def _name_of(file: Path) -> str:
     return os.fsencode(file.name).decode("utf-8", "replace")
 
 
+class _Watched(io.BufferedIOBase):
+    """A file that tells how far it was read."""
+
+    def __init__(self, file: BinaryIO, on_read: Callable[[int], object]) -> None:
+        self._file = file
+        self._on_read = on_read
+
+    def read(self, size: int | None = -1) -> bytes:
+        data = self._file.read(-1 if size is None else size)
+        self._on_read(self._file.tell())
+        return data
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        return self._file.seek(offset, whence)
+
+    def tell(self) -> int:
+        return self._file.tell()
+
+    def fileno(self) -> int:
+        return self._file.fileno()
+
+    def close(self) -> None:
+        self._file.close()
+        super().close()
+
+
 def _given(**params: Any) -> Json:
     return {name: value for name, value in params.items() if value is not None}
+
+
+def _as_lines(objects: Sequence[Json]) -> bytes:
+    return b"".join(json.dumps(one).encode() + b"\n" for one in objects)
+
+
+def _unreadable(file: Path, error: OSError) -> InvalidRequest:
+    return InvalidRequest("unreadable_file", f"Can't read {file}: {error.strerror}")

@@ -15,6 +15,8 @@ FORMATS = ("JPEG", "PNG", "WEBP", "BMP", "TIFF")
 ACCEPTED = "JPEG, PNG, WebP, BMP or TIFF"
 # What Pillow raises for damaged photos and EXIF; UnidentifiedImageError is an OSError.
 BROKEN = (OSError, SyntaxError, ValueError, TypeError, LookupError, EOFError, struct.error)
+# Of files that are looked for in folders and archives; what they are is told by their content.
+PHOTO_SUFFIXES = {".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff"}
 SNIFFED_BYTES = 16  # enough to tell every accepted format
 
 # Our own limit is checked from the header before anything is decoded.

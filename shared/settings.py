@@ -80,6 +80,18 @@ class Settings(BaseSettings):
     # What is accepted.
     max_file_size: int = Field(10_485_760, gt=0, description="bytes of one photo")
     max_image_pixels: int = Field(50_000_000, gt=0, description="width x height of one photo")
+    max_archive_size: int = Field(
+        10_737_418_240,
+        gt=0,
+        description="bytes of one batch: of its archive, packed and unpacked, or of all its files",
+    )
+    max_batch_photos: int = Field(
+        100_000, gt=0, description="photos in one batch; all members of an archive count"
+    )
+    import_prefix: str = Field(
+        "imports/",
+        description="where the objects lie that a batch may name by their keys",
+    )
     max_vocabulary_bytes: int = Field(64_000_000, gt=0, description="bytes of an imported one")
     presign_seconds: int = Field(
         900, ge=1, le=604_800, description="time to send and complete a direct upload"
@@ -141,6 +153,9 @@ class Settings(BaseSettings):
         2_000_000_000, ge=500_000_000, description="memory of one decoding process"
     )
     decode_timeout_seconds: float = Field(30.0, gt=0, description="for one photo")
+    batch_ahead_photos: int = Field(
+        500, ge=1, description="queued photos at which batches wait for the extractors"
+    )
     auto_fit_photos: int = Field(
         200, ge=1, description="photos at which a map without a vocabulary fits its own"
     )

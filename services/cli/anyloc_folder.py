@@ -18,9 +18,10 @@ from typing import Any
 
 from services.cli.anyloc_database import DATABASE_NAME, AnylocRow, read_rows
 from services.cli.output import shown
-from services.cli.photo_places import SUFFIXES, FoundPhoto
+from services.cli.photo_places import FoundPhoto
 from shared.client import Json
 from shared.errors import InvalidRequest
+from shared.photo_formats import PHOTO_SUFFIXES
 
 UPLOADS = "uploads"
 VOCABULARY = "c_centers.pt"
@@ -72,7 +73,7 @@ def read_folder(folder: Path, database: Path | None, uploads: Path | None) -> An
     unlisted = [
         AnylocPhoto(path, shown(Path(path.name)))
         for path in sorted(set().union(*files.values()) - named)
-        if path.suffix.lower() in SUFFIXES
+        if path.suffix.lower() in PHOTO_SUFFIXES
     ]
     kept, duplicates = _without_doubles(listed + unlisted)
     return AnylocFolder(

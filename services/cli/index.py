@@ -1,4 +1,4 @@
-"""`placewise index DIR`: a folder of photos into the map."""
+"""`placewise index DIR` or `placewise index ARCHIVE`: many photos into the map."""
 
 from __future__ import annotations
 
@@ -21,15 +21,21 @@ from services.cli.output import (
     progress_bar,
 )
 from services.cli.photo_places import find_photos
+from services.cli.upload_archive import check_archive, upload_archive
 from services.cli.upload_many import FitOption, UpdateOption, print_faults, upload_many
 from shared.catalog.photos import PhotoRole
 from shared.client import Json
+from shared.errors import InvalidRequest
 
 
 def index(
     folder: Annotated[
         Path,
-        typer.Argument(metavar="DIR", exists=True, file_okay=False, help="Searched recursively."),
+        typer.Argument(
+            metavar="DIR|ARCHIVE",
+            exists=True,
+            help="A folder, which is searched recursively; or a zip, tar or gzipped tar.",
+        ),
     ],
     table: Annotated[
         Path | None,
@@ -61,12 +67,20 @@ def index(
     key: KeyOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Upload every photo of a folder and wait until all are searchable.
+    """Upload every photo of a folder or an archive and wait until all are searchable.
 
     Coordinates come from the CSV, from @UTM@ file names, or from EXIF. Run it again after an
-    interruption: what is there already is not described twice.
+    interruption: what is there already is not described twice. An archive brings its own table:
+    photos.csv or manifest.jsonl.
     """
     with explained(as_json):
+        if folder.is_file():
+            check_archive(folder)
+            _check_options(table, utm_zone, places, role, update)
+            with connect(server, map_name, key) as client, progress_bar() as progress:
+                report = upload_archive(client, folder, fit, progress)
+            _end(report, map_name, role, as_json)
+            return
         photos = find_photos(folder, table, utm_zone, places_by_folder=places)
         if role != PhotoRole.DATABASE:
             photos = [replace(p, fields={**p.fields, "role": role}) for p in photos]
@@ -74,12 +88,35 @@ def index(
             # Labelled queries teach no vocabulary: they must not start a fit either.
             learns = fit and role == PhotoRole.DATABASE
             report = upload_many(client, photos, learns, progress, update=update)
-        if as_json:
-            print_json(report)
-        else:
-            _print(report, map_name, role)
-        if report["refused"] or report["failed"]:
-            raise typer.Exit(1)
+        _end(report, map_name, role, as_json)
+
+
+def _check_options(
+    table: Path | None, utm_zone: str | None, places: bool, role: PhotoRole, update: bool
+) -> None:
+    """An archive is read by the server, which knows of no options."""
+    given = {
+        "--csv": table,
+        "--utm-zone": utm_zone,
+        "--places-by-folder": places,
+        "--role": role != PhotoRole.DATABASE,
+        "--update": update,
+    }
+    if wrong := [name for name, value in given.items() if value]:
+        raise InvalidRequest(
+            "not_for_archives",
+            f"{', '.join(wrong)}: only for folders. Put what is to be said into the archive, as "
+            "photos.csv or manifest.jsonl; or unpack it and index the folder.",
+        )
+
+
+def _end(report: Json, map_name: str | None, role: PhotoRole, as_json: bool) -> None:
+    if as_json:
+        print_json(report)
+    else:
+        _print(report, map_name, role)
+    if report["refused"] or report["failed"]:
+        raise typer.Exit(1)
 
 
 def _print(report: Json, map_name: str | None, role: PhotoRole) -> None:

@@ -5,16 +5,13 @@ EXIF is read by the server, and fills what is not said here.
 
 from __future__ import annotations
 
-import csv
 from dataclasses import dataclass
 from pathlib import Path
 
 from shared.datasets.utm_names import fields_of_name
 from shared.errors import InvalidRequest
-
-SUFFIXES = {".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff"}
-CSV_FILE_COLUMNS = ("filename", "file", "path")
-CSV_COLUMNS = ("latitude", "longitude", "heading", "captured_at", "place", "tags")
+from shared.intake.manifest import bad_lines, read_csv
+from shared.photo_formats import PHOTO_SUFFIXES
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,12 +37,14 @@ def find_photos(
     paths = sorted(
         path
         for path in folder.rglob("*")
-        if path.is_file() and path.suffix.lower() in SUFFIXES and not path.name.startswith(".")
+        if path.is_file()
+        and path.suffix.lower() in PHOTO_SUFFIXES
+        and not path.name.startswith(".")
     )
     if not paths:
         raise InvalidRequest(
             "no_photos",
-            f"There is no photo ({', '.join(sorted(SUFFIXES))}) below {folder}.",
+            f"There is no photo ({', '.join(sorted(PHOTO_SUFFIXES))}) below {folder}.",
         )
     said = _read_table(folder, table, set(paths)) if table else {}
     found = []
@@ -59,33 +58,13 @@ def find_photos(
 
 def _read_table(folder: Path, table: Path, paths: set[Path]) -> dict[Path, dict[str, str]]:
     try:
-        with table.open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.DictReader(file)
-            columns = reader.fieldnames or []
-            name_column = next((c for c in CSV_FILE_COLUMNS if c in columns), None)
-            if name_column is None:
-                raise InvalidRequest(
-                    "bad_table",
-                    f"{table} has no column {' or '.join(CSV_FILE_COLUMNS)}; "
-                    f"beside it may stand {', '.join(CSV_COLUMNS)}. Its first line, read as "
-                    f"separated by commas, is {', '.join(columns) or 'empty'}.",
-                )
-            unknown = [c for c in columns if c not in (name_column, *CSV_COLUMNS)]
-            if unknown:
-                raise InvalidRequest(
-                    "bad_table",
-                    f"{table}: the columns {', '.join(unknown)} mean nothing here. Known are "
-                    f"{name_column}, {', '.join(CSV_COLUMNS)}: rename them, or take them out.",
-                )
-            said = {}
-            for row in reader:
-                path = folder / (row[name_column] or "")  # a short row has None
-                if path not in paths:
-                    raise InvalidRequest(
-                        "bad_table",
-                        f"{table}, line {reader.line_num}: there is no photo {path}.",
-                    )
-                said[path] = {c: row[c] for c in CSV_COLUMNS if row.get(c)}
-            return said
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        data = table.read_bytes()
+    except OSError as error:
         raise InvalidRequest("bad_table", f"Can't read {table}: {error}") from error
+    said = {}
+    for row in read_csv(data, str(table)):
+        path = folder / row.name
+        if path not in paths:
+            raise bad_lines("bad_table", str(table), [(row.line, f"there is no photo {path}")])
+        said[path] = row.fields
+    return said

@@ -69,8 +69,9 @@ def extractor() -> None:
 
 
 def steward() -> None:
-    """Keep the store healthy and evaluate maps; any number of them may run."""
+    """Keep the store healthy, evaluate maps, bring in batches; any number of them may run."""
     with _service() as (settings, catalog):
+        from services.steward.batches.worker import BatchWorker
         from services.steward.evaluate import Evaluator
         from services.steward.loop import Steward
 
@@ -86,9 +87,11 @@ def steward() -> None:
             store = open_store(settings, alone=False)
             name = f"steward-{socket.gethostname()}-{os.getpid()}"
             evaluator = Evaluator(catalog, search, settings, name)
+            batches = BatchWorker(catalog, store, hints, settings, name)
             duties = Steward(catalog, store, hints, settings)
             parts = [
                 start_part("evaluator", evaluator.run, stop, on_death),
+                start_part("batches", batches.run, stop, on_death),
                 start_part("steward", duties.run, stop, on_death),
             ]
             messages.print("Placewise steward is at work")

@@ -82,15 +82,9 @@ def upload_many(
     describing = progress.add_task("describing", total=len(pending))
     pending = _wait_all(client, pending, failed, progress, describing)
 
-    stats = client.stats()
-    vocabulary: Json | None = None
-    if (
-        fit
-        and stats["vocabulary"] in ("foreign", None)
-        and stats["total_images"] >= FIT_FROM_PHOTOS
-    ):
-        vocabulary = fit_and_wait(client, {}, progress)
-        stats = client.stats()
+    stats, vocabulary = client.stats(), None
+    if fit:
+        stats, vocabulary = fit_if_worth_it(client, stats, progress)
     _wait_all(client, pending, failed, progress, describing)
     return {
         "photos": len(photos),
@@ -102,6 +96,15 @@ def upload_many(
         "vocabulary": stats["vocabulary"],
         "fitted": vocabulary,
     }
+
+
+def fit_if_worth_it(client: Client, stats: Json, progress: Progress) -> tuple[Json, Json | None]:
+    """Fit a vocabulary where the map has none of its own and photos enough; the map's figures after
+    that, and the vocabulary if one was fitted."""
+    if stats["vocabulary"] not in ("foreign", None) or stats["total_images"] < FIT_FROM_PHOTOS:
+        return stats, None
+    vocabulary = fit_and_wait(client, {}, progress)
+    return client.stats(), vocabulary
 
 
 def print_faults(report: Json, *words: str) -> None:

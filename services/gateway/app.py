@@ -6,6 +6,7 @@ from fastapi import Depends, FastAPI, Security
 from fastapi.security import HTTPBearer
 
 from services.gateway import (
+    batches,
     direct_upload,
     evaluations,
     figures,
@@ -47,13 +48,14 @@ def create_app(gateway: Gateway) -> FastAPI:
     )
     app.state.gateway = gateway
     app.state.room = Room(gateway.catalog, gateway.settings)
-    app.add_middleware(BodyLimit)
+    app.add_middleware(BodyLimit, streamed={f"{API}{batches.PATH}"})
     app.add_middleware(KeyCheck, keys=gateway.keys)  # the last one added is the first one asked
     install_problem_handlers(app)
     app.add_exception_handler(Replay, answer_again)
     for module in (
         maps,
         upload,
+        batches,
         direct_upload,
         jobs,
         similarity,

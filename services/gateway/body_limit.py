@@ -1,6 +1,9 @@
-"""A limit on bodies that are read whole: JSON. Forms with files have theirs as they stream."""
+"""A limit on bodies that are read whole: JSON. Forms with files, and manifests, have theirs as they
+stream."""
 
 from __future__ import annotations
+
+from collections.abc import Container
 
 from fastapi import Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -14,11 +17,13 @@ MAX_JSON_BYTES = 1_000_000
 class BodyLimit:
     """Answers 413 (`body_too_large`) to a JSON body over the limit, without reading its rest."""
 
-    def __init__(self, app: ASGIApp) -> None:
+    def __init__(self, app: ASGIApp, streamed: Container[str] = ()) -> None:
+        """Paths in `streamed` have a limit of their own for every kind of body."""
         self._app = app
+        self._streamed = streamed
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http" or _is_form(scope):
+        if scope["type"] != "http" or _is_form(scope) or scope["path"] in self._streamed:
             await self._app(scope, receive, send)
             return
         size = 0

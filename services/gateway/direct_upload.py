@@ -33,13 +33,9 @@ from services.gateway.context import (
     UploadId,
 )
 from services.gateway.once import OnceDep, Replay
-from services.gateway.photo_fields import PhotoFields, check_pair
-from services.gateway.photo_header import read_photo_header
 from services.gateway.photos import PhotoPatch
-from services.gateway.receive import Received, base_name, check_photo_begin, too_large
 from services.gateway.room import ROOM_FOR_JOBS, Kind, RoomDep
 from services.gateway.schemas import Answer, UploadAnswer
-from services.gateway.store_photo import Incoming, Stored, store_photo
 from services.gateway.upload import UPLOAD_ANSWERS, Said, answer_upload
 from shared.catalog.base import db_now_plus
 from shared.catalog.direct_uploads import DirectUpload, get_direct_upload
@@ -47,6 +43,11 @@ from shared.catalog.idempotency import KeptAnswer
 from shared.catalog.maps import get_map
 from shared.errors import Conflict, NotFound, PlacewiseError, Unavailable, Unprocessable
 from shared.ids import new_id
+from shared.intake.incoming import Incoming
+from shared.intake.photo_fields import PhotoFields, check_pair
+from shared.intake.photo_header import read_photo_header
+from shared.intake.received import Received, base_name, check_photo_begin, file_too_large
+from shared.intake.store_photo import Stored, store_photo
 from shared.objects import DirectStore, ObjectInfo
 from shared.objects.keys import incoming_key, new_original_key
 from shared.objects.s3 import S3Store
@@ -99,7 +100,7 @@ def presign(
     store = _direct_store(gateway)
     limit = gateway.settings.max_file_size
     if wanted.file_size > limit:
-        raise too_large(limit)
+        raise file_too_large(limit)
     said = wanted.said()
     _fields(said)  # what can't be understood is refused now, not after the bytes were sent
     upload_id = new_id()
@@ -195,7 +196,7 @@ def _complete(gateway: Gateway, map_name: str, upload_id: UUID, key: str) -> Sto
         with store.open(key) as file:
             header = read_photo_header(file, gateway.settings.max_image_pixels)
         incoming = Incoming(received, media_type, header, _fields(upload.said))
-        stored = store_photo(gateway, map_name, incoming, keep)
+        stored = store_photo(gateway.catalog, gateway.hints, map_name, incoming, keep)
     except (PlacewiseError, Replay):
         store.delete(key)
         raise

@@ -8,8 +8,8 @@ from uuid import UUID
 
 from fastapi import Depends, Query
 
-from services.gateway.photo_fields import MAX_TEXT, parse_tags, parse_time
 from shared.errors import invalid_field
+from shared.intake.photo_fields import MAX_TEXT, parse_tags, parse_time
 from shared.photo_filter import Box, Circle, PhotoFilter
 
 TIME = "ISO 8601; no offset means UTC"

@@ -19,6 +19,7 @@ from services.gateway.schemas import JobAnswer, JobsAnswer
 from services.gateway.waiting import read_job, wait_for_job
 from shared.catalog.maps import get_map
 from shared.jobs import Job, JobKind, JobState
+from shared.jobs.batches import cancel_batch, retry_batch
 from shared.jobs.finish import cancel, retry
 from shared.jobs.hints import lane_of
 from shared.jobs.model_changes import cancel_model_change
@@ -96,6 +97,8 @@ def cancel_job(
         found = get_job(session, get_map(session, map_name).id, job_id, lock=True)
         if found.kind in MODEL_CHANGES:
             cancel_model_change(session, found)
+        elif found.kind == JobKind.BATCH:
+            cancel_batch(session, found)
         else:
             cancel(found)
         session.flush()
@@ -114,10 +117,13 @@ def cancel_job(
 def retry_job(
     gateway: GatewayDep, job_id: JobId, once: OnceDep, map_name: MapName = DEFAULT_MAP
 ) -> JobAnswer:
-    """Queue a failed or cancelled job again."""
+    """Queue a failed or cancelled job again; of a batch, the items that have failed."""
     with gateway.catalog.write() as session:
         found = get_job(session, get_map(session, map_name).id, job_id, lock=True)
-        retry(session, found)
+        if found.kind == JobKind.BATCH:
+            retry_batch(session, found)
+        else:
+            retry(session, found)
         session.flush()
         session.refresh(found)
         answer = JobAnswer.of(found)

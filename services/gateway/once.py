@@ -30,7 +30,6 @@ from sqlalchemy.orm import Session
 from starlette.concurrency import run_in_threadpool
 
 from services.gateway.context import DEFAULT_MAP, Gateway, GatewayDep
-from services.gateway.receive import Received
 from services.gateway.schemas import job_started
 from shared.catalog.idempotency import (
     CallMade,
@@ -40,6 +39,7 @@ from shared.catalog.idempotency import (
     release_key,
 )
 from shared.errors import Conflict, PlacewiseError, invalid_field
+from shared.intake.received import Received
 from shared.jobs import Job
 from shared.objects import ObjectStore
 from shared.problems import problem_response

@@ -19,12 +19,6 @@ from sqlalchemy.orm import Session
 
 from services.gateway.context import DEFAULT_MAP, NO_NUL, FileId, GatewayDep, MapName
 from services.gateway.filters import FilterDep
-from services.gateway.photo_fields import (
-    check_metadata,
-    check_pair,
-    parse_tags,
-    parse_time,
-)
 from services.gateway.schemas import (
     DeleteAnswer,
     MetadataAnswer,
@@ -43,6 +37,12 @@ from shared.catalog.photos import (
     search_metadata,
 )
 from shared.errors import NotFound, invalid_field
+from shared.intake.photo_fields import (
+    check_metadata,
+    check_pair,
+    parse_tags,
+    parse_time,
+)
 from shared.jobs import Job
 from shared.jobs.finish import cancel
 from shared.jobs.table import UNFINISHED

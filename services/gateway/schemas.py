@@ -132,7 +132,10 @@ class JobAnswer(Answer):
     job_id: UUID
     kind: JobKind
     state: JobState
-    stage: str | None = Field(description="of a model change: sample, cluster, describe, load")
+    stage: str | None = Field(
+        description="of a model change: sample, cluster, describe, "
+        "load; of a batch: list, store, describe"
+    )
     waiting_for: str | None = Field(description="what has to be there before the job can go on")
     awaited: list[str] | None = Field(
         description="the search workers that it waits for, once they take longer than a minute"

@@ -23,19 +23,15 @@ from services.gateway.context import (
 from services.gateway.filters import FilterDep
 from services.gateway.find_similar import Wanted, find_similar, query_by_job, query_by_photo
 from services.gateway.once import Once, OnceFormDep
-from services.gateway.photo_header import read_photo_header
-from services.gateway.receive import (
-    Received,
-    check_photo_begin,
-    describe_form,
-    receive_file,
-)
+from services.gateway.receive import describe_form, receive_file
 from services.gateway.room import ROOM_FOR_QUERIES, Kind, RoomDep
 from services.gateway.schemas import JobStarted, SimilarityAnswer, job_started
 from services.gateway.waiting import preferred_wait, wait_for_job
 from shared.catalog.maps import get_map
 from shared.errors import Conflict, Gone, PlacewiseError, Unprocessable, invalid_field
 from shared.ids import new_id
+from shared.intake.photo_header import read_photo_header
+from shared.intake.received import Received, check_photo_begin
 from shared.jobs import Job, JobKind, JobState, Priority
 from shared.jobs.hints import Lane
 from shared.jobs.table import UNFINISHED, get_job

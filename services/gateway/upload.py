@@ -12,20 +12,15 @@ from starlette.concurrency import run_in_threadpool
 
 from services.gateway.context import DEFAULT_MAP, Gateway, GatewayDep, MapName
 from services.gateway.once import OnceFormDep
-from services.gateway.photo_fields import read_form_fields
-from services.gateway.photo_header import read_photo_header
-from services.gateway.receive import (
-    Received,
-    check_photo_begin,
-    describe_form,
-    receive_file,
-)
+from services.gateway.receive import describe_form, receive_file
 from services.gateway.room import ROOM_FOR_JOBS, Kind, RoomDep
 from services.gateway.schemas import UploadAnswer, job_url
-from services.gateway.store_photo import Incoming, Keep, Stored, store_photo
 from services.gateway.waiting import preferred_wait, wait_for_job
 from shared.catalog.photos import PhotoRole
 from shared.errors import PlacewiseError
+from shared.intake.incoming import examine
+from shared.intake.received import Received, check_photo_begin
+from shared.intake.store_photo import Keep, Stored, store_photo
 from shared.jobs import Job, JobState
 from shared.jobs.table import UNFINISHED
 from shared.objects.keys import new_original_key
@@ -159,12 +154,8 @@ async def answer_upload(
 def _store(gateway: Gateway, map_name: str, received: Received, keep: Keep) -> Stored:
     """Check what came and acknowledge it; whatever is not kept leaves no bytes behind."""
     try:
-        media_type = check_photo_begin(received.begin)
-        fields = read_form_fields(received.fields)
-        with received.open(gateway.store) as file:
-            header = read_photo_header(file, gateway.settings.max_image_pixels)
-        incoming = Incoming(received, media_type, header, fields)
-        stored = store_photo(gateway, map_name, incoming, keep)
+        incoming = examine(gateway.store, received, gateway.settings.max_image_pixels)
+        stored = store_photo(gateway.catalog, gateway.hints, map_name, incoming, keep)
     except PlacewiseError:
         # Only what is certainly refused: after a lost connection the row may be committed.
         gateway.store.delete(received.key)

@@ -24,9 +24,11 @@ from shared.catalog.photos import Photo
 from shared.catalog.session import Catalog
 from shared.catalog.vocabularies import Vocabulary
 from shared.chunks import delete_chunk
-from shared.jobs.table import MODEL_CHANGES, UNFINISHED, Job, JobKind
+from shared.jobs.batches import BatchItem
+from shared.jobs.table import MODEL_CHANGES, UNFINISHED, Job, JobKind, JobState
 from shared.objects import ObjectStore
 from shared.objects.keys import (
+    ARCHIVES,
     INCOMING,
     ORIGINALS,
     QUERIES,
@@ -187,6 +189,21 @@ def collect_work(catalog: Catalog, store: ObjectStore) -> None:
             store.delete(key)
 
 
+def collect_archives(catalog: Catalog, store: ObjectStore) -> None:
+    """Archives whose batch has ended. One that no job knows may just be coming in."""
+    keys = [info.key for info in store.list(ARCHIVES)]
+    if not keys:
+        return
+    with catalog.read() as session:
+        ended = session.scalars(
+            select(Job.params).where(Job.kind == JobKind.BATCH, Job.state.not_in(UNFINISHED))
+        )
+        done = {params.get("object_key") for params in ended}
+    for key in keys:
+        if key in done:
+            store.delete(key)
+
+
 def collect_orphans(catalog: Catalog, store: ObjectStore, age_seconds: float) -> int:
     """Objects older than `age_seconds` that no row knows: crashes between object and commit."""
     with catalog.read() as session:
@@ -216,12 +233,26 @@ def collect(catalog: Catalog, store: ObjectStore, settings: Settings) -> None:
     collect_queries(catalog, store, settings.query_ttl_seconds)
     collect_work(catalog, store)
     collect_direct_uploads(catalog, store)
+    collect_archives(catalog, store)
 
 
 def _known_originals(session: Session, keys: list[str]) -> Iterable[str]:
-    """Those of photos, and whatever Placewise has not put there: that is not ours to remove."""
+    """Those of photos and of waiting items of batches; and whatever Placewise has not put there:
+    that is not ours to remove."""
     stored = session.scalars(select(Photo.object_key).where(Photo.object_key.in_(keys)))
-    return [*stored, *(key for key in keys if not is_original_key(key))]
+    waiting = session.scalars(
+        select(BatchItem.object_key).where(
+            BatchItem.object_key.in_(keys), BatchItem.state == JobState.QUEUED
+        )
+    )
+    return [*stored, *filter(None, waiting), *(key for key in keys if not is_original_key(key))]
+
+
+def _known_archives(session: Session, keys: list[str]) -> Iterable[str]:
+    waiting = session.scalars(
+        select(Job.params).where(Job.kind == JobKind.BATCH, Job.state.in_(UNFINISHED))
+    )
+    return [params["object_key"] for params in waiting if "object_key" in params]
 
 
 def _known_incoming(session: Session, keys: list[str]) -> Iterable[str]:
@@ -274,6 +305,7 @@ def _ids(names: Iterable[str]) -> set[UUID]:
 
 REFERENCED: dict[str, Callable[[Session, list[str]], Iterable[str]]] = {
     INCOMING: _known_incoming,
+    ARCHIVES: _known_archives,
     ORIGINALS: _known_originals,
     THUMBNAILS: _known_thumbnails,
     "chunks/": _known_chunks,

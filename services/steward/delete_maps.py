@@ -22,10 +22,17 @@ from shared.catalog.searches import Search
 from shared.catalog.session import Catalog
 from shared.catalog.vocabularies import Vocabulary
 from shared.chunks import delete_chunk
+from shared.jobs.batches import BatchItem
 from shared.jobs.finish import cancel_all
 from shared.jobs.table import Job, JobKind
 from shared.objects import ObjectStore
-from shared.objects.keys import incoming_key, query_key, query_vector_key, thumbnail_key
+from shared.objects.keys import (
+    ORIGINALS,
+    incoming_key,
+    query_key,
+    query_vector_key,
+    thumbnail_key,
+)
 
 log = logging.getLogger(__name__)
 
@@ -48,7 +55,7 @@ def _step(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
     """Remove the next rows of the map with their objects; True when the map is gone."""
     with catalog.write() as session:
         cancel_all(session, Job.map_id == map_id)
-    for some_were_left in (_chunks, _queries, _photos, _direct_uploads):
+    for some_were_left in (_chunks, _queries, _batches, _photos, _direct_uploads):
         if some_were_left(catalog, store, map_id):
             return False
     _vocabularies(catalog, store, map_id)
@@ -93,6 +100,36 @@ def _queries(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
         with catalog.write() as session:
             session.execute(delete(Job).where(Job.id.in_(ids)))
     return bool(ids)
+
+
+def _batches(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
+    """Their archives, their items, and uploaded files that have not become photos."""
+    with catalog.read() as session:
+        params = session.scalars(
+            select(Job.params).where(Job.map_id == map_id, Job.kind == JobKind.BATCH)
+        ).all()
+        items = session.scalars(
+            select(BatchItem)
+            .join(Job, Job.id == BatchItem.job_id)
+            .where(Job.map_id == map_id)
+            .limit(AT_ONCE)
+        ).all()
+    for archive in params:
+        if "object_key" in archive:
+            store.delete(archive["object_key"])
+    for item in items:
+        if item.photo_id is None and item.object_key and item.object_key.startswith(ORIGINALS):
+            store.delete(item.object_key)
+    if items:
+        with catalog.write() as session:
+            for job_id in {item.job_id for item in items}:
+                numbers = [item.number for item in items if item.job_id == job_id]
+                session.execute(
+                    delete(BatchItem).where(
+                        BatchItem.job_id == job_id, BatchItem.number.in_(numbers)
+                    )
+                )
+    return bool(items)
 
 
 def _photos(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:

@@ -6,38 +6,25 @@ time: no photo is described for them. One that was killed begins anew.
 
 from __future__ import annotations
 
-import logging
 import threading
 import time
-from collections.abc import Callable
 from typing import Any
-from uuid import UUID
-
-from sqlalchemy.exc import SQLAlchemyError
 
 from services.steward.measure import Measure
+from services.steward.take import Stopped, Taker, token_of
 from shared.catalog.chunks import count_searchable
 from shared.catalog.evaluations import Evaluation
 from shared.catalog.generations import Generation, active_generation
 from shared.catalog.session import Catalog
-from shared.errors import Conflict, PlacewiseError, Unavailable
+from shared.errors import Conflict
 from shared.ids import new_id
-from shared.jobs import Job, claim, hold_lease
-from shared.jobs.finish import fail, release, succeed
-from shared.jobs.leases import fallen, held
-from shared.jobs.table import STEWARD_JOBS
+from shared.jobs import Job, JobKind
+from shared.jobs.finish import succeed
+from shared.jobs.leases import held
 from shared.search_protocol import SearchPort
 from shared.settings import Settings
 
-log = logging.getLogger(__name__)
-
-IDLE_SECONDS = 0.5
-AWAY_SECONDS = 2.0  # pause of a job when the search tier or the catalog is away
 REPORT_SECONDS = 0.5  # between two notes of the progress
-
-
-class Stopped(Exception):
-    """The job was cancelled, or its steward is to end."""
 
 
 class Evaluator:
@@ -47,47 +34,15 @@ class Evaluator:
         self._catalog = catalog
         self._search = search
         self._settings = settings
-        self._name = name
+        self._taker = Taker(catalog, settings, name, JobKind.EVALUATE)
 
     def run(self, stop: threading.Event) -> None:
         """Take evaluation jobs until `stop` is set."""
-        while not stop.is_set():
-            try:
-                if not self.evaluate_next(stop):
-                    stop.wait(IDLE_SECONDS)
-            except SQLAlchemyError:
-                log.exception("the catalog can't be reached; trying again in %g s", AWAY_SECONDS)
-                stop.wait(AWAY_SECONDS)
+        self._taker.run(stop, lambda job: self._evaluate(job, stop))
 
     def evaluate_next(self, stop: threading.Event) -> bool:
         """Do the next evaluation job; False when there is none."""
-        lease_seconds = self._settings.lease_seconds
-        with self._catalog.write() as session:
-            jobs = claim(
-                session,
-                worker=self._name,
-                limit=1,
-                lease_seconds=lease_seconds,
-                kinds=STEWARD_JOBS,
-            )
-        if not jobs:
-            return False
-        job = jobs[0]
-        with hold_lease(self._catalog, _token(job), lease_seconds):
-            try:
-                self._evaluate(job, stop)
-            except Stopped:
-                self._end(job, release)
-            except (Unavailable, OSError, SQLAlchemyError) as error:
-                log.warning("the evaluation %s pauses: %s", job.id, error)
-                self._end(job, lambda mine: release(mine, after_seconds=AWAY_SECONDS))
-            except PlacewiseError as error:
-                problem = error.as_problem()
-                self._end(job, lambda mine: fail(mine, problem))
-            except Exception as error:
-                log.exception("the evaluation %s crashed", job.id)
-                self._crashed(job, error)
-        return True
+        return self._taker.take_next(lambda job: self._evaluate(job, stop))
 
     def _evaluate(self, job: Job, stop: threading.Event) -> None:
         with self._catalog.read() as session:
@@ -114,7 +69,7 @@ class Evaluator:
         measured = measure.run(sample)
         evaluation_id = new_id()
         with self._catalog.write() as session:
-            for mine in held(session, _token(job), [job]):
+            for mine in held(session, token_of(job), [job]):
                 session.get_one(
                     Generation, generation.id
                 ).calibration = measured.calibration.model_dump()
@@ -139,24 +94,9 @@ class Evaluator:
     def _report(self, job: Job, asked: int, total: int | None = None) -> None:
         """Note the progress; Stopped when the job is no longer ours."""
         with self._catalog.write() as session:
-            mine = held(session, _token(job), [job])
+            mine = held(session, token_of(job), [job])
             for current in mine:
                 current.progress_total = max(1, total or current.progress_total)
                 current.progress_done = min(asked, current.progress_total)
         if not mine:
             raise Stopped
-
-    def _end(self, job: Job, how: Callable[[Job], None]) -> None:
-        with self._catalog.write() as session:
-            for mine in held(session, _token(job), [job]):
-                how(mine)
-
-    def _crashed(self, job: Job, error: Exception) -> None:
-        with self._catalog.write() as session:
-            for mine in held(session, _token(job), [job]):
-                fallen(session, mine, self._settings.max_attempts, cause=type(error).__name__)
-
-
-def _token(job: Job) -> UUID:
-    assert job.lease_token is not None, "a claimed job carries a token"
-    return job.lease_token

@@ -11,9 +11,11 @@ from shared.catalog.photos import Photo
 from shared.catalog.search_workers import RegisteredWorker
 from shared.catalog.searches import Search
 from shared.catalog.vocabularies import Vocabulary
+from shared.jobs.batches import BatchItem
 from shared.jobs.table import Job
 
 __all__ = [
+    "BatchItem",
     "Chunk",
     "Descriptor",
     "DirectUpload",

@@ -12,6 +12,7 @@ from shared.catalog.photos import Photo
 from shared.errors import Conflict
 from shared.jobs.table import (
     MODEL_CHANGES,
+    SLICED_JOBS,
     UNFINISHED,
     Job,
     JobKind,
@@ -56,9 +57,9 @@ def fail(job: Job, problem: dict[str, Any]) -> None:
 def release(job: Job, *, after_seconds: float = 0.0, waiting_for: WaitingFor | None = None) -> None:
     """Give the job back without counting an attempt: to go on later, or once something is there.
 
-    A model change stays `running` between its slices; everything else is `queued` again.
+    A sliced job stays `running` between its slices; everything else is `queued` again.
     """
-    job.state = JobState.RUNNING if job.kind in MODEL_CHANGES else JobState.QUEUED
+    job.state = JobState.RUNNING if job.kind in SLICED_JOBS else JobState.QUEUED
     job.waiting_for = waiting_for
     job.run_after = db_now_plus(after_seconds) if after_seconds else None
     _drop_lease(job)

@@ -15,6 +15,7 @@ from sqlalchemy.orm import Session
 
 from shared.catalog.base import db_now, db_now_plus, rowcount
 from shared.catalog.session import Catalog
+from shared.jobs.batches import cancel_items, is_listed_batch
 from shared.jobs.finish import fail, release
 from shared.jobs.model_changes import abandon_generation
 from shared.jobs.table import Job, locked_under
@@ -96,9 +97,11 @@ def fallen(session: Session, job: Job, max_attempts: int, *, cause: str | None) 
         return
     fell_alone = job.claimed_together == 1
     job.attempts += fell_alone
-    if job.attempts >= max_attempts:
+    # A batch goes on without the one photo that may be to blame; its worker sees to that.
+    if job.attempts >= max_attempts and not is_listed_batch(job):
         fail(job, _fallen_problem(job, cause))
         abandon_generation(session, job)
+        cancel_items(session, job)
         return
     job.alone = job.alone or not fell_alone
     release(job)

@@ -67,13 +67,17 @@ class JobKind(StrEnum):
     IMPORT = "import_vocabulary"  # check a vocabulary file and switch to it
     SWITCH = "switch"  # switch to a vocabulary that the map already has
     EVALUATE = "evaluate"  # ask the map about photos whose place is known, and count
+    BATCH = "batch"  # bring in many photos; each has a job of its own (`shared.jobs.batches`)
 
 
 MODEL_CHANGES = (JobKind.FIT, JobKind.IMPORT, JobKind.SWITCH)
 
 # Who takes what: extractors need photos and a backbone, the steward only the search tier.
 EXTRACTOR_JOBS = (JobKind.INDEX, JobKind.REINDEX, JobKind.DESCRIBE, *MODEL_CHANGES)
-STEWARD_JOBS = (JobKind.EVALUATE,)
+STEWARD_JOBS = (JobKind.EVALUATE, JobKind.BATCH)
+
+# Done in slices: between two of them they are running, and no one holds their lease.
+SLICED_JOBS = (*MODEL_CHANGES, JobKind.BATCH)
 
 
 class Priority(IntEnum):
@@ -81,6 +85,7 @@ class Priority(IntEnum):
 
     QUERY = 100  # someone waits for the answer
     UPLOAD = 50
+    BATCH = 40  # its photos, too: one upload does not wait for thousands
     MODEL_CHANGE = 20
     REINDEX = 10
     EVALUATION = 5

@@ -76,6 +76,11 @@ class FolderStore:
                 "object_not_found", f"The object store has no {key!r}.", key=key
             ) from None
 
+    def read_range(self, key: str, begin: int, size_bytes: int) -> bytes:
+        with self.open(key) as file:
+            file.seek(begin)
+            return file.read(size_bytes)
+
     def head(self, key: str) -> ObjectInfo | None:
         try:
             status = self.path(key).stat()

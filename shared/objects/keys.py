@@ -4,14 +4,18 @@ from __future__ import annotations
 
 from uuid import UUID
 
+from shared.errors import Misconfigured
 from shared.ids import new_id
 
 INCOMING = "incoming/"
+ARCHIVES = "archives/"
 ORIGINALS = "originals/"
 QUERIES = "queries/"
 THUMBNAILS = "thumbnails/"
 VOCABULARIES = "vocabularies/"
 WORK = "work/"
+
+OWN = (ARCHIVES, "chunks/", ORIGINALS, QUERIES, THUMBNAILS, VOCABULARIES, WORK)
 
 
 def is_key(key: str) -> bool:
@@ -27,6 +31,26 @@ def check_key(key: str) -> str:
     if not is_key(key):
         raise ValueError(f"not an object key: {key!r}")
     return key
+
+
+def new_archive_key() -> str:
+    """A fresh key for an archive that a batch brings its photos from."""
+    return f"{ARCHIVES}{new_id()}"
+
+
+def check_import_prefix(prefix: str) -> None:
+    """Misconfigured (`bad_setting`) unless the prefix is a folder, and none of Placewise's own."""
+    if not prefix.endswith("/") or not is_key(prefix[:-1]) or prefix.startswith("."):
+        raise Misconfigured(
+            "bad_setting",
+            f"IMPORT_PREFIX is {prefix!r}; it is a folder of the object store, such as imports/.",
+        )
+    if prefix.startswith(OWN):
+        raise Misconfigured(
+            "bad_setting",
+            f"IMPORT_PREFIX is {prefix!r}, and there lies what belongs to Placewise. Take another "
+            f"folder than {', '.join(OWN)}.",
+        )
 
 
 def new_original_key() -> str:

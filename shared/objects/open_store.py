@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from shared.objects.bucket_owner import check_no_bucket
 from shared.objects.folder import FolderStore
+from shared.objects.keys import check_import_prefix
 from shared.objects.port import ObjectStore
 from shared.objects.s3 import Bucket, S3Store
 from shared.objects.upload_dir import place_originals
@@ -15,8 +16,10 @@ def open_store(settings: Settings, *, alone: bool = True) -> ObjectStore:
 
     `alone` says that no other process writes there: a folder is then tidied of half-written files.
     Asks nothing of an S3 server: `check` does. Raises Misconfigured as `place_originals` does,
-    and `object_store_changed` for a folder whose objects lie in a bucket.
+    `object_store_changed` for a folder whose objects lie in a bucket, and `bad_setting` for an
+    IMPORT_PREFIX that is none.
     """
+    check_import_prefix(settings.import_prefix)
     if settings.s3_endpoint is not None:
         return S3Store(Bucket.of(settings))
     home = settings.placewise_home

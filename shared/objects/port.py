@@ -47,8 +47,8 @@ class ObjectStore(Protocol):
     anything else. No key may continue another one's after a slash: `a` and `a/b` are a file and a
     folder of one name. A folder refuses the second one with ValueError, a bucket keeps both.
 
-    `get` and `open` raise NotFound (`object_not_found`) for a missing key. Everything raises
-    Unavailable while a store on another machine can't be used: `object_store_unavailable`,
+    `get`, `open` and `read_range` raise NotFound (`object_not_found`) for a missing key. Everything
+    raises Unavailable while a store on another machine can't be used: `object_store_unavailable`,
     `object_store_busy`, `object_store_refused`, `bucket_not_found`; writing raises its kind
     StorageFull (`object_store_full`, `disk_full`) when there is no room. Reading from what `open`
     has given raises so, too.
@@ -62,6 +62,10 @@ class ObjectStore(Protocol):
 
     def open(self, key: str) -> BinaryIO:
         """A seekable reader that fetches only what is read."""
+
+    def read_range(self, key: str, begin: int, size_bytes: int) -> bytes:
+        """Up to `size_bytes` from the offset `begin`, fewer only where the object ends before; for
+        readers that rest between two ranges longer than a server keeps a connection."""
 
     def head(self, key: str) -> ObjectInfo | None: ...
 

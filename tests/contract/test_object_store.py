@@ -56,6 +56,30 @@ class ObjectStoreContract:
             assert file.tell() == 5
             assert file.read(1) == data[5:6]
 
+    def test_range_is_read_in_one_call(self, store: ObjectStore) -> None:
+        data = os.urandom(MEGABYTE)
+        store.put("big", data)
+        for begin, size in ((0, 10), (500_000, 1), (999_990, 10), (0, MEGABYTE), (7, 300_000)):
+            assert store.read_range("big", begin, size) == data[begin : begin + size]
+
+    @pytest.mark.parametrize(("begin", "size"), [(4, 100), (5, 1), (6, 1), (1000, 10), (2, 0)])
+    def test_range_that_reaches_behind_the_end_is_short(
+        self, store: ObjectStore, begin: int, size: int
+    ) -> None:
+        store.put("short", b"12345")
+        assert store.read_range("short", begin, size) == b"12345"[begin : begin + size]
+
+    def test_range_of_an_empty_object_is_empty(self, store: ObjectStore) -> None:
+        store.put("empty", b"")
+        assert store.read_range("empty", 0, 10) == b""
+
+    def test_range_of_a_missing_object_is_not_found(self, store: ObjectStore) -> None:
+        with pytest.raises(NotFound) as caught:
+            store.read_range("not/there", 0, 10)
+        assert caught.value.code == "object_not_found"
+        with pytest.raises(ValueError):
+            store.read_range("../a", 0, 10)
+
     def test_writer_joins_what_is_written_piece_by_piece(self, store: ObjectStore) -> None:
         pieces = [os.urandom(size) for size in (1, 0, 100_000, 7, 300_000)]
         writer = store.writer("originals/pieces")

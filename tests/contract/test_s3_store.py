@@ -40,6 +40,7 @@ READS: dict[str, Callable[[ObjectStore], object]] = {
     "check": lambda store: store.check(),
     "get": lambda store: store.get("a"),
     "open": lambda store: store.open("a"),
+    "read_range": lambda store: store.read_range("a", 0, 1),
     "head": lambda store: store.head("a"),
     "list": lambda store: list(store.list("")),
 }

@@ -15,13 +15,13 @@ import urllib3
 from sqlalchemy import func, select, update
 
 from services.extractor.worker import ExtractorWorker
-from services.gateway.photo_header import read_photo_header
 from services.steward.collect import collect_direct_uploads, collect_orphans
 from services.steward.delete_maps import delete_maps
 from shared.catalog.base import db_now_plus
 from shared.catalog.direct_uploads import DirectUpload
 from shared.catalog.photos import Photo
 from shared.catalog.session import Catalog
+from shared.intake.photo_header import read_photo_header
 from shared.objects import FolderStore
 from shared.objects.s3 import S3Store
 from shared.settings import Settings

@@ -13,12 +13,12 @@ from sqlalchemy import func, select, update
 
 from services.extractor.worker import ExtractorWorker
 from services.gateway import model_changes, once
-from services.gateway.photo_header import read_photo_header
 from shared.catalog.base import db_now_plus
 from shared.catalog.idempotency import KeyedCall
 from shared.catalog.photos import Photo
 from shared.catalog.session import Catalog
 from shared.errors import Unavailable
+from shared.intake.photo_header import read_photo_header
 from shared.jobs import Job
 from shared.objects import FolderStore
 from shared.settings import Settings
@@ -64,6 +64,11 @@ def call_map(service: Service, **options: Any) -> httpx2.Response:
     return service("POST", "/maps", json={"name": "city"}, **options)
 
 
+def call_batch(service: Service, **options: Any) -> httpx2.Response:
+    files = [("file", (f"{number}.jpg", photo_bytes(number))) for number in (1, 2)]
+    return service("POST", "/upload/batch", files=files, **options)
+
+
 def call_evaluation(service: Service, **options: Any) -> httpx2.Response:
     return service("POST", "/evaluations", **options)
 
@@ -93,6 +98,7 @@ CALLS: dict[str, tuple[int, Callable[..., httpx2.Response]]] = {
     "import": (202, call_import),
     "generations": (202, call_switch),
     "evaluations": (202, call_evaluation),
+    "batch": (202, call_batch),
 }
 every_call = pytest.mark.parametrize(("status", "call"), CALLS.values(), ids=CALLS)
 
@@ -210,7 +216,7 @@ def test_a_failure_of_ours_is_not_kept(
         raise Unavailable("object_store_unavailable", "Away.")
 
     with monkeypatch.context() as broken:
-        broken.setattr("services.gateway.upload.read_photo_header", away)
+        broken.setattr("shared.intake.incoming.read_photo_header", away)
         problem(upload(service, photo_bytes(1)), 503, "object_store_unavailable")
         broken.setattr(model_changes, "count_live", away)
         problem(call_fit(service, headers=keyed("fit")), 503, "object_store_unavailable")
@@ -231,7 +237,7 @@ def test_a_call_under_way_is_told_to_come_again(service: Service, store: FolderS
         return reader(*arguments)
 
     with pytest.MonkeyPatch.context() as patch, ThreadPoolExecutor(1) as pool:
-        patch.setattr("services.gateway.upload.read_photo_header", slowly)
+        patch.setattr("shared.intake.incoming.read_photo_header", slowly)
         first = pool.submit(upload, service, photo_bytes(1))
         assert reached.wait(timeout=30)
         try:

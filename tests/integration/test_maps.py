@@ -18,7 +18,6 @@ from services.extractor.loaded import LoadedModels
 from services.extractor.renew import renew_outdated_generations
 from services.extractor.worker import ExtractorWorker
 from services.gateway import upload as upload_module
-from services.gateway.store_photo import store_photo
 from services.steward import delete_maps as delete_maps_module
 from services.steward.collect import collect_orphans
 from services.steward.compact import compact
@@ -33,6 +32,7 @@ from shared.catalog.models import Model
 from shared.catalog.photos import Photo
 from shared.catalog.search_workers import RegisteredWorker
 from shared.catalog.session import Catalog
+from shared.intake.store_photo import store_photo
 from shared.jobs import InProcessHints, Job, JobKind, JobState
 from shared.objects import FolderStore
 from shared.settings import Settings

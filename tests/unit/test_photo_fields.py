@@ -6,14 +6,14 @@ from datetime import UTC, datetime
 
 import pytest
 
-from services.gateway.photo_fields import (
+from shared.errors import Unprocessable
+from shared.intake.photo_fields import (
     MAX_TAGS,
     MAX_TEXT,
     PhotoFields,
     check_metadata,
     read_form_fields,
 )
-from shared.errors import Unprocessable
 
 
 def refused(form: dict[str, str]) -> Unprocessable:

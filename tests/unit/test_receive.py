@@ -11,15 +11,10 @@ import pytest
 from starlette.requests import ClientDisconnect, Request
 from starlette.types import Message
 
-from services.gateway.receive import (
-    MAX_FIELDS_BYTES,
-    OVERHEAD_BYTES,
-    WRITE_BYTES,
-    Received,
-    check_photo_begin,
-    receive_file,
-)
+from services.gateway.form import MAX_FIELDS_BYTES, OVERHEAD_BYTES
+from services.gateway.receive import WRITE_BYTES, receive_file
 from shared.errors import InvalidRequest, PlacewiseError, TooLarge, UnsupportedMedia
+from shared.intake.received import Received, check_photo_begin
 from shared.objects import FolderStore
 from tests.support.photos import photo_bytes
 

@@ -6,6 +6,7 @@ import io
 import os
 from typing import TYPE_CHECKING
 
+from minio.error import S3Error
 from urllib3.response import BaseHTTPResponse
 
 from shared.errors import Unavailable
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
     from _typeshed import WriteableBuffer
 
 BUFFER_BYTES = 64 * 1024
+BEHIND_THE_END = "InvalidRange"
 
 
 class S3Reader(io.RawIOBase):
@@ -104,3 +106,20 @@ def open_object(bucket: Bucket, key: str) -> io.BufferedReader:
     """The object as a file; NotFound where there is none. Fetches what is read, and what the
     network has on its way by then."""
     return io.BufferedReader(S3Reader(bucket, key), BUFFER_BYTES)
+
+
+def read_range(bucket: Bucket, key: str, begin: int, size_bytes: int) -> bytes:
+    """Up to so many bytes from `begin`, in one request; b"" behind the object's end."""
+    if size_bytes <= 0:
+        return b""  # to the client 0 means everything
+    with bucket.explained(key):
+        try:
+            answer = bucket.client.get_object(bucket.name, key, offset=begin, length=size_bytes)
+        except S3Error as error:
+            if error.code != BEHIND_THE_END:
+                raise
+            return b""
+        try:
+            return answer.read()  # raises when less comes than was promised
+        finally:
+            answer.release_conn()

@@ -14,7 +14,7 @@ from shared.objects.keys import check_key
 from shared.objects.port import ObjectInfo, PresignedPut
 from shared.objects.s3.bucket import NO_KEY, Bucket
 from shared.objects.s3.presign import presign_put
-from shared.objects.s3.reader import S3Reader, open_object
+from shared.objects.s3.reader import S3Reader, open_object, read_range
 from shared.objects.s3.writer import S3Writer
 
 PROBE = ".placewise-check"  # no object: an upload that is begun and given up
@@ -43,6 +43,9 @@ class S3Store:
 
     def open(self, key: str) -> BinaryIO:
         return open_object(self.bucket, check_key(key))
+
+    def read_range(self, key: str, begin: int, size_bytes: int) -> bytes:
+        return read_range(self.bucket, check_key(key), begin, size_bytes)
 
     def head(self, key: str) -> ObjectInfo | None:
         check_key(key)

@@ -8,23 +8,25 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
+from uuid import UUID
 
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
-from services.gateway.context import API, Gateway
-from services.gateway.photo_fields import PhotoFields
-from services.gateway.photo_header import PhotoHeader
-from services.gateway.receive import Received
 from shared.catalog.maps import get_map
 from shared.catalog.photos import Photo, PhotoRole, find_live_by_sha256
+from shared.catalog.session import Catalog
 from shared.errors import Conflict
 from shared.ids import new_id
-from shared.jobs import Job, JobKind, JobState, Priority
+from shared.intake.incoming import Incoming
+from shared.intake.photo_fields import PhotoFields
+from shared.jobs import Hints, Job, JobKind, JobState, Priority
 from shared.jobs.finish import requeue
 
 SAME_DEGREES = 1e-7  # about a centimetre
+
+Result = TypeVar("Result")
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,76 +37,78 @@ class Stored:
     """False: the same bytes were there already and need no work."""
 
 
-@dataclass(frozen=True, slots=True)
-class Incoming:
-    """A checked photo whose bytes lie in the object store."""
-
-    received: Received
-    media_type: str
-    header: PhotoHeader
-    fields: PhotoFields
-
-
 Keep = Callable[[Session, Stored], Stored]
 """Writes down what was stored in the transaction that stores it, and hands it on."""
 
 
-def store_photo(gateway: Gateway, map_name: str, incoming: Incoming, keep: Keep) -> Stored:
+def store_photo(
+    catalog: Catalog, hints: Hints, map_name: str, incoming: Incoming, keep: Keep
+) -> Stored:
     """Acknowledge the photo, or the one with the same bytes that the map has already.
 
-    Raises Conflict (`photo_differs`) when something else was said of that one.
+    Raises NotFound (`map_not_found`), and Conflict (`photo_differs`) when something else was said
+    of that one.
     """
-    try:
-        stored = _store(gateway, map_name, incoming, keep)
-    except IntegrityError:
-        # The same bytes were committed between our look and our insert: look again.
-        stored = _store(gateway, map_name, incoming, keep)
+    stored = try_again_once(lambda: _store(catalog, map_name, incoming, keep))
     if stored.queued:
-        gateway.hints.send()
+        hints.send()
     return stored
 
 
-def _store(gateway: Gateway, map_name: str, incoming: Incoming, keep: Keep) -> Stored:
+def try_again_once(store: Callable[[], Result]) -> Result:
+    """`store`, a transaction with `put_photo`; once more when it lost the race for its bytes."""
+    try:
+        return store()
+    except IntegrityError:
+        # The same bytes were committed between our look and our insert: look again.
+        return store()
+
+
+def put_photo(
+    session: Session, map_id: UUID, incoming: Incoming, priority: Priority = Priority.UPLOAD
+) -> Stored:
+    """The photo's row and its job's, in the caller's transaction.
+
+    Raises Conflict (`photo_differs`), and IntegrityError when the same bytes were committed since
+    the transaction has looked for them.
+    """
     received, header, fields = incoming.received, incoming.header, incoming.fields
-    with gateway.catalog.write() as session:
-        map_ = get_map(session, map_name)
-        existing = find_live_by_sha256(session, map_.id, received.sha256)
-        if existing is not None:
-            return keep(session, _same_again(session, existing, fields))
-        photo_id, job_id = new_id(), new_id()
-        said_where = fields.latitude is not None
-        photo = Photo(
-            id=photo_id,
-            map_id=map_.id,
-            job_id=job_id,
-            sha256=received.sha256,
-            object_key=received.key,
-            filename=received.filename,
-            media_type=incoming.media_type,
-            size_bytes=received.size_bytes,
-            width=header.width,
-            height=header.height,
-            latitude=fields.latitude if said_where else header.latitude,
-            longitude=fields.longitude if said_where else header.longitude,
-            heading=fields.heading if fields.heading is not None else header.heading,
-            captured_at=fields.captured_at or header.captured_at,
-            place=fields.place,
-            tags=fields.tags or [],
-            attributes=fields.metadata or {},
-            role=fields.role or PhotoRole.DATABASE,
-        )
-        session.add(photo)
-        session.flush()
-        job = Job(
-            id=job_id,
-            map_id=map_.id,
-            kind=JobKind.INDEX,
-            priority=Priority.UPLOAD,
-            photo_id=photo_id,
-        )
-        session.add(job)
-        session.flush()
-        return keep(session, Stored(photo, job, queued=True))
+    existing = find_live_by_sha256(session, map_id, received.sha256)
+    if existing is not None:
+        return _same_again(session, existing, fields)
+    photo_id, job_id = new_id(), new_id()
+    said_where = fields.latitude is not None
+    photo = Photo(
+        id=photo_id,
+        map_id=map_id,
+        job_id=job_id,
+        sha256=received.sha256,
+        object_key=received.key,
+        filename=received.filename,
+        media_type=incoming.media_type,
+        size_bytes=received.size_bytes,
+        width=header.width,
+        height=header.height,
+        latitude=fields.latitude if said_where else header.latitude,
+        longitude=fields.longitude if said_where else header.longitude,
+        heading=fields.heading if fields.heading is not None else header.heading,
+        captured_at=fields.captured_at or header.captured_at,
+        place=fields.place,
+        tags=fields.tags or [],
+        attributes=fields.metadata or {},
+        role=fields.role or PhotoRole.DATABASE,
+    )
+    session.add(photo)
+    session.flush()
+    job = Job(id=job_id, map_id=map_id, kind=JobKind.INDEX, priority=priority, photo_id=photo_id)
+    session.add(job)
+    session.flush()
+    return Stored(photo, job, queued=True)
+
+
+def _store(catalog: Catalog, map_name: str, incoming: Incoming, keep: Keep) -> Stored:
+    with catalog.write() as session:
+        return keep(session, put_photo(session, get_map(session, map_name).id, incoming))
 
 
 def _same_again(session: Session, photo: Photo, fields: PhotoFields) -> Stored:
@@ -113,7 +117,7 @@ def _same_again(session: Session, photo: Photo, fields: PhotoFields) -> Stored:
         raise Conflict(
             "photo_differs",
             "The map has a photo with the same bytes of which something else was said: "
-            f"{', '.join(differing)}. To change that: PATCH {API}/uploads/{photo.id}, or "
+            f"{', '.join(differing)}. To change that: PATCH /api/v1/uploads/{photo.id}, or "
             "`placewise index --update`.",
             file_id=str(photo.id),
             differing=differing,

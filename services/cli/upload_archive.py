@@ -1,0 +1,81 @@
+"""An archive of photos into a map: sent as it is, brought in by the server, waited for."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from rich.progress import Progress, TaskID
+
+from services.cli.upload_many import LOOK_SECONDS, fit_if_worth_it
+from shared.archive_formats import ACCEPTED_ARCHIVES, SNIFFED_ARCHIVE_BYTES, sniff_archive
+from shared.client import FINISHED, Client, Json
+from shared.errors import InvalidRequest, Unprocessable
+
+
+def check_archive(path: Path) -> None:
+    """InvalidRequest (`not_an_archive`) for a file that the server would refuse."""
+    try:
+        with path.open("rb") as file:
+            begin = file.read(SNIFFED_ARCHIVE_BYTES)
+    except OSError as error:
+        raise InvalidRequest("unreadable_file", f"Can't read {path}: {error.strerror}") from error
+    if sniff_archive(begin) is None:
+        raise InvalidRequest(
+            "not_an_archive",
+            f"{path} is no folder, and by its content not {ACCEPTED_ARCHIVES}.",
+        )
+
+
+def upload_archive(client: Client, archive: Path, fit: bool, progress: Progress) -> Json:
+    """Upload, describe, and fit a vocabulary where the map needs one.
+
+    Returns what `upload_many` does. Raises the reason of a batch that has failed as a whole.
+    """
+    client.stats()  # a wrong address, key or map is said before gigabytes are sent
+    sending = progress.add_task("uploading (bytes)", total=archive.stat().st_size)
+    started = client.upload_archive(
+        archive, lambda sent_bytes: progress.update(sending, completed=sent_bytes)
+    )
+    describing = progress.add_task("describing", total=None)
+    job = _wait(client, started["job_id"], progress, describing)
+    stats, fitted = client.stats(), None
+    if fit:
+        stats, fitted = fit_if_worth_it(client, stats, progress)
+    if job["state"] not in FINISHED and stats["vocabulary"] is not None:
+        job = _wait(client, started["job_id"], progress, describing)
+    if job["state"] in ("failed", "cancelled"):
+        error: Json = job["error"] or {}
+        raise Unprocessable(
+            error.get("code", "job_ended"), error.get("detail", f"The batch was {job['state']}.")
+        )
+    bad = list(client.batch_items(started["job_id"], "failed", "cancelled"))
+    counts: Json = job["result"] or {}
+    there = counts.get("already_there", 0)
+    return {
+        "photos": job["progress"]["total"],
+        "uploaded": job["progress"]["total"] - there - sum(not item["file_id"] for item in bad),
+        "already_there": there,
+        "searchable": client.stats()["searchable_images"],
+        "refused": [_fault(item) for item in bad if not item["file_id"]],
+        "failed": [_fault(item) for item in bad if item["file_id"]],
+        "vocabulary": stats["vocabulary"],
+        "fitted": fitted,
+        "ignored": counts.get("ignored", 0),
+    }
+
+
+def _wait(client: Client, job_id: str, progress: Progress, bar: TaskID) -> Json:
+    """The job once it has ended, or waits for a vocabulary."""
+    wait_seconds = 0.0
+    while True:
+        job = client.job(job_id, wait_seconds)
+        wait_seconds = LOOK_SECONDS
+        done: Json = job["progress"]
+        progress.update(bar, completed=done["done"] + done["failed"], total=done["total"] or None)
+        if job["state"] in FINISHED or job["waiting_for"]:
+            return job
+
+
+def _fault(item: Json) -> Json:
+    error: Json = item["error"] or {}
+    return {"path": item["name"], "reason": str(error.get("detail", item["state"]))}

@@ -1,0 +1,95 @@
+"""Taking the steward's own jobs: one at a time, under a lease, whatever it comes to."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from uuid import UUID
+
+from sqlalchemy.exc import SQLAlchemyError
+
+from shared.catalog.session import Catalog
+from shared.errors import PlacewiseError, Unavailable
+from shared.jobs import Job, JobKind, claim, hold_lease
+from shared.jobs.batches import cancel_items
+from shared.jobs.finish import fail, release
+from shared.jobs.leases import fallen, held
+from shared.settings import Settings
+
+log = logging.getLogger(__name__)
+
+IDLE_SECONDS = 0.5
+AWAY_SECONDS = 2.0  # pause of a job when the object store, the search tier or the catalog is away
+
+
+class Stopped(Exception):
+    """The job was cancelled, or its steward is to end."""
+
+
+@dataclass(frozen=True, slots=True)
+class Taker:
+    """Takes jobs of one kind; `do` does one, or a slice of it, and ends or releases it itself."""
+
+    catalog: Catalog
+    settings: Settings
+    name: str
+    kind: JobKind
+
+    def run(self, stop: threading.Event, do: Callable[[Job], None]) -> None:
+        """Take jobs until `stop` is set."""
+        while not stop.is_set():
+            try:
+                if not self.take_next(do):
+                    stop.wait(IDLE_SECONDS)
+            except SQLAlchemyError:
+                log.exception("the catalog can't be reached; trying again in %g s", AWAY_SECONDS)
+                stop.wait(AWAY_SECONDS)
+
+    def take_next(self, do: Callable[[Job], None]) -> bool:
+        """Do the next job; False when there is none."""
+        lease_seconds = self.settings.lease_seconds
+        with self.catalog.write() as session:
+            jobs = claim(
+                session, worker=self.name, limit=1, lease_seconds=lease_seconds, kinds=[self.kind]
+            )
+        if not jobs:
+            return False
+        job = jobs[0]
+        with hold_lease(self.catalog, token_of(job), lease_seconds):
+            try:
+                do(job)
+            except Stopped:
+                self._end(job, release)
+            except (Unavailable, OSError, SQLAlchemyError) as error:
+                log.warning("the job %s (%s) pauses: %s", job.id, job.kind, error)
+                self._end(job, lambda mine: release(mine, after_seconds=AWAY_SECONDS))
+            except PlacewiseError as error:
+                self._fail(job, error)
+            except Exception as error:
+                log.exception("the job %s (%s) crashed", job.id, job.kind)
+                self._crashed(job, error)
+        return True
+
+    def _end(self, job: Job, how: Callable[[Job], None]) -> None:
+        with self.catalog.write() as session:
+            for mine in held(session, token_of(job), [job]):
+                how(mine)
+
+    def _fail(self, job: Job, error: PlacewiseError) -> None:
+        with self.catalog.write() as session:
+            for mine in held(session, token_of(job), [job]):
+                fail(mine, error.as_problem())
+                cancel_items(session, mine)
+
+    def _crashed(self, job: Job, error: Exception) -> None:
+        with self.catalog.write() as session:
+            for mine in held(session, token_of(job), [job]):
+                fallen(session, mine, self.settings.max_attempts, cause=type(error).__name__)
+
+
+def token_of(job: Job) -> UUID:
+    """The token that a claimed job carries."""
+    assert job.lease_token is not None, "a claimed job carries a token"
+    return job.lease_token

@@ -1,0 +1,110 @@
+"""What is learnt of a file while its bytes go into the object store."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import PurePosixPath, PureWindowsPath
+from typing import BinaryIO
+
+from shared.errors import PlacewiseError, TooLarge, UnsupportedMedia
+from shared.objects import ObjectStore
+from shared.photo_formats import ACCEPTED, SNIFFED_BYTES, sniff_media_type
+
+MAX_NAME_CHARACTERS = 255
+
+
+@dataclass(slots=True)
+class Received:
+    """A file that lies whole under `key` of the object store, and what is said of it."""
+
+    key: str
+    filename: str
+    size_bytes: int
+    sha256: str
+    begin: bytes
+    """The file's first bytes, as many as tell its format."""
+    fields: dict[str, str] = field(default_factory=dict)
+    """In the upload form's names."""
+    whole: bytes | None = None
+    """All of its bytes where they are few, and at hand."""
+
+    def open(self, store: ObjectStore) -> BinaryIO:
+        """The file, from memory or from the store."""
+        return store.open(self.key) if self.whole is None else io.BytesIO(self.whole)
+
+
+class PassingFile:
+    """Counts, hashes and checks a file of which only a piece is there at a time."""
+
+    def __init__(
+        self,
+        max_bytes: int,
+        check_begin: Callable[[bytes], object] = lambda begin: None,
+        *,
+        begin_bytes: int = SNIFFED_BYTES,
+        too_large: Callable[[int], PlacewiseError] | None = None,
+    ) -> None:
+        """`check_begin` sees the first `begin_bytes` as soon as they are there, and may raise;
+        `too_large` makes the refusal of more than `max_bytes`."""
+        self.size_bytes = 0
+        self.begin = b""
+        self._max_bytes = max_bytes
+        self._begin_bytes = begin_bytes
+        self._too_large = too_large or file_too_large
+        self._check_begin = check_begin
+        self._checked = False
+        self._hash = hashlib.sha256()
+
+    @property
+    def sha256(self) -> str:
+        """Of what has passed, in hexadecimal digits."""
+        return self._hash.hexdigest()
+
+    def add(self, piece: bytes) -> None:
+        """The next bytes. Raises TooLarge (`file_too_large`, unless another refusal was
+        given) and what `check_begin` raises."""
+        self.size_bytes += len(piece)
+        if self.size_bytes > self._max_bytes:
+            raise self._too_large(self._max_bytes)
+        if len(self.begin) < self._begin_bytes:
+            self.begin = (self.begin + piece)[: self._begin_bytes]
+        if not self._checked and len(self.begin) == self._begin_bytes:
+            self._check()
+        self._hash.update(piece)
+
+    def end(self) -> None:
+        """That was all: a file shorter than its signature is checked now; an empty one never."""
+        if not self._checked and self.size_bytes:
+            self._check()
+
+    def _check(self) -> None:
+        self._checked = True
+        self._check_begin(self.begin)
+
+
+def check_photo_begin(begin: bytes) -> str:
+    """The photo's media type by its content; 415 for anything that is not accepted."""
+    media_type = sniff_media_type(begin)
+    if media_type is None:
+        raise UnsupportedMedia(
+            "unsupported_photo",
+            f"By its content this is not a photo that Placewise reads: send {ACCEPTED}.",
+        )
+    return media_type
+
+
+def base_name(filename: str) -> str:
+    """The last part of what someone calls a file, on either kind of system."""
+    name = PurePosixPath(PureWindowsPath(filename).name).name
+    return "".join(c for c in name if c.isprintable())[:MAX_NAME_CHARACTERS] or "photo"
+
+
+def file_too_large(max_bytes: int) -> PlacewiseError:
+    return TooLarge(
+        "file_too_large",
+        f"The file is larger than {max_bytes} bytes (MAX_FILE_SIZE).",
+        max_bytes=max_bytes,
+    )
