@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 WANTED_ABOVE_A_BATCH_MS = 100.0
 SIZE, SIZE_BYTES = (1024, 768), 100_000
 WIDTH = 7168
-TEXTURES = 16
+TEXTURES = 64  # so that few of the rows that are found are equal
 SECONDS = 120.0
 SEED = 20_261_121
 
@@ -63,7 +63,7 @@ def measure(
         first = upload_all(caller.url, [form_of(photo) for photo in photos], 4)
         wait_for_jobs(fleet.catalog, SECONDS)
         _ask(caller, photos[0])  # connections, and the query's own way
-        _queue(fleet, UUID(first[0]["file_id"]), backlog)
+        _queue(fleet, [UUID(answer["file_id"]) for answer in first], backlog)
         begun = _wait_for_chunks(fleet, 3)
         bar = progress.add_task("asking", total=seconds)
         moments = random.Random(SEED)
@@ -104,21 +104,24 @@ def _ask(caller: Caller, photo: bytes) -> float:
     return took
 
 
-def _queue(fleet: Fleet, photo_id: UUID, count: int) -> None:
-    """Photos that were uploaded, all with the bytes of one: sending thousands takes long and shows
-    nothing more."""
+def _queue(fleet: Fleet, photo_ids: Sequence[UUID], count: int) -> None:
+    """Uploads with the bytes of these photos: sending thousands takes long and shows nothing
+    more."""
     with fleet.catalog.write() as session:
-        known = session.get_one(Photo, photo_id)
-        shared = {
-            column: getattr(known, column)
-            for column in ("map_id", "object_key", "filename", "media_type", "size_bytes")
-        }
+        known = [session.get_one(Photo, photo_id) for photo_id in photo_ids]
+        shared = [
+            {
+                column: getattr(photo, column)
+                for column in ("map_id", "object_key", "filename", "media_type", "size_bytes")
+            }
+            for photo in known
+        ]
         ids = [(new_id(), new_id()) for _ in range(count)]
         session.execute(
             insert(Photo),
             [
                 {
-                    **shared,
+                    **shared[number % len(shared)],
                     "id": photo,
                     "job_id": job,
                     "sha256": f"{number:064d}",
@@ -133,7 +136,7 @@ def _queue(fleet: Fleet, photo_id: UUID, count: int) -> None:
             [
                 {
                     "id": job,
-                    "map_id": known.map_id,
+                    "map_id": known[0].map_id,
                     "kind": JobKind.INDEX,
                     "priority": Priority.UPLOAD,
                     "photo_id": photo,

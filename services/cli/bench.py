@@ -20,6 +20,16 @@ app = typer.Typer(help="Measure this machine.", no_args_is_help=True)
 OF_DEV = ("benchmarks", "tests", "psutil", "pytest", "testcontainers")
 
 
+@app.command("spine")
+def spine(
+    photos: Annotated[int, typer.Option(min=2)] = 200,
+    queries: Annotated[int, typer.Option(min=1)] = 50,
+    as_json: JsonOption = False,
+) -> None:
+    """How long do upload, description and both kinds of query take on an embedded server?"""
+    _measure("spine", as_json, photos=photos, queries=queries)
+
+
 @app.command("scaling")
 def scaling(
     workers: Annotated[str, typer.Option(help="Numbers of extractors.")] = "1,2,4,8",

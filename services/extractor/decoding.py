@@ -10,6 +10,7 @@ import logging
 import multiprocessing
 import resource
 import threading
+from collections import deque
 from collections.abc import Sequence
 from concurrent.futures import TimeoutError as TimedOut
 from concurrent.futures import wait
@@ -26,6 +27,10 @@ from shared.vision.preprocessing import Preprocessing
 log = logging.getLogger(__name__)
 
 LOOK_SECONDS = 1.0  # how often a waiting batch looks whether the pool still lives
+
+# Photos of a batch that a child has before it: one under way and the next. All of them at once
+# would keep a query's photo, which comes from another thread, waiting behind the whole batch.
+SCHEDULED_EACH = 2
 
 # Of Pillow's blocks, 16 MiB at most each, kept by a child between two photos.
 KEPT_BLOCKS = 8
@@ -51,11 +56,14 @@ class DecoderPool:
                 log.error("the decoder pool broke; starting a new one")
                 self.close()
                 self._pool = self._new_pool()
-        pending = [self._schedule(data, preprocessing) for data in photos]
-        return [
-            self._result(future, data, preprocessing)
-            for future, data in zip(pending, photos, strict=True)
-        ]
+        outcomes: list[Decoded | PlacewiseError] = []
+        pending: deque[tuple[ProcessFuture[Decoded], bytes]] = deque()
+        for data in photos:
+            if len(pending) == self._settings.decode_processes * SCHEDULED_EACH:
+                outcomes.append(self._result(*pending.popleft(), preprocessing))
+            pending.append((self._schedule(data, preprocessing), data))
+        outcomes += [self._result(future, data, preprocessing) for future, data in pending]
+        return outcomes
 
     def close(self) -> None:
         """End the children now."""
