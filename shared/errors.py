@@ -1,13 +1,13 @@
 """Every error that a caller can meet, with its HTTP status and its stable code.
 
 PlacewiseError
-├── InvalidRequest 400          no_file, empty_file, malformed_body
+├── InvalidRequest 400          no_file, empty_file, malformed_body, bad_manifest, ...
 ├── Unauthorized 401            key_missing, key_unknown
 ├── NotFound 404                photo_not_found, job_not_found, map_not_found, ...
 ├── Conflict 409                not_searchable, coordinates_differ, model_change_running, ...
 ├── Gone 410                    query_expired
-├── TooLarge 413                file_too_large
-├── UnsupportedMedia 415        unsupported_photo, unsupported_body
+├── TooLarge 413                file_too_large, batch_too_large, ...
+├── UnsupportedMedia 415        unsupported_photo, unsupported_body, unsupported_archive
 ├── Unprocessable 422           invalid_field, undecodable_photo, too_many_pixels, ...
 ├── TooManyRequests 429         queue_full, too_many_uploads (come again after `Retry-After`)
 ├── Unavailable 503             search_behind, chunk_unreadable, ... (may be tried again)

@@ -297,7 +297,8 @@ def test_limits_of_a_batch_are_said_and_leave_nothing(
 
     archive = zip_of({"a.jpg": bytes(range(256)) * 20}, 0)
     assert refused(files={"archive": ("a.zip", archive)}) == "batch_too_large"
-    assert refused(files=[("file", file) for file in files(1, 2, 3)]) == "batch_too_large"
+    large = [("file", (f"{n}.jpg", b"\xff\xd8\xff" + bytes(2000))) for n in range(2)]
+    assert refused(files=large) == "batch_too_large"
     tiny = [("file", (f"{n}.jpg", b"\xff\xd8\xff")) for n in range(3)]
     assert refused(files=tiny) == "too_many_photos"
     keys = lines(*({"key": f"imports/{n}.jpg"} for n in range(3)))
@@ -647,7 +648,7 @@ def test_a_steward_killed_at_any_step_leaves_each_photo_once(
     else:
         job_id = batches.start(archive=PACKED[source](photos))
     real: Any = getattr(FolderStore, step)
-    for life in range(1, 4):
+    for life in (1, 3, 7):  # an archive that kills three while it is looked through is given up
         left = [life]
 
         def die(self: FolderStore, *arguments: Any, left: list[int] = left) -> Any:

@@ -1,0 +1,214 @@
+"""Batches as a user sees them: over HTTP, by the command line, in one process and in several."""
+
+from __future__ import annotations
+
+import io
+import json
+import signal
+import time
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx2
+import pytest
+
+from shared.client import Client
+from shared.errors import InvalidRequest
+from shared.objects.s3 import S3Store
+from tests.e2e.test_separate_services import Deployment, until
+from tests.support.archives import PACKED, tar_of, zip_of
+from tests.support.photos import photo_bytes
+from tests.support.server import ServerProcess, environment, run_command
+from tests.support.servers import PostgresServer, S3Server, start_redis
+
+SETTINGS = {"max_file_size": 100_000}
+
+
+def photos(*numbers: int) -> dict[str, bytes]:
+    return {f"{number}.jpg": photo_bytes(number) for number in numbers}
+
+
+def table(*numbers: int) -> bytes:
+    rows = (f"{number}.jpg,{45 + number / 1000},7\n" for number in numbers)
+    return ("filename,latitude,longitude\n" + "".join(rows)).encode()
+
+
+@pytest.fixture
+def client(server: ServerProcess) -> Iterator[Client]:
+    with Client(str(server.client.base_url)) as opened:
+        yield opened
+
+
+def test_an_archive_is_searchable_when_its_job_has_succeeded(server: ServerProcess) -> None:
+    archive = zip_of(photos(*range(100, 112)) | {"photos.csv": table(*range(100, 112))})
+    answer = server.client.post("/api/v1/upload/batch", files={"archive": ("a.zip", archive)})
+    assert answer.status_code == 202
+    started = answer.json()
+    assert answer.headers["location"] == started["status_url"]
+    job = server.finished(started["job_id"])
+    assert job["state"] == "succeeded", job
+    assert job["kind"] == "batch"
+    assert job["progress"] == {"done": 12, "total": 12, "failed": 0}
+    items = server.client.get(started["items_url"]).json()["items"]
+    assert [item["name"] for item in items] == [f"{number}.jpg" for number in range(100, 112)]
+    found = server.ask(photo_bytes(105), top_k=1).json()["similar_images"][0]
+    assert (found["original_filename"], found["latitude"]) == ("105.jpg", 45.105)
+
+
+def test_the_client_sends_files_with_a_manifest_and_names_of_objects(
+    client: Client, server: ServerProcess, tmp_path: Path
+) -> None:
+    paths = []
+    for name, data in photos(120, 121).items():
+        paths.append(tmp_path / name)
+        paths[-1].write_bytes(data)
+    started = client.upload_files(paths, [{"filename": "121.jpg", "place": "hall"}])
+    assert client.wait_for(started["job_id"])["state"] == "succeeded"
+    one, two = client.batch_items(started["job_id"])
+    assert client.photo(one["file_id"])["place"] is None
+    assert client.photo(two["file_id"])["place"] == "hall"
+
+    imports = server.home / "objects" / "imports"
+    imports.mkdir()
+    (imports / "a.jpg").write_bytes(photo_bytes(122))
+    started = client.import_objects([{"key": "imports/a.jpg"}, {"key": "imports/b.jpg"}])
+    job = client.wait_for(started["job_id"])
+    assert job["progress"] == {"done": 1, "total": 2, "failed": 1}
+    [failed] = client.batch_items(started["job_id"], "failed")
+    assert failed["error"]["code"] == "object_not_found"
+    with pytest.raises(InvalidRequest, match="IMPORT_PREFIX"):
+        client.import_objects([{"key": "originals/a.jpg"}])
+
+
+def test_a_manifest_of_more_than_a_megabyte_is_read(server: ServerProcess) -> None:
+    lines = b"".join(b'{"key": "imports/%064d.jpg"}\n' % number for number in range(15_000))
+    assert len(lines) > 1_000_000
+    answer = server.client.post(
+        "/api/v1/upload/batch",
+        content=lines,
+        headers={"Content-Type": "application/x-ndjson"},
+    )
+    assert answer.status_code == 202, answer.text
+    job_id = answer.json()["job_id"]
+    assert server.client.get(f"/api/v1/jobs/{job_id}").json()["progress"]["total"] == 15_000
+    cancelled = server.client.post(f"/api/v1/jobs/{job_id}/cancel").json()
+    assert cancelled["state"] == "cancelled"
+
+
+def index(server: ServerProcess, path: Path, *options: str, code: int = 0) -> dict[str, Any]:
+    env = environment(server.home)
+    ended = run_command("index", path, *options, "--json", env=env, cwd=path.parent)
+    assert ended.returncode == code, ended.stdout + ended.stderr
+    report: dict[str, Any] = json.loads(ended.stdout)
+    return report
+
+
+@pytest.mark.parametrize("kind", ["zip", "tar.gz"])
+def test_index_takes_an_archive_as_it_takes_a_folder(
+    server: ServerProcess, tmp_path: Path, kind: str
+) -> None:
+    first = 140 if kind == "zip" else 150
+    path = tmp_path / "photos"  # its name says nothing
+    path.write_bytes(PACKED[kind](photos(*range(first, first + 4)) | {"bad.jpg": b"no photo"}))
+    report = index(server, path, code=1)
+    assert (report["photos"], report["uploaded"], report["already_there"]) == (5, 4, 0)
+    [refused] = report["refused"]
+    assert refused["path"] == "bad.jpg"
+    assert "not a photo" in refused["reason"]
+    path.write_bytes(PACKED[kind](photos(*range(first, first + 4))))
+    report = index(server, path)
+    assert (report["uploaded"], report["already_there"], report["refused"]) == (0, 4, [])
+
+
+def test_index_says_what_is_no_archive_and_what_an_archive_can_not_be_told(
+    server: ServerProcess, tmp_path: Path
+) -> None:
+    path = tmp_path / "photos.zip"
+    path.write_bytes(b"not a zip, whatever its name says" * 50)
+    assert index(server, path, code=1)["code"] == "not_an_archive"
+    path.write_bytes(zip_of(photos(160)))
+    refused = index(server, path, "--role", "query", code=1)
+    assert refused["code"] == "not_for_archives"
+    assert "--role" in refused["detail"]
+    path.write_bytes(zip_of({"readme.txt": b"hello"}))
+    assert index(server, path, code=1)["code"] == "no_photos"
+
+
+def test_a_bomb_does_no_harm(server: ServerProcess) -> None:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
+        for number in range(3):
+            archive.writestr(f"{number}.jpg", b"\xff\xd8\xff" + bytes(50_000_000))
+    answer = server.client.post(
+        "/api/v1/upload/batch", files={"archive": ("bomb.zip", buffer.getvalue())}
+    )
+    job = server.finished(answer.json()["job_id"])
+    assert job["progress"] == {"done": 0, "total": 3, "failed": 3}
+    items = server.client.get(answer.json()["items_url"]).json()["items"]
+    assert {item["error"]["code"] for item in items} == {"file_too_large"}
+
+
+def test_a_batch_goes_on_after_each_kill_and_brings_each_photo_in_once(tmp_path: Path) -> None:
+    count = 120
+    archive = tar_of(photos(*range(count)), "w:gz")
+    with ServerProcess(tmp_path / "home", batch_ahead_photos=20) as server:
+        answer = server.client.post("/api/v1/upload/batch", files={"archive": ("a", archive)})
+        job_url = f"/api/v1/jobs/{answer.json()['job_id']}"
+        for reached in (10, 40, 80):
+            while server.client.get(job_url).json()["progress"]["done"] < reached:
+                time.sleep(0.01)
+            server.kill()
+            server.start()
+        job = server.finished(answer.json()["job_id"])
+        assert job["state"] == "succeeded", job
+        assert job["progress"] == {"done": count, "total": count, "failed": 0}
+        assert job["result"]["already_there"] == 0, "none was brought in a second time"
+        stats = server.client.get("/api/v1/database/stats").json()
+        assert (stats["total_images"], stats["searchable_images"]) == (count, count)
+        originals = server.home / "objects" / "originals"
+        # A kill may leave one that is being written; the steward removes it after a day.
+        assert count <= len([p for p in originals.iterdir() if p.is_file()]) <= count + 3
+        archives = server.home / "objects" / "archives"
+        deadline = time.monotonic() + 30
+        while any(archives.iterdir()):
+            assert time.monotonic() < deadline, server.log()
+            time.sleep(0.2)
+
+
+def test_a_batch_in_separate_services_outlives_its_steward(
+    tmp_path: Path, postgres: PostgresServer, s3: S3Server
+) -> None:
+    bucket = s3.new_bucket()
+    store = S3Store(bucket)
+    count = 60
+    with start_redis(own=True) as redis:
+        deployment = Deployment(tmp_path, postgres.new_database(), redis.url)
+        try:
+            deployment.settings |= s3.variables(bucket.name) | {"batch_ahead_photos": 10}
+            deployment.start("search")
+            deployment.settings["search_urls"] = deployment.address("search", 0)
+            deployment.start("gateway")
+            deployment.start("extractor")
+            steward = deployment.start("steward")
+            with httpx2.Client(base_url=deployment.address("gateway", 1), timeout=60) as client:
+                until(lambda: client.get("/readyz").is_success)
+                archive = zip_of(photos(*range(count)) | {"photos.csv": table(*range(count))})
+                answer = client.post("/api/v1/upload/batch", files={"archive": ("a", archive)})
+                assert answer.status_code == 202, answer.text
+                job_url = answer.json()["status_url"]
+                until(lambda: client.get(job_url).json()["progress"]["done"] >= 10)
+                steward.send_signal(signal.SIGKILL)
+                steward.wait()
+                deployment.start("steward")
+                until(lambda: client.get(job_url).json()["state"] == "succeeded")
+                job = client.get(job_url).json()
+                assert job["progress"] == {"done": count, "total": count, "failed": 0}
+                assert job["result"]["already_there"] == 0
+                stats = client.get("/api/v1/database/stats").json()
+                assert (stats["total_images"], stats["searchable_images"]) == (count, count)
+            until(lambda: not list(store.list("archives/")))
+            assert "Traceback" not in deployment.logs()
+        finally:
+            deployment.close()

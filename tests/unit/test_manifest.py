@@ -1,0 +1,92 @@
+"""Lists that say where many photos were taken: what they give, how they name their bad lines."""
+
+from __future__ import annotations
+
+import pytest
+
+from shared.errors import InvalidRequest, PlacewiseError
+from shared.intake.manifest import MOST_NAMED, Said, read_csv, read_jsonl
+from shared.intake.photo_fields import read_form_fields
+
+
+def refused(data: bytes) -> PlacewiseError:
+    with pytest.raises(InvalidRequest) as caught:
+        read_jsonl(data, "the manifest")
+    assert caught.value.code == "bad_manifest"
+    return caught.value
+
+
+def test_lines_give_the_forms_fields_by_the_photos_names() -> None:
+    data = (
+        b"\xef\xbb\xbf"
+        b'{"filename": "a.jpg", "latitude": 45.5, "longitude": -7, "tags": ["x", "y"]}\n'
+        b"\n"
+        b'{"path": "in/b.jpg", "place": "h\xc3\xa4ll", "metadata": {"n": [1]}, "heading": null}\r\n'
+        b'{"file": "c.jpg", "captured_at": "2026-05-01", "role": "query"}'
+    )
+    said = read_jsonl(data, "the manifest")
+    assert said == [
+        Said(1, "a.jpg", {"latitude": "45.5", "longitude": "-7", "tags": "x,y"}),
+        Said(3, "in/b.jpg", {"place": "häll", "metadata": '{"n": [1]}'}),
+        Said(4, "c.jpg", {"captured_at": "2026-05-01", "role": "query"}),
+    ]
+    fields = [read_form_fields(one.fields) for one in said]
+    assert (fields[0].latitude, fields[0].longitude, fields[0].tags) == (45.5, -7, ["x", "y"])
+    assert fields[1].metadata == {"n": [1]}
+
+
+@pytest.mark.parametrize(
+    ("line", "why"),
+    [
+        (b"{", "is not JSON"),
+        (b"\xff\xfe", "is not JSON"),
+        (b"[" * 100_000, "is not JSON"),
+        (b"3", "is not a JSON object"),
+        (b"{}", "has no filename or file or path"),
+        (b'{"file": 3}', "file is no text"),
+        (b'{"file": ""}', "file is no text"),
+        (b'{"file": "a\\u0000"}', "NUL"),
+        (b'{"file": "a", "place": "\\ud800"}', "surrogate"),
+        (b'{"file": "a", "lat": 3}', "lat is unknown; known are latitude"),
+        (b'{"file": "a", "latitude": true}', "latitude can't be true"),
+        (b'{"file": "a", "latitude": [1]}', "latitude can't be [1]"),
+        (b'{"file": "a", "tags": ["a,b"]}', "without commas"),
+        (b'{"file": "a", "place": 3}', "place can't be 3"),
+        (b'{"file": "first.jpg"}', "stands in line 1 already"),
+    ],
+)
+def test_a_bad_line_is_named_with_its_number(line: bytes, why: str) -> None:
+    error = refused(b'{"file": "first.jpg"}\n\n' + line + b'\n{"file": "last.jpg"}\n')
+    assert [fault["line"] for fault in error.extra["errors"]] == [3]
+    assert "the manifest, line 3: " in error.detail
+    assert why in error.detail
+
+
+def test_a_wrong_value_is_no_bad_line_but_the_photos_own_error() -> None:
+    [said] = read_jsonl(b'{"file": "a", "latitude": 95, "longitude": 7}', "the manifest")
+    with pytest.raises(PlacewiseError, match="latitude"):
+        read_form_fields(said.fields)
+
+
+def test_only_the_first_bad_lines_are_named() -> None:
+    error = refused(b"oops\n" * 1000)
+    assert len(error.extra["errors"]) == MOST_NAMED
+
+
+@pytest.mark.parametrize(
+    ("table", "why"),
+    [
+        (b"file,place\na.jpg,hall,more\n", "line 2: has too many columns"),
+        (b"file,place\na.jpg,x\na.jpg,y\n", "line 3: 'a.jpg' stands in line 2 already"),
+        (b"file,place\na.jpg,a\0b\n", ""),
+        (b"file,lat\na.jpg,3\n", "lat mean nothing here"),
+        (b"\xff\xfe", "Can't read"),
+        (b"", "has no column filename"),
+    ],
+)
+def test_a_table_that_can_not_be_understood_is_refused(table: bytes, why: str) -> None:
+    with pytest.raises(InvalidRequest) as caught:
+        read_csv(table, "photos.csv")
+    assert caught.value.code == "bad_table"
+    assert "photos.csv" in caught.value.detail
+    assert why in caught.value.detail
