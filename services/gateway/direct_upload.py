@@ -159,8 +159,9 @@ async def complete(
 
     def replace(said: Said) -> None:
         with gateway.catalog.write() as session:
-            upload = session.get_one(DirectUpload, upload_id)
-            upload.status, upload.answer = said.status, said.answer.model_dump_json()
+            upload = session.get(DirectUpload, upload_id)
+            if upload is not None:  # its map may have been deleted during the wait
+                upload.status, upload.answer = said.status, said.answer.model_dump_json()
 
     return await answer_upload(request, response, gateway, stored, key, replace)
 
