@@ -19,7 +19,7 @@ import numpy as np
 from PIL import Image
 
 from benchmarks.report import Report
-from shared.client import Client, Json, retry_while_away
+from shared.client import Client, Json
 from shared.errors import Unavailable
 from shared.home import RunningServer, running_server
 
@@ -60,7 +60,8 @@ def _server(home: Path) -> Iterator[RunningServer]:
                 if server.poll() is not None or time.monotonic() > deadline:
                     raise Unavailable("server_unreachable", "The server did not start.")
                 time.sleep(0.1)
-            retry_while_away(lambda: Client(running.url, key=running.key).stats(), START_SECONDS)
+            with Client(running.url, key=running.key, patience_seconds=START_SECONDS) as client:
+                client.stats()
             yield running
         finally:
             server.terminate()
