@@ -34,14 +34,8 @@ from services.gateway.schemas import (
 from shared.catalog.chunks import descriptor_of
 from shared.catalog.generations import active_generation
 from shared.catalog.maps import bump_version, get_map, lock_map
-from shared.catalog.photos import (
-    MetadataFilter,
-    Photo,
-    PhotoRole,
-    get_photo,
-    mark_deleted,
-    search_metadata,
-)
+from shared.catalog.metadata_search import COUNTED_AT_MOST, MetadataFilter, search_metadata
+from shared.catalog.photos import Photo, PhotoRole, get_photo, mark_deleted
 from shared.errors import NotFound, invalid_field
 from shared.jobs import Job
 from shared.jobs.finish import cancel
@@ -219,6 +213,7 @@ def search(
     page = found[:limit]
     return MetadataAnswer(
         total_found=total,
+        total_is_exact=total < COUNTED_AT_MOST,
         images=[PhotoAnswer(**PhotoAnswer.fields_of(item)) for item in page],
         next_cursor=_cursor(page[-1]) if len(found) > limit else None,
         query_time_ms=(time.perf_counter() - started) * 1000,

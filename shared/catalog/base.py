@@ -9,17 +9,19 @@ from __future__ import annotations
 from datetime import UTC, datetime
 from typing import Any
 
-from sqlalchemy import JSON, DateTime, Dialect, MetaData
-from sqlalchemy.dialects.postgresql import JSONB
+from sqlalchemy import JSON, DateTime, Dialect, Index, MetaData
+from sqlalchemy.dialects.postgresql import ARRAY, JSONB
 from sqlalchemy.ext.compiler import compiles
 from sqlalchemy.orm import DeclarativeBase
 from sqlalchemy.sql.elements import ColumnElement
 from sqlalchemy.sql.functions import FunctionElement
-from sqlalchemy.types import Boolean, Float, TypeDecorator
+from sqlalchemy.types import Boolean, Float, Text, TypeDecorator
 
 from shared.geodesy import EARTH_RADIUS_M, without_dust
 
 SQLITE_DISTANCE = "placewise_distance_m"
+
+Condition = ColumnElement[bool]
 
 
 class UtcDateTime(TypeDecorator[datetime]):
@@ -69,6 +71,11 @@ class Base(DeclarativeBase):
     )
 
 
+def partial_index(name: str, *columns: Any, only: Condition) -> Index:
+    """An index of the rows that meet `only`."""
+    return Index(name, *columns, postgresql_where=only, sqlite_where=only)
+
+
 class db_now(FunctionElement[datetime]):
     """The database's clock, now (not the transaction's start)."""
 
@@ -87,6 +94,16 @@ class json_array_has(FunctionElement[bool]):
     """True where a JSON array column holds a string: `json_array_has(Photo.tags, "night")`."""
 
     type = Boolean()
+    inherit_cache = True
+
+
+class filename_trigrams(FunctionElement[Any]):
+    """Every three characters in a row of a text, case ignored: what an index of substrings holds.
+
+    PostgreSQL only, by a function that a migration has made: no extension has to be installed.
+    """
+
+    type = ARRAY(Text())
     inherit_cache = True
 
 
@@ -134,6 +151,11 @@ def _json_array_has_sqlite(element: json_array_has, compiler: Any, **kw: Any) ->
     return f"EXISTS (SELECT 1 FROM json_each({array_sql}) WHERE json_each.value = {value_sql})"  # noqa: S608  (compiled SQL, no text of users)
 
 
+@compiles(filename_trigrams)
+def _filename_trigrams(element: filename_trigrams, compiler: Any, **kw: Any) -> str:
+    return f"placewise_trigrams({compiler.process(element.clauses, **kw)})"
+
+
 @compiles(db_distance_m, "postgresql")
 def _distance_postgresql(element: db_distance_m, compiler: Any, **kw: Any) -> str:
     lat_1, lon_1, lat_2, lon_2 = (
@@ -157,6 +179,3 @@ def _distance_sqlite(element: db_distance_m, compiler: Any, **kw: Any) -> str:
 def rowcount(result: Any) -> int:
     """How many rows an UPDATE or DELETE touched."""
     return int(result.rowcount)
-
-
-Condition = ColumnElement[bool]

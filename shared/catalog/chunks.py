@@ -35,7 +35,7 @@ class Chunk(Base):
     __tablename__ = "chunks"
 
     id: Mapped[UUID] = mapped_column(Uuid, primary_key=True, default=new_id)
-    generation_id: Mapped[UUID] = mapped_column(Uuid, ForeignKey("generations.id"))
+    generation_id: Mapped[UUID] = mapped_column(Uuid, ForeignKey("generations.id"), index=True)
     slot: Mapped[int] = mapped_column(Integer)
     object_key: Mapped[str] = mapped_column(Text, unique=True)
     rows: Mapped[int] = mapped_column(Integer)
