@@ -16,6 +16,7 @@ from uuid import UUID
 from sqlalchemy.exc import SQLAlchemyError
 
 from services.steward.measure import Measure
+from shared.catalog.away import Outage
 from shared.catalog.chunks import count_searchable
 from shared.catalog.evaluations import Evaluation
 from shared.catalog.generations import Generation, active_generation
@@ -51,12 +52,15 @@ class Evaluator:
 
     def run(self, stop: threading.Event) -> None:
         """Take evaluation jobs until `stop` is set."""
+        outage = Outage("evaluator")
         while not stop.is_set():
             try:
-                if not self.evaluate_next(stop):
+                done = self.evaluate_next(stop)
+                outage.over()
+                if not done:
                     stop.wait(IDLE_SECONDS)
-            except SQLAlchemyError:
-                log.exception("the catalog can't be reached; trying again in %g s", AWAY_SECONDS)
+            except SQLAlchemyError as error:
+                outage.met(error)
                 stop.wait(AWAY_SECONDS)
 
     def evaluate_next(self, stop: threading.Event) -> bool:

@@ -1,7 +1,8 @@
 """How much a map holds, and how much was asked of it.
 
-A map of up to COUNTED_NOW rows is counted whenever someone asks. Counting more would cost every
-caller seconds: the steward counts larger ones from time to time, and the answer says when it did.
+A map of up to COUNTED_NOW photos, jobs and searches is counted whenever someone asks. Counting
+more would cost every caller seconds: the steward counts larger ones from time to time, and the
+answer says when it did.
 """
 
 from __future__ import annotations
@@ -16,13 +17,12 @@ from sqlalchemy import Float, ForeignKey, Select, Uuid, func, literal, select
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
 from shared.catalog.base import Base, JsonValue, UtcDateTime, db_now, db_now_plus
-from shared.catalog.chunks import count_located, count_searchable
+from shared.catalog.chunks import COUNTED_NOW, count_located, count_searchable
 from shared.catalog.generations import active_generation
 from shared.catalog.photos import Photo, PhotoRole, count_live
 from shared.catalog.searches import Search
 from shared.jobs.table import Job
 
-COUNTED_NOW = 10_000  # photos, jobs or searches of a map; some 10 ms
 LEAST_AGE_SECONDS = 30.0
 # A large map's figures are counted in 1/50 of the time at most.
 REST = 50.0

@@ -220,6 +220,14 @@ def count_live(session: Session, map_id: UUID, role: PhotoRole | None = None) ->
     return session.scalar(counted) or 0
 
 
+def has_live(session: Session, map_id: UUID, role: PhotoRole) -> bool:
+    """Whether the map has a live photo of the role."""
+    wanted = select(Photo.id).where(
+        Photo.map_id == map_id, Photo.deleted_at.is_(None), Photo.role == role
+    )
+    return session.scalar(wanted.limit(1)) is not None
+
+
 def has_place() -> Condition:
     """True for photos with coordinates or a place label."""
     return or_(Photo.latitude.is_not(None), Photo.place.is_not(None))
