@@ -20,6 +20,7 @@ import typer
 from PIL import Image
 from rich.table import Table
 
+from services.cli.bench_catalog.command import bench_catalog
 from services.cli.output import JsonOption, answers, explained, print_json, progress_bar
 from shared.client import Client, Json, retry_while_away
 from shared.errors import Unavailable
@@ -33,6 +34,9 @@ app = typer.Typer(help="Timings on this machine.", no_args_is_help=True)
 @app.callback()
 def _bench() -> None:
     """A group, so that each benchmark has its own name."""
+
+
+app.command("catalog")(bench_catalog)
 
 
 @app.command("spine")

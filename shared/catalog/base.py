@@ -77,7 +77,7 @@ def partial_index(name: str, *columns: Any, only: Condition) -> Index:
 
 
 class db_now(FunctionElement[datetime]):
-    """The database's clock, now (not the transaction's start)."""
+    """The database's clock at the statement's start (not the transaction's)."""
 
     type = UtcDateTime()
     inherit_cache = True
@@ -116,7 +116,8 @@ class db_distance_m(FunctionElement[float]):
 
 @compiles(db_now, "postgresql")
 def _now_postgresql(element: db_now, compiler: Any, **kw: Any) -> str:
-    return "clock_timestamp()"
+    # Not clock_timestamp(): what may change within a statement can't be looked up in an index.
+    return "statement_timestamp()"
 
 
 @compiles(db_now, "sqlite")
@@ -128,7 +129,7 @@ def _now_sqlite(element: db_now, compiler: Any, **kw: Any) -> str:
 @compiles(db_now_plus, "postgresql")
 def _now_plus_postgresql(element: db_now_plus, compiler: Any, **kw: Any) -> str:
     seconds = compiler.process(element.clauses, **kw)
-    return f"(clock_timestamp() + make_interval(secs => CAST({seconds} AS double precision)))"
+    return f"(statement_timestamp() + make_interval(secs => CAST({seconds} AS double precision)))"
 
 
 @compiles(db_now_plus, "sqlite")
