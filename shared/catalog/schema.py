@@ -91,11 +91,15 @@ def check_schema(catalog: Catalog) -> None:
 
 
 def wait_for_schema(catalog: Catalog, seconds: float) -> None:
-    """Until the catalog answers with a schema that this release can work with.
+    """Until the catalog answers with a schema that this release can work with. SQLite, which only
+    processes of one machine share, is brought up to date instead.
 
     After `seconds` raises what is still in the way: Unavailable, or Misconfigured as `check_schema`
     does. `schema_too_new` is raised at once: waiting does not help.
     """
+    if catalog.is_sqlite:
+        migrate(catalog)
+        return
     deadline, told = time.monotonic() + seconds, False
     while True:
         try:
