@@ -36,9 +36,11 @@ from services.steward.evaluate import Evaluator
 from services.steward.loop import Steward
 from services.steward.queue import free_leases
 from shared.admin_key import AdminKey, admin_key, hash_key, is_loopback, new_local_key
+from shared.catalog.connections import Limits
 from shared.catalog.maps import ensure_default_map
+from shared.catalog.schema import migrate
 from shared.catalog.search_workers import forget_dead_workers
-from shared.catalog.session import Catalog
+from shared.catalog.session import open_catalog
 from shared.errors import Misconfigured
 from shared.home import announced, lock_home
 from shared.jobs import InProcessHints
@@ -99,12 +101,12 @@ def standalone(settings: Settings, *, new_key: bool = False) -> Iterator[Standal
     with contextlib.ExitStack() as held:
         held.enter_context(lock_home(home))
         listener = held.enter_context(listening(settings.host, settings.port))
-        catalog = Catalog(settings.catalog_url())
+        catalog = open_catalog(settings, "embedded")
         store = open_store(settings)
         if isinstance(store, S3Store):
             claim_bucket(home, store)
         hints = InProcessHints()
-        catalog.migrate()
+        migrate(catalog)
         with catalog.write() as session:
             ensure_default_map(session, settings.new_map_extractor)
             # The lock says that no other worker lives: what is there is left by a killed process.
@@ -124,7 +126,8 @@ def standalone(settings: Settings, *, new_key: bool = False) -> Iterator[Standal
         steward = Steward(catalog, store, hints, settings)
         evaluator = Evaluator(catalog, search, settings, name=name)
         batches = BatchWorker(catalog, store, hints, settings, name=name)
-        gateway = Gateway(catalog, store, hints, search, settings, keys)
+        requests = catalog.limited(Limits.of_requests(settings))
+        gateway = Gateway(requests, store, hints, search, settings, keys)
         server = http_server(
             create_app(gateway), access_log=settings.debug, on_stop=gateway.job_watch.end_soon
         )

@@ -56,6 +56,18 @@ def latitude_band(latitude: float, radius_m: float) -> tuple[float, float]:
     return latitude - reach, latitude + reach
 
 
+def longitude_reach(latitude: float, radius_m: float) -> float | None:
+    """Degrees of longitude to both sides, outside of which nothing lies within `radius_m` of a
+    point at this latitude; None where that is every longitude, or nearly so (around a pole)."""
+    angle = radius_m / EARTH_RADIUS_M
+    if angle >= math.pi / 2:
+        return None
+    sine = math.sin(angle) / max(math.cos(math.radians(latitude)), LEAST_DEGREES)
+    if sine > 0.999:  # from here on the arc's own rounding grows
+        return None
+    return math.degrees(math.asin(sine)) * (1 + 1e-9) + 1e-9
+
+
 def centre_of(latitudes: Degrees, longitudes: Degrees, weights: Degrees) -> tuple[float, float]:
     """The weighted centre of (n,) points as latitude and longitude: the mean of their vectors.
 

@@ -10,10 +10,11 @@ from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel, ConfigDict
-from sqlalchemy.exc import DBAPIError
+from sqlalchemy.exc import SQLAlchemyError
 from starlette.exceptions import HTTPException
 
-from shared.errors import InvalidRequest, PlacewiseError, Unavailable, Unprocessable
+from shared.catalog.away import as_unavailable
+from shared.errors import InvalidRequest, PlacewiseError, Unprocessable
 
 log = logging.getLogger(__name__)
 
@@ -51,7 +52,7 @@ def install_problem_handlers(app: FastAPI) -> None:
     app.add_exception_handler(PlacewiseError, _on_placewise_error)
     app.add_exception_handler(RequestValidationError, _on_validation_error)
     app.add_exception_handler(HTTPException, _on_http_exception)
-    app.add_exception_handler(DBAPIError, _on_database_error)
+    app.add_exception_handler(SQLAlchemyError, _on_database_error)
     app.add_exception_handler(Exception, _on_any_error)
 
 
@@ -121,11 +122,10 @@ async def _on_http_exception(request: Request, error: Exception) -> JSONResponse
 
 
 async def _on_database_error(request: Request, error: Exception) -> JSONResponse:
-    log.error("the catalog failed", exc_info=error)
-    return problem_response(
-        Unavailable("catalog_unavailable", "The catalog can't be reached right now. Try again."),
-        request,
-    )
+    unavailable = as_unavailable(error)
+    if unavailable is None:  # a bug: another try would meet it again
+        return await _on_any_error(request, error)
+    return await _on_placewise_error(request, unavailable)
 
 
 async def _on_any_error(request: Request, error: Exception) -> JSONResponse:

@@ -51,6 +51,34 @@ class Settings(BaseSettings):
         description="SQLAlchemy URL of the catalog; unset: SQLite under PLACEWISE_HOME",
     )
 
+    # How a process talks to PostgreSQL. SQLite, when embedded, has none of this.
+    database_pool_size: int = Field(
+        10, ge=1, le=1000, description="connections that a process keeps open"
+    )
+    database_pool_overflow: int = Field(
+        20, ge=0, le=1000, description="further connections while they are needed"
+    )
+    database_pool_wait_seconds: float = Field(
+        3.0, gt=0, description="longest wait for a free connection of these"
+    )
+    database_connect_seconds: float = Field(
+        3.0, ge=2, description="longest wait for a new connection, for each address of its host"
+    )
+    database_statement_seconds: float = Field(
+        5.0, gt=0, description="longest statement of a request"
+    )
+    database_lock_seconds: float = Field(
+        3.0, gt=0, description="longest wait of a request for a lock"
+    )
+    database_work_seconds: float = Field(
+        60.0, gt=0, description="longest statement of extractors, search and the steward"
+    )
+    schema_wait_seconds: float = Field(
+        60.0,
+        ge=0,
+        description="how long a service that starts waits for the catalog and `placewise migrate`",
+    )
+
     # Where objects lie when not in PLACEWISE_HOME: a bucket of any S3 server.
     s3_endpoint: str | None = Field(
         None, description="host:port of an S3 server for all objects; unset: PLACEWISE_HOME/objects"

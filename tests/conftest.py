@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 from sqlalchemy.engine import make_url
 
+from shared.catalog.schema import migrate
 from shared.catalog.session import Catalog
 from shared.objects import FolderStore
 from shared.settings import Settings
@@ -101,7 +102,7 @@ def migrated_postgres(postgres: PostgresServer) -> str:
 
 def _migrate(url: str) -> None:
     catalog = Catalog(url)
-    catalog.migrate()
+    migrate(catalog)
     catalog.close()
 
 

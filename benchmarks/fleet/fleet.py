@@ -13,6 +13,7 @@ from typing import Any, Self
 
 from benchmarks.fleet.servers import Servers
 from benchmarks.fleet.service import Service
+from shared.catalog.schema import migrate
 from shared.catalog.session import Catalog
 from shared.objects import ObjectStore
 from shared.objects.s3 import S3Store
@@ -101,7 +102,7 @@ class Fleet:
         return self.services[name]
 
     def __enter__(self) -> Self:
-        self.catalog.migrate()
+        migrate(self.catalog)
         return self
 
     def __exit__(

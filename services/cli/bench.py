@@ -12,12 +12,16 @@ from typing import Annotated, Any
 
 import typer
 
+from services.cli.bench_catalog.command import bench_catalog
 from services.cli.output import JsonOption, answers, explained, print_json, progress_bar
 from shared.errors import Misconfigured
 
 app = typer.Typer(help="Measure this machine.", no_args_is_help=True)
 
 OF_DEV = ("benchmarks", "tests", "psutil", "pytest", "testcontainers")
+
+
+app.command("catalog")(bench_catalog)
 
 
 @app.command("spine")

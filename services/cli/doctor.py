@@ -18,7 +18,7 @@ from services.cli.configuration import read_settings
 from services.cli.extractor_checks import device_check, extractor_check, memory_check
 from services.cli.output import JsonOption, answers, print_json
 from shared.catalog.photos import Photo
-from shared.catalog.session import Catalog
+from shared.catalog.session import open_catalog
 from shared.client import Client
 from shared.errors import Misconfigured, PlacewiseError
 from shared.home import running_server
@@ -138,7 +138,7 @@ def _server(settings: Settings) -> str:
         return f"running on {running.url}: {searchable} of {photos} photos searchable ({named})"
     if not (settings.placewise_home / "catalog.sqlite").exists():
         return "not running, and nothing is stored yet (start it: make run)"
-    catalog = Catalog(settings.catalog_url())
+    catalog = open_catalog(settings, "doctor")
     try:
         with catalog.read() as session:
             photos = session.scalar(

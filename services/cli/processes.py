@@ -17,8 +17,11 @@ from services.cli.output import explained, messages
 from services.cli.serve import set_log_levels
 from services.http_server import http_server, listening, stopped_by_signals, url_of
 from services.parts import start_part
+from shared.catalog.connections import Limits
 from shared.catalog.maps import ensure_default_map
-from shared.catalog.session import Catalog
+from shared.catalog.schema import migrate as migrate_catalog
+from shared.catalog.schema import wait_for_schema
+from shared.catalog.session import Catalog, open_catalog
 from shared.errors import Misconfigured
 from shared.jobs.celery_app import make_celery
 from shared.jobs.celery_hints import CeleryHints
@@ -29,7 +32,7 @@ from shared.settings import Settings
 
 def gateway() -> None:
     """Answer the HTTP API (HOST, PORT). Beyond loopback it needs ADMIN_KEY."""
-    with _service() as (settings, catalog):
+    with _service("gateway") as (settings, catalog):
         from services.gateway.app import create_app
         from services.gateway.context import Gateway
         from services.gateway.keys import keys_of
@@ -44,7 +47,8 @@ def gateway() -> None:
             with catalog.write() as session:
                 ensure_default_map(session, settings.new_map_extractor)
             store = open_store(settings, alone=False)
-            context = Gateway(catalog, store, hints, search, settings, keys)
+            requests = catalog.limited(Limits.of_requests(settings))
+            context = Gateway(requests, store, hints, search, settings, keys)
             server = http_server(
                 create_app(context),
                 access_log=settings.debug,
@@ -57,7 +61,7 @@ def gateway() -> None:
 
 def extractor() -> None:
     """Describe photos: a Celery worker on REDIS_URL, DATABASE_URL and the object store."""
-    with _service() as (settings, catalog):
+    with _service("extractor") as (settings, catalog):
         from services.extractor.service import serve_extractor  # brings torch
 
         serve_extractor(
@@ -70,7 +74,7 @@ def extractor() -> None:
 
 def steward() -> None:
     """Keep the store healthy, evaluate maps, bring in batches; any number of them may run."""
-    with _service() as (settings, catalog):
+    with _service("steward") as (settings, catalog):
         from services.steward.batches.worker import BatchWorker
         from services.steward.evaluate import Evaluator
         from services.steward.loop import Steward
@@ -101,15 +105,29 @@ def steward() -> None:
             raise Misconfigured("part_died", "A part of the steward died; the log above says why.")
 
 
-@contextlib.contextmanager
-def _service() -> Iterator[tuple[Settings, Catalog]]:
-    """The settings, and the migrated catalog."""
+def migrate() -> None:
+    """Bring the catalog's tables up to date (DATABASE_URL): once per release, before its services
+    start. Those of the release before go on meanwhile."""
     with explained(as_json=False):
         settings = read_settings()
         set_log_levels(settings.debug)
-        catalog = Catalog(settings.catalog_url())
+        catalog = open_catalog(settings, "migrate")
         try:
-            catalog.migrate()
+            migrate_catalog(catalog)
+        finally:
+            catalog.close()
+    messages.print("The catalog's schema is up to date")
+
+
+@contextlib.contextmanager
+def _service(name: str) -> Iterator[tuple[Settings, Catalog]]:
+    """The settings, and the catalog, once its schema is the one that this release needs."""
+    with explained(as_json=False):
+        settings = read_settings()
+        set_log_levels(settings.debug)
+        catalog = open_catalog(settings, name)
+        try:
+            wait_for_schema(catalog, settings.schema_wait_seconds)
             yield settings, catalog
         finally:
             catalog.close()

@@ -65,8 +65,9 @@ def _publish_photos(
             photo_ids=[photo_of(job) for job in batch.ready],
             spec=batch.target.generation.spec,
         )
-    outcome = Published()
-    with catalog.write() as session:
+
+    def commit(session: Session) -> Published:
+        outcome = Published()
         lock_map(session, batch.jobs[0].map_id)
         generation = lock_generation(session, generation_id)
         mine = {job.id: job for job in held(session, batch.token, batch.jobs)}
@@ -112,14 +113,17 @@ def _publish_photos(
                 [{"generation_id": generation_id, "chunk_id": chunk_id, **new} for new in fresh],
             )
             bump_version(session, generation.map_id)
-    return outcome
+        return outcome
+
+    return catalog.run(commit)
 
 
 def _publish_queries(catalog: Catalog, store: ObjectStore, batch: Batch, rows: Rows) -> Published:
     for job, row in zip(batch.ready, rows, strict=True):
         store.put(query_vector_key(job.id), encode_rows(row[np.newaxis]))
-    outcome = Published()
-    with catalog.write() as session:
+
+    def commit(session: Session) -> Published:
+        outcome = Published()
         mine = {job.id: job for job in held(session, batch.token, batch.jobs)}
         for stale, error in batch.failed:
             if stale.id in mine:
@@ -134,7 +138,9 @@ def _publish_queries(catalog: Catalog, store: ObjectStore, batch: Batch, rows: R
                 }
                 succeed(mine[stale.id], reference)
                 outcome.succeeded += 1
-    return outcome
+        return outcome
+
+    return catalog.run(commit)
 
 
 def _wanted_states(kind: JobKind) -> tuple[GenerationState, ...]:

@@ -14,8 +14,10 @@ from collections.abc import Callable
 from typing import Any
 
 from celery import signals
+from sqlalchemy.exc import SQLAlchemyError
 
-from services.extractor.worker import ExtractorWorker
+from services.extractor.worker import AWAY_SECONDS, DrainResult, ExtractorWorker
+from shared.catalog.away import Outage
 from shared.catalog.session import Catalog
 from shared.jobs.celery_app import DRAIN_TASK, make_celery
 from shared.jobs.celery_hints import CeleryHints
@@ -42,8 +44,17 @@ def serve_extractor(
     worker = ExtractorWorker(catalog, store, settings, name)
     stop = threading.Event()
 
+    outage = Outage("extractor")
+
     def drain() -> dict[str, Any]:
-        result = worker.drain(stop, settings.drain_seconds)
+        try:
+            result = worker.drain(stop, settings.drain_seconds)
+        except SQLAlchemyError as error:
+            outage.met(error)
+            stop.wait(AWAY_SECONDS)
+            hints.send(Lane.BULK)  # what lies there is still to be done
+            return DrainResult().as_dict()
+        outage.over()
         if result.more and not stop.is_set():
             hints.send(Lane.BULK)
         elif result.claimed:

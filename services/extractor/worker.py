@@ -27,6 +27,7 @@ from services.extractor.prepare import Batch, prepare
 from services.extractor.publish import Published, publish
 from services.extractor.renew import renew_outdated_generations
 from services.extractor.target import find_target
+from shared.catalog.away import Outage
 from shared.catalog.generations import active_generation
 from shared.catalog.maps import lock_map
 from shared.catalog.session import Catalog
@@ -122,13 +123,15 @@ class ExtractorWorker:
     def run(self, stop: threading.Event, hints: InProcessHints) -> None:
         """Drain whenever there is work, until `stop` is set: the embedded worker's life."""
         self.warm_up()
+        outage = Outage("extractor")
         while not stop.is_set():
             try:
                 result = self.drain(stop)
-            except SQLAlchemyError:
-                log.exception("the catalog can't be reached; trying again in %g s", AWAY_SECONDS)
+            except SQLAlchemyError as error:
+                outage.met(error)
                 stop.wait(AWAY_SECONDS)
                 continue
+            outage.over()
             if result.claimed:
                 log.info("drained: %s", result.as_dict())
             else:

@@ -13,7 +13,7 @@ from services.gateway.context import DEFAULT_MAP, GatewayDep, MapName, read_curs
 from services.gateway.once import OnceDep
 from services.gateway.room import ROOM_FOR_JOBS
 from services.gateway.schemas import Answer, JobStarted, job_started
-from shared.catalog.chunks import count_located
+from shared.catalog.chunks import has_located
 from shared.catalog.evaluations import Evaluation, list_evaluations
 from shared.catalog.generations import active_generation
 from shared.catalog.maps import get_map
@@ -85,7 +85,7 @@ def evaluate(
     with gateway.catalog.write() as session:
         map_ = get_map(session, map_name)
         generation = active_generation(session, map_.id)
-        if generation is None or not count_located(session, generation.id, PhotoRole.DATABASE):
+        if generation is None or not has_located(session, generation.id, PhotoRole.DATABASE):
             raise Conflict(
                 "nothing_to_evaluate",
                 "The map has no described photo with coordinates or a place. Upload some, and wait "

@@ -10,6 +10,8 @@ from uuid import UUID
 
 from fastapi import APIRouter, Query, Request
 from fastapi.responses import StreamingResponse
+from sqlalchemy.exc import SQLAlchemyError
+from sqlalchemy.orm import Session
 from starlette.concurrency import run_in_threadpool
 
 from services.gateway.context import DEFAULT_MAP, Gateway, GatewayDep, JobId, MapName, read_cursor
@@ -17,6 +19,7 @@ from services.gateway.once import OnceDep
 from services.gateway.room import ROOM_FOR_JOBS
 from services.gateway.schemas import JobAnswer, JobsAnswer
 from services.gateway.waiting import read_job, wait_for_job
+from shared.catalog.away import as_unavailable
 from shared.catalog.maps import get_map
 from shared.jobs import Job, JobKind, JobState
 from shared.jobs.batches import cancel_batch, retry_batch
@@ -28,6 +31,7 @@ from shared.jobs.table import MODEL_CHANGES, UNFINISHED, get_job, list_jobs
 router = APIRouter(tags=["jobs"])
 
 LOOK_SECONDS = 0.25  # of a stream of events
+AWAY_SECONDS = 1.0  # between two looks while the catalog is away
 HEARTBEAT_SECONDS = 15.0  # a comment line, so that proxies keep a silent stream open
 
 
@@ -93,7 +97,8 @@ def cancel_job(
     gateway: GatewayDep, job_id: JobId, once: OnceDep, map_name: MapName = DEFAULT_MAP
 ) -> JobAnswer:
     """End a job at once; what a worker computes for it meanwhile is thrown away."""
-    with gateway.catalog.write() as session:
+
+    def end(session: Session) -> JobAnswer:
         found = get_job(session, get_map(session, map_name).id, job_id, lock=True)
         if found.kind in MODEL_CHANGES:
             cancel_model_change(session, found)
@@ -105,7 +110,9 @@ def cancel_job(
         session.refresh(found)
         answer = JobAnswer.of(found)
         once.keep(session, 200, answer)
-    return answer
+        return answer
+
+    return gateway.catalog.run(end)
 
 
 @router.post(
@@ -141,7 +148,14 @@ async def _events(request: Request, gateway: Gateway, job_id: UUID) -> AsyncIter
     sent: dict[str, Any] | None = None
     number, spoken = 0, time.monotonic()
     while not await request.is_disconnected():
-        found = await run_in_threadpool(read_job, gateway, job_id)
+        try:
+            found = await run_in_threadpool(read_job, gateway, job_id)
+        except SQLAlchemyError as error:
+            if as_unavailable(error) is None:
+                raise
+            yield ": the catalog is away\n\n"
+            await asyncio.sleep(AWAY_SECONDS)
+            continue
         if found is None:
             return
         answer = JobAnswer.of(found)

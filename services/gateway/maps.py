@@ -14,7 +14,7 @@ from sqlalchemy.orm import Session
 from services.gateway.context import DEFAULT_MAP, NO_NUL, GatewayDep
 from services.gateway.once import OnceDep
 from services.gateway.schemas import Answer
-from shared.catalog.chunks import count_searchable
+from shared.catalog.figures import figures_of
 from shared.catalog.generations import active_generation
 from shared.catalog.maps import (
     MAP_NAME,
@@ -26,7 +26,6 @@ from shared.catalog.maps import (
     lock_map,
     mark_map_deleted,
 )
-from shared.catalog.photos import PhotoRole, count_live
 from shared.catalog.vocabularies import standing_of
 from shared.errors import Misconfigured, invalid_field
 from shared.jobs import Job
@@ -66,6 +65,7 @@ class MapAnswer(Answer):
     photos: int
     searchable: int
     labelled_queries: int
+    counted_at: datetime = Field(description="when the three counts above were made")
     generation_id: UUID | None
     vocabulary: str | None = Field(description="own, foreign, none; null before the first photo")
     created_at: datetime
@@ -111,24 +111,29 @@ def one_map(gateway: GatewayDep, name: MapPath) -> MapAnswer:
 @router.delete("/maps/{name}", operation_id="delete_map", response_model=MapDeleted)
 def delete_map(gateway: GatewayDep, name: MapPath) -> MapDeleted:
     """Gone with all its photos at once; its bytes follow. `default` is made anew, empty."""
-    with gateway.catalog.write() as session:
+
+    def remove(session: Session) -> None:
         map_ = lock_map(session, get_map(session, name).id)
         cancel_all(session, Job.map_id == map_.id)
         mark_map_deleted(session, map_)
         if name == DEFAULT_MAP:
             ensure_default_map(session, gateway.settings.new_map_extractor)
+
+    gateway.catalog.run(remove)
     return MapDeleted(success=True, message=f"The map {name} is deleted.", deleted_map=name)
 
 
 def _answer(session: Session, map_: Map) -> MapAnswer:
     generation = active_generation(session, map_.id)
+    figures, counted_at = figures_of(session, map_.id)
     return MapAnswer(
         name=map_.name,
         extractor=map_.extractor,
         version=map_.version,
-        photos=count_live(session, map_.id, PhotoRole.DATABASE),
-        searchable=count_searchable(session, generation.id) if generation else 0,
-        labelled_queries=count_live(session, map_.id, PhotoRole.QUERY),
+        photos=figures.photos,
+        searchable=figures.searchable,
+        labelled_queries=figures.labelled_queries,
+        counted_at=counted_at,
         generation_id=generation.id if generation else None,
         vocabulary=standing_of(session, generation) if generation else None,
         created_at=map_.created_at,

@@ -19,10 +19,10 @@ from services.gateway.schemas import (
     VocabularyAnswer,
     job_started,
 )
-from shared.catalog.chunks import count_described
+from shared.catalog.chunks import about_described
 from shared.catalog.generations import list_generations
 from shared.catalog.maps import get_map
-from shared.catalog.photos import PhotoRole, count_live
+from shared.catalog.photos import PhotoRole, has_live
 from shared.catalog.vocabularies import get_vocabulary, list_vocabularies
 from shared.errors import Conflict, PlacewiseError
 from shared.jobs import Job, JobKind
@@ -79,7 +79,7 @@ def fit_vocabulary(
     params = (wanted or FitRequest.model_validate({})).model_dump()
     with gateway.catalog.write() as session:
         map_id = get_map(session, map_name).id
-        if count_live(session, map_id, PhotoRole.DATABASE) == 0:
+        if not has_live(session, map_id, PhotoRole.DATABASE):
             raise Conflict("no_photos", "The map has no photos to learn from. Upload some first.")
         job = start_model_change(session, map_id, JobKind.FIT, params)
         once.keep_job(session, job)
@@ -140,7 +140,7 @@ def generations(gateway: GatewayDep, map_name: MapName = DEFAULT_MAP) -> list[Ge
     """The map's generations, newest first."""
     with gateway.catalog.read() as session:
         return [
-            GenerationAnswer.of(generation, count_described(session, generation.id))
+            GenerationAnswer.of(generation, about_described(session, generation.id))
             for generation in list_generations(session, get_map(session, map_name).id)
         ]
 

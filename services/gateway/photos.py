@@ -14,7 +14,6 @@ from uuid import UUID
 from fastapi import APIRouter, Query, Request
 from fastapi.responses import Response, StreamingResponse
 from pydantic import BaseModel, ConfigDict, Field
-from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from services.gateway.context import DEFAULT_MAP, NO_NUL, FileId, GatewayDep, MapName
@@ -28,14 +27,8 @@ from services.gateway.schemas import (
 from shared.catalog.chunks import descriptor_of
 from shared.catalog.generations import active_generation
 from shared.catalog.maps import bump_version, get_map, lock_map
-from shared.catalog.photos import (
-    MetadataFilter,
-    Photo,
-    PhotoRole,
-    get_photo,
-    mark_deleted,
-    search_metadata,
-)
+from shared.catalog.metadata_search import COUNTED_AT_MOST, MetadataFilter, search_metadata
+from shared.catalog.photos import Photo, PhotoRole, get_photo, mark_deleted
 from shared.errors import NotFound, invalid_field
 from shared.intake.photo_fields import (
     check_metadata,
@@ -44,8 +37,7 @@ from shared.intake.photo_fields import (
     parse_time,
 )
 from shared.jobs import Job
-from shared.jobs.finish import cancel
-from shared.jobs.table import UNFINISHED
+from shared.jobs.finish import cancel_all
 from shared.objects.keys import thumbnail_key
 
 router = APIRouter(tags=["photos"])
@@ -121,16 +113,16 @@ def delete_photo(
     gateway: GatewayDep, file_id: FileId, map_name: MapName = DEFAULT_MAP
 ) -> DeleteAnswer:
     """Gone from every answer at once; the bytes follow within seconds."""
-    with gateway.catalog.write() as session:
+
+    def remove(session: Session) -> str:
         map_ = lock_map(session, get_map(session, map_name).id)
         found = get_photo(session, map_.id, file_id)
         mark_deleted(session, found, bump_version(session, map_.id))
-        unfinished = select(Job).where(Job.photo_id == found.id, Job.state.in_(UNFINISHED))
-        for job in session.scalars(unfinished.with_for_update()):
-            cancel(job)
-    return DeleteAnswer(
-        success=True, message=f"{found.filename} is deleted.", deleted_file_id=file_id
-    )
+        cancel_all(session, Job.photo_id == found.id)
+        return found.filename
+
+    filename = gateway.catalog.run(remove)
+    return DeleteAnswer(success=True, message=f"{filename} is deleted.", deleted_file_id=file_id)
 
 
 @router.get(
@@ -219,6 +211,7 @@ def search(
     page = found[:limit]
     return MetadataAnswer(
         total_found=total,
+        total_is_exact=total < COUNTED_AT_MOST,
         images=[PhotoAnswer(**PhotoAnswer.fields_of(item)) for item in page],
         next_cursor=_cursor(page[-1]) if len(found) > limit else None,
         query_time_ms=(time.perf_counter() - started) * 1000,

@@ -116,7 +116,8 @@ class SimilarityAnswer(Answer):
 
 
 class MetadataAnswer(Answer):
-    total_found: int = Field(description="all that match, not only this page")
+    total_found: int = Field(description="all that match, not only this page; at most 10,000")
+    total_is_exact: bool = Field(description="false: there may be more than `total_found`")
     images: list[PhotoAnswer]
     next_cursor: str | None
     query_time_ms: float

@@ -11,6 +11,7 @@ from uuid import UUID
 from sqlalchemy.exc import SQLAlchemyError
 
 from services.search.worker import SearchWorker
+from shared.catalog.away import Outage
 from shared.catalog.search_workers import forget_worker, tell_of_worker
 from shared.catalog.session import Catalog
 from shared.ids import new_id
@@ -37,17 +38,19 @@ class Presence:
 
     def run(self, stop: threading.Event) -> None:
         """Keep the entry until `stop` is set, and remove it then."""
+        outage = Outage("search worker's entry")
         while not stop.is_set():
             try:
                 self.tell()
-            except SQLAlchemyError:
-                log.exception("search can't register in the catalog; trying again")
+                outage.over()
+            except SQLAlchemyError as error:
+                outage.met(error)
             stop.wait(LOOK_SECONDS)
         try:
             with self._catalog.write() as session:
                 forget_worker(session, self.id)
-        except SQLAlchemyError:
-            log.exception("search could not sign off; the steward will")
+        except SQLAlchemyError as error:
+            log.warning("search could not sign off, the steward will: %s", error)
 
     def tell(self) -> None:
         """Write what there is to tell: news at once, else a heartbeat when it is due."""

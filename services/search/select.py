@@ -18,7 +18,7 @@ Mask = NDArray[np.bool_]
 def select(photos: PhotoColumns, wanted: PhotoFilter, exclude: Collection[UUID]) -> Mask:
     """(n,) bool: findable photos that pass the filter and are not excluded.
 
-    The same photos that `catalog.photos.filter_conditions` lets pass in SQL.
+    The same photos that `catalog.metadata_search.filter_conditions` lets pass in SQL.
     """
     mask = photos.findable.copy()
     if wanted.near is not None:

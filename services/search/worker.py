@@ -15,6 +15,7 @@ from services.search.lag import Lags
 from services.search.query_row import QueryRows, expired
 from services.search.scan import top_k
 from services.search.snapshot import Snapshot
+from shared.catalog.away import Outage
 from shared.catalog.generations import GenerationState
 from shared.catalog.session import Catalog
 from shared.errors import Unavailable
@@ -59,11 +60,15 @@ class SearchWorker:
         self._run(stop, (GenerationState.BUILDING,))
 
     def _run(self, stop: threading.Event, states: Collection[GenerationState]) -> None:
+        outage = Outage(f"search for what is {' or '.join(states)}")
         while not stop.is_set():
             try:
                 self.follow(states)
-            except (SQLAlchemyError, OSError):
-                log.exception("search can't follow the catalog; serving what is loaded")
+                outage.over()
+            except SQLAlchemyError as error:  # what is loaded goes on answering
+                outage.met(error)
+            except OSError:
+                log.exception("search can't load what is new; serving what is loaded")
             stop.wait(self._settings.search_follow_seconds)
 
     def follow(self, states: Collection[GenerationState] = FOLLOWED) -> None:

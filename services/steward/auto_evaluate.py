@@ -8,11 +8,10 @@ from uuid import UUID
 from sqlalchemy import exists, select
 from sqlalchemy.orm import Session
 
-from shared.catalog.chunks import count_located, count_searchable
 from shared.catalog.evaluations import last_evaluation
+from shared.catalog.figures import figures_of
 from shared.catalog.generations import Generation, active_generation
 from shared.catalog.maps import list_maps, lock_map
-from shared.catalog.photos import PhotoRole
 from shared.catalog.session import Catalog
 from shared.ids import new_id
 from shared.jobs import Job, JobKind, JobState, Priority
@@ -50,10 +49,10 @@ def _due(session: Session, map_id: UUID, least_photos: int) -> dict[str, Any] | 
     generation = active_generation(session, map_id)
     if generation is None or _is_busy(session, map_id):
         return None
-    if count_located(session, generation.id, PhotoRole.DATABASE) < least_photos:
+    figures, _ = figures_of(session, map_id)
+    if figures.located < least_photos:
         return None
-    searchable = count_searchable(session, generation.id)
-    queries = count_located(session, generation.id, PhotoRole.QUERY)
+    searchable, queries = figures.searchable, figures.located_queries
     seen = _seen(session, generation)
     if seen is not None and not (_differs(searchable, seen[0]) or _differs(queries, seen[1])):
         return None

@@ -15,6 +15,7 @@ from sqlalchemy import delete, select
 from shared.catalog.chunks import Chunk, Descriptor
 from shared.catalog.direct_uploads import DirectUpload
 from shared.catalog.evaluations import Evaluation
+from shared.catalog.figures import MapFigures
 from shared.catalog.generations import Generation
 from shared.catalog.maps import Map
 from shared.catalog.photos import Photo
@@ -60,6 +61,7 @@ def _step(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
             return False
     _vocabularies(catalog, store, map_id)
     with catalog.write() as session:
+        session.execute(delete(MapFigures).where(MapFigures.map_id == map_id))
         session.execute(delete(Evaluation).where(Evaluation.map_id == map_id))
         session.execute(delete(Search).where(Search.map_id == map_id))
         session.execute(delete(Job).where(Job.map_id == map_id))

@@ -8,14 +8,18 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+from sqlalchemy.exc import SQLAlchemyError
+
 from services.steward.auto_evaluate import evaluate_changed_maps
 from services.steward.collect import collect, collect_orphans
 from services.steward.compact import compact
+from services.steward.count_maps import count_large_maps
 from services.steward.delete_maps import delete_maps
 from services.steward.model_changes import advance_model_changes, fit_maps_that_wait
 from services.steward.queue import free_leases, resend_hints
 from services.steward.retention import forget_old_jobs, forget_old_keys, forget_old_searches
 from services.steward.search_workers import remove_dead_workers
+from shared.catalog.away import Outage
 from shared.catalog.session import Catalog
 from shared.jobs import Hints
 from shared.objects import ObjectStore
@@ -40,6 +44,7 @@ class Steward:
     def __init__(
         self, catalog: Catalog, store: ObjectStore, hints: Hints, settings: Settings
     ) -> None:
+        self._outage = Outage("steward")
         self.duties = [
             Duty("free leases", 1.0, lambda: free_leases(catalog, settings.max_attempts)),
             Duty("resend hints", 2.0, lambda: resend_hints(catalog, hints)),
@@ -54,6 +59,7 @@ class Steward:
                 2.0,
                 lambda: fit_maps_that_wait(catalog, hints, settings.auto_fit_photos),
             ),
+            Duty("count large maps", 10.0, lambda: count_large_maps(catalog)),
             Duty("compact", 5.0, lambda: compact(catalog, store, settings.compact_chunks)),
             Duty("delete maps", 1.0, lambda: delete_maps(catalog, store)),
             Duty("collect", 10.0, lambda: collect(catalog, store, settings)),
@@ -91,6 +97,9 @@ class Steward:
     def _do(self, duty: Duty) -> None:
         try:
             duty.do()
+            self._outage.over()
+        except SQLAlchemyError as error:
+            self._outage.met(error)
         except Exception:  # one duty's trouble must not end the others
             log.exception(
                 "the steward could not %s; next try in %g s",

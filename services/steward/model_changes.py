@@ -16,14 +16,14 @@ from sqlalchemy.orm import Session, aliased
 
 from services.steward.search_workers import search_has_loaded
 from shared.catalog.base import Condition, db_now
-from shared.catalog.chunks import Descriptor, count_described
+from shared.catalog.chunks import Descriptor, about_described
 from shared.catalog.generations import (
     Generation,
     GenerationState,
     active_generation,
     lock_generation,
 )
-from shared.catalog.maps import Map, bump_version, lock_map
+from shared.catalog.maps import Map, bump_version, list_maps, lock_map
 from shared.catalog.photos import Photo, PhotoRole
 from shared.catalog.session import Catalog
 from shared.errors import Conflict
@@ -62,17 +62,8 @@ def advance_model_changes(catalog: Catalog, hints: Hints) -> None:
 def fit_maps_that_wait(catalog: Catalog, hints: Hints, auto_fit_photos: int) -> None:
     """A map whose photos wait for a vocabulary gets one fitted once it has enough of them."""
     with catalog.read() as session:
-        ready = session.scalars(
-            select(Job.map_id)
-            .join(Photo, Photo.id == Job.photo_id)
-            .where(
-                Job.kind == JobKind.INDEX,
-                Job.waiting_for == WaitingFor.VOCABULARY,
-                Photo.role == PhotoRole.DATABASE,
-            )
-            .group_by(Job.map_id)
-            .having(func.count() >= auto_fit_photos)
-        ).all()
+        maps = [map_.id for map_ in list_maps(session)]
+        ready = [id_ for id_ in maps if _waiting_photos(session, id_, auto_fit_photos)]
     for map_id in ready:
         with catalog.write() as session:
             if _last_change_failed(session, map_id):
@@ -83,6 +74,22 @@ def fit_maps_that_wait(catalog: Catalog, hints: Hints, auto_fit_photos: int) -> 
                 continue  # one is under way
         log.info("map %s has enough photos: fitting a vocabulary (job %s)", map_id, job.id)
         hints.send()
+
+
+def _waiting_photos(session: Session, map_id: UUID, least: int) -> bool:
+    """Whether `least` database photos of the map wait for a vocabulary."""
+    waiting = (
+        select(Job.id)
+        .join(Photo, Photo.id == Job.photo_id)
+        .where(
+            Job.map_id == map_id,
+            Job.waiting_for == WaitingFor.VOCABULARY,
+            Job.kind == JobKind.INDEX,
+            Photo.role == PhotoRole.DATABASE,
+        )
+        .limit(least)
+    )
+    return session.scalar(select(func.count()).select_from(waiting.subquery())) == least
 
 
 def _advance(session: Session, job: Job, generation_id: UUID) -> int:
@@ -100,7 +107,7 @@ def _advance(session: Session, job: Job, generation_id: UUID) -> int:
         )
     if queued or session.scalar(select(exists().where(open_jobs, Job.state.in_(UNFINISHED)))):
         sampled = int(job.params.get("sampled", 0))
-        done = count_described(session, generation_id)
+        done = about_described(session, generation_id)
         # Also when it was complete before: photos have come since.
         job.waiting_for, job.stage, job.awaited = WaitingFor.DESCRIPTORS, "describe", None
         job.progress_done = max(0, min(sampled + done, job.progress_total - 1))
@@ -112,7 +119,7 @@ def _advance(session: Session, job: Job, generation_id: UUID) -> int:
         _switch(session, generation)
     job.progress_failed = failed
     job.progress_total = max(job.progress_total, failed)
-    photos = count_described(session, generation_id)
+    photos = about_described(session, generation_id)
     succeed(
         job,
         {

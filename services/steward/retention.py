@@ -18,7 +18,7 @@ DAY_SECONDS = 86_400.0
 def forget_old_jobs(catalog: Catalog, retention_days: float) -> None:
     """Jobs that ended long ago. One that left its photo undescribed stays: it holds the reason, and
     the same bytes again, or a retry, queue it anew."""
-    of_a_photo = exists().where(Photo.job_id == Job.id)
+    of_a_photo = exists().where(Photo.id == Job.photo_id, Photo.job_id == Job.id)
     old = (
         select(Job.id)
         .where(

@@ -10,6 +10,7 @@ from uuid import UUID
 
 from sqlalchemy.exc import SQLAlchemyError
 
+from shared.catalog.away import Outage
 from shared.catalog.session import Catalog
 from shared.errors import PlacewiseError, Unavailable
 from shared.jobs import Job, JobKind, claim, hold_lease
@@ -39,12 +40,15 @@ class Taker:
 
     def run(self, stop: threading.Event, do: Callable[[Job], None]) -> None:
         """Take jobs until `stop` is set."""
+        outage = Outage(f"steward's {self.kind} worker")
         while not stop.is_set():
             try:
-                if not self.take_next(do):
+                done = self.take_next(do)
+                outage.over()
+                if not done:
                     stop.wait(IDLE_SECONDS)
-            except SQLAlchemyError:
-                log.exception("the catalog can't be reached; trying again in %g s", AWAY_SECONDS)
+            except SQLAlchemyError as error:
+                outage.met(error)
                 stop.wait(AWAY_SECONDS)
 
     def take_next(self, do: Callable[[Job], None]) -> bool:

@@ -9,17 +9,19 @@ from __future__ import annotations
 from datetime import UTC, datetime
 from typing import Any
 
-from sqlalchemy import JSON, DateTime, Dialect, MetaData
-from sqlalchemy.dialects.postgresql import JSONB
+from sqlalchemy import JSON, DateTime, Dialect, Index, MetaData
+from sqlalchemy.dialects.postgresql import ARRAY, JSONB
 from sqlalchemy.ext.compiler import compiles
 from sqlalchemy.orm import DeclarativeBase
 from sqlalchemy.sql.elements import ColumnElement
 from sqlalchemy.sql.functions import FunctionElement
-from sqlalchemy.types import Boolean, Float, TypeDecorator
+from sqlalchemy.types import Boolean, Float, Text, TypeDecorator
 
 from shared.geodesy import EARTH_RADIUS_M, without_dust
 
 SQLITE_DISTANCE = "placewise_distance_m"
+
+Condition = ColumnElement[bool]
 
 
 class UtcDateTime(TypeDecorator[datetime]):
@@ -69,8 +71,13 @@ class Base(DeclarativeBase):
     )
 
 
+def partial_index(name: str, *columns: Any, only: Condition) -> Index:
+    """An index of the rows that meet `only`."""
+    return Index(name, *columns, postgresql_where=only, sqlite_where=only)
+
+
 class db_now(FunctionElement[datetime]):
-    """The database's clock, now (not the transaction's start)."""
+    """The database's clock at the statement's start (not the transaction's)."""
 
     type = UtcDateTime()
     inherit_cache = True
@@ -90,6 +97,16 @@ class json_array_has(FunctionElement[bool]):
     inherit_cache = True
 
 
+class filename_trigrams(FunctionElement[Any]):
+    """Every three characters in a row of a text, case ignored: what an index of substrings holds.
+
+    PostgreSQL only, by a function that a migration has made: no extension has to be installed.
+    """
+
+    type = ARRAY(Text())
+    inherit_cache = True
+
+
 class db_distance_m(FunctionElement[float]):
     """`geodesy.distance_m` in SQL: latitude and longitude of two points, in degrees."""
 
@@ -99,7 +116,8 @@ class db_distance_m(FunctionElement[float]):
 
 @compiles(db_now, "postgresql")
 def _now_postgresql(element: db_now, compiler: Any, **kw: Any) -> str:
-    return "clock_timestamp()"
+    # Not clock_timestamp(): what may change within a statement can't be looked up in an index.
+    return "statement_timestamp()"
 
 
 @compiles(db_now, "sqlite")
@@ -111,7 +129,7 @@ def _now_sqlite(element: db_now, compiler: Any, **kw: Any) -> str:
 @compiles(db_now_plus, "postgresql")
 def _now_plus_postgresql(element: db_now_plus, compiler: Any, **kw: Any) -> str:
     seconds = compiler.process(element.clauses, **kw)
-    return f"(clock_timestamp() + make_interval(secs => CAST({seconds} AS double precision)))"
+    return f"(statement_timestamp() + make_interval(secs => CAST({seconds} AS double precision)))"
 
 
 @compiles(db_now_plus, "sqlite")
@@ -132,6 +150,11 @@ def _json_array_has_sqlite(element: json_array_has, compiler: Any, **kw: Any) ->
     array, value = element.clauses
     array_sql, value_sql = compiler.process(array, **kw), compiler.process(value, **kw)
     return f"EXISTS (SELECT 1 FROM json_each({array_sql}) WHERE json_each.value = {value_sql})"  # noqa: S608  (compiled SQL, no text of users)
+
+
+@compiles(filename_trigrams)
+def _filename_trigrams(element: filename_trigrams, compiler: Any, **kw: Any) -> str:
+    return f"placewise_trigrams({compiler.process(element.clauses, **kw)})"
 
 
 @compiles(db_distance_m, "postgresql")
@@ -157,6 +180,3 @@ def _distance_sqlite(element: db_distance_m, compiler: Any, **kw: Any) -> str:
 def rowcount(result: Any) -> int:
     """How many rows an UPDATE or DELETE touched."""
     return int(result.rowcount)
-
-
-Condition = ColumnElement[bool]

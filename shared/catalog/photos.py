@@ -19,11 +19,10 @@ from sqlalchemy import (
     String,
     Text,
     Uuid,
+    and_,
     func,
-    literal,
     or_,
     select,
-    tuple_,
     update,
 )
 from sqlalchemy.orm import Mapped, Session, mapped_column
@@ -34,14 +33,12 @@ from shared.catalog.base import (
     Degrees,
     JsonValue,
     UtcDateTime,
-    db_distance_m,
     db_now,
-    json_array_has,
+    filename_trigrams,
+    partial_index,
 )
 from shared.errors import NotFound
-from shared.geodesy import latitude_band
 from shared.ids import new_id
-from shared.photo_filter import EVERYTHING, Box, Circle, PhotoFilter
 
 
 class PhotoRole(StrEnum):
@@ -97,6 +94,40 @@ class Photo(Base):
         Index("ix_photos_map_uploaded", "map_id", "uploaded_at", "id"),
         Index("ix_photos_map_changed", "map_id", "changed_version"),
         Index("ix_photos_map_position", "map_id", "latitude", "longitude"),
+        Index("ix_photos_object_key", "object_key"),
+        partial_index("ix_photos_map_size", "map_id", "size_bytes", only=deleted_at.is_(None)),
+        partial_index(
+            "ix_photos_map_captured",
+            "map_id",
+            "captured_at",
+            only=and_(deleted_at.is_(None), captured_at.is_not(None)),
+        ),
+        partial_index(
+            "ix_photos_map_place",
+            "map_id",
+            "place",
+            only=and_(deleted_at.is_(None), place.is_not(None)),
+        ),
+        partial_index(
+            "ix_photos_map_labelled",
+            "map_id",
+            "id",
+            only=and_(deleted_at.is_(None), role == PhotoRole.QUERY),
+        ),
+        # Of all maps: an array has no order that a map could come first in.
+        Index(
+            "ix_photos_tags",
+            "tags",
+            postgresql_using="gin",
+            postgresql_ops={"tags": "jsonb_path_ops"},
+            postgresql_where=deleted_at.is_(None),
+        ).ddl_if(dialect="postgresql"),
+        Index(
+            "ix_photos_filename",
+            filename_trigrams(filename),
+            postgresql_using="gin",
+            postgresql_where=deleted_at.is_(None),
+        ).ddl_if(dialect="postgresql"),
         Index(
             "ix_photos_deleted",
             "deleted_at",
@@ -189,102 +220,17 @@ def count_live(session: Session, map_id: UUID, role: PhotoRole | None = None) ->
     return session.scalar(counted) or 0
 
 
+def has_live(session: Session, map_id: UUID, role: PhotoRole) -> bool:
+    """Whether the map has a live photo of the role."""
+    wanted = select(Photo.id).where(
+        Photo.map_id == map_id, Photo.deleted_at.is_(None), Photo.role == role
+    )
+    return session.scalar(wanted.limit(1)) is not None
+
+
 def has_place() -> Condition:
     """True for photos with coordinates or a place label."""
     return or_(Photo.latitude.is_not(None), Photo.place.is_not(None))
-
-
-@dataclass(frozen=True, slots=True)
-class MetadataFilter:
-    """Conditions of a metadata search; None means "any". Bounds are inclusive."""
-
-    filename: str | None = None
-    """Part of the file name, case ignored; `%` and `_` are ordinary characters."""
-    upload_after: datetime | None = None
-    upload_before: datetime | None = None
-    min_file_size: int | None = None
-    max_file_size: int | None = None
-    photos: PhotoFilter = EVERYTHING
-    """Where, when and what the photo shows."""
-    role: PhotoRole | None = None
-
-    def conditions(self) -> list[Condition]:
-        found: list[Condition] = []
-        if self.filename is not None:
-            found.append(Photo.filename.icontains(self.filename, autoescape=True))
-        if self.upload_after is not None:
-            found.append(Photo.uploaded_at >= self.upload_after)
-        if self.upload_before is not None:
-            found.append(Photo.uploaded_at <= self.upload_before)
-        if self.min_file_size is not None:
-            found.append(Photo.size_bytes >= self.min_file_size)
-        if self.max_file_size is not None:
-            found.append(Photo.size_bytes <= self.max_file_size)
-        if self.role is not None:
-            found.append(Photo.role == self.role)
-        return found + filter_conditions(self.photos)
-
-
-def filter_conditions(wanted: PhotoFilter) -> list[Condition]:
-    """The filter in SQL."""
-    found: list[Condition] = []
-    if wanted.near is not None:
-        found += _within(wanted.near)
-    if wanted.box is not None:
-        found += _inside(wanted.box)
-    if wanted.captured_after is not None:
-        found.append(Photo.captured_at >= wanted.captured_after)
-    if wanted.captured_before is not None:
-        found.append(Photo.captured_at <= wanted.captured_before)
-    if wanted.place is not None:
-        found.append(Photo.place == wanted.place)
-    if wanted.ids is not None:
-        found.append(Photo.id.in_(wanted.ids))
-    found.extend(json_array_has(Photo.tags, tag) for tag in wanted.tags)
-    return found
-
-
-def _within(circle: Circle) -> list[Condition]:
-    south, north = latitude_band(circle.latitude, circle.radius_m)
-    away = db_distance_m(
-        literal(circle.latitude), literal(circle.longitude), Photo.latitude, Photo.longitude
-    )
-    return [Photo.latitude.between(south, north), away <= circle.radius_m]
-
-
-def _inside(box: Box) -> list[Condition]:
-    return [
-        Photo.latitude.between(box.south, box.north),
-        or_(
-            func.abs(Photo.latitude) == 90.0,
-            *(Photo.longitude.between(west, east) for west, east in box.longitude_ranges()),
-        ),
-    ]
-
-
-def search_metadata(
-    session: Session,
-    map_id: UUID,
-    wanted: MetadataFilter,
-    limit: int,
-    after: tuple[datetime, UUID] | None,
-) -> tuple[list[Photo], int]:
-    """Newest first: up to `limit` live photos after the cursor, and how many match in all."""
-    conditions = [
-        Photo.map_id == map_id,
-        Photo.deleted_at.is_(None),
-        *wanted.conditions(),
-    ]
-    total = session.scalar(select(func.count()).select_from(Photo).where(*conditions)) or 0
-    page = select(Photo).where(*conditions)
-    if after is not None:
-        page = page.where(tuple_(Photo.uploaded_at, Photo.id) < tuple_(*_bound(after)))
-    page = page.order_by(Photo.uploaded_at.desc(), Photo.id.desc()).limit(limit)
-    return list(session.scalars(page)), total
-
-
-def _bound(after: tuple[datetime, UUID]) -> tuple[Any, Any]:
-    return literal(after[0], UtcDateTime()), literal(after[1], Uuid())
 
 
 def mark_deleted(session: Session, photo: Photo, version: int) -> None:

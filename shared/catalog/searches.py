@@ -32,6 +32,7 @@ class Search(Base):
     __table_args__ = (
         Index("ix_searches_map_time", "map_id", "searched_at"),
         Index("ix_searches_map_id", "map_id", "id"),
+        Index("ix_searches_time", "searched_at"),
     )
 
 

@@ -3,35 +3,48 @@
 from __future__ import annotations
 
 import contextlib
+import copy
+import logging
+import random
 import threading
-from collections.abc import Iterator
-from pathlib import Path
-from typing import Any
+import time
+from collections.abc import Callable, Iterator
+from typing import Any, TypeVar
 
-from alembic import command
-from alembic.config import Config
 from sqlalchemy import create_engine, event
 from sqlalchemy.engine import make_url
+from sqlalchemy.exc import DBAPIError
 from sqlalchemy.orm import Session, sessionmaker
 
+from shared.catalog.away import SACRIFICED, sqlstate
 from shared.catalog.base import SQLITE_DISTANCE
+from shared.catalog.connections import Limits, Pool, make_postgres_engine
 from shared.geodesy import distance_m
+from shared.settings import Settings
 
-MIGRATIONS = Path(__file__).parent / "migrations"
+log = logging.getLogger(__name__)
 
 # A writer that waits this long for SQLite's single write lock has met a bug, not a queue.
 SQLITE_BUSY_SECONDS = 60
+
+TRIES = 5  # of a unit that PostgreSQL sacrifices to others
+FIRST_PAUSE_SECONDS = 0.05  # doubled each time
+
+T = TypeVar("T")
 
 
 class Catalog:
     """Opens sessions on one database.
 
     `read()` gives a consistent snapshot and never writes; `write()` commits when its block ends
-    and rolls back when it raises. Objects stay readable after the block.
+    and rolls back when it raises; `run(unit)` is a `write()` that begins anew after a deadlock.
+    Objects stay readable after the block. Whatever the database refuses raises SQLAlchemyError;
+    `shared.catalog.away` says what of it is an outage.
     """
 
-    def __init__(self, url: str) -> None:
+    def __init__(self, url: str, pool: Pool = Pool(), limits: Limits = Limits()) -> None:
         self.url = make_url(url)
+        self.limits = limits
         self.is_sqlite = self.url.get_backend_name() == "sqlite"
         if self.is_sqlite:
             self.engine = create_engine(
@@ -44,10 +57,16 @@ class Catalog:
             event.listen(self.engine, "connect", _prepare_sqlite)
             event.listen(self.engine, "begin", _begin_sqlite)
         else:
-            self.engine = create_engine(self.url, pool_size=10, max_overflow=30, pool_pre_ping=True)
+            self.engine = make_postgres_engine(self.url, pool)
         self._sessions = sessionmaker(expire_on_commit=False)
         # SQLite has one writer: queueing here is fair and does not spin as its busy handler does.
         self._sqlite_writer = threading.Lock()
+
+    def limited(self, limits: Limits) -> Catalog:
+        """The same connections, for transactions with other limits."""
+        other = copy.copy(self)
+        other.limits = limits
+        return other
 
     @contextlib.contextmanager
     def read(self) -> Iterator[Session]:
@@ -57,35 +76,57 @@ class Catalog:
             if self.is_sqlite
             else {"isolation_level": "REPEATABLE READ", "postgresql_readonly": True}
         )
-        engine = self.engine.execution_options(placewise_write=False, **isolation)
-        with self._sessions(bind=engine) as session:
+        with self._session(placewise_write=False, **isolation) as session:
             yield session
 
     @contextlib.contextmanager
     def write(self) -> Iterator[Session]:
         """A session that commits when the block ends. PostgreSQL: READ COMMITTED."""
-        engine = self.engine.execution_options(placewise_write=True)
         turn = self._sqlite_writer if self.is_sqlite else contextlib.nullcontext()
-        with turn, self._sessions(bind=engine) as session:
+        with turn, self._session(placewise_write=True) as session:
             yield session
             session.commit()
 
-    def migrate(self) -> None:
-        """Bring the schema to the newest version; safe to call from several processes at once."""
-        if self.is_sqlite and self.url.database:
-            Path(self.url.database).parent.mkdir(parents=True, exist_ok=True)
-        config = Config()
-        config.set_main_option("script_location", str(MIGRATIONS))
-        with self.engine.execution_options(placewise_write=True).begin() as connection:
-            if not self.is_sqlite:
-                # One migration at a time; the number is "plac" in ASCII.
-                connection.exec_driver_sql("SELECT pg_advisory_xact_lock(1886151011)")
-            config.attributes["connection"] = connection
-            command.upgrade(config, "head")
+    def run(self, unit: Callable[[Session], T]) -> T:
+        """What `unit` returns, after its transaction is committed.
+
+        For units that lock rows of several tables: where PostgreSQL ends one for another's sake
+        (a deadlock, a serialization failure), the whole unit is run again, up to TRIES times. It
+        begins from nothing each time: `unit` may change nothing but the session. Every other
+        error is raised at once.
+        """
+        for attempt in range(TRIES - 1):
+            try:
+                with self.write() as session:
+                    return unit(session)
+            except DBAPIError as error:
+                reason = SACRIFICED.get(sqlstate(error) or "")
+                if reason is None:
+                    raise
+                log.info("%s: %s is run again", reason, unit.__qualname__)
+            # Apart, or they meet again.
+            time.sleep(random.uniform(0.5, 1.0) * FIRST_PAUSE_SECONDS * 2**attempt)  # noqa: S311
+        with self.write() as session:
+            return unit(session)
 
     def close(self) -> None:
         """Close every pooled connection."""
         self.engine.dispose()
+
+    def _session(self, **options: Any) -> Session:
+        return self._sessions(
+            bind=self.engine.execution_options(placewise_limits=self.limits, **options)
+        )
+
+
+def open_catalog(settings: Settings, service: str, limits: Limits | None = None) -> Catalog:
+    """The catalog that the settings name, for a service of this name; `limits` are those of
+    background work unless given."""
+    return Catalog(
+        settings.catalog_url(),
+        Pool.of(settings, service),
+        Limits.of_work(settings) if limits is None else limits,
+    )
 
 
 def _prepare_sqlite(connection: Any, _record: Any) -> None:

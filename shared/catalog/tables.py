@@ -3,11 +3,13 @@
 from shared.catalog.chunks import Chunk, Descriptor
 from shared.catalog.direct_uploads import DirectUpload
 from shared.catalog.evaluations import Evaluation
+from shared.catalog.figures import MapFigures
 from shared.catalog.generations import Generation
 from shared.catalog.idempotency import KeyedCall
 from shared.catalog.maps import Map
 from shared.catalog.models import Model
 from shared.catalog.photos import Photo
+from shared.catalog.schema_compatibility import SchemaCompatibility
 from shared.catalog.search_workers import RegisteredWorker
 from shared.catalog.searches import Search
 from shared.catalog.vocabularies import Vocabulary
@@ -24,9 +26,11 @@ __all__ = [
     "Job",
     "KeyedCall",
     "Map",
+    "MapFigures",
     "Model",
     "Photo",
     "RegisteredWorker",
+    "SchemaCompatibility",
     "Search",
     "Vocabulary",
 ]

@@ -13,6 +13,7 @@ from sqlalchemy import select, update
 from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.orm import Session
 
+from shared.catalog.away import Outage
 from shared.catalog.base import db_now, db_now_plus, rowcount
 from shared.catalog.session import Catalog
 from shared.jobs.batches import cancel_items, is_listed_batch
@@ -38,6 +39,7 @@ def extend_lease(session: Session, token: UUID, lease_seconds: float) -> bool:
 def hold_lease(catalog: Catalog, token: UUID, lease_seconds: float) -> Iterator[None]:
     """Extends the lease from a thread while the block runs, three times per lease."""
     done = threading.Event()
+    outage = Outage(f"lease {token}")
 
     def keep() -> None:
         while not done.wait(lease_seconds / 3):
@@ -45,9 +47,9 @@ def hold_lease(catalog: Catalog, token: UUID, lease_seconds: float) -> Iterator[
                 with catalog.write() as session:
                     if not extend_lease(session, token, lease_seconds):
                         return
-            except SQLAlchemyError:
-                # The catalog is away: the lease may run out, and then the token fences the commit.
-                log.warning("the lease %s could not be extended", token, exc_info=True)
+            except SQLAlchemyError as error:
+                # The lease may run out, and then the token fences the commit.
+                outage.met(error)
 
     keeper = threading.Thread(target=keep, name=f"lease-{token}", daemon=True)
     keeper.start()

@@ -43,7 +43,14 @@ from sqlalchemy import (
 )
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
-from shared.catalog.base import Base, Condition, JsonValue, UtcDateTime, db_now
+from shared.catalog.base import (
+    Base,
+    Condition,
+    JsonValue,
+    UtcDateTime,
+    db_now,
+    partial_index,
+)
 from shared.errors import NotFound
 from shared.ids import new_id
 
@@ -97,6 +104,11 @@ class WaitingFor(StrEnum):
     SEARCH = "search"  # every live search worker has to load the new generation
 
 
+def _ready(state: Any, lease_token: Any, waiting_for: Any) -> Condition:
+    """What `claimable` asks of every row: indexes of such rows serve claims."""
+    return and_(state.in_(UNFINISHED), lease_token.is_(None), waiting_for.is_(None))
+
+
 class Job(Base):
     """One thing to do. See the module's docstring for `state`, `attempts` and the lease."""
 
@@ -108,9 +120,7 @@ class Job(Base):
     state: Mapped[JobState] = mapped_column(String(20), default=JobState.QUEUED)
     priority: Mapped[int] = mapped_column(Integer)
     photo_id: Mapped[UUID | None] = mapped_column(Uuid, ForeignKey("photos.id"), index=True)
-    generation_id: Mapped[UUID | None] = mapped_column(
-        Uuid, ForeignKey("generations.id"), index=True
-    )
+    generation_id: Mapped[UUID | None] = mapped_column(Uuid, ForeignKey("generations.id"))
     params: Mapped[dict[str, Any]] = mapped_column(JsonValue, default=dict)
     stage: Mapped[str | None] = mapped_column(String(30))
     waiting_for: Mapped[str | None] = mapped_column(String(30))
@@ -134,21 +144,30 @@ class Job(Base):
     finished_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
 
     __table_args__ = (
-        Index(
-            "ix_jobs_claimable",
+        # Claiming: whatever goes first, then the rest of its batch.
+        partial_index(
+            "ix_jobs_ready", priority.desc(), "id", only=_ready(state, lease_token, waiting_for)
+        ),
+        partial_index(
+            "ix_jobs_ready_batch",
+            "kind",
+            "map_id",
             priority.desc(),
             "id",
-            postgresql_where=and_(state.in_(UNFINISHED), lease_token.is_(None)),
-            sqlite_where=and_(state.in_(UNFINISHED), lease_token.is_(None)),
+            only=_ready(state, lease_token, waiting_for),
         ),
-        Index(
-            "ix_jobs_leased",
-            "lease_until",
-            postgresql_where=lease_token.is_not(None),
-            sqlite_where=lease_token.is_not(None),
+        partial_index("ix_jobs_leased", "lease_until", only=lease_token.is_not(None)),
+        partial_index(
+            "ix_jobs_waiting", "map_id", "waiting_for", "id", only=waiting_for.is_not(None)
         ),
+        # What is listed when no kind is asked for; a model change has very many others.
+        partial_index("ix_jobs_map_listed", "map_id", "id", only=kind != JobKind.REINDEX),
+        partial_index("ix_jobs_finished", "finished_at", only=finished_at.is_not(None)),
+        partial_index("ix_jobs_queries", "created_at", only=kind == JobKind.DESCRIBE),
         Index("ix_jobs_map_state", "map_id", "state", "id"),
-        Index("ix_jobs_finished_kind", "kind", "finished_at"),
+        Index("ix_jobs_map_kind", "map_id", "kind", "id"),
+        Index("ix_jobs_kind_waiting", "kind", "waiting_for"),
+        Index("ix_jobs_generation_state", "generation_id", "state"),
     )
 
 

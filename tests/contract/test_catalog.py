@@ -25,16 +25,15 @@ from shared.catalog.generations import (
     building_generation,
 )
 from shared.catalog.maps import DEFAULT_MAP, Map, bump_version, ensure_default_map, get_map
+from shared.catalog.metadata_search import MetadataFilter, search_metadata
 from shared.catalog.models import Model, ensure_model
 from shared.catalog.photos import (
-    MetadataFilter,
     Photo,
     changed_since,
     count_live,
     find_live_by_sha256,
     get_photo,
     live_photos,
-    search_metadata,
 )
 from shared.catalog.session import Catalog
 from shared.errors import NotFound

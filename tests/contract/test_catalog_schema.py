@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
+import pytest
 from alembic.autogenerate import compare_metadata
 from alembic.migration import MigrationContext
 
 import shared.catalog.tables  # noqa: F401
 from shared.catalog.base import Base
+from shared.catalog.schema import migrate
 from shared.catalog.session import Catalog
 
 
+# PostgreSQL alone has it.
+@pytest.mark.filterwarnings("ignore:autogenerate skipping .* index 'ix_photos_filename'")
 def test_migrations_lead_to_the_tables_that_the_code_describes(catalog: Catalog) -> None:
     with catalog.engine.connect() as connection:
         difference = compare_metadata(MigrationContext.configure(connection), Base.metadata)
-    assert difference == []
+    # Alembic does not know that SQLite goes without the index of tags.
+    elsewhere = {"ix_photos_tags"} if catalog.is_sqlite else set()
+    assert [
+        change for change in difference if getattr(change[1], "name", "") not in elsewhere
+    ] == []
 
 
 def test_migrating_twice_changes_nothing(catalog: Catalog) -> None:
-    catalog.migrate()
+    migrate(catalog)

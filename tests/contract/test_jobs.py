@@ -16,6 +16,7 @@ from sqlalchemy.exc import OperationalError
 
 from shared.catalog.base import db_now, db_now_plus
 from shared.catalog.generations import Generation, GenerationState
+from shared.catalog.schema import migrate
 from shared.catalog.session import Catalog
 from shared.errors import Conflict, NotFound, Unprocessable
 from shared.ids import new_id
@@ -261,7 +262,7 @@ def test_workers_that_claim_at_once_never_get_the_same_job(catalog: Catalog, map
 def test_a_claim_passes_over_what_another_one_is_just_taking(postgres: PostgresServer) -> None:
     """PostgreSQL alone: SQLite's one writer makes the second worker wait its turn."""
     catalog = Catalog(postgres.new_database())
-    catalog.migrate()
+    migrate(catalog)
     with catalog.write() as session:
         map_id = add_map(session).id
     waiting = queue(catalog, map_id, 6)
@@ -279,7 +280,7 @@ def test_extending_a_lease_locks_its_jobs_in_the_order_of_finishing_them(
 ) -> None:
     """PostgreSQL alone. In two orders the lease's thread and the worker's meet in a deadlock."""
     catalog = Catalog(postgres.new_database())
-    catalog.migrate()
+    migrate(catalog)
     low, high = new_id(), new_id()
     with catalog.write() as session:
         map_id = add_map(session).id

@@ -11,14 +11,8 @@ from sqlalchemy import delete, select
 
 from services.search.select import select as select_rows
 from services.search.snapshot import PhotoColumns
-from shared.catalog.photos import (
-    MetadataFilter,
-    Photo,
-    PhotoFacts,
-    PhotoRole,
-    filter_conditions,
-    search_metadata,
-)
+from shared.catalog.metadata_search import MetadataFilter, filter_conditions, search_metadata
+from shared.catalog.photos import Photo, PhotoFacts, PhotoRole
 from shared.catalog.session import Catalog
 from shared.photo_filter import Box, Circle, PhotoFilter
 from tests.support.catalog_rows import add_map, add_photo

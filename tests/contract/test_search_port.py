@@ -33,6 +33,7 @@ from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.maps import Map, bump_version, lock_map
 from shared.catalog.models import ensure_model
 from shared.catalog.photos import Photo, PhotoRole, mark_deleted
+from shared.catalog.schema import migrate
 from shared.catalog.session import Catalog
 from shared.chunks import decode_rows, encode_rows, manifest_key, write_chunk
 from shared.errors import Gone, Unavailable
@@ -770,7 +771,7 @@ class AddDeleteMerge(RuleBasedStateMachine):
 def migrated(tmp_path: Path) -> None:
     path = tmp_path / "migrated.sqlite"
     catalog = Catalog(f"sqlite:///{path}")
-    catalog.migrate()
+    migrate(catalog)
     catalog.close()  # the last connection writes everything into the one file
     AddDeleteMerge.migrated = path
 

@@ -78,6 +78,10 @@ def deployment(tmp_path: Path, postgres: PostgresServer) -> Iterator[Deployment]
     with start_redis(own=True) as redis:
         made = Deployment(tmp_path, postgres.new_database(), redis.url)
         try:
+            migrated = run_command(
+                "migrate", env=environment(made.home, **made.settings), cwd=tmp_path
+            )
+            assert migrated.returncode == 0, migrated.stderr
             yield made
         finally:
             made.close()

@@ -10,6 +10,7 @@ import pytest
 
 from services.gateway import job_watch
 from services.gateway.job_watch import JobWatch
+from shared.catalog.schema import migrate
 from shared.catalog.session import Catalog
 from shared.ids import new_id
 from shared.jobs import JobState
@@ -21,7 +22,7 @@ LONG = 30.0
 @pytest.fixture
 def catalog(tmp_path: Path) -> Catalog:
     made = Catalog(f"sqlite:///{tmp_path / 'catalog.sqlite'}")
-    made.migrate()
+    migrate(made)
     return made
 
 

@@ -26,10 +26,12 @@ from services.steward.evaluate import Evaluator
 from services.steward.model_changes import advance_model_changes
 from shared.catalog.base import Base
 from shared.catalog.chunks import Chunk, Descriptor
+from shared.catalog.figures import keep_figures
 from shared.catalog.generations import Generation
 from shared.catalog.maps import Map
 from shared.catalog.models import Model
 from shared.catalog.photos import Photo
+from shared.catalog.schema_compatibility import SchemaCompatibility
 from shared.catalog.search_workers import RegisteredWorker
 from shared.catalog.session import Catalog
 from shared.intake.store_photo import store_photo
@@ -48,15 +50,17 @@ class Away(Exception):
     pass
 
 
+OF_NO_MAP = {kind.__tablename__ for kind in (Model, RegisteredWorker, SchemaCompatibility)}
+
+
 def rows(catalog: Catalog) -> Counter[str]:
-    """How many rows lie in each table but the models' and the search workers', which belong to no
-    map."""
+    """How many rows lie in each table but those that belong to no map."""
     with catalog.read() as session:
         return Counter(
             {
                 table.name: session.scalar(select(func.count()).select_from(table)) or 0
                 for table in Base.metadata.sorted_tables
-                if table.name not in (Model.__tablename__, RegisteredWorker.__tablename__)
+                if table.name not in OF_NO_MAP
             }
         )
 
@@ -103,6 +107,8 @@ def live_in(service: Service, name: str) -> None:
     assert evaluator.evaluate_next(threading.Event())
     service.json("POST", "/vocabularies", 202, params=params, json={"clusters": 3, "seed": 5})
     finish_changes(service)
+    with service.catalog.write() as session:
+        keep_figures(session, id_of(service, name))
     buffer = io.BytesIO()
     np.save(buffer, np.ones((4, 99), np.float32))
     files = {"file": ("centres.npy", buffer.getvalue())}

@@ -1,0 +1,244 @@
+"""Everything that the services ask of the catalog, called as they call it."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Iterator
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+from uuid import UUID
+
+from PIL import Image
+from sqlalchemy import select
+from starlette.testclient import TestClient
+
+from services.cli.bench_catalog.explain import Explainer
+from services.cli.bench_catalog.fill import BIG, Filled
+from services.gateway.app import create_app
+from services.gateway.context import Gateway
+from services.gateway.keys import NoKeys
+from services.search.follow import wanted_versions
+from services.steward.located import read_located
+from services.steward.loop import Steward
+from shared.catalog.chunks import Descriptor, live_chunks, live_facts
+from shared.catalog.photos import Photo, PhotoRole, changed_since
+from shared.catalog.search_workers import tell_of_worker
+from shared.catalog.session import Catalog
+from shared.errors import PlacewiseError
+from shared.ids import new_id
+from shared.jobs import InProcessHints, Job, JobState, begin, claim, extend_lease
+from shared.jobs.finish import release
+from shared.jobs.leases import held
+from shared.jobs.table import STEWARD_JOBS
+from shared.objects import FolderStore
+from shared.search_protocol import Hit, SearchRequest, SearchResponse, SearchStatus
+from shared.settings import Settings
+from shared.shards import WHOLE
+
+# They read a whole map, and that is known: a count every so often, an evaluation, and parts of file
+# names that are too short for an index.
+READS_EVERYTHING = (
+    "steward: count large maps",
+    "evaluation: located photos",
+    "GET /search?filename=zq",
+)
+
+
+class AnySearch:
+    """Answers every search with the same photos: here the join with the catalog counts."""
+
+    def __init__(self, photo_ids: list[UUID]) -> None:
+        self._hits = tuple(Hit(photo_id=photo_id, score=0.5) for photo_id in photo_ids)
+
+    def search(self, request: SearchRequest) -> SearchResponse:
+        return SearchResponse(
+            hits=self._hits[: request.k],
+            certificate="exhaustive",
+            rows_scanned=0,
+            rows_reranked=0,
+            snapshot_version=request.min_version,
+            missing=(),
+        )
+
+    def status(self) -> SearchStatus:
+        return SearchStatus(shard="0/1", rows=0, resident_bytes=0, versions={}, missing=())
+
+
+def call_everything(
+    catalog: Catalog, filled: Filled, explainer: Explainer, folder: Path
+) -> Iterator[str]:
+    """Make every call once, on the largest map; yields each one's name before it is made."""
+    for name, do in _calls(catalog, filled, folder):
+        yield name
+        with explainer.call(name):
+            do()
+
+
+def _calls(
+    catalog: Catalog, filled: Filled, folder: Path
+) -> Iterator[tuple[str, Callable[[], object]]]:
+    settings = Settings(_env_file=None).model_copy(update={"auto_evaluate_photos": 20})
+    store = FolderStore(folder / "objects")
+    with catalog.read() as session:
+        described = session.scalars(
+            select(Descriptor.photo_id)
+            .where(Descriptor.generation_id == filled.generation)
+            .order_by(Descriptor.photo_id)
+            .limit(200)
+        ).all()
+    ids = list(described)
+    client = TestClient(
+        create_app(Gateway(catalog, store, InProcessHints(), AnySearch(ids), settings, NoKeys()))
+    )
+    steward = Steward(catalog, store, InProcessHints(), settings)
+    # First, because requests read what it has counted; so does it, wherever it has run before.
+    for duty in sorted(steward.duties, key=lambda duty: duty.name != "count large maps"):
+        yield f"steward: {duty.name}", duty.do
+    yield from _requests(client, catalog, filled, ids)
+    yield from _extractor(catalog)
+    yield from _search(catalog, filled)
+
+
+def _requests(
+    client: TestClient, catalog: Catalog, filled: Filled, ids: list[UUID]
+) -> Iterator[tuple[str, Callable[[], object]]]:
+    with catalog.read() as session:
+        photo = session.get_one(Photo, ids[50])
+        jobs = {
+            state: session.scalars(
+                select(Job.id).where(Job.map_id == filled.big, Job.state == state).limit(1)
+            ).one()
+            for state in (JobState.QUEUED, JobState.FAILED)
+        }
+    days_ago = {n: (datetime.now(UTC) - timedelta(days=n)).isoformat() for n in (1, 29)}
+    near = f"{photo.latitude},{photo.longitude}"
+
+    def ask(method: str, path: str, **options: Any) -> tuple[str, Callable[[], object]]:
+        wanted = options.pop("params", {})
+        params = wanted if path.startswith("/maps") else {"map": BIG, **wanted}
+        said = "&".join(f"{name}={str(value)[:40]}" for name, value in wanted.items())
+        label = f"{method} {_without_ids(path)}{'?' if said else ''}{said}"
+
+        def call() -> None:
+            answer = client.request(method, f"/api/v1{path}", params=params, **options)
+            if answer.status_code >= 400:
+                raise PlacewiseError("bad_answer", f"{label}: {answer.text}")
+
+        return label, call
+
+    for found in (
+        {},
+        {"limit": 1000},
+        {"filename": photo.filename[6:14]},
+        {"filename": "street-"},
+        {"filename": "no-such-photo"},
+        {"filename": "zq"},
+        {"upload_after": days_ago[1]},
+        {"upload_before": days_ago[29]},
+        {"min_file_size": 3_199_000},
+        {"min_file_size": 1_000_000, "max_file_size": 1_000_500},
+        {"near": f"{near},50"},
+        {"near": f"{near},2000"},
+        {"near": f"{near},200000"},
+        {"box": "45.05,7.65,45.051,7.651"},
+        {"box": "44,7,46,8"},
+        {"place": "place-100"},
+        {"tags": "night"},
+        {"tags": "tag-100"},
+        {"tags": "night,tag-100"},
+        {"captured_after": days_ago[1]},
+        {"captured_before": days_ago[29]},
+        {"ids": ",".join(str(i) for i in ids[:100])},
+        {"role": "query"},
+        {"place": "place-100", "tags": "night", "near": f"{near},2000"},
+    ):
+        yield ask("GET", "/search", params=found)
+    one = f"/uploads/{photo.id}"
+    for path in ("/maps", f"/maps/{BIG}", "/database/stats", one, "/generations"):
+        yield ask("GET", path)
+    for found in (
+        {},
+        {"state": "failed"},
+        {"state": "queued"},
+        {"kind": "evaluate"},
+        {"kind": "index", "state": "failed"},
+        {"cursor": str(jobs[JobState.FAILED])},
+    ):
+        yield ask("GET", "/jobs", params=found)
+    yield ask("GET", "/searches")
+    yield ask("GET", "/evaluations")
+    yield ask("GET", "/vocabularies")
+    yield ask("GET", f"/jobs/{jobs[JobState.QUEUED]}")
+    yield ask("POST", f"/jobs/{jobs[JobState.QUEUED]}/cancel")
+    yield ask("POST", f"/jobs/{jobs[JobState.FAILED]}/retry")
+    yield ask("POST", f"/similarity/{photo.id}", params={"top_k": 10})
+    yield ask("PATCH", one, json={"place": "elsewhere"})
+    yield ask("DELETE", f"/uploads/{ids[60]}")
+    buffer = io.BytesIO()
+    Image.new("RGB", (64, 48), "gray").save(buffer, "JPEG")
+    yield ask("POST", "/upload", files={"file": ("a.jpg", buffer.getvalue())})
+    yield ask("POST", "/evaluations", json={})
+
+
+def _extractor(catalog: Catalog) -> Iterator[tuple[str, Callable[[], object]]]:
+    claimed: list[Job] = []
+
+    def take() -> None:
+        with catalog.write() as session:
+            claimed[:] = claim(session, worker="bench", limit=16, lease_seconds=60, begun=False)
+
+    def keep() -> None:
+        token = claimed[0].lease_token
+        assert token is not None
+        with catalog.write() as session:
+            begin(session, token, len(claimed))
+            extend_lease(session, token, 60)
+
+    def give_back() -> None:
+        token = claimed[0].lease_token
+        assert token is not None
+        with catalog.write() as session:
+            for job in held(session, token, claimed):
+                release(job)
+
+    def take_queries() -> None:
+        with catalog.write() as session:
+            claim(session, worker="bench", limit=16, lease_seconds=60, least_priority=100)
+
+    def take_evaluations() -> None:
+        with catalog.write() as session:
+            claim(session, worker="bench", limit=1, lease_seconds=60, kinds=STEWARD_JOBS)
+
+    yield "extractor: claim a batch", take
+    yield "extractor: hold the lease", keep
+    yield "extractor: give back", give_back
+    yield "extractor: claim queries", take_queries
+    yield "evaluator: claim", take_evaluations
+
+
+def _search(catalog: Catalog, filled: Filled) -> Iterator[tuple[str, Callable[[], object]]]:
+    def follow() -> None:
+        versions = wanted_versions(catalog)
+        assert filled.generation in versions
+        with catalog.read() as session:
+            chunks = live_chunks(session, filled.generation)
+            live_facts(session, chunks[0].id)
+            changed_since(session, filled.big, filled.photos - 100)
+
+    def tell() -> None:
+        with catalog.write() as session:
+            tell_of_worker(session, new_id(), "bench", None, WHOLE, {})
+
+    def evaluate() -> None:
+        with catalog.read() as session:
+            read_located(session, filled.big, filled.generation, PhotoRole.QUERY)
+            read_located(session, filled.big, filled.generation, PhotoRole.DATABASE)
+
+    yield "search: follow", follow
+    yield "search: register", tell
+    yield "evaluation: located photos", evaluate
+
+
+def _without_ids(path: str) -> str:
+    return "/".join("{id}" if len(part) == 36 else part for part in path.split("/"))

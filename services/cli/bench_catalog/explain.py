@@ -1,0 +1,121 @@
+"""The plan of every statement that is sent while a block runs, and what it read."""
+
+from __future__ import annotations
+
+import contextlib
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+from sqlalchemy import event
+
+from shared.catalog.metadata_search import COUNTED_AT_MOST
+from shared.catalog.session import Catalog
+
+EXPLAINED = re.compile(r"\s*(SELECT|WITH|UPDATE|DELETE|INSERT)\b", re.IGNORECASE)
+LARGE = ("photos", "jobs", "descriptors", "searches")
+
+# What may be read whatever is returned: counts stop at COUNTED_AT_MOST, of two tables at most.
+READ_FREELY = 2 * COUNTED_AT_MOST + 2_000
+READ_PER_ROW = 20
+
+
+@dataclass(frozen=True, slots=True)
+class Explained:
+    """One statement. `read` is rows that scans have looked at, `milliseconds` the server's."""
+
+    call: str
+    sql: str
+    scans: tuple[str, ...]
+    read: int
+    returned: int
+    milliseconds: float
+    sequential: tuple[str, ...]
+    """Large tables that were read from one end to the other."""
+
+    def faults(self) -> list[str]:
+        found = [f"sequential scan over {table}" for table in self.sequential]
+        if self.read > max(READ_FREELY, READ_PER_ROW * self.returned):
+            found.append(f"reads {self.read:,} rows to return {self.returned:,}")
+        return found
+
+
+@dataclass
+class Explainer:
+    """Explains what goes through the catalog while `call` runs."""
+
+    catalog: Catalog
+    small: bool = False
+    """Reading everything is cheap, so the planner would: what matters is that it need not. Scans
+    and joins of whole tables are forbidden; a walk through a whole index shows in what is read."""
+    found: list[Explained] = field(default_factory=list)
+
+    @contextlib.contextmanager
+    def call(self, name: str) -> Iterator[None]:
+        seen: set[str] = set()
+
+        def before(
+            connection: Any, _cursor: Any, sql: str, parameters: Any, _context: Any, many: bool
+        ) -> None:
+            if many or sql in seen or not EXPLAINED.match(sql) or "pg_catalog" in sql:
+                return
+            seen.add(sql)
+            self.found.append(self._explain(connection, name, sql, parameters))
+
+        event.listen(self.catalog.engine, "before_cursor_execute", before)
+        try:
+            yield
+        finally:
+            event.remove(self.catalog.engine, "before_cursor_execute", before)
+
+    def _explain(self, connection: Any, call: str, sql: str, parameters: Any) -> Explained:
+        # In its own transaction, so on the very rows; and undone, so that it changes nothing.
+        with connection.connection.cursor() as cursor:
+            cursor.execute("SAVEPOINT explained")
+            if self.small:
+                for method in ("seqscan", "hashjoin", "mergejoin"):
+                    cursor.execute(f"SET LOCAL enable_{method} = off")
+            cursor.execute(f"EXPLAIN (ANALYZE, FORMAT JSON) {sql}", parameters)
+            plan = cursor.fetchone()[0][0]
+            cursor.execute("ROLLBACK TO SAVEPOINT explained")
+        nodes = list(_nodes(plan["Plan"]))
+        scans = [node for node in nodes if "Relation Name" in node and "Scan" in node["Node Type"]]
+        return Explained(
+            call=call,
+            sql=" ".join(sql.split()),
+            scans=tuple(_named(node) for node in nodes if "Scan" in node["Node Type"]),
+            read=sum(_read(node) for node in scans),
+            returned=_returned(plan["Plan"]),
+            milliseconds=plan["Planning Time"] + plan["Execution Time"],
+            sequential=tuple(
+                node["Relation Name"]
+                for node in scans
+                if node["Node Type"] == "Seq Scan"
+                and node["Relation Name"] in LARGE
+                and _read(node) > READ_FREELY
+            ),
+        )
+
+
+def _nodes(plan: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    yield plan
+    for child in plan.get("Plans", ()):
+        yield from _nodes(child)
+
+
+def _read(node: dict[str, Any]) -> int:
+    removed = node.get("Rows Removed by Filter", 0) + node.get("Rows Removed by Index Recheck", 0)
+    return int((node["Actual Rows"] + removed) * node["Actual Loops"])
+
+
+def _returned(plan: dict[str, Any]) -> int:
+    """Rows that come out; of a change, those that it is applied to."""
+    if plan["Node Type"] == "ModifyTable":
+        return max((_returned(child) for child in plan.get("Plans", ())), default=1)
+    return int(plan["Actual Rows"])
+
+
+def _named(node: dict[str, Any]) -> str:
+    on = node.get("Index Name") or node.get("Relation Name") or node.get("CTE Name") or ""
+    return f"{node['Node Type']} {on}".strip()

@@ -1,0 +1,79 @@
+"""What a failing catalog means: away for now, too busy, a transaction sacrificed, or a bug.
+
+Only the first three are worth another try; whoever has a bug in his statement must hear of it.
+"""
+
+from __future__ import annotations
+
+import logging
+
+from sqlalchemy.exc import DBAPIError, InterfaceError, InternalError, OperationalError
+from sqlalchemy.exc import TimeoutError as PoolTimeout
+
+from shared.errors import Unavailable
+
+log = logging.getLogger(__name__)
+
+SACRIFICED = {"40001": "serialization failure", "40P01": "deadlock"}
+TOO_SLOW = {"57014": "the statement took too long", "55P03": "a lock was not to be had"}
+READ_ONLY = "25006"  # the old primary, after a failover
+
+
+def sqlstate(error: BaseException) -> str | None:
+    """PostgreSQL's five characters; None for what came from elsewhere."""
+    return getattr(getattr(error, "orig", None), "sqlstate", None)
+
+
+def as_unavailable(error: BaseException) -> Unavailable | None:
+    """What to tell whoever asked when the catalog can't be used right now; None for what is no
+    such error (a violated constraint, say)."""
+    if isinstance(error, PoolTimeout):
+        return _busy("every connection is in use")
+    if not isinstance(error, DBAPIError):
+        return None
+    state = sqlstate(error)
+    if state in TOO_SLOW:
+        return _busy(TOO_SLOW[state])
+    if state in SACRIFICED:
+        return _busy(SACRIFICED[state])
+    away = isinstance(error, OperationalError | InterfaceError) or error.connection_invalidated
+    if away or (isinstance(error, InternalError) and state == READ_ONLY):
+        return Unavailable(
+            "catalog_unavailable", "The catalog can't be reached right now. Try again in a moment."
+        )
+    return None
+
+
+def _busy(why: str) -> Unavailable:
+    return Unavailable(
+        "catalog_busy",
+        f"The catalog is too busy right now ({why}). Try again in a moment, and ask for less at "
+        "once if it happens again.",
+    )
+
+
+class Outage:
+    """Says once that the catalog is away, and once that it is back: one for each loop."""
+
+    def __init__(self, who: str) -> None:
+        self._who = who
+        self._away = False
+
+    def met(self, error: Exception) -> None:
+        """`error` ended a round of the loop. What is no outage is logged in full each time."""
+        unavailable = as_unavailable(error)
+        if unavailable is None:
+            log.error("the %s met an error in the catalog", self._who, exc_info=error)
+        elif not self._away:
+            self._away = True
+            log.warning("the %s waits for the catalog: %s", self._who, _first_line(error))
+
+    def over(self) -> None:
+        """A round went well."""
+        if self._away:
+            self._away = False
+            log.warning("the %s has the catalog back", self._who)
+
+
+def _first_line(error: Exception) -> str:
+    return str(getattr(error, "orig", None) or error).strip().split("\n", 1)[0]

@@ -1,0 +1,150 @@
+"""Photos by what is known of them: conditions in SQL, and a page of those that meet them.
+
+What is rare is looked up in an index of its condition and sorted; what is frequent is found by
+walking through the newest photos. Counting first says which of the two it is, so that no page
+depends on how well the planner guesses.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from datetime import datetime
+from uuid import UUID
+
+from sqlalchemy import Select, Uuid, func, literal, or_, select, tuple_
+from sqlalchemy.orm import Session
+
+from shared.catalog.base import (
+    Condition,
+    UtcDateTime,
+    db_distance_m,
+    filename_trigrams,
+    json_array_has,
+)
+from shared.catalog.photos import Photo, PhotoRole
+from shared.geodesy import latitude_band, longitude_reach
+from shared.photo_filter import EVERYTHING, Box, Circle, PhotoFilter
+
+# Further than that nobody counts, nor turns pages: a count costs as much as it counts.
+COUNTED_AT_MOST = 10_000
+TRIGRAM = 3
+
+
+@dataclass(frozen=True, slots=True)
+class MetadataFilter:
+    """Conditions of a metadata search; None means "any". Bounds are inclusive."""
+
+    filename: str | None = None
+    """Part of the file name, case ignored; `%` and `_` are ordinary characters."""
+    upload_after: datetime | None = None
+    upload_before: datetime | None = None
+    min_file_size: int | None = None
+    max_file_size: int | None = None
+    photos: PhotoFilter = EVERYTHING
+    """Where, when and what the photo shows."""
+    role: PhotoRole | None = None
+
+    def conditions(self, *, trigrams: bool) -> list[Condition]:
+        """The filter in SQL; `trigrams` where the catalog has an index of them."""
+        found: list[Condition] = []
+        if self.filename is not None:
+            found.append(Photo.filename.icontains(self.filename, autoescape=True))
+            if trigrams and len(self.filename) >= TRIGRAM:
+                part = filename_trigrams(literal(self.filename))
+                found.append(filename_trigrams(Photo.filename).bool_op("@>")(part))
+        if self.upload_after is not None:
+            found.append(Photo.uploaded_at >= self.upload_after)
+        if self.upload_before is not None:
+            found.append(Photo.uploaded_at <= self.upload_before)
+        if self.min_file_size is not None:
+            found.append(Photo.size_bytes >= self.min_file_size)
+        if self.max_file_size is not None:
+            found.append(Photo.size_bytes <= self.max_file_size)
+        if self.role is not None:
+            found.append(Photo.role == self.role)
+        return found + filter_conditions(self.photos)
+
+
+def filter_conditions(wanted: PhotoFilter) -> list[Condition]:
+    """The filter in SQL."""
+    found: list[Condition] = []
+    if wanted.near is not None:
+        found += _within(wanted.near)
+    if wanted.box is not None:
+        found += _inside(wanted.box)
+    if wanted.captured_after is not None:
+        found.append(Photo.captured_at >= wanted.captured_after)
+    if wanted.captured_before is not None:
+        found.append(Photo.captured_at <= wanted.captured_before)
+    if wanted.place is not None:
+        found.append(Photo.place == wanted.place)
+    if wanted.ids is not None:
+        found.append(Photo.id.in_(wanted.ids))
+    found.extend(json_array_has(Photo.tags, tag) for tag in wanted.tags)
+    return found
+
+
+def search_metadata(
+    session: Session,
+    map_id: UUID,
+    wanted: MetadataFilter,
+    limit: int,
+    after: tuple[datetime, UUID] | None,
+) -> tuple[list[Photo], int]:
+    """Newest first: up to `limit` live photos after the cursor, and how many match in all, counted
+    up to COUNTED_AT_MOST."""
+    on_postgres = session.get_bind().dialect.name == "postgresql"
+    conditions = [
+        Photo.map_id == map_id,
+        Photo.deleted_at.is_(None),
+        *wanted.conditions(trigrams=on_postgres),
+    ]
+    counted = select(literal(1)).select_from(Photo).where(*conditions).limit(COUNTED_AT_MOST)
+    total = session.scalar(select(func.count()).select_from(counted.subquery())) or 0
+    page: Select[Photo]
+    if total < COUNTED_AT_MOST:
+        rare = select(Photo.id).where(*conditions).cte("rare")
+        page = select(Photo).join(rare.prefix_with("MATERIALIZED"), rare.c.id == Photo.id)
+    else:
+        page = select(Photo).where(*conditions)
+    if after is not None:
+        page = page.where(tuple_(Photo.uploaded_at, Photo.id) < tuple_(*_bound(after)))
+    page = page.order_by(Photo.uploaded_at.desc(), Photo.id.desc()).limit(limit)
+    return list(session.scalars(page)), total
+
+
+def _within(circle: Circle) -> list[Condition]:
+    south, north = latitude_band(circle.latitude, circle.radius_m)
+    away = db_distance_m(
+        literal(circle.latitude), literal(circle.longitude), Photo.latitude, Photo.longitude
+    )
+    found = [Photo.latitude.between(south, north), away <= circle.radius_m]
+    reach = longitude_reach(circle.latitude, circle.radius_m)
+    if reach is None or reach >= 180:
+        return found
+    # What the index can sort out by itself; the distance decides.
+    west, east = circle.longitude - reach, circle.longitude + reach
+    around = Box(
+        south=south,
+        west=west + 360 if west < -180 else west,
+        north=north,
+        east=east - 360 if east > 180 else east,
+    )
+    found.append(or_(*_longitudes(around)))
+    return found
+
+
+def _inside(box: Box) -> list[Condition]:
+    at_a_pole = [func.abs(Photo.latitude) == 90.0] if box.north == 90 or box.south == -90 else []
+    return [
+        Photo.latitude.between(box.south, box.north),
+        or_(*at_a_pole, *_longitudes(box)),
+    ]
+
+
+def _longitudes(box: Box) -> list[Condition]:
+    return [Photo.longitude.between(west, east) for west, east in box.longitude_ranges()]
+
+
+def _bound(after: tuple[datetime, UUID]) -> tuple[object, object]:
+    return literal(after[0], UtcDateTime()), literal(after[1], Uuid())

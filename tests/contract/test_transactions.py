@@ -1,0 +1,164 @@
+"""Transactions that PostgreSQL ends, and what is run again: deadlocks and nothing else."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from uuid import UUID
+
+import pytest
+from sqlalchemy import select, text
+from sqlalchemy.exc import DBAPIError, IntegrityError, OperationalError
+from sqlalchemy.exc import TimeoutError as PoolTimeout
+from sqlalchemy.orm import Session
+
+from shared.catalog.away import as_unavailable
+from shared.catalog.connections import Limits, Pool
+from shared.catalog.maps import Map, lock_map
+from shared.catalog.session import TRIES, Catalog
+from tests.support.catalog_rows import add_map
+from tests.support.servers import PostgresServer
+
+
+@pytest.fixture
+def catalog(postgres: PostgresServer, migrated_postgres: str) -> Iterator[Catalog]:
+    opened = Catalog(
+        postgres.new_database(migrated_postgres),
+        Pool(name="placewise-test", size=2, overflow=1, wait_seconds=0.2),
+        Limits(statement_seconds=10, lock_seconds=5),
+    )
+    yield opened
+    opened.close()
+
+
+@pytest.fixture
+def maps(catalog: Catalog) -> list[UUID]:
+    with catalog.write() as session:
+        return [add_map(session, name).id for name in ("a", "b")]
+
+
+def test_units_that_wait_for_each_other_both_come_to_their_end(
+    catalog: Catalog, maps: list[UUID]
+) -> None:
+    both = threading.Barrier(2)
+    runs: list[UUID] = []
+
+    def unit_of(order: list[UUID]) -> None:
+        def unit(session: Session) -> None:
+            first = lock_map(session, order[0])
+            if order[0] not in runs:  # its first run: the other holds its row, too
+                runs.append(order[0])
+                both.wait()
+            else:
+                runs.append(order[0])
+            first.version += 1
+            lock_map(session, order[1]).version += 1
+
+        catalog.run(unit)
+
+    with ThreadPoolExecutor() as pool:
+        list(pool.map(unit_of, (maps, maps[::-1])))
+    assert len(runs) == 3, "one of the two was sacrificed, and run once more"
+    with catalog.read() as session:
+        assert session.scalars(select(Map.version)).all() == [2, 2], "each unit counted once"
+
+
+def test_serialization_failure_is_run_again_until_it_succeeds(
+    catalog: Catalog, maps: list[UUID]
+) -> None:
+    runs = 0
+
+    def unit(session: Session) -> int:
+        nonlocal runs
+        runs += 1
+        session.execute(text("SET TRANSACTION ISOLATION LEVEL REPEATABLE READ"))
+        seen = session.get_one(Map, maps[0])
+        if runs < 3:
+            with catalog.write() as other:
+                other.get_one(Map, maps[0]).version += 1
+        seen.version += 100
+        session.flush()
+        return seen.version
+
+    assert catalog.run(unit) == 102
+    assert runs == 3
+
+
+def test_units_that_never_get_through_are_given_up(catalog: Catalog) -> None:
+    runs = 0
+
+    def unit(session: Session) -> None:
+        nonlocal runs
+        runs += 1
+        session.execute(text("DO $$ BEGIN RAISE EXCEPTION 'no' USING ERRCODE = '40P01'; END $$"))
+
+    with pytest.raises(OperationalError):
+        catalog.run(unit)
+    assert runs == TRIES
+
+
+@pytest.mark.parametrize("state", ["23505", "55P03", "57014", "53300"])
+def test_every_other_error_is_raised_at_once(catalog: Catalog, state: str) -> None:
+    runs = 0
+
+    def unit(session: Session) -> None:
+        nonlocal runs
+        runs += 1
+        session.execute(text(f"DO $$ BEGIN RAISE EXCEPTION 'no' USING ERRCODE = '{state}'; END $$"))
+
+    with pytest.raises(DBAPIError) as caught:
+        catalog.run(unit)
+    assert runs == 1
+    told = as_unavailable(caught.value)
+    assert (told and told.code) == {
+        "23505": None,  # a bug, or the caller's business
+        "55P03": "catalog_busy",
+        "57014": "catalog_busy",
+        "53300": "catalog_unavailable",
+    }[state]
+
+
+def test_violated_constraint_is_no_outage(catalog: Catalog, maps: list[UUID]) -> None:
+    with pytest.raises(IntegrityError) as caught, catalog.write() as session:
+        add_map(session, "a")
+    assert as_unavailable(caught.value) is None
+
+
+def test_limits_hold_inside_the_transaction_and_leave_nothing_behind(catalog: Catalog) -> None:
+    """Behind a PgBouncer, what a transaction leaves behind another service would meet."""
+    names = ("statement_timeout", "lock_timeout", "idle_in_transaction_session_timeout")
+    with catalog.limited(Limits(statement_seconds=1.5, lock_seconds=0.5)).read() as session:
+        inside = [session.scalar(text(f"SHOW {name}")) for name in names]
+        assert session.scalar(text("SHOW application_name")) == "placewise-test"
+        prepared = text("SELECT count(*) FROM pg_prepared_statements")
+        for _ in range(10):
+            assert session.scalar(prepared) == 0
+    assert inside == ["1500ms", "500ms", "1min"]
+    with catalog.engine.connect() as connection:
+        after = [connection.exec_driver_sql(f"SHOW {name}").scalar() for name in names]
+    assert after == ["0", "0", "0"]
+
+
+def test_statement_that_takes_too_long_is_ended_and_the_connection_stays_good(
+    catalog: Catalog,
+) -> None:
+    quick = catalog.limited(Limits(statement_seconds=0.2))
+    with pytest.raises(OperationalError) as caught, quick.read() as session:
+        session.execute(text("SELECT pg_sleep(30)"))
+    told = as_unavailable(caught.value)
+    assert told is not None
+    assert told.code == "catalog_busy"
+    with quick.read() as session:
+        assert session.scalar(select(1)) == 1
+
+
+def test_no_free_connection_is_told_within_the_configured_wait(catalog: Catalog) -> None:
+    with catalog.read() as a, catalog.read() as b, catalog.read() as c:
+        for session in (a, b, c):
+            session.scalar(select(1))
+        with pytest.raises(PoolTimeout) as caught, catalog.read() as one_too_many:
+            one_too_many.scalar(select(1))
+    told = as_unavailable(caught.value)
+    assert told is not None
+    assert told.code == "catalog_busy"

@@ -1,0 +1,230 @@
+"""PostgreSQL killed, silent or too busy: a 503 within seconds, no part dies, nothing is lost."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import httpx2
+import pytest
+from sqlalchemy import func, select
+from starlette.testclient import TestClient
+
+from services.extractor.worker import ExtractorWorker
+from services.gateway.app import create_app
+from services.gateway.context import Gateway
+from services.gateway.keys import NoKeys
+from services.parts import start_part
+from services.search.presence import Presence
+from services.search.worker import SearchWorker
+from services.steward.evaluate import Evaluator
+from services.steward.loop import Steward
+from shared.catalog.chunks import Descriptor, descriptor_of
+from shared.catalog.connections import Limits, Pool
+from shared.catalog.generations import active_generation
+from shared.catalog.maps import ensure_default_map, get_map, lock_map
+from shared.catalog.photos import Photo
+from shared.catalog.schema import migrate
+from shared.catalog.session import Catalog
+from shared.jobs import InProcessHints
+from shared.objects import FolderStore
+from shared.search_protocol import SearchRequest
+from shared.settings import Settings
+from tests.support.photos import photo_bytes
+from tests.support.servers import PostgresServer, start_postgres
+
+API = "/api/v1"
+STATEMENT_SECONDS = 2.0
+# A statement, a ping or a connection that is given up, on a busy machine.
+ANSWER_SECONDS = 12.0
+RECOVERY_SECONDS = 60.0
+UPLOADERS = 3
+
+
+@pytest.fixture(scope="module")
+def breakable() -> Iterator[PostgresServer]:
+    """A server of this module's own."""
+    with start_postgres(own=True) as server:
+        yield server
+
+
+class House:
+    """Every service's parts in this process, on one PostgreSQL."""
+
+    def __init__(self, url: str, folder: Path) -> None:
+        settings = Settings().model_copy(
+            update={"lease_seconds": 3.0, "device": "cpu", "decode_processes": 1}
+        )
+        self.catalog = Catalog(url, Pool(size=4, overflow=4, wait_seconds=1.0, connect_seconds=2.0))
+        migrate(self.catalog)
+        with self.catalog.write() as session:
+            ensure_default_map(session, settings.new_map_extractor)
+        store, hints = FolderStore(folder / "objects"), InProcessHints()
+        self.search = SearchWorker(self.catalog, store, settings)
+        self._extractor = ExtractorWorker(self.catalog, store, settings, "extractor")
+        self.requests = self.catalog.limited(Limits(STATEMENT_SECONDS, lock_seconds=1.0))
+        gateway = Gateway(self.requests, store, hints, self.search, settings, NoKeys())
+        self.client = TestClient(create_app(gateway), raise_server_exceptions=False)
+        self.died = threading.Event()
+        self._stop = threading.Event()
+        self._parts = [
+            start_part(name, part, self._stop, self.died.set)
+            for name, part in (
+                ("search", self.search.run),
+                ("presence", Presence(self.catalog, self.search, "search").run),
+                ("extractor", partial(self._extractor.run, hints=hints)),
+                ("steward", Steward(self.catalog, store, hints, settings).run),
+                ("evaluator", Evaluator(self.catalog, self.search, settings, "evaluator").run),
+            )
+        ]
+
+    def call(self, method: str, path: str, **options: Any) -> httpx2.Response:
+        begun = time.monotonic()
+        answer = self.client.request(method, path, **options)
+        took = time.monotonic() - begun
+        assert took < ANSWER_SECONDS, f"{method} {path} took {took:.1f} s"
+        if answer.status_code == 503 and path not in ("/readyz", f"{API}/health"):
+            assert answer.headers["retry-after"], answer.text
+            assert answer.json()["code"] in ("catalog_unavailable", "catalog_busy"), answer.text
+        return answer
+
+    def upload(self, number: int) -> httpx2.Response:
+        files = {"file": (f"{number}.jpg", photo_bytes(number))}
+        return self.call("POST", f"{API}/upload", files=files)
+
+    def searchable(self) -> int:
+        with self.catalog.read() as session:
+            return session.scalar(select(func.count()).select_from(Descriptor)) or 0
+
+    def wait_for(self, searchable: int) -> None:
+        deadline = time.monotonic() + RECOVERY_SECONDS
+        while self.searchable() < searchable and time.monotonic() < deadline:
+            time.sleep(0.1)
+        assert self.searchable() == searchable
+
+    def request(self, photo_id: str) -> SearchRequest:
+        """What the gateway asks the search tier for a stored photo."""
+        with self.catalog.read() as session:
+            map_ = get_map(session, "default")
+            generation = active_generation(session, map_.id)
+            assert generation is not None
+            found = descriptor_of(session, generation.id, session.get_one(Photo, photo_id).id)
+            assert found is not None
+            return SearchRequest(
+                map_id=map_.id,
+                generation_id=generation.id,
+                object_key=found[1].object_key,
+                row=found[0].row,
+                min_version=map_.version,
+                k=3,
+            )
+
+    def close(self) -> None:
+        self._stop.set()
+        for part in self._parts:
+            part.join()
+        self._extractor.close()
+        self.catalog.close()
+
+
+@pytest.fixture
+def house(breakable: PostgresServer, tmp_path: Path) -> Iterator[House]:
+    made = House(breakable.new_database(), tmp_path)
+    try:
+        yield made
+    finally:
+        made.close()
+
+
+def test_catalog_killed_under_uploads_loses_nothing_that_was_acknowledged(
+    house: House, breakable: PostgresServer, caplog: pytest.LogCaptureFixture
+) -> None:
+    assert breakable.process is not None
+    first = house.upload(0).json()["file_id"]
+    house.wait_for(1)
+    request = house.request(first)
+    house.search.follow()
+    acknowledged, refused, strange = {first}, threading.Event(), []
+    stop = threading.Event()
+
+    def upload(numbers: Iterator[int]) -> None:
+        for number in numbers:
+            while not stop.is_set():
+                answer = house.upload(number)
+                if answer.status_code in (200, 202):
+                    acknowledged.add(answer.json()["file_id"])
+                    break
+                if answer.status_code != 503:
+                    strange.append(answer.text)
+                    return
+                refused.set()
+                time.sleep(0.1)
+
+    uploaders = [
+        threading.Thread(target=upload, args=(iter(range(1 + n, 31, UPLOADERS)),))
+        for n in range(UPLOADERS)
+    ]
+    for uploader in uploaders:
+        uploader.start()
+    while len(acknowledged) < 8:
+        time.sleep(0.01)
+    breakable.process.kill()
+    try:
+        assert refused.wait(ANSWER_SECONDS)
+        assert house.call("GET", "/livez").status_code == 200
+        assert house.call("GET", "/readyz").status_code == 503
+        assert house.call("GET", f"{API}/search").status_code == 503
+        parts = house.call("GET", f"{API}/health")
+        assert (parts.status_code, parts.json()["parts"]["catalog"]["status"]) == (503, "unhealthy")
+        assert house.search.search(request).hits, "search answers from memory"
+        time.sleep(3.0)  # every loop meets it several times
+    finally:
+        breakable.process.start()
+    for uploader in uploaders:
+        uploader.join(RECOVERY_SECONDS)
+    stop.set()
+    assert not strange
+    assert len(acknowledged) == 31
+    house.wait_for(31)
+    assert house.call("GET", "/readyz").status_code == 200
+    assert not house.died.is_set(), "a part ended"
+    for part in ("steward", "extractor", "evaluator"):
+        said = [r.message for r in caplog.records if f"the {part} waits" in r.message]
+        assert len(said) == 1, f"once per outage: {said}"
+
+
+def test_silent_catalog_is_given_up_within_seconds(house: House, breakable: PostgresServer) -> None:
+    assert breakable.process is not None
+    assert house.call("GET", f"{API}/search").status_code == 200
+    breakable.process.pause()
+    try:
+        assert house.call("GET", f"{API}/search").status_code == 503
+        assert house.call("GET", "/readyz").status_code == 503
+        assert house.call("GET", "/livez").status_code == 200
+    finally:
+        breakable.process.resume()
+    deadline = time.monotonic() + RECOVERY_SECONDS
+    while house.call("GET", "/readyz").status_code != 200 and time.monotonic() < deadline:
+        time.sleep(0.1)
+    assert house.call("GET", f"{API}/search").status_code == 200
+    assert not house.died.is_set()
+
+
+def test_locked_map_and_an_empty_pool_are_busy_and_not_an_error(house: House) -> None:
+    with house.catalog.write() as session:
+        lock_map(session, get_map(session, "default").id)
+        locked = house.call("DELETE", f"{API}/maps/default")
+    assert (locked.status_code, locked.json()["code"]) == (503, "catalog_busy")
+    with contextlib.ExitStack() as taken:
+        with contextlib.suppress(Exception):
+            while True:
+                taken.enter_context(house.catalog.read()).scalar(select(1))
+        empty = house.call("GET", f"{API}/search")
+    assert (empty.status_code, empty.json()["code"]) == (503, "catalog_busy")
+    assert house.call("GET", f"{API}/search").status_code == 200
+    assert not house.died.is_set()

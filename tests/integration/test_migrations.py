@@ -1,0 +1,151 @@
+"""Migrations beside a running fleet: traffic goes on, and a release knows its own schema."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from uuid import UUID
+
+import pytest
+from sqlalchemy import func, select, text
+
+from shared.catalog import schema
+from shared.catalog.connections import Limits, Pool
+from shared.catalog.photos import Photo
+from shared.catalog.schema import check_schema, migrate, wait_for_schema
+from shared.catalog.session import Catalog
+from shared.errors import Misconfigured, Unavailable
+from tests.support.catalog_rows import add_map, add_photo
+from tests.support.servers import PostgresServer
+
+
+@pytest.fixture
+def catalog(postgres: PostgresServer) -> Iterator[Catalog]:
+    opened = Catalog(postgres.new_database(), Pool(), Limits(5, 3))
+    yield opened
+    opened.close()
+
+
+def back_to_0006(catalog: Catalog) -> None:
+    """As if the newest release's indexes had not been made."""
+    with catalog.engine.begin() as connection:
+        for index in ("ix_photos_filename", "ix_photos_tags", "ix_photos_map_size"):
+            connection.exec_driver_sql(f"DROP INDEX {index}")
+        connection.exec_driver_sql("UPDATE alembic_version SET version_num = '0006'")
+
+
+def test_migration_under_uploads_loses_none_and_fails_none(catalog: Catalog) -> None:
+    migrate(catalog)
+    back_to_0006(catalog)
+    with catalog.write() as session:
+        map_id = add_map(session).id
+    stored: list[UUID] = []
+    failed: list[Exception] = []
+    stop = threading.Event()
+
+    def upload() -> None:
+        while not stop.is_set():
+            try:
+                with catalog.write() as session:
+                    stored.append(add_photo(session, map_id).id)
+            except Exception as error:
+                failed.append(error)
+                return
+
+    uploaders = [threading.Thread(target=upload) for _ in range(3)]
+    for uploader in uploaders:
+        uploader.start()
+    while len(stored) < 100:
+        time.sleep(0.01)
+    before = len(stored)
+    migrate(catalog)
+    during = len(stored) - before
+    stop.set()
+    for uploader in uploaders:
+        uploader.join()
+    assert not failed
+    assert during > 0, "uploads stood still meanwhile"
+    check_schema(catalog)
+    with catalog.read() as session:
+        assert session.scalar(select(func.count()).select_from(Photo)) == len(stored)
+
+
+def test_migration_gives_way_to_a_lock_and_is_tried_again(catalog: Catalog) -> None:
+    migrate(catalog)
+    with catalog.engine.begin() as connection:
+        connection.exec_driver_sql("DROP TABLE map_figures, schema_compatibility")
+        connection.exec_driver_sql("DROP FUNCTION placewise_trigrams CASCADE")
+        connection.exec_driver_sql("UPDATE alembic_version SET version_num = '0003'")
+    done = threading.Event()
+
+    def run() -> None:
+        migrate(catalog)
+        done.set()
+
+    with catalog.write() as session:
+        # 0006 refers to maps, which takes a lock that this one keeps out.
+        session.execute(text("LOCK TABLE maps IN ROW EXCLUSIVE MODE"))
+        migrating = threading.Thread(target=run)
+        migrating.start()
+        assert not done.wait(2.5), "longer than it waits for a lock"
+    migrating.join(timeout=60)
+    assert done.is_set()
+    check_schema(catalog)
+
+
+def test_lock_that_is_never_free_ends_the_migration(catalog: Catalog) -> None:
+    with catalog.engine.begin() as connection:
+        connection.exec_driver_sql(f"SELECT pg_advisory_xact_lock({schema.ADVISORY_LOCK})")
+        with pytest.raises(Unavailable, match="Another migration"):
+            migrate(catalog, patience_seconds=0.2)
+
+
+def test_broken_off_index_is_built_anew(catalog: Catalog) -> None:
+    migrate(catalog)
+    back_to_0006(catalog)
+    with catalog.engine.begin() as connection:
+        connection.exec_driver_sql("CREATE INDEX ix_photos_map_size ON photos (map_id)")
+        connection.exec_driver_sql(
+            "UPDATE pg_index SET indisvalid = false"
+            " WHERE indexrelid = 'ix_photos_map_size'::regclass"
+        )
+    migrate(catalog)
+    with catalog.read() as session:
+        made = session.scalar(
+            text("SELECT indexdef FROM pg_indexes WHERE indexname = 'ix_photos_map_size'")
+        )
+    assert "size_bytes" in made
+
+
+def test_service_waits_for_the_migration_and_then_starts(catalog: Catalog) -> None:
+    with pytest.raises(Misconfigured, match="placewise migrate") as caught:
+        wait_for_schema(catalog, 0.1)
+    assert caught.value.code == "schema_outdated"
+    waiting = threading.Thread(target=wait_for_schema, args=(catalog, 60))
+    waiting.start()
+    migrate(catalog)
+    waiting.join(timeout=30)
+    assert not waiting.is_alive()
+
+
+def test_schema_of_a_later_release_is_fine_until_it_is_no_longer_understood(
+    catalog: Catalog,
+) -> None:
+    migrate(catalog)
+    with catalog.engine.begin() as connection:
+        connection.exec_driver_sql("UPDATE alembic_version SET version_num = '9998'")
+    check_schema(catalog)
+    with catalog.engine.begin() as connection:
+        connection.exec_driver_sql("UPDATE schema_compatibility SET understood_from = '9998'")
+    with pytest.raises(Misconfigured) as caught:
+        wait_for_schema(catalog, 60)
+    assert caught.value.code == "schema_too_new"
+
+
+def test_catalog_that_is_away_is_waited_for(catalog: Catalog) -> None:
+    nowhere = Catalog("postgresql+psycopg://nobody@127.0.0.1:1/none", Pool(connect_seconds=2))
+    with pytest.raises(Unavailable) as caught:
+        wait_for_schema(nowhere, 0.1)
+    assert caught.value.code == "catalog_unavailable"
+    nowhere.close()

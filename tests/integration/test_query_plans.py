@@ -1,0 +1,54 @@
+"""Every statement that the services send finds its rows by an index."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from services.cli.bench_catalog.calls import READS_EVERYTHING, call_everything
+from services.cli.bench_catalog.explain import Explainer
+from services.cli.bench_catalog.fill import fill
+from shared.catalog.connections import Limits, Pool
+from shared.catalog.session import Catalog
+from tests.support.servers import PostgresServer
+
+# The first map has more rows than any statement may read: one that reads it all stands out.
+PHOTOS = 60_000
+
+
+def test_no_statement_reads_a_whole_map(
+    postgres: PostgresServer, migrated_postgres: str, tmp_path: Path
+) -> None:
+    catalog = Catalog(postgres.new_database(migrated_postgres), Pool(), Limits(250, 250))
+    try:
+        filled = fill(catalog, PHOTOS)
+        explainer = Explainer(catalog, small=True)
+        calls = list(call_everything(catalog, filled, explainer, tmp_path))
+    finally:
+        catalog.close()
+    assert {e.call for e in explainer.found} >= set(calls) - {
+        "steward: fit maps that wait",
+        "steward: evaluate changed maps",
+    }, "every call asks something"
+    assert set(READS_EVERYTHING) <= set(calls), "an exception that is none any more"
+    faulty = {
+        f"{e.call}: {e.faults()} {e.scans} {e.sql}"
+        for e in explainer.found
+        if e.faults() and e.call not in READS_EVERYTHING
+    }
+    assert not faulty, "\n".join(sorted(faulty))
+
+
+def test_missing_index_is_noticed(
+    postgres: PostgresServer, migrated_postgres: str, tmp_path: Path
+) -> None:
+    catalog = Catalog(postgres.new_database(migrated_postgres), Pool(), Limits(250, 250))
+    try:
+        filled = fill(catalog, PHOTOS)
+        with catalog.engine.begin() as connection:
+            connection.exec_driver_sql("DROP INDEX ix_photos_tags")
+        explainer = Explainer(catalog, small=True)
+        for _ in call_everything(catalog, filled, explainer, tmp_path):
+            pass
+    finally:
+        catalog.close()
+    assert any("tags" in e.call and e.faults() for e in explainer.found)
