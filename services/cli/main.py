@@ -16,6 +16,7 @@ from services.cli import (
     import_anyloc,
     index,
     maps,
+    migrate,
     processes,
     search,
     serve,
@@ -35,6 +36,7 @@ app.command("search")(search.search)
 app.command("gateway")(processes.gateway)
 app.command("extractor")(processes.extractor)
 app.command("steward")(processes.steward)
+app.command("migrate")(migrate.migrate)
 app.command("index")(index.index)
 app.command("import-anyloc")(import_anyloc.import_anyloc)
 app.command("query")(ask.query)

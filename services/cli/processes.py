@@ -1,6 +1,7 @@
 """`placewise gateway|extractor|steward`: services in processes of their own (`search` is beside).
 
-They share DATABASE_URL (PostgreSQL), REDIS_URL, the object store, and SEARCH_URLS.
+They share DATABASE_URL (PostgreSQL), REDIS_URL, the object store, and SEARCH_URLS. What only one of
+them needs is imported there: each has an image of its own, with its own packages.
 """
 
 from __future__ import annotations
@@ -11,20 +12,21 @@ import signal
 import socket
 import threading
 from collections.abc import Iterator
+from typing import TYPE_CHECKING
 
 from services.cli.configuration import read_settings
 from services.cli.output import explained, messages
 from services.cli.serve import set_log_levels
-from services.http_server import http_server, listening, stopped_by_signals, url_of
 from services.parts import start_part
+from shared.catalog.installation import open_own_store
 from shared.catalog.maps import ensure_default_map
 from shared.catalog.session import Catalog
 from shared.errors import Misconfigured
-from shared.jobs.celery_app import make_celery
-from shared.jobs.celery_hints import CeleryHints
-from shared.objects.open_store import open_store
 from shared.search_http import HttpSearch
 from shared.settings import Settings
+
+if TYPE_CHECKING:
+    from shared.jobs.celery_hints import CeleryHints
 
 
 def gateway() -> None:
@@ -33,6 +35,7 @@ def gateway() -> None:
         from services.gateway.app import create_app
         from services.gateway.context import Gateway
         from services.gateway.keys import keys_of
+        from services.http_server import http_server, listening, stopped_by_signals, url_of
 
         with (
             listening(settings.host, settings.port) as listener,
@@ -43,7 +46,7 @@ def gateway() -> None:
             keys = keys_of(settings)
             with catalog.write() as session:
                 ensure_default_map(session, settings.new_map_extractor)
-            store = open_store(settings, alone=False)
+            store = open_own_store(catalog, settings, alone=False)
             app = create_app(Gateway(catalog, store, hints, search, settings, keys))
             server = http_server(app, access_log=settings.debug)
             messages.print(f"Placewise gateway serves {url}", soft_wrap=True)
@@ -56,7 +59,7 @@ def extractor() -> None:
     with _service() as (settings, catalog):
         from services.extractor.service import serve_extractor  # brings torch
 
-        serve_extractor(catalog, open_store(settings, alone=False), settings)
+        serve_extractor(catalog, open_own_store(catalog, settings, alone=False), settings)
 
 
 def steward() -> None:
@@ -74,7 +77,7 @@ def steward() -> None:
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, lambda *_: stop.set())
         with _hints(settings) as hints, _search(settings) as search:
-            store = open_store(settings, alone=False)
+            store = open_own_store(catalog, settings, alone=False)
             name = f"steward-{socket.gethostname()}-{os.getpid()}"
             evaluator = Evaluator(catalog, search, settings, name)
             duties = Steward(catalog, store, hints, settings)
@@ -105,6 +108,9 @@ def _service() -> Iterator[tuple[Settings, Catalog]]:
 
 @contextlib.contextmanager
 def _hints(settings: Settings) -> Iterator[CeleryHints]:
+    from shared.jobs.celery_app import make_celery
+    from shared.jobs.celery_hints import CeleryHints
+
     hints = CeleryHints(make_celery(settings), settings)
     try:
         yield hints

@@ -17,14 +17,14 @@ def search() -> None:
         settings = read_settings()
         # Imported only here: the other commands need no server.
         from services.search.server import search_service
+        from shared.catalog.installation import open_own_store
         from shared.catalog.session import Catalog
-        from shared.objects.open_store import open_store
 
         set_log_levels(settings.debug)
         catalog = Catalog(settings.catalog_url())
         try:
             catalog.migrate()
-            store = open_store(settings, alone=False)  # others write there while this one reads
+            store = open_own_store(catalog, settings, alone=False)  # others write there meanwhile
             with search_service(settings, catalog, store) as running:
                 messages.print(
                     f"Placewise search serves shard {settings.shard} on {running.url}\n"

@@ -16,6 +16,7 @@ from celery import signals
 
 from services.extractor.worker import ExtractorWorker
 from shared.catalog.session import Catalog
+from shared.heartbeat import Heartbeat
 from shared.jobs.celery_app import DRAIN_TASK, make_celery
 from shared.jobs.celery_hints import CeleryHints
 from shared.jobs.hints import Lane
@@ -31,6 +32,7 @@ def serve_extractor(catalog: Catalog, store: ObjectStore, settings: Settings) ->
     hints = CeleryHints(app, settings)
     name = f"extractor-{socket.gethostname()}-{os.getpid()}"
     worker = ExtractorWorker(catalog, store, settings, name)
+    heartbeat = Heartbeat(settings.heartbeat_file)
     stop = threading.Event()
 
     def drain() -> dict[str, Any]:
@@ -46,7 +48,12 @@ def serve_extractor(catalog: Catalog, store: ObjectStore, settings: Settings) ->
     def on_shutdown(**_: object) -> None:
         stop.set()
 
+    def on_heartbeat(**_: object) -> None:
+        heartbeat.beat()
+
     signals.worker_shutting_down.connect(on_shutdown, weak=False)
+    # Sent every two seconds from the loop that takes hints, while it is connected to Redis.
+    signals.heartbeat_sent.connect(on_heartbeat, weak=False)
     try:
         worker.warm_up()
         for lane in Lane:
@@ -65,6 +72,7 @@ def serve_extractor(catalog: Catalog, store: ObjectStore, settings: Settings) ->
         )
     finally:
         signals.worker_shutting_down.disconnect(on_shutdown)
+        signals.heartbeat_sent.disconnect(on_heartbeat)
         stop.set()
         worker.close()
         hints.close()

@@ -17,6 +17,7 @@ from services.steward.queue import free_leases, resend_hints
 from services.steward.retention import forget_old_jobs, forget_old_searches
 from services.steward.search_workers import remove_dead_workers
 from shared.catalog.session import Catalog
+from shared.heartbeat import Heartbeat
 from shared.jobs import Hints
 from shared.objects import ObjectStore
 from shared.settings import Settings
@@ -40,6 +41,7 @@ class Steward:
     def __init__(
         self, catalog: Catalog, store: ObjectStore, hints: Hints, settings: Settings
     ) -> None:
+        self._heartbeat = Heartbeat(settings.heartbeat_file)
         self.duties = [
             Duty("free leases", 1.0, lambda: free_leases(catalog, settings.max_attempts)),
             Duty("resend hints", 2.0, lambda: resend_hints(catalog, hints)),
@@ -85,6 +87,7 @@ class Steward:
             for duty in self.duties:
                 if time.monotonic() >= duty.due and not stop.is_set():
                     self._do(duty)
+                    self._heartbeat.beat()
             stop.wait(TICK_SECONDS)
 
     def _do(self, duty: Duty) -> None:

@@ -3,6 +3,7 @@
 from shared.catalog.chunks import Chunk, Descriptor
 from shared.catalog.evaluations import Evaluation
 from shared.catalog.generations import Generation
+from shared.catalog.installation import Installation
 from shared.catalog.maps import Map
 from shared.catalog.models import Model
 from shared.catalog.photos import Photo
@@ -16,6 +17,7 @@ __all__ = [
     "Descriptor",
     "Evaluation",
     "Generation",
+    "Installation",
     "Job",
     "Map",
     "Model",

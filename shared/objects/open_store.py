@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from shared.objects.bucket_owner import check_no_bucket
 from shared.objects.folder import FolderStore
 from shared.objects.port import ObjectStore
 from shared.objects.s3 import Bucket, S3Store
@@ -14,13 +13,12 @@ def open_store(settings: Settings, *, alone: bool = True) -> ObjectStore:
     """The bucket at S3_ENDPOINT, else the folder PLACEWISE_HOME/objects with UPLOAD_DIR.
 
     `alone` says that no other process writes there: a folder is then tidied of half-written files.
-    Asks nothing of an S3 server: `check` does. Raises Misconfigured as `place_originals` does,
-    and `object_store_changed` for a folder whose objects lie in a bucket.
+    Asks nothing of an S3 server: `check` does. Whether the store is the catalog's own is for
+    `shared.catalog.installation` to say. Raises Misconfigured as `place_originals` does.
     """
     if settings.s3_endpoint is not None:
         return S3Store(Bucket.of(settings))
     home = settings.placewise_home
-    check_no_bucket(home)
     objects = home / "objects"
     elsewhere = place_originals(home, objects, settings.upload_dir)
     return FolderStore(objects, elsewhere, alone=alone)
