@@ -68,9 +68,9 @@ def test_compose_file_makes_a_placewise_that_works_and_ends_in_time(
 
     # The passwords are asked for.
     assert machine.run_once("create-bucket", S3_SECRET_KEY="another") == 1
-    with Redis.from_url(f"redis://127.0.0.1:{machine.port('redis')}") as stranger:
-        with pytest.raises(RedisError):
-            stranger.ping()
+    redis = f"redis://127.0.0.1:{machine.port('redis')}"
+    with Redis.from_url(redis) as stranger, pytest.raises(RedisError):
+        stranger.ping()
 
     for service in AT_WORK:
         machine.start(service)

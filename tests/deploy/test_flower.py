@@ -97,18 +97,18 @@ def test_flower_shows_what_a_drain_did_and_only_to_who_has_the_password(
     )
     machine.wait_until_healthy("extractor")
 
-    # Also when the drain came before Flower had heard of the worker.
     settings = Settings(
         redis_url=f"redis://:{values['REDIS_PASSWORD']}@127.0.0.1:{machine.port('redis')}/0"
     )
     app = make_celery(settings)
     hints = CeleryHints(app, settings)
     try:
-        until(lambda: flower.get("/api/workers").json())
+        until(lambda: flower.get("/workers", params={"json": "1"}).json()["data"])
         for number in range(PHOTOS, 2 * PHOTOS):
             upload(catalog_on_postgres, store, map_id, photo_bytes(number))
         hints.send(Lane.BULK)
 
+        # Drains of before Flower heard of the worker need not be there.
         def drains() -> list[dict[str, Any]]:
             tasks = flower.get("/api/tasks").json().values()
             done = [task for task in tasks if task["state"] == "SUCCESS"]
@@ -128,12 +128,8 @@ def test_flower_shows_what_a_drain_did_and_only_to_who_has_the_password(
         assert list(answers.values()) == [{"ok": "pong"}]
         # What it shows can't be changed by it.
         name = next(iter(answers))
-        assert flower.post(f"/api/worker/shutdown/{name}").status_code in (403, 404, 405)
-        assert flower.post(f"/api/task/send-task/{DRAIN_TASK}", json={}).status_code in (
-            403,
-            404,
-            405,
-        )
+        for path in (f"/api/worker/shutdown/{name}", f"/api/task/send-task/{DRAIN_TASK}"):
+            assert flower.post(path).status_code == 403
     finally:
         hints.close()
         app.close()
