@@ -132,10 +132,18 @@ def test_no_manifest_holds_a_secret_and_each_service_gets_only_its_own(build: st
 
 
 @EACH
-def test_whoever_asks_search_knows_every_shard(build: str) -> None:
+def test_whoever_asks_search_knows_every_worker_that_may_be_there(build: str) -> None:
     workers = of_kind(build, "StatefulSet")
     (config,) = of_kind(build, "ConfigMap").values()
-    urls = {f"http://{name}:8000" for name in workers}
+    scaled = of_kind(build, "HorizontalPodAutoscaler")
+    urls = {
+        f"http://{name}-{number}.{worker['spec']['serviceName']}:8000"
+        for name, worker in workers.items()
+        for number in range(scaled[name]["spec"]["maxReplicas"])
+    }
+    for worker in workers.values():
+        service = of_kind(build, "Service")[worker["spec"]["serviceName"]]
+        assert service["spec"]["clusterIP"] == "None"
     assert set(config["data"]["SEARCH_URLS"].split(",")) == urls
     shards = {variables(worker)["SEARCH_SHARD"]["value"] for worker in workers.values()}
     assert shards == {f"{number}/{len(workers)}" for number in range(len(workers))}
