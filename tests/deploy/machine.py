@@ -6,6 +6,7 @@ things are is exchanged: a service's host and port, and the folders that are its
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import signal
@@ -116,7 +117,8 @@ class Machine:
 
     def close(self) -> None:
         for process in self._running.values():
-            process.kill()
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)  # with its children
         for process in self._running.values():
             process.wait()
 

@@ -117,7 +117,6 @@ def test_compose_file_makes_a_placewise_that_works_and_ends_in_time(
     for service in ("gateway", "extractor", "search-0", "steward"):
         assert machine.stop(service) == 0, machine.log(service)
         assert "Traceback" not in machine.log(service)
-    machine.stop("objects")
 
 
 def ended(client: httpx2.Client, job_id: str) -> Any:
