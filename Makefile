@@ -12,7 +12,7 @@ UV_VERSION := 0.13.8
 INSTALLED := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help setup run test lint types bench demo clean
+.PHONY: help setup run test lint types bench demo env clean
 
 help: ## list the targets
 	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | awk -F':.*## ' '{printf "  make %-8s %s\n", $$1, $$2}'
@@ -54,6 +54,11 @@ bench: $(INSTALLED) ## time the main job: upload, describe, search
 
 demo: $(INSTALLED) ## draw a city, index it, fit, ask, print recall, write docs/demo.jpg
 	$(BIN)/python -m benchmarks.demo --picture docs/demo.jpg
+
+env: ## write .env for docker compose, with fresh secrets (one that is there stays as it is)
+	@test ! -e .env || { echo ".env is there already"; exit 1; }
+	@umask 077 && $(PYTHON) -c 'import re, secrets; print(re.sub(r"(?m)^([A-Z0-9_]+=)$$", lambda name: name[1] + secrets.token_hex(20), open(".env.example").read()), end="")' > .env
+	@echo "Written: .env. Next: docker compose up --build --detach"
 
 clean: ## remove the environment and what tools left behind (your data under PLACEWISE_HOME stays)
 	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis

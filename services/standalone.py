@@ -37,6 +37,7 @@ from services.steward.loop import Steward
 from services.steward.queue import free_leases
 from shared.admin_key import AdminKey, admin_key, hash_key, is_loopback, new_local_key
 from shared.catalog.connections import Limits
+from shared.catalog.installation import open_own_store
 from shared.catalog.maps import ensure_default_map
 from shared.catalog.schema import migrate
 from shared.catalog.search_workers import forget_dead_workers
@@ -44,9 +45,6 @@ from shared.catalog.session import open_catalog
 from shared.errors import Misconfigured
 from shared.home import announced, lock_home
 from shared.jobs import InProcessHints
-from shared.objects.bucket_owner import claim_bucket
-from shared.objects.open_store import open_store
-from shared.objects.s3 import S3Store
 from shared.settings import Settings
 
 log = logging.getLogger(__name__)
@@ -87,8 +85,8 @@ def standalone(settings: Settings, *, new_key: bool = False) -> Iterator[Standal
     Beyond loopback, or with an ADMIN_KEY, every call needs a key; `new_key` replaces the one that
     an earlier start has made. Raises Misconfigured: `home_in_use` for a folder that another server
     has, `address_in_use`, `separate_services` where SEARCH_URLS is set, `no_key_needed` for a new
-    key on loopback, and those of `admin_key`, `open_store` and `claim_bucket`; Unavailable for a
-    bucket that can't be used.
+    key on loopback, and those of `admin_key` and `open_own_store`; Unavailable for a bucket that
+    can't be used.
     """
     if settings.search_addresses:
         raise Misconfigured(
@@ -102,11 +100,9 @@ def standalone(settings: Settings, *, new_key: bool = False) -> Iterator[Standal
         held.enter_context(lock_home(home))
         listener = held.enter_context(listening(settings.host, settings.port))
         catalog = open_catalog(settings, "embedded")
-        store = open_store(settings)
-        if isinstance(store, S3Store):
-            claim_bucket(home, store)
-        hints = InProcessHints()
         migrate(catalog)
+        store = open_own_store(catalog, settings, alone=True)
+        hints = InProcessHints()
         with catalog.write() as session:
             ensure_default_map(session, settings.new_map_extractor)
             # The lock says that no other worker lives: what is there is left by a killed process.

@@ -105,6 +105,12 @@ class Settings(BaseSettings):
         None, description="Redis that carries hints between services; unset: one process"
     )
 
+    heartbeat_file: Path | None = Field(
+        None,
+        description="file that an extractor or steward of its own touches while it works, for "
+        "health checks; unset: none",
+    )
+
     # What is accepted.
     max_file_size: int = Field(10_485_760, gt=0, description="bytes of one photo")
     max_image_pixels: int = Field(50_000_000, gt=0, description="width x height of one photo")

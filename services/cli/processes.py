@@ -1,6 +1,7 @@
 """`placewise gateway|extractor|steward`: services in processes of their own (`search` is beside).
 
-They share DATABASE_URL (PostgreSQL), REDIS_URL, the object store, and SEARCH_URLS.
+They share DATABASE_URL (PostgreSQL), REDIS_URL, the object store, and SEARCH_URLS. What only one of
+them needs is imported there: each has an image of its own, with its own packages.
 """
 
 from __future__ import annotations
@@ -11,23 +12,24 @@ import signal
 import socket
 import threading
 from collections.abc import Iterator
+from typing import TYPE_CHECKING
 
 from services.cli.configuration import read_settings
 from services.cli.output import explained, messages
 from services.cli.serve import set_log_levels
-from services.http_server import http_server, listening, stopped_by_signals, url_of
 from services.parts import start_part
 from shared.catalog.connections import Limits
+from shared.catalog.installation import ensure_installation, open_own_store
 from shared.catalog.maps import ensure_default_map
 from shared.catalog.schema import migrate as migrate_catalog
 from shared.catalog.schema import wait_for_schema
 from shared.catalog.session import Catalog, open_catalog
 from shared.errors import Misconfigured
-from shared.jobs.celery_app import make_celery
-from shared.jobs.celery_hints import CeleryHints
-from shared.objects.open_store import open_store
 from shared.search_http import HttpSearch
 from shared.settings import Settings
+
+if TYPE_CHECKING:
+    from shared.jobs.celery_hints import CeleryHints
 
 
 def gateway() -> None:
@@ -36,6 +38,7 @@ def gateway() -> None:
         from services.gateway.app import create_app
         from services.gateway.context import Gateway
         from services.gateway.keys import keys_of
+        from services.http_server import http_server, listening, stopped_by_signals, url_of
 
         with (
             listening(settings.host, settings.port) as listener,
@@ -46,7 +49,7 @@ def gateway() -> None:
             keys = keys_of(settings)
             with catalog.write() as session:
                 ensure_default_map(session, settings.new_map_extractor)
-            store = open_store(settings, alone=False)
+            store = open_own_store(catalog, settings, alone=False)
             requests = catalog.limited(Limits.of_requests(settings))
             context = Gateway(requests, store, hints, search, settings, keys)
             server = http_server(
@@ -66,7 +69,7 @@ def extractor() -> None:
 
         serve_extractor(
             catalog,
-            open_store(settings, alone=False),
+            open_own_store(catalog, settings, alone=False),
             settings,
             lambda: messages.print("Placewise extractor is at work"),
         )
@@ -88,7 +91,7 @@ def steward() -> None:
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, lambda *_: stop.set())
         with _hints(settings) as hints, _search(settings) as search:
-            store = open_store(settings, alone=False)
+            store = open_own_store(catalog, settings, alone=False)
             name = f"steward-{socket.gethostname()}-{os.getpid()}"
             evaluator = Evaluator(catalog, search, settings, name)
             batches = BatchWorker(catalog, store, hints, settings, name)
@@ -114,9 +117,11 @@ def migrate() -> None:
         catalog = open_catalog(settings, "migrate")
         try:
             migrate_catalog(catalog)
+            with catalog.write() as session:
+                installation = ensure_installation(session)
         finally:
             catalog.close()
-    messages.print("The catalog's schema is up to date")
+    messages.print(f"The catalog's schema is up to date (installation {installation.id})")
 
 
 @contextlib.contextmanager
@@ -135,6 +140,9 @@ def _service(name: str) -> Iterator[tuple[Settings, Catalog]]:
 
 @contextlib.contextmanager
 def _hints(settings: Settings) -> Iterator[CeleryHints]:
+    from shared.jobs.celery_app import make_celery
+    from shared.jobs.celery_hints import CeleryHints
+
     hints = CeleryHints(make_celery(settings), settings)
     try:
         yield hints

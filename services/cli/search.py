@@ -17,15 +17,15 @@ def search() -> None:
         settings = read_settings()
         # Imported only here: the other commands need no server.
         from services.search.server import search_service
+        from shared.catalog.installation import open_own_store
         from shared.catalog.schema import wait_for_schema
         from shared.catalog.session import open_catalog
-        from shared.objects.open_store import open_store
 
         set_log_levels(settings.debug)
         catalog = open_catalog(settings, "search")
         try:
             wait_for_schema(catalog, settings.schema_wait_seconds)
-            store = open_store(settings, alone=False)  # others write there while this one reads
+            store = open_own_store(catalog, settings, alone=False)  # others write there meanwhile
             with search_service(settings, catalog, store) as running:
                 messages.print(
                     f"Placewise search serves shard {settings.shard} on {running.url}\n"

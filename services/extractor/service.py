@@ -19,6 +19,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from services.extractor.worker import AWAY_SECONDS, DrainResult, ExtractorWorker
 from shared.catalog.away import Outage
 from shared.catalog.session import Catalog
+from shared.heartbeat import Heartbeat
 from shared.jobs.celery_app import DRAIN_TASK, make_celery
 from shared.jobs.celery_hints import CeleryHints
 from shared.jobs.hints import Lane
@@ -42,6 +43,7 @@ def serve_extractor(
     hints = CeleryHints(app, settings)
     name = f"extractor-{socket.gethostname()}-{os.getpid()}"
     worker = ExtractorWorker(catalog, store, settings, name)
+    heartbeat = Heartbeat(settings.heartbeat_file)
     stop = threading.Event()
 
     outage = Outage("extractor")
@@ -69,8 +71,13 @@ def serve_extractor(
     def on_worker_ready(**_: object) -> None:
         on_ready()
 
+    def on_heartbeat(**_: object) -> None:
+        heartbeat.beat()
+
     signals.worker_shutting_down.connect(on_shutdown, weak=False)
     signals.worker_ready.connect(on_worker_ready, weak=False)
+    # Sent every two seconds from the loop that takes hints, while it is connected to Redis.
+    signals.heartbeat_sent.connect(on_heartbeat, weak=False)
     try:
         worker.warm_up()
         for lane in Lane:
@@ -90,6 +97,7 @@ def serve_extractor(
     finally:
         signals.worker_shutting_down.disconnect(on_shutdown)
         signals.worker_ready.disconnect(on_worker_ready)
+        signals.heartbeat_sent.disconnect(on_heartbeat)
         stop.set()
         worker.close()
         hints.close()

@@ -32,6 +32,7 @@ from shared.catalog.generations import active_generation
 from shared.catalog.maps import lock_map
 from shared.catalog.session import Catalog
 from shared.errors import Conflict, PlacewiseError, Unavailable
+from shared.heartbeat import Heartbeat
 from shared.jobs import InProcessHints, Job, Priority, begin, claim, hold_lease
 from shared.jobs.finish import fail, release
 from shared.jobs.leases import fallen, held
@@ -102,6 +103,7 @@ class ExtractorWorker:
         self._catalog = catalog
         self._store = store
         self._settings = settings
+        self._heartbeat = Heartbeat(settings.heartbeat_file)
         self._name = name
         self._only_worker = only_worker
         self._models = LoadedModels(store, settings)
@@ -173,6 +175,7 @@ class ExtractorWorker:
 
     def _take(self, result: DrainResult, least_priority: int | None = None) -> Work | None:
         settings = self._settings
+        self._heartbeat.beat()  # before and after each batch: a drain may last for several
         with self._catalog.write() as session:
             jobs = claim(
                 session,

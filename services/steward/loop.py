@@ -21,6 +21,7 @@ from services.steward.retention import forget_old_jobs, forget_old_keys, forget_
 from services.steward.search_workers import remove_dead_workers
 from shared.catalog.away import Outage
 from shared.catalog.session import Catalog
+from shared.heartbeat import Heartbeat
 from shared.jobs import Hints
 from shared.objects import ObjectStore
 from shared.settings import Settings
@@ -45,6 +46,7 @@ class Steward:
         self, catalog: Catalog, store: ObjectStore, hints: Hints, settings: Settings
     ) -> None:
         self._outage = Outage("steward")
+        self._heartbeat = Heartbeat(settings.heartbeat_file)
         self.duties = [
             Duty("free leases", 1.0, lambda: free_leases(catalog, settings.max_attempts)),
             Duty("resend hints", 2.0, lambda: resend_hints(catalog, hints)),
@@ -92,6 +94,7 @@ class Steward:
             for duty in self.duties:
                 if time.monotonic() >= duty.due and not stop.is_set():
                     self._do(duty)
+                    self._heartbeat.beat()
             stop.wait(TICK_SECONDS)
 
     def _do(self, duty: Duty) -> None:

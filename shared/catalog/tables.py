@@ -6,6 +6,7 @@ from shared.catalog.evaluations import Evaluation
 from shared.catalog.figures import MapFigures
 from shared.catalog.generations import Generation
 from shared.catalog.idempotency import KeyedCall
+from shared.catalog.installation import Installation
 from shared.catalog.maps import Map
 from shared.catalog.models import Model
 from shared.catalog.photos import Photo
@@ -23,6 +24,7 @@ __all__ = [
     "DirectUpload",
     "Evaluation",
     "Generation",
+    "Installation",
     "Job",
     "KeyedCall",
     "Map",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from shared.objects.bucket_owner import check_no_bucket
 from shared.objects.folder import FolderStore
 from shared.objects.keys import check_import_prefix
 from shared.objects.port import ObjectStore
@@ -15,15 +14,14 @@ def open_store(settings: Settings, *, alone: bool = True) -> ObjectStore:
     """The bucket at S3_ENDPOINT, else the folder PLACEWISE_HOME/objects with UPLOAD_DIR.
 
     `alone` says that no other process writes there: a folder is then tidied of half-written files.
-    Asks nothing of an S3 server: `check` does. Raises Misconfigured as `place_originals` does,
-    `object_store_changed` for a folder whose objects lie in a bucket, and `bad_setting` for an
-    IMPORT_PREFIX that is none.
+    Asks nothing of an S3 server: `check` does. Whether the store is the catalog's own is for
+    `shared.catalog.installation` to say. Raises Misconfigured as `place_originals` does, and
+    `bad_setting` for an IMPORT_PREFIX that is none.
     """
     check_import_prefix(settings.import_prefix)
     if settings.s3_endpoint is not None:
         return S3Store(Bucket.of(settings))
     home = settings.placewise_home
-    check_no_bucket(home)
     objects = home / "objects"
     elsewhere = place_originals(home, objects, settings.upload_dir)
     return FolderStore(objects, elsewhere, alone=alone)

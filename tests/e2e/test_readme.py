@@ -118,7 +118,7 @@ def test_every_command_of_the_readme_does_what_the_readme_shows(place: Path, por
 
 
 @pytest.mark.parametrize(
-    "target", ["help", "setup", "run", "test", "lint", "types", "bench", "demo", "clean"]
+    "target", ["help", "setup", "run", "test", "lint", "types", "bench", "demo", "env", "clean"]
 )
 def test_make_knows_the_target(target: str) -> None:
     subprocess.run(["make", "-n", target], cwd=REPOSITORY, check=True, capture_output=True)
@@ -126,7 +126,7 @@ def test_make_knows_the_target(target: str) -> None:
 
 def test_make_alone_lists_the_targets() -> None:
     done = subprocess.run(["make"], cwd=REPOSITORY, check=True, capture_output=True, text=True)
-    for target in ("setup", "run", "test", "lint", "types", "bench", "demo", "clean"):
+    for target in ("setup", "run", "test", "lint", "types", "bench", "demo", "env", "clean"):
         assert f"make {target} " in done.stdout
 
 

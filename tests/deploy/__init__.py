@@ -1,0 +1,1 @@
+"""The deployment files, checked without the machines that they are for."""

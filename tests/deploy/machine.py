@@ -1,0 +1,171 @@
+"""The services of docker-compose.yml as processes of this machine, on the ports that are free.
+
+A service's command, environment and health check are taken from the file as they stand. Only where
+things are is exchanged: a service's host and port, and the folders that are its own in a container.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Mapping
+from pathlib import Path
+
+from tests.deploy.composition import Json, seconds
+from tests.support.server import environment
+from tests.support.servers.daemon import free_ports
+from tests.support.servers.programs import find_redis, find_weed
+
+START_SECONDS = 90.0
+WEED_PORTS = ("master.port", "volume.port", "filer.port")
+# What the images of others bring along.
+WGET = """#!{python}
+import sys, urllib.request
+target, url = sys.argv[-2:]
+data = urllib.request.urlopen(url, timeout=5).read()
+target == "-" and sys.stdout.buffer.write(data)
+"""
+
+
+class Machine:
+    """`start` a service, ask for its health, `stop` it as an orchestrator would."""
+
+    def __init__(self, root: Path, services: Mapping[str, Json], places: Mapping[str, str]) -> None:
+        """`places` says where servers of others are: {"postgres:5432": "127.0.0.1:18123"}."""
+        self.root = root
+        self._services = services
+        self._ports = dict(zip(services, free_ports(len(services)), strict=True))
+        self._places = dict(places)
+        for name in services:
+            for inside in ("8000", "6379", "8333", "5555"):
+                self._places.setdefault(f"{name}:{inside}", f"127.0.0.1:{self._ports[name]}")
+        self._running: dict[str, subprocess.Popen[bytes]] = {}
+        self._programs = root / "bin"
+        self._programs.mkdir(parents=True)
+        self._install()
+
+    def port(self, service: str) -> int:
+        return self._ports[service]
+
+    def url(self, service: str) -> str:
+        return f"http://127.0.0.1:{self.port(service)}"
+
+    def run_once(self, service: str, **changed: str) -> int:
+        """The exit code of a service that ends by itself."""
+        self.start(service, **changed)
+        return self._running.pop(service).wait(timeout=START_SECONDS)
+
+    def start(self, service: str, **changed: str) -> None:
+        """`changed` are variables that are to be other than the file says."""
+        of = self._services[service]
+        command = [*(of.get("entrypoint") or []), *(of["command"] or [])]
+        with self._log(service).open("ab") as log:
+            self._running[service] = subprocess.Popen(
+                [self._here(service, part) for part in command],
+                env={**self._environment(service), **changed},
+                cwd=self.folder(service),
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                start_new_session=True,
+            )
+
+    def is_healthy(self, service: str) -> bool:
+        """What the service's own check says, within the time that it has."""
+        check = self._services[service]["healthcheck"]
+        kind, *test = check["test"]
+        command = test if kind == "CMD" else ["sh", "-c", *test]
+        done = subprocess.run(
+            [self._here(service, part) for part in command],
+            env=self._environment(service),
+            cwd=self.folder(service),
+            capture_output=True,
+            # Twice: this machine is shared by tests.
+            timeout=2 * seconds(check["timeout"]),
+            check=False,
+        )
+        return done.returncode == 0
+
+    def wait_until_healthy(self, *services: str) -> None:
+        deadline = time.monotonic() + START_SECONDS
+        for service in services:
+            while not self.is_healthy(service):
+                assert self._running[service].poll() is None, f"{service}: {self.log(service)}"
+                assert time.monotonic() < deadline, f"{service}: {self.log(service)}"
+                time.sleep(0.2)
+
+    def folder(self, service: str) -> Path:
+        """Its /tmp and /data."""
+        folder = self.root / service
+        folder.mkdir(exist_ok=True)
+        return folder
+
+    def stop(self, service: str) -> int:
+        """The stop signal; the exit code. subprocess.TimeoutExpired after the grace period."""
+        of = self._services[service]
+        process = self._running.pop(service)
+        process.send_signal(signal.Signals[of.get("stop_signal", "SIGTERM")])
+        return process.wait(timeout=seconds(of["stop_grace_period"]))
+
+    def log(self, service: str) -> str:
+        return self._log(service).read_text(errors="replace")[-4000:]
+
+    def close(self) -> None:
+        for process in self._running.values():
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)  # with its children
+        for process in self._running.values():
+            process.wait()
+
+    def _here(self, service: str, text: str) -> str:
+        """A command's part or a variable's value, with this machine's places in it."""
+        for inside, here in self._places.items():
+            text = re.sub(rf"(?<![\w.-]){re.escape(inside)}(?!\d)", here, text)
+        own = self._ports[service]
+        text = re.sub(r"127\.0\.0\.1:(8000|8333|5555)(?!\d)", f"127.0.0.1:{own}", text)
+        text = text.replace("127.0.0.1:9333", f"127.0.0.1:{self._weed['master.port']}")
+        return re.sub(r"(?<![\w.])/(tmp|data)\b", str(self.folder(service)), text)
+
+    def _environment(self, service: str) -> dict[str, str]:
+        base = environment(self.folder(service))
+        for name in ("EXTRACTOR", "ALLOW_TEST_EXTRACTORS", "DECODE_PROCESSES", "PLACEWISE_HOME"):
+            del base[name]  # placewise.env and the image say
+        said = self._services[service].get("environment") or {}
+        read = {name: self._here(service, value) for name, value in said.items()}
+        for port in ("PORT", "FLOWER_PORT"):
+            if port in read:
+                read[port] = str(self._ports[service])
+        path = f"{self._programs}:{Path(sys.executable).parent}:{os.environ['PATH']}"
+        home = {"PLACEWISE_HOME": str(self.folder(service))}
+        return {**base, **home, **read, "PATH": path, "REDISCLI_PORT": str(self._ports["redis"])}
+
+    def _log(self, service: str) -> Path:
+        return self.root / f"{service}.log"
+
+    def _install(self) -> None:
+        """The programs of the other images, which listen on their images' ports."""
+        redis, weed = find_redis(), find_weed()
+        assert redis is not None, "no redis-server: make setup"
+        assert weed is not None, "no weed: make setup"
+        flags = [flag for name in WEED_PORTS for flag in (name, f"{name}.grpc")]
+        self._weed = dict(zip(flags, free_ports(len(flags)), strict=True))
+        ports = " ".join(f"-{flag}={port}" for flag, port in self._weed.items())
+        grpc = free_ports(1)[0]
+        mine = f"-s3.port={self._ports['objects']} -s3.port.grpc={grpc}"
+        small = "-master.volumeSizeLimitMB=64 -volume.max=100"
+        port = self._ports["redis"]
+        self._program("redis-server", f'exec {redis} "$@" --port {port} --bind 127.0.0.1')
+        self._program("redis-cli", f'exec {redis.with_name("redis-cli")} -p {port} "$@"')
+        self._program("weed", f'exec {weed} "$@" {ports} {mine} {small}')
+        self._program("wget", WGET.format(python=sys.executable), interpreter="")
+        self._program("python", f'exec {sys.executable} "$@"')
+
+    def _program(self, name: str, text: str, interpreter: str = "#!/bin/sh\n") -> None:
+        file = self._programs / name
+        file.write_text(interpreter + text + "\n")
+        file.chmod(0o755)

@@ -1,0 +1,256 @@
+"""The compose files: valid, complete, closed to whoever is not meant to come in."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+from services.http_server import GRACEFUL_SECONDS
+from shared.settings import Settings
+from tests.deploy.composition import (
+    EMBEDDED,
+    PROFILES,
+    ROOT,
+    SERVICES,
+    Json,
+    make_env,
+    read_by_docker,
+    seconds,
+    services,
+    variables,
+)
+
+BOTH = pytest.mark.parametrize("file", [SERVICES, EMBEDDED], ids=lambda file: file.name)
+REQUIRED = {
+    "ADMIN_KEY",
+    "FLOWER_PASSWORD",
+    "POSTGRES_PASSWORD",
+    "REDIS_PASSWORD",
+    "S3_ACCESS_KEY",
+    "S3_SECRET_KEY",
+}
+OURS = {"gateway", "extractor", "extractor-gpu", "search-0", "search-1", "steward"}
+ONCE = {"migrate", "create-bucket", "own-objects"}
+
+
+@pytest.fixture(scope="module")
+def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("project")
+    make_env(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def values(project: Path) -> dict[str, str]:
+    return variables(project / ".env")
+
+
+@pytest.fixture(scope="module")
+def everything(project: Path, values: dict[str, str]) -> dict[str, Json]:
+    return services(SERVICES, project, values)
+
+
+@pytest.fixture(scope="module")
+def all_services(project: Path, everything: dict[str, Json]) -> dict[str, Json]:
+    return {**everything, **services(EMBEDDED, project, {})}
+
+
+@BOTH
+def test_file_follows_the_compose_specification(file: Path) -> None:
+    command = ["check-jsonschema", "--builtin-schema", "vendor.compose-spec", str(file)]
+    program = str(Path(sys.executable).with_name(command[0]))
+    done = subprocess.run([program, *command[1:]], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_each_choice_of_profiles_is_read_and_has_what_it_says(
+    project: Path, values: dict[str, str]
+) -> None:
+    always = {"gateway", "search-0", "search-1", "steward", "postgres", "redis"}
+    always |= {"migrate", "create-bucket"}
+    more = {
+        "cpu": {"extractor"},
+        "gpu": {"extractor-gpu"},
+        "seaweedfs": {"objects", "own-objects"},
+        "flower": {"flower"},
+    }
+    assert set(more) == set(PROFILES)
+    without = {**values, "COMPOSE_PROFILES": ""}
+    assert set(services(SERVICES, project, without, ())) == always
+    for profile, added in more.items():
+        assert set(services(SERVICES, project, without, (profile,))) == always | added
+    # What `make env` chooses.
+    chosen = always | more["cpu"] | more["seaweedfs"] | more["flower"]
+    assert set(services(SERVICES, project, values, ())) == chosen
+
+
+@pytest.mark.parametrize("missing", sorted(REQUIRED))
+def test_without_a_secret_nothing_starts_and_the_answer_says_what_to_do(
+    missing: str, tmp_path: Path, values: dict[str, str]
+) -> None:
+    for given in ({**values, missing: ""}, {k: v for k, v in values.items() if k != missing}):
+        said = read_by_docker(SERVICES, tmp_path, given, (), "-q")
+        assert said.returncode != 0
+        assert missing in said.stderr
+        assert "make env" in said.stderr
+
+
+def test_make_env_sets_every_secret_anew_and_readable_by_its_user_alone(
+    tmp_path: Path, project: Path, values: dict[str, str]
+) -> None:
+    assert {name for name in REQUIRED if values[name]} == REQUIRED
+    other = variables(make_env(tmp_path))
+    for name in REQUIRED - {"S3_ACCESS_KEY"}:
+        assert len(values[name]) == 40
+        assert other[name] != values[name]
+    assert (project / ".env").stat().st_mode & 0o077 == 0
+
+
+def test_make_env_leaves_an_env_that_is_there(project: Path) -> None:
+    before = (project / ".env").read_text()
+    done = subprocess.run(["make", "env"], cwd=project, capture_output=True, check=False)
+    assert done.returncode != 0
+    assert (project / ".env").read_text() == before
+
+
+def test_no_secret_stands_in_the_files() -> None:
+    for file in (SERVICES, EMBEDDED):
+        for name in REQUIRED:
+            assert f"{name}:-" not in file.read_text().replace("${ADMIN_KEY:-}", "")
+
+
+def test_every_service_runs_without_rights_that_it_does_not_need(
+    all_services: dict[str, Json],
+) -> None:
+    for name, service in all_services.items():
+        assert service["read_only"], name
+        assert service["cap_drop"] == ["ALL"], name
+        assert service["security_opt"] == ["no-new-privileges:true"], name
+        assert not service.get("privileged"), name
+        limits = service["deploy"]["resources"]["limits"]
+        assert {"cpus", "memory", "pids"} <= set(limits), name
+        if name == "own-objects":
+            assert (service["user"], service["cap_add"]) == ("0:0", ["CHOWN"])
+            assert service["network_mode"] == "none"
+        else:
+            assert int(service["user"].split(":")[0]) > 0, name
+            assert not service.get("cap_add"), name
+
+
+def test_every_service_has_a_health_check_or_is_done_once(
+    all_services: dict[str, Json],
+) -> None:
+    for name, service in all_services.items():
+        check = service["healthcheck"]
+        if name in ONCE:
+            assert check["disable"], name
+            assert service["restart"] == "no"
+        else:
+            assert check["test"][0] in ("CMD", "CMD-SHELL"), name
+            assert service["restart"] == "unless-stopped"
+
+
+def test_every_image_has_a_fixed_version(all_services: dict[str, Json]) -> None:
+    for name, service in all_services.items():
+        assert re.search(r":\d+\.\d+", service["image"]), name
+    for base in re.findall(r"^FROM (\S+)", (ROOT / "deploy/Dockerfile").read_text(), re.MULTILINE):
+        assert re.search(r":\d+\.\d+\.\d+-", base), base
+
+
+def test_each_image_is_built_for_the_command_that_it_runs(all_services: dict[str, Json]) -> None:
+    extras = {"placewise": "embedded", "migrate": "gateway", "create-bucket": "gateway"}
+    built = {name: s["build"]["args"] for name, s in all_services.items() if "build" in s}
+    for name, arguments in built.items():
+        service = re.sub(r"-(gpu|\d)$", "", name)
+        assert arguments["SERVICE"] == extras.get(name, service)
+    assert "/cpu" in built["extractor"]["TORCH_INDEX"]
+    assert built["extractor-gpu"]["TORCH_INDEX"] == ""
+    assert all_services["extractor"]["image"] != all_services["extractor-gpu"]["image"]
+
+
+def test_whoever_asks_search_knows_every_shard(everything: dict[str, Json]) -> None:
+    workers = {name: s for name, s in everything.items() if name.startswith("search-")}
+    urls = {f"http://{name}:{s['environment']['PORT']}" for name, s in workers.items()}
+    for name in ("gateway", "steward"):
+        assert set(everything[name]["environment"]["SEARCH_URLS"].split(",")) == urls
+    shards = {s["environment"]["SEARCH_SHARD"] for s in workers.values()}
+    assert shards == {f"{number}/{len(workers)}" for number in range(len(workers))}
+
+
+def test_services_wait_until_the_tables_and_the_bucket_are_made(
+    everything: dict[str, Json],
+) -> None:
+    for name in OURS:
+        waits = everything[name]["depends_on"]
+        for once in ("migrate", "create-bucket"):
+            assert waits[once]["condition"] == "service_completed_successfully", name
+    assert everything["migrate"]["depends_on"]["postgres"]["condition"] == "service_healthy"
+    # Another S3 server may be used, and then this one is not there.
+    assert everything["create-bucket"]["depends_on"]["objects"] == {
+        "condition": "service_healthy",
+        "required": False,
+    }
+
+
+def test_only_the_gateway_and_flower_listen_to_the_machine_and_only_on_loopback(
+    all_services: dict[str, Json],
+) -> None:
+    open_to = {name: s["ports"] for name, s in all_services.items() if s.get("ports")}
+    assert set(open_to) == {"gateway", "flower", "placewise"}
+    for ports in open_to.values():
+        assert {port["host_ip"] for port in ports} == {"127.0.0.1"}
+
+
+def test_the_servers_are_on_a_network_that_leads_nowhere(everything: dict[str, Json]) -> None:
+    assert yaml.safe_load(SERVICES.read_text())["networks"]["inside"]["internal"]
+    servers = {"postgres", "redis", "objects"}
+    assert {n for n, s in everything.items() if set(s.get("networks", {})) == {"inside"}} >= servers
+    # S3_ENDPOINT may be elsewhere.
+    for name in (*OURS, "create-bucket"):
+        assert set(everything[name]["networks"]) == {"inside", "outside"}, name
+
+
+def test_an_extractor_has_time_to_end_its_drain(everything: dict[str, Json]) -> None:
+    for name in ("extractor", "extractor-gpu"):
+        drain_seconds = float(everything[name]["environment"]["DRAIN_SECONDS"])
+        assert seconds(everything[name]["stop_grace_period"]) > drain_seconds + 60
+        # Nor may a drain be taken for a standstill.
+        assert float(everything[name]["healthcheck"]["test"][-1]) > 10 * drain_seconds
+        assert drain_seconds == Settings().drain_seconds
+    for name in ("gateway", "search-0", "search-1"):
+        assert seconds(everything[name]["stop_grace_period"]) > 2 * GRACEFUL_SECONDS
+
+
+def test_redis_forgets_nothing_by_itself(everything: dict[str, Json]) -> None:
+    command = " ".join(everything["redis"]["command"])
+    assert "--appendonly yes" in command
+    assert "--maxmemory-policy noeviction" in command
+    # And its password is on no command line.
+    password = everything["redis"]["environment"]["REDISCLI_AUTH"]
+    assert password
+    assert password not in command
+
+
+def test_another_s3_server_needs_no_change_of_the_file(
+    project: Path, values: dict[str, str]
+) -> None:
+    other = {"COMPOSE_PROFILES": "cpu", "S3_ENDPOINT": "s3.example.com", "S3_SECURE": "true"}
+    found = services(SERVICES, project, {**values, **other}, ())
+    assert "objects" not in found
+    for name in ("gateway", "extractor", "search-0", "steward", "create-bucket"):
+        environment = found[name]["environment"]
+        assert environment["S3_ENDPOINT"] == "s3.example.com"
+        assert environment["S3_SECURE"] == "true"
+
+
+def test_container_file_has_no_known_fault() -> None:
+    hadolint = Path(sys.executable).with_name("hadolint")
+    done = subprocess.run(
+        [hadolint, ROOT / "deploy/Dockerfile"], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stdout
