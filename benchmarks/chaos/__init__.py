@@ -1,11 +1,54 @@
 """The fault suite: photos are uploaded and asked for while parts die, then everything is counted.
 
-    placewise bench chaos --photos 2000 --seconds 600 --seed 1
-
 `faults` says what goes wrong, `traffic` uploads and asks meanwhile, `audit` counts, `run` does one
 fault after the other.
 """
 
-from benchmarks.chaos.run import Report, run_chaos
+from __future__ import annotations
 
-__all__ = ["Report", "run_chaos"]
+import tempfile
+from collections import Counter
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from benchmarks.chaos.faults import every_fault
+from benchmarks.chaos.run import Outcome, Run, run_chaos
+from benchmarks.report import Report
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
+
+__all__ = ["Run", "measure", "run_chaos"]
+
+
+def measure(progress: Progress, *, photos: int, fault_seconds: float, seed: int) -> Report:
+    """Every fault once, in the order that the seed decides."""
+    faults = every_fault()
+    bar = progress.add_task("breaking things", total=len(faults))
+
+    def show(outcome: Outcome) -> None:
+        progress.update(bar, advance=1, description=outcome.fault)
+
+    with tempfile.TemporaryDirectory() as folder:
+        run = run_chaos(
+            Path(folder), photos=photos, fault_seconds=fault_seconds, seed=seed, on_outcome=show
+        )
+    report = Report(f"{photos} photos, {len(run.outcomes)} faults of {len(faults)}, seed {seed}")
+    counted: Counter[str] = Counter()
+    for outcome in run.outcomes:
+        counts = outcome.counts
+        report.add(f"recovered after: {outcome.fault}", outcome.recovery_seconds, "s")
+        counted["calls repeated"] += outcome.refused
+        counted["photos lost"] += counts.lost
+        counted["photos searchable twice"] += counts.twice
+        counted["jobs stuck"] += counts.stuck
+        counted["jobs failed"] += counts.failed
+        counted["chunks torn"] += counts.torn
+        counted["wrong matches"] += outcome.wrong
+        counted["unexpected answers"] += outcome.unexpected
+    report.add("calls repeated", counted.pop("calls repeated", 0))
+    report.add("answers compared", run.asked)
+    for what, count in counted.items():
+        report.add(what, count, at_most=0)
+    report.details = {"fell": [name for o in run.outcomes for name in o.fell], "found": run.details}
+    return report

@@ -82,6 +82,19 @@ def query_latency(
     )
 
 
+@app.command("chaos")
+def chaos(
+    photos: Annotated[int, typer.Option(min=30, help="Uploaded while parts die.")] = 2000,
+    fault_seconds: Annotated[
+        float, typer.Option(min=0.1, help="How long a part stays away, where that has a length.")
+    ] = 30,
+    seed: Annotated[int, typer.Option(help="Decides the order and the moments.")] = 1,
+    as_json: JsonOption = False,
+) -> None:
+    """Is anything lost, doubled, stuck or wrong while every part dies, one after the other?"""
+    _measure("chaos", as_json, photos=photos, fault_seconds=fault_seconds, seed=seed)
+
+
 @app.command("rolling")
 def rolling(as_json: JsonOption = False) -> None:
     """Is a request refused or a job lost while every service is restarted, one after the other?"""
