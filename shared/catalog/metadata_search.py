@@ -94,11 +94,8 @@ def search_metadata(
     """Newest first: up to `limit` live photos after the cursor, and how many match in all, counted
     up to COUNTED_AT_MOST."""
     on_postgres = session.get_bind().dialect.name == "postgresql"
-    conditions = [
-        Photo.map_id == map_id,
-        Photo.deleted_at.is_(None),
-        *wanted.conditions(trigrams=on_postgres),
-    ]
+    live = [Photo.map_id == map_id, Photo.deleted_at.is_(None)]
+    conditions = [*live, *wanted.conditions(trigrams=on_postgres)]
     counted = select(literal(1)).select_from(Photo).where(*conditions).limit(COUNTED_AT_MOST)
     total = session.scalar(select(func.count()).select_from(counted.subquery())) or 0
     page: Select[Photo]
@@ -106,7 +103,7 @@ def search_metadata(
         rare = select(Photo.id).where(*conditions).cte("rare")
         page = select(Photo).join(rare.prefix_with("MATERIALIZED"), rare.c.id == Photo.id)
     else:
-        page = select(Photo).where(*conditions)
+        page = select(Photo).where(*live, *wanted.conditions(trigrams=False))
     if after is not None:
         page = page.where(tuple_(Photo.uploaded_at, Photo.id) < tuple_(*_bound(after)))
     page = page.order_by(Photo.uploaded_at.desc(), Photo.id.desc()).limit(limit)
