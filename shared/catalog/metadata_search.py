@@ -12,7 +12,7 @@ from datetime import datetime
 from uuid import UUID
 
 from sqlalchemy import Select, Uuid, func, literal, or_, select, tuple_
-from sqlalchemy.orm import Session
+from sqlalchemy.orm import Session, aliased
 
 from shared.catalog.base import (
     Condition,
@@ -44,43 +44,43 @@ class MetadataFilter:
     """Where, when and what the photo shows."""
     role: PhotoRole | None = None
 
-    def conditions(self, *, trigrams: bool) -> list[Condition]:
+    def conditions(self, photo: type[Photo] = Photo, *, trigrams: bool) -> list[Condition]:
         """The filter in SQL; `trigrams` where the catalog has an index of them."""
         found: list[Condition] = []
         if self.filename is not None:
-            found.append(Photo.filename.icontains(self.filename, autoescape=True))
+            found.append(photo.filename.icontains(self.filename, autoescape=True))
             if trigrams and len(self.filename) >= TRIGRAM:
                 part = filename_trigrams(literal(self.filename))
-                found.append(filename_trigrams(Photo.filename).bool_op("@>")(part))
+                found.append(filename_trigrams(photo.filename).bool_op("@>")(part))
         if self.upload_after is not None:
-            found.append(Photo.uploaded_at >= self.upload_after)
+            found.append(photo.uploaded_at >= self.upload_after)
         if self.upload_before is not None:
-            found.append(Photo.uploaded_at <= self.upload_before)
+            found.append(photo.uploaded_at <= self.upload_before)
         if self.min_file_size is not None:
-            found.append(Photo.size_bytes >= self.min_file_size)
+            found.append(photo.size_bytes >= self.min_file_size)
         if self.max_file_size is not None:
-            found.append(Photo.size_bytes <= self.max_file_size)
+            found.append(photo.size_bytes <= self.max_file_size)
         if self.role is not None:
-            found.append(Photo.role == self.role)
-        return found + filter_conditions(self.photos)
+            found.append(photo.role == self.role)
+        return found + filter_conditions(self.photos, photo)
 
 
-def filter_conditions(wanted: PhotoFilter) -> list[Condition]:
+def filter_conditions(wanted: PhotoFilter, photo: type[Photo] = Photo) -> list[Condition]:
     """The filter in SQL."""
     found: list[Condition] = []
     if wanted.near is not None:
-        found += _within(wanted.near)
+        found += _within(wanted.near, photo)
     if wanted.box is not None:
-        found += _inside(wanted.box)
+        found += _inside(wanted.box, photo)
     if wanted.captured_after is not None:
-        found.append(Photo.captured_at >= wanted.captured_after)
+        found.append(photo.captured_at >= wanted.captured_after)
     if wanted.captured_before is not None:
-        found.append(Photo.captured_at <= wanted.captured_before)
+        found.append(photo.captured_at <= wanted.captured_before)
     if wanted.place is not None:
-        found.append(Photo.place == wanted.place)
+        found.append(photo.place == wanted.place)
     if wanted.ids is not None:
-        found.append(Photo.id.in_(wanted.ids))
-    found.extend(json_array_has(Photo.tags, tag) for tag in wanted.tags)
+        found.append(photo.id.in_(wanted.ids))
+    found.extend(json_array_has(photo.tags, tag) for tag in wanted.tags)
     return found
 
 
@@ -98,24 +98,30 @@ def search_metadata(
     conditions = [*live, *wanted.conditions(trigrams=on_postgres)]
     counted = select(literal(1)).select_from(Photo).where(*conditions).limit(COUNTED_AT_MOST)
     total = session.scalar(select(func.count()).select_from(counted.subquery())) or 0
+    newest = (Photo.uploaded_at.desc(), Photo.id.desc())
+    if after is not None:
+        live.append(tuple_(Photo.uploaded_at, Photo.id) < tuple_(*_bound(after)))
     page: Select[Photo]
     if total < COUNTED_AT_MOST:
         rare = select(Photo.id).where(*conditions).cte("rare")
         page = select(Photo).join(rare.prefix_with("MATERIALIZED"), rare.c.id == Photo.id)
+        page = page.where(*live).order_by(*newest)
     else:
-        page = select(Photo).where(*live, *wanted.conditions(trigrams=False))
-    if after is not None:
-        page = page.where(tuple_(Photo.uploaded_at, Photo.id) < tuple_(*_bound(after)))
-    page = page.order_by(Photo.uploaded_at.desc(), Photo.id.desc()).limit(limit)
-    return list(session.scalars(page)), total
+        # An offset keeps the conditions outside: inside, the planner may look all of them up in an
+        # index of theirs and sort hundreds of thousands.
+        walked = select(Photo).where(*live).order_by(*newest).offset(0).subquery()
+        seen = aliased(Photo, walked)
+        page = select(seen).where(*wanted.conditions(seen, trigrams=False))
+        page = page.order_by(seen.uploaded_at.desc(), seen.id.desc())
+    return list(session.scalars(page.limit(limit))), total
 
 
-def _within(circle: Circle) -> list[Condition]:
+def _within(circle: Circle, photo: type[Photo]) -> list[Condition]:
     south, north = latitude_band(circle.latitude, circle.radius_m)
     away = db_distance_m(
-        literal(circle.latitude), literal(circle.longitude), Photo.latitude, Photo.longitude
+        literal(circle.latitude), literal(circle.longitude), photo.latitude, photo.longitude
     )
-    found = [Photo.latitude.between(south, north), away <= circle.radius_m]
+    found = [photo.latitude.between(south, north), away <= circle.radius_m]
     reach = longitude_reach(circle.latitude, circle.radius_m)
     if reach is None or reach >= 180:
         return found
@@ -127,20 +133,20 @@ def _within(circle: Circle) -> list[Condition]:
         north=north,
         east=east - 360 if east > 180 else east,
     )
-    found.append(or_(*_longitudes(around)))
+    found.append(or_(*_longitudes(around, photo)))
     return found
 
 
-def _inside(box: Box) -> list[Condition]:
-    at_a_pole = [func.abs(Photo.latitude) == 90.0] if box.north == 90 or box.south == -90 else []
+def _inside(box: Box, photo: type[Photo]) -> list[Condition]:
+    at_a_pole = [func.abs(photo.latitude) == 90.0] if box.north == 90 or box.south == -90 else []
     return [
-        Photo.latitude.between(box.south, box.north),
-        or_(*at_a_pole, *_longitudes(box)),
+        photo.latitude.between(box.south, box.north),
+        or_(*at_a_pole, *_longitudes(box, photo)),
     ]
 
 
-def _longitudes(box: Box) -> list[Condition]:
-    return [Photo.longitude.between(west, east) for west, east in box.longitude_ranges()]
+def _longitudes(box: Box, photo: type[Photo]) -> list[Condition]:
+    return [photo.longitude.between(west, east) for west, east in box.longitude_ranges()]
 
 
 def _bound(after: tuple[datetime, UUID]) -> tuple[object, object]:

@@ -16,7 +16,7 @@ RATE_SECONDS = 60.0
 MOST_FINISHED = 100_000  # counted in RATE_SECONDS at most: nobody is faster
 
 # All but `reindex`: a model change queues every photo of its map, behind everything that is asked.
-ASKED_FOR = (Priority.UPLOAD, Priority.MODEL_CHANGE, Priority.EVALUATION)
+ASKED_FOR = (Priority.UPLOAD, Priority.BATCH, Priority.MODEL_CHANGE, Priority.EVALUATION)
 
 
 @dataclass(frozen=True, slots=True)
