@@ -12,16 +12,12 @@ from typing import Annotated, Any
 
 import typer
 
-from services.cli.bench_catalog.command import bench_catalog
 from services.cli.output import JsonOption, answers, explained, print_json, progress_bar
 from shared.errors import Misconfigured
 
 app = typer.Typer(help="Measure this machine.", no_args_is_help=True)
 
 OF_DEV = ("benchmarks", "tests", "psutil", "pytest", "testcontainers")
-
-
-app.command("catalog")(bench_catalog)
 
 
 @app.command("spine")
@@ -80,6 +76,20 @@ def query_latency(
         milliseconds=milliseconds,
         batch=batch,
     )
+
+
+@app.command("catalog")
+def catalog(
+    photos: Annotated[int, typer.Option(min=100_000, help="Rows to make.")] = 1_000_000,
+    as_json: JsonOption = False,
+) -> None:
+    """Does any statement of the services read a large table from end to end?
+
+    Fills a database of its own on the server of DATABASE_URL, and drops it in the end.
+    """
+    with explained(as_json):
+        program = _program("catalog.command")
+    program.bench_catalog(photos, as_json)
 
 
 @app.command("chaos")

@@ -1,7 +1,8 @@
 """The worker: drains the job table, one batch after the other, queries first.
 
-While a batch is on the GPU the next one is read and decoded. A query that arrives meanwhile goes
-before a bulk batch that is already decoded, so it waits for one batch at most.
+While a batch is on the GPU the next one is read and decoded. A query that arrives meanwhile is
+described beside it; where that can't be, it goes before the next bulk batch, so that it waits for
+one batch at most.
 """
 
 from __future__ import annotations
@@ -12,7 +13,8 @@ import math
 import threading
 import time
 from collections import defaultdict
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, field
 from typing import Any
 from uuid import UUID
@@ -34,15 +36,17 @@ from shared.catalog.session import Catalog
 from shared.errors import Conflict, PlacewiseError, Unavailable
 from shared.heartbeat import Heartbeat
 from shared.jobs import InProcessHints, Job, Priority, begin, claim, hold_lease
+from shared.jobs.claim import any_claimable
 from shared.jobs.finish import fail, release
 from shared.jobs.leases import fallen, held
 from shared.jobs.model_changes import abandon_generation
-from shared.jobs.table import MODEL_CHANGES, JobKind, WaitingFor
+from shared.jobs.table import EXTRACTOR_JOBS, MODEL_CHANGES, JobKind, WaitingFor
 from shared.objects import ObjectStore
 from shared.settings import Settings
 
 log = logging.getLogger(__name__)
 
+QUERY_LOOK_SECONDS = 0.1  # between two looks for queries while a bulk batch is described
 IDLE_SECONDS = 1.0  # how long a lost hint can cost
 AWAY_SECONDS = 2.0  # pause of jobs when the store or the catalog is not there right now
 OPERATOR_SECONDS = 15.0  # pause of photos that need an operator first (weights missing, say)
@@ -59,6 +63,15 @@ class DrainResult:
     seconds: defaultdict[str, float] = field(default_factory=lambda: defaultdict(float))
     more: bool = False
     """It ended before the work did."""
+
+    def add(self, other: DrainResult) -> None:
+        """Count what another one has counted, too."""
+        self.maps |= other.maps
+        self.claimed += other.claimed
+        self.succeeded += other.succeeded
+        self.failed += other.failed
+        for stage, took in other.seconds.items():
+            self.seconds[stage] += took
 
     def as_dict(self) -> dict[str, Any]:
         """For logs and for Flower."""
@@ -111,6 +124,7 @@ class ExtractorWorker:
         self._changes = ModelChanges(catalog, store, self._models, self._decoders, settings)
         # Two: a query's photo does not wait until those of the next batch are read.
         self._ahead = ThreadPoolExecutor(max_workers=2, thread_name_prefix="prepare")
+        self._beside = ThreadPoolExecutor(max_workers=1, thread_name_prefix="queries")
 
     def warm_up(self) -> None:
         """Load the extractor of new maps, so that the first photo does not wait for it."""
@@ -141,6 +155,7 @@ class ExtractorWorker:
 
     def close(self) -> None:
         """End the decoders; what is claimed comes back when its lease expires."""
+        self._beside.shutdown(wait=True)
         self._ahead.shutdown(wait=True, cancel_futures=True)
         self._decoders.close()
 
@@ -163,7 +178,11 @@ class ExtractorWorker:
                         self._do(query, result)
                 # Taken before the forward pass: the next photos are decoded while it runs.
                 ahead = self._take(result)
-                self._do(work, result)
+                if _may_have_company(work):
+                    with self._queries_beside(result, stop):
+                        self._do(work, result, company=1)
+                else:
+                    self._do(work, result)
                 if ahead is None:
                     ahead = self._take(result)
         finally:
@@ -173,7 +192,36 @@ class ExtractorWorker:
                     unfinished.lease.close()
         return result
 
-    def _take(self, result: DrainResult, least_priority: int | None = None) -> Work | None:
+    @contextlib.contextmanager
+    def _queries_beside(self, result: DrainResult, stop: threading.Event) -> Iterator[None]:
+        """While the block describes a bulk batch, queries are described in another thread."""
+        done, seen = threading.Event(), DrainResult()
+        queries = self._beside.submit(self._answer_queries, done, stop, seen)
+        try:
+            yield
+        finally:
+            done.set()
+            wait([queries])
+            result.add(seen)
+        queries.result()
+
+    def _answer_queries(
+        self, done: threading.Event, stop: threading.Event, result: DrainResult
+    ) -> None:
+        while not (done.is_set() or stop.is_set()):
+            with self._catalog.read() as session:
+                asked = any_claimable(session, EXTRACTOR_JOBS, Priority.QUERY, alone=False)
+            query = (
+                self._take(result, least_priority=Priority.QUERY, alone=False) if asked else None
+            )
+            if query is None:
+                done.wait(QUERY_LOOK_SECONDS)
+            else:
+                self._do(query, result, company=1)
+
+    def _take(
+        self, result: DrainResult, least_priority: int | None = None, *, alone: bool = True
+    ) -> Work | None:
         settings = self._settings
         self._heartbeat.beat()  # before and after each batch: a drain may last for several
         with self._catalog.write() as session:
@@ -183,6 +231,7 @@ class ExtractorWorker:
                 limit=settings.batch_photos,
                 lease_seconds=settings.lease_seconds,
                 least_priority=least_priority,
+                alone=alone,
                 begun=False,
             )
         if not jobs:
@@ -201,7 +250,8 @@ class ExtractorWorker:
             return None
         return prepare(self._catalog, self._store, self._decoders, jobs, target)
 
-    def _do(self, work: Work, result: DrainResult) -> None:
+    def _do(self, work: Work, result: DrainResult, company: int = 0) -> None:
+        """`company`: so many others may be described beside it, and share the blame for a fall."""
         with work.lease:
             try:
                 if work.batch is None:
@@ -214,7 +264,7 @@ class ExtractorWorker:
                     if batch is None:
                         self._wait_for_vocabulary(work)
                     else:
-                        self._begin(work)
+                        self._begin(work, company)
                         outcome = self._describe(batch)
                         result.succeeded += outcome.succeeded
                         result.failed += outcome.failed
@@ -228,10 +278,10 @@ class ExtractorWorker:
                 log.exception("a batch of %d jobs crashed", len(work.jobs))
                 self._crashed(work, error)
 
-    def _begin(self, work: Work) -> None:
+    def _begin(self, work: Work, company: int = 0) -> None:
         """Decoding, in other processes, is done: a fall from here on may be the photos' fault."""
         with self._catalog.write() as session:
-            begin(session, work.token, len(work.jobs))
+            begin(session, work.token, len(work.jobs) + company)
 
     def _describe(self, batch: Batch) -> Published:
         target = batch.target
@@ -293,6 +343,12 @@ class ExtractorWorker:
                     self._settings.max_attempts,
                     cause=type(error).__name__,
                 )
+
+
+def _may_have_company(work: Work) -> bool:
+    """A job that is tried alone has to be: else nobody knows who felled the worker."""
+    head = work.jobs[0]
+    return work.batch is not None and head.priority < Priority.QUERY and not head.alone
 
 
 def no_vocabulary() -> Conflict:

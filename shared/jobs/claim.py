@@ -8,7 +8,7 @@ from uuid import UUID
 from sqlalchemy import func, select, update
 from sqlalchemy.orm import Session
 
-from shared.catalog.base import db_now, db_now_plus
+from shared.catalog.base import Condition, db_now, db_now_plus
 from shared.ids import new_id
 from shared.jobs.table import (
     EXTRACTOR_JOBS,
@@ -29,19 +29,19 @@ def claim(
     lease_seconds: float,
     kinds: Sequence[JobKind] = EXTRACTOR_JOBS,
     least_priority: int | None = None,
+    alone: bool = True,
     begun: bool = True,
 ) -> list[Job]:
     """Up to `limit` claimable jobs of one kind, map and generation, leased under one fresh token.
 
     The first by (priority, age) decides which; jobs that other workers hold are passed over
     (`FOR UPDATE SKIP LOCKED`; SQLite has one writer). A job marked `alone` and a model change come
-    as a batch of one. With `least_priority`, jobs below it are left alone. A worker that will first
-    do what can't harm it (read, decode) says so with `begun=False`, and calls `begin` after that.
+    as a batch of one. Jobs below `least_priority` are left, and without `alone` those that have to
+    be tried alone. A worker that will first do what can't harm it (read, decode) says so with
+    `begun=False`, and calls `begin` after that.
     """
     order = (Job.priority.desc(), Job.id)
-    wanted = [claimable(kinds)]
-    if least_priority is not None:
-        wanted.append(Job.priority >= least_priority)
+    wanted = _wanted(kinds, least_priority, alone)
     head = session.scalar(
         select(Job).where(*wanted).order_by(*order).limit(1).with_for_update(skip_locked=True)
     )
@@ -86,6 +86,14 @@ def claim(
     return batch
 
 
+def any_claimable(
+    session: Session, kinds: Sequence[JobKind], least_priority: int | None = None, *, alone: bool
+) -> bool:
+    """Is there something for `claim` with the same arguments?"""
+    found = session.scalar(select(Job.id).where(*_wanted(kinds, least_priority, alone)).limit(1))
+    return found is not None
+
+
 def begin(session: Session, token: UUID, together: int) -> None:
     """From here on the `together` jobs under the token may be to blame if the worker falls."""
     session.execute(
@@ -94,3 +102,12 @@ def begin(session: Session, token: UUID, together: int) -> None:
         .values(claimed_together=together)
         .execution_options(synchronize_session=False)
     )
+
+
+def _wanted(kinds: Sequence[JobKind], least_priority: int | None, alone: bool) -> list[Condition]:
+    wanted = [claimable(kinds)]
+    if least_priority is not None:
+        wanted.append(Job.priority >= least_priority)
+    if not alone:
+        wanted.append(Job.alone.is_(False))
+    return wanted

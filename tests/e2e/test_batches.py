@@ -187,6 +187,7 @@ def test_a_batch_in_separate_services_outlives_its_steward(
         deployment = Deployment(tmp_path, postgres.new_database(), redis.url)
         try:
             deployment.settings |= s3.variables(bucket.name) | {"batch_ahead_photos": 10}
+            deployment.migrate()
             deployment.start("search")
             deployment.settings["search_urls"] = deployment.address("search", 0)
             deployment.start("gateway")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import re
 import time
 from pathlib import Path
 from typing import Any
@@ -68,7 +69,8 @@ def test_a_map_is_made_listed_and_looked_at(server: ServerProcess) -> None:
     assert [map_["name"] for map_ in listed] == sorted(map_["name"] for map_ in listed)
     assert {"default", name} <= {map_["name"] for map_ in listed}
     (found,) = (map_ for map_ in listed if map_["name"] == name)
-    assert found == got(server.client.get(f"{MAPS}/{name}"))
+    alone = got(server.client.get(f"{MAPS}/{name}"))
+    assert found | {"counted_at": None} == alone | {"counted_at": None}
     assert found["extractor"] == "test-tiny-vlad"
     assert (found["photos"], found["searchable"], found["labelled_queries"]) == (0, 0, 0)
     assert (found["generation_id"], found["vocabulary"]) == (None, None)
@@ -104,13 +106,15 @@ def test_every_call_says_how_to_make_the_map_that_is_missing(server: ServerProce
         for method, call in calls.items():
             if not any(p["name"] == "map" for p in call.get("parameters", ())):
                 continue
+            if "/presign" in path:
+                continue  # asks for a bucket first, which this server has none of
             content = call.get("requestBody", {}).get("content", {})
             body: dict[str, Any] = {}
             if "multipart/form-data" in content:
                 body = {"files": {"file": ("photo.jpg", photo_bytes(1))}}
             elif "application/json" in content:
                 body = {"json": {}}
-            here = path.replace("{file_id}", str(uuid4())).replace("{job_id}", str(uuid4()))
+            here = re.sub(r"{\w+}", lambda _: str(uuid4()), path)
             answer = server.client.request(method, here, params={"map": "nowhere"}, **body)
             detail = problem(answer, 404, "map_not_found")["detail"]
             assert "placewise maps create nowhere" in detail

@@ -35,6 +35,11 @@ class Deployment:
         }
         self._processes: list[subprocess.Popen[bytes]] = []
 
+    def migrate(self) -> None:
+        env = environment(self.home, **self.settings)
+        migrated = run_command("migrate", env=env, cwd=self.root)
+        assert migrated.returncode == 0, migrated.stderr
+
     def start(self, service: str, **settings: Any) -> subprocess.Popen[bytes]:
         log = self.root / f"{service}-{len(self._processes)}.log"
         with log.open("wb") as out:
@@ -78,10 +83,7 @@ def deployment(tmp_path: Path, postgres: PostgresServer) -> Iterator[Deployment]
     with start_redis(own=True) as redis:
         made = Deployment(tmp_path, postgres.new_database(), redis.url)
         try:
-            migrated = run_command(
-                "migrate", env=environment(made.home, **made.settings), cwd=tmp_path
-            )
-            assert migrated.returncode == 0, migrated.stderr
+            made.migrate()
             yield made
         finally:
             made.close()

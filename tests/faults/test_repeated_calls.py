@@ -31,6 +31,7 @@ def deployment(
     made = Deployment(tmp_path, postgres.new_database(), redis.url)
     made.settings["search_urls"] = "http://127.0.0.1:9"  # nobody searches here
     try:
+        made.migrate()
         yield made
     finally:
         made.close()

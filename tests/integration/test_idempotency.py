@@ -218,7 +218,7 @@ def test_a_failure_of_ours_is_not_kept(
     with monkeypatch.context() as broken:
         broken.setattr("shared.intake.incoming.read_photo_header", away)
         problem(upload(service, photo_bytes(1)), 503, "object_store_unavailable")
-        broken.setattr(model_changes, "count_live", away)
+        broken.setattr(model_changes, "has_live", away)
         problem(call_fit(service, headers=keyed("fit")), 503, "object_store_unavailable")
     assert count(catalog, KeyedCall) == 0
     assert upload(service, photo_bytes(1)).status_code == 202

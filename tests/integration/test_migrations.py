@@ -8,6 +8,8 @@ from collections.abc import Iterator
 from uuid import UUID
 
 import pytest
+from alembic import command
+from alembic.config import Config
 from sqlalchemy import func, select, text
 
 from shared.catalog import schema
@@ -27,17 +29,17 @@ def catalog(postgres: PostgresServer) -> Iterator[Catalog]:
     opened.close()
 
 
-def back_to_0006(catalog: Catalog) -> None:
-    """As if the newest release's indexes had not been made."""
-    with catalog.engine.begin() as connection:
-        for index in ("ix_photos_filename", "ix_photos_tags", "ix_photos_map_size"):
-            connection.exec_driver_sql(f"DROP INDEX {index}")
-        connection.exec_driver_sql("UPDATE alembic_version SET version_num = '0006'")
+def migrate_to(catalog: Catalog, revision: str) -> None:
+    """As an earlier release would have left it."""
+    config = Config()
+    config.set_main_option("script_location", str(schema.MIGRATIONS))
+    with catalog.engine.connect() as connection:
+        config.attributes["connection"] = connection
+        command.upgrade(config, revision)
 
 
 def test_migration_under_uploads_loses_none_and_fails_none(catalog: Catalog) -> None:
-    migrate(catalog)
-    back_to_0006(catalog)
+    migrate_to(catalog, "0006")
     with catalog.write() as session:
         map_id = add_map(session).id
     stored: list[UUID] = []
@@ -72,11 +74,7 @@ def test_migration_under_uploads_loses_none_and_fails_none(catalog: Catalog) -> 
 
 
 def test_migration_gives_way_to_a_lock_and_is_tried_again(catalog: Catalog) -> None:
-    migrate(catalog)
-    with catalog.engine.begin() as connection:
-        connection.exec_driver_sql("DROP TABLE map_figures, schema_compatibility")
-        connection.exec_driver_sql("DROP FUNCTION placewise_trigrams CASCADE")
-        connection.exec_driver_sql("UPDATE alembic_version SET version_num = '0003'")
+    migrate_to(catalog, "0005")
     done = threading.Event()
 
     def run() -> None:
@@ -102,8 +100,7 @@ def test_lock_that_is_never_free_ends_the_migration(catalog: Catalog) -> None:
 
 
 def test_broken_off_index_is_built_anew(catalog: Catalog) -> None:
-    migrate(catalog)
-    back_to_0006(catalog)
+    migrate_to(catalog, "0006")
     with catalog.engine.begin() as connection:
         connection.exec_driver_sql("CREATE INDEX ix_photos_map_size ON photos (map_id)")
         connection.exec_driver_sql(

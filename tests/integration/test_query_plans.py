@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from services.cli.bench_catalog.calls import READS_EVERYTHING, call_everything
-from services.cli.bench_catalog.explain import Explainer
-from services.cli.bench_catalog.fill import fill
+from benchmarks.catalog.calls import READS_EVERYTHING, call_everything
+from benchmarks.catalog.explain import Explainer
+from benchmarks.catalog.fill import fill
 from shared.catalog.connections import Limits, Pool
 from shared.catalog.session import Catalog
 from tests.support.servers import PostgresServer

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from email.message import Message
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -225,8 +226,9 @@ def slept(monkeypatch: pytest.MonkeyPatch) -> list[float]:
         waits.append(seconds)
         clock[0] += seconds
 
-    monkeypatch.setattr("shared.client.time.sleep", sleep)
-    monkeypatch.setattr("shared.client.time.monotonic", lambda: clock[0])
+    # The client's alone: threads that other tests have left go by the real one.
+    own = SimpleNamespace(sleep=sleep, monotonic=lambda: clock[0])
+    monkeypatch.setattr("shared.client.time", own)
     return waits
 
 

@@ -16,9 +16,9 @@ from psycopg.sql import SQL, Identifier
 from rich.table import Table
 from sqlalchemy.engine import URL, make_url
 
-from services.cli.bench_catalog.calls import READS_EVERYTHING, call_everything
-from services.cli.bench_catalog.explain import Explainer
-from services.cli.bench_catalog.fill import fill
+from benchmarks.catalog.calls import READS_EVERYTHING, call_everything
+from benchmarks.catalog.explain import Explainer
+from benchmarks.catalog.fill import fill
 from services.cli.configuration import read_settings
 from services.cli.output import JsonOption, answers, explained, messages, print_json
 from shared.catalog.connections import Limits, Pool

@@ -13,8 +13,8 @@ from PIL import Image
 from sqlalchemy import select
 from starlette.testclient import TestClient
 
-from services.cli.bench_catalog.explain import Explainer
-from services.cli.bench_catalog.fill import BIG, Filled
+from benchmarks.catalog.explain import Explainer
+from benchmarks.catalog.fill import BIG, Filled
 from services.gateway.app import create_app
 from services.gateway.context import Gateway
 from services.gateway.keys import NoKeys
