@@ -10,6 +10,7 @@ from typing import Any, Literal, Self
 from shared.errors import Misconfigured
 
 HERE = "`placewise bench scale --measure`, two cores with other work on them, 2026-11-21"
+CHANGE = "PostgreSQL, 69,000 photos of one map, all in memory, two cores, 2026-11-21"
 CATALOG = "`placewise bench catalog`, a million photos, two cores, 2026-11-21"
 
 
@@ -93,8 +94,10 @@ class Inputs:
         320, "B", f"a search with its indexes (64 a photo, one of five was asked for): {CATALOG}"
     )
     search_history_days: float = _built(90, "days", "SEARCH_HISTORY_DAYS")
-    walked_row_us: float = _assumed(2, "us", "a row that a statement of PostgreSQL walks past")
-    deleted_row_us: float = _assumed(10, "us", "a row that it deletes, with its indexes")
+    walked_row_us: float = _measured(
+        1.8, "us", f"a photo that a model change's statement walks past: {CHANGE}"
+    )
+    deleted_row_us: float = _measured(4.5, "us", f"a job that one deletes: {CHANGE}")
     catalog_copies: float = _assumed(2, "", "PostgreSQL and one standby")
     catalog_ram_share: float = _assumed(0.15, "", "of its bytes; at least 8 GB")
     catalog_vcpus: float = _assumed(8, "", "of each copy")

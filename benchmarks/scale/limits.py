@@ -11,6 +11,7 @@ from shared.settings import Settings
 
 LOADING_SECONDS = 600.0
 STEWARD_SILENT_SECONDS = 900.0  # deploy/k8s: after which it is started again
+CHANGE_SECONDS = 0.5  # services/steward/loop.py, "advance model changes"
 STATEMENT_SECONDS = float(Settings.model_fields["database_work_seconds"].default)
 FOLLOW_SECONDS = float(Settings.model_fields["search_follow_seconds"].default)
 
@@ -62,6 +63,11 @@ def limits(width: Width, i: Inputs) -> list[Limit]:
             f"the walk over all objects takes longer than {STEWARD_SILENT_SECONDS:.0f} s",
             STEWARD_SILENT_SECONDS / i.list_page_seconds * 1000 / 2,
             f"{STEWARD_SILENT_SECONDS:.0f} s / list_page_seconds x 1,000 / 2 objects a photo",
+        ),
+        Limit(
+            "while a model change is described, the steward holds the map's lock most of the time",
+            CHANGE_SECONDS / (i.walked_row_us / 1e6),
+            f"{CHANGE_SECONDS:g} s between two of its looks / walked_row_us",
         ),
         Limit(
             "the statement that finds photos for a model change takes longer than "

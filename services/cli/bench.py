@@ -19,7 +19,7 @@ from shared.errors import Misconfigured
 
 app = typer.Typer(help="Measure this machine.", no_args_is_help=True)
 
-OF_DEV = ("benchmarks", "tests", "psutil", "pytest", "testcontainers")
+OF_DEV = ("benchmarks", "tests", "psutil", "pytest", "testcontainers", "threadpoolctl")
 
 
 app.command("catalog")(bench_catalog)
