@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib
 import os
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -17,7 +18,7 @@ from shared.errors import Misconfigured
 
 app = typer.Typer(help="Measure this machine.", no_args_is_help=True)
 
-OF_DEV = ("benchmarks", "tests", "psutil", "pytest", "testcontainers")
+OF_DEV = ("benchmarks", "tests", "psutil", "pytest", "testcontainers", "threadpoolctl")
 
 
 @app.command("spine")
@@ -109,6 +110,43 @@ def chaos(
 def rolling(as_json: JsonOption = False) -> None:
     """Is a request refused or a job lost while every service is restarted, one after the other?"""
     _measure("rolling", as_json)
+
+
+@app.command("scale")
+def scale(
+    given: Annotated[
+        list[str] | None,
+        typer.Option("--set", help="An input, as price_gpu_hour=2; may be repeated."),
+    ] = None,
+    measured: Annotated[
+        bool, typer.Option("--measure", help="Measure on this machine what it can tell.")
+    ] = False,
+    page: Annotated[
+        Path | None,
+        typer.Option(
+            "--markdown",
+            exists=True,
+            dir_okay=False,
+            help="Renew this page's tables: docs/scale.md",
+        ),
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """What do 10 thousand, 1 million and 100 million photos take: machines, bytes, money?"""
+    with explained(as_json):
+        program = _program("scale")
+        found = None
+        if measured:
+            with progress_bar() as progress:
+                found = program.measure(progress)
+        sizing = program.size_up(given or [], found)
+        if page is not None:
+            page.write_text(sizing.put_into(page.read_text(encoding="utf-8")), encoding="utf-8")
+    if as_json:
+        print_json(sizing.as_json())
+    elif page is None:
+        for sheet in sizing.sheets():
+            answers.print(sheet.table())
 
 
 def _measure(name: str, as_json: bool, **options: Any) -> None:

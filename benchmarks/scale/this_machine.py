@@ -1,0 +1,165 @@
+"""What a machine tells of itself in seconds: the speed of the scan, and what is beside the rows."""
+
+from __future__ import annotations
+
+import hashlib
+import statistics
+import time
+import tracemalloc
+from collections.abc import Callable
+from datetime import UTC, datetime
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from sqlalchemy import insert
+from threadpoolctl import threadpool_limits
+
+from benchmarks.report import Report
+from services.search.scan import top_k
+from services.search.snapshot import LoadedChunk, PhotoColumns
+from shared.catalog.chunks import Chunk, live_chunks
+from shared.catalog.generations import Generation, GenerationState
+from shared.catalog.maps import create_map
+from shared.catalog.models import ensure_model
+from shared.catalog.photos import PhotoFacts, PhotoRole
+from shared.catalog.schema import migrate
+from shared.catalog.session import Catalog
+from shared.ids import new_id
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
+
+CHUNK_ROWS = 1000
+CHUNKS = {7168: 20, 98_304: 2}  # 573 and 786 MB: far beyond every cache
+ROUNDS = 7
+LISTED = 5000
+SEED = 20_261_121
+
+
+def measure(progress: Progress) -> Report:
+    """Figures named like the inputs that they stand for. Takes some seconds and a GB of memory."""
+    report = Report("This machine")
+    bar = progress.add_task("measuring", total=len(CHUNKS) + 3)
+    for dimension, chunks in CHUNKS.items():
+        report.add(f"scan_us_{dimension}", 1e6 * _scan_seconds(dimension, chunks), "us")
+        progress.update(bar, advance=1)
+    for name, found, unit in (
+        ("photo_columns_bytes", _column_bytes, "B"),
+        ("hash_bytes_per_second", _hash_rate, "B/s"),
+        ("chunk_list_us", _list_microseconds, "us"),
+    ):
+        report.add(name, found(), unit)
+        progress.update(bar, advance=1)
+    return report
+
+
+def _scan_seconds(dimension: int, chunks: int) -> float:
+    """Of one row, in a search as services/search answers it, which excludes the query's photo."""
+    draw = np.random.default_rng(SEED)
+    loaded = []
+    for _ in range(chunks):
+        rows = draw.random((CHUNK_ROWS, dimension), dtype=np.float32)
+        rows /= np.linalg.norm(rows, axis=1, keepdims=True)
+        columns = PhotoColumns.of(CHUNK_ROWS, enumerate(_facts(CHUNK_ROWS)))
+        loaded.append(LoadedChunk(new_id(), "chunks/x", rows, columns))
+    query, itself = loaded[0].rows[0], frozenset({loaded[0].photos.photo_id[0]})
+    with threadpool_limits(1):
+        seconds = _median_seconds(lambda: top_k(loaded, query, 10, exclude=itself))
+    return seconds / (chunks * CHUNK_ROWS)
+
+
+def _facts(count: int) -> list[PhotoFacts]:
+    """Photos as a street has them: coordinates and a time, every third with a place, two tags."""
+    return [
+        PhotoFacts(
+            photo_id=new_id(),
+            role=PhotoRole.DATABASE,
+            deleted_at=None,
+            latitude=45.0 + number / 1e6,
+            longitude=7.0,
+            captured_at=datetime(2026, 11, 21, tzinfo=UTC),
+            place=f"place-{number}" if number % 3 == 0 else None,
+            tags=["night", f"tag-{number}"] if number % 5 == 0 else [],
+        )
+        for number in range(count)
+    ]
+
+
+def _column_bytes() -> float:
+    """Of a row: arrays and the Python objects that they refer to."""
+    count = 5 * CHUNK_ROWS
+    tracemalloc.start()
+    try:
+        before = tracemalloc.get_traced_memory()[0]
+        columns = PhotoColumns.of(count, enumerate(_facts(count)))
+        used = tracemalloc.get_traced_memory()[0] - before
+    finally:
+        tracemalloc.stop()
+    assert len(columns.photo_id) == count
+    return used / count
+
+
+def _hash_rate() -> float:
+    data = bytes(CHUNK_ROWS * 4 * 98_304 // 4)
+    return len(data) / _median_seconds(lambda: hashlib.sha256(data).digest())
+
+
+def _list_microseconds() -> float:
+    """Of one chunk's row, when a search worker lists a generation's chunks."""
+    with TemporaryDirectory() as folder:
+        catalog = Catalog(f"sqlite:///{Path(folder) / 'catalog.sqlite'}")
+        try:
+            migrate(catalog)
+            generation_id = _generation_of(catalog, LISTED)
+
+            def list_them() -> None:
+                with catalog.read() as session:
+                    assert len(live_chunks(session, generation_id)) == LISTED
+
+            return 1e6 * _median_seconds(list_them) / LISTED
+        finally:
+            catalog.close()
+
+
+def _generation_of(catalog: Catalog, chunks: int) -> Any:
+    with catalog.write() as session:
+        generation = Generation(
+            id=new_id(),
+            map_id=create_map(session, "bench", "test-tiny-avg").id,
+            state=GenerationState.ACTIVE,
+            extractor="bench",
+            spec={"clusters": None},
+            spec_fingerprint="0" * 64,
+            dimension=7168,
+            model_id=ensure_model(session, "bench", "0" * 64, "MIT", {}).id,
+        )
+        session.add(generation)
+        session.flush()
+        session.execute(
+            insert(Chunk),
+            [
+                {
+                    "generation_id": generation.id,
+                    "slot": slot,
+                    "object_key": f"chunks/{slot}.npy",
+                    "rows": CHUNK_ROWS,
+                    "size_bytes": 1,
+                    "sha256": "0" * 64,
+                    "sealed": True,
+                }
+                for slot in range(chunks)
+            ],
+        )
+        return generation.id
+
+
+def _median_seconds(do: Callable[[], object]) -> float:
+    do()  # the first one fills caches
+    took = []
+    for _ in range(ROUNDS):
+        begun = time.perf_counter()
+        do()
+        took.append(time.perf_counter() - begun)
+    return statistics.median(took)
