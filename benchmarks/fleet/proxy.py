@@ -28,8 +28,12 @@ class Mode(enum.Enum):
     OPEN = "everything passes"
     REFUSED = "every connection ends at once"
     CUT = "every connection ends within its first request"
+    CUT_ANSWER = "every connection ends after so many bytes of answers"
     SLOW = "every connection crawls"
     FULL = "HTTP: what would write is answered with 507, the rest passes"
+
+
+CUTS = {Mode.CUT, Mode.CUT_ANSWER}
 
 
 class FaultProxy:
@@ -39,6 +43,7 @@ class FaultProxy:
         self.port = port
         self._target = target
         self._mode = Mode.OPEN
+        self._cut_after_bytes = CUT_AFTER_BYTES
         self._open: set[asyncio.Task[None]] = set()
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, name="proxy", daemon=True)
@@ -64,8 +69,9 @@ class FaultProxy:
         self._loop.close()
 
     @contextlib.contextmanager
-    def misbehaving(self, mode: Mode) -> Iterator[None]:
+    def misbehaving(self, mode: Mode, *, cut_after_bytes: int = CUT_AFTER_BYTES) -> Iterator[None]:
         """While the block runs."""
+        self._cut_after_bytes = cut_after_bytes
         self._set(mode)
         try:
             yield
@@ -121,13 +127,13 @@ class FaultProxy:
         async with self._upstream() as (up_reader, up_writer):
             up_writer.write(head)
             both = [
-                asyncio.create_task(self._pump(reader, up_writer, mode)),
-                asyncio.create_task(self._pump(up_reader, writer, mode)),
+                asyncio.create_task(self._pump(reader, up_writer, mode, cut=mode is Mode.CUT)),
+                asyncio.create_task(self._pump(up_reader, writer, mode, cut=mode in CUTS)),
             ]
             try:
                 await asyncio.wait(both, return_when=asyncio.FIRST_COMPLETED)
                 # What the other side had sent already still arrives.
-                await asyncio.wait(both, timeout=0 if mode is Mode.CUT else 1)
+                await asyncio.wait(both, timeout=0 if mode in CUTS else 1)
             finally:
                 for pump in both:
                     pump.cancel()
@@ -152,12 +158,12 @@ class FaultProxy:
         await reader.read()  # until the client has had it all
 
     async def _pump(
-        self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, mode: Mode
+        self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, mode: Mode, *, cut: bool
     ) -> None:
-        passed = 0
+        passed, most = 0, self._cut_after_bytes
         while piece := await reader.read(SLOW_PIECE_BYTES if mode is Mode.SLOW else PIECE_BYTES):
-            if mode is Mode.CUT and passed + len(piece) > CUT_AFTER_BYTES:
-                writer.write(piece[: CUT_AFTER_BYTES - passed])
+            if cut and passed + len(piece) > most:
+                writer.write(piece[: most - passed])
                 await writer.drain()
                 return
             if mode is Mode.SLOW:

@@ -34,6 +34,8 @@ class Echo(http.server.BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         self.send_response(200)
+        if self.close_connection:  # as S3 servers say it: the client is not to use it again
+            self.send_header("Connection", "close")
         self.send_header("Content-Length", str(len(BODY)))
         self.end_headers()
         self.wfile.write(BODY)

@@ -26,6 +26,7 @@ from urllib3.response import BaseHTTPResponse
 
 from shared.errors import Misconfigured, NotFound, PlacewiseError, StorageFull, Unavailable
 from shared.objects.s3.client import S3Client
+from shared.objects.s3.connections import Connections
 from shared.settings import Settings
 
 log = logging.getLogger(__name__)
@@ -96,7 +97,7 @@ class Bucket:
             )
         # One limit for both: urllib3 sends a request's body under the connection's.
         seconds = settings.s3_timeout_seconds
-        connections = urllib3.PoolManager(
+        connections = Connections(
             num_pools=2,
             maxsize=CONNECTIONS,
             timeout=urllib3.Timeout(connect=seconds, read=seconds),
