@@ -1,52 +1,54 @@
-"""The command's tree."""
+"""The command's tree, of which a run imports only the branch that it is asked for."""
 
 from __future__ import annotations
 
+import importlib
 import logging
+import sys
+from collections.abc import Collection
 
 import typer
 
-from services.cli import (
-    ask,
-    bench,
-    configuration,
-    datasets,
-    doctor,
-    evaluate,
-    import_anyloc,
-    index,
-    maps,
-    processes,
-    search,
-    serve,
-    storage,
-    vocabulary,
-)
+# In the order of the help: the module below services.cli, and what of it is the command.
+COMMANDS = {
+    "serve": ("serve", "serve"),
+    "search": ("search", "search"),
+    "gateway": ("processes", "gateway"),
+    "extractor": ("processes", "extractor"),
+    "steward": ("processes", "steward"),
+    "migrate": ("processes", "migrate"),
+    "index": ("index", "index"),
+    "import-anyloc": ("import_anyloc", "import_anyloc"),
+    "query": ("ask", "query"),
+    "evaluate": ("evaluate", "evaluate"),
+    "config": ("configuration", "config"),
+    "doctor": ("doctor", "doctor"),
+    "maps": ("maps", "app"),
+    "vocabulary": ("vocabulary", "app"),
+    "datasets": ("datasets", "app"),
+    "storage": ("storage", "app"),
+    "bench": ("bench", "app"),
+}
 
-app = typer.Typer(
-    name="placewise",
-    help="Photo in, place out: visual place recognition on your own photos.",
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-    add_completion=False,
-)
-app.command("serve")(serve.serve)
-app.command("search")(search.search)
-app.command("gateway")(processes.gateway)
-app.command("extractor")(processes.extractor)
-app.command("steward")(processes.steward)
-app.command("migrate")(processes.migrate)
-app.command("index")(index.index)
-app.command("import-anyloc")(import_anyloc.import_anyloc)
-app.command("query")(ask.query)
-app.command("evaluate")(evaluate.evaluate)
-app.add_typer(maps.app, name="maps")
-app.add_typer(vocabulary.app, name="vocabulary")
-app.add_typer(datasets.app, name="datasets")
-app.add_typer(storage.app, name="storage")
-app.add_typer(bench.app, name="bench")
-app.command("config")(configuration.config)
-app.command("doctor")(doctor.doctor)
+
+def tree(names: Collection[str] = COMMANDS.keys()) -> typer.Typer:
+    """The commands of these names. Each brings libraries that the others can do without."""
+    app = typer.Typer(
+        name="placewise",
+        help="Photo in, place out: visual place recognition on your own photos.",
+        no_args_is_help=True,
+        pretty_exceptions_enable=False,
+        add_completion=False,
+    )
+    app.callback()(_placewise)
+    for name in names:
+        module, attribute = COMMANDS[name]
+        command = getattr(importlib.import_module(f"services.cli.{module}"), attribute)
+        if isinstance(command, typer.Typer):
+            app.add_typer(command, name=name)
+        else:
+            app.command(name)(command)
+    return app
 
 
 def run() -> None:
@@ -54,4 +56,10 @@ def run() -> None:
     logging.basicConfig(
         level=logging.WARNING, format="%(asctime)s %(levelname)s %(name)s: %(message)s"
     )
-    app()
+    asked = sys.argv[1:2]
+    # What is no command is answered by the whole tree: the help, or what was meant.
+    tree(asked if asked and asked[0] in COMMANDS else COMMANDS.keys())()
+
+
+def _placewise() -> None:
+    """Makes a tree of one command a tree, too."""

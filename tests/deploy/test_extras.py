@@ -39,6 +39,8 @@ class Absent:
 sys.meta_path.insert(0, Absent())
 for module in modules:
     importlib.import_module(module)
+if "services.cli.main" in modules:
+    sys.modules["services.cli.main"].tree()
 """
 
 
