@@ -6,6 +6,9 @@ HOST ?= 127.0.0.1
 PORT ?= 8000
 PLACEWISE_HOME ?= ./var
 
+# Where it is set, each process would compile PyTorch and all else anew: seconds, every time.
+unexport PYTHONDONTWRITEBYTECODE
+
 VENV := .venv
 BIN := $(VENV)/bin
 UV_VERSION := 0.13.8
@@ -39,7 +42,7 @@ run: $(INSTALLED) ## serve the embedded Placewise on http://HOST:PORT, data unde
 	HOST=$(HOST) PORT=$(PORT) PLACEWISE_HOME=$(PLACEWISE_HOME) $(BIN)/placewise serve
 
 test: $(INSTALLED) ## every test (PLACEWISE_TEST_DATA=FOLDER adds those on real photos)
-	$(BIN)/python -m pytest tests --numprocesses auto --dist loadfile
+	$(BIN)/python -m pytest tests --numprocesses auto --dist loadfile --no-loadscope-reorder
 
 lint: $(INSTALLED) ## ruff, formatting and the import contracts
 	$(BIN)/ruff check .

@@ -24,13 +24,19 @@ from tests.support.servers import (
 )
 
 REAL_PHOTOS = "PLACEWISE_TEST_DATA"
+TESTS = Path(__file__).parent
+# A long test that begins last is waited for alone.
+LONGEST_FIRST = ("faults", "deploy", "e2e", "integration", "contract", "unit")
 
 # As the command does before torch is loaded; see services/cli/__init__.py.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Without the real photos, the tests that need them are deselected, and one line says so."""
+    """What waits most comes first, beside what calculates. Without the real photos, the tests that
+    need them are deselected, and one line says so."""
+    kinds = {kind: place for place, kind in enumerate(LONGEST_FIRST)}
+    items.sort(key=lambda item: kinds.get(item.path.relative_to(TESTS).parts[0], len(kinds)))
     if os.environ.get(REAL_PHOTOS):
         return
     without = [item for item in items if item.get_closest_marker("real_photos")]
