@@ -40,7 +40,7 @@ from shared.vision.extractors import Extractor
 from shared.vision.preprocessing import get_preprocessing
 from shared.vision.vocabulary import Centres, decode_centres
 from tests.integration.workplace import Workplace, expected_row, same
-from tests.support.catalog_rows import end_pauses, expire_lease, states
+from tests.support.catalog_rows import end_pauses, expire_lease, set_columns, states
 from tests.support.photos import photo_bytes
 
 Describe = Callable[[Extractor, NDArray[np.uint8], Centres | None], NDArray[np.float32]]
@@ -478,6 +478,46 @@ def test_a_query_waits_for_one_batch_at_most(averages: Workplace, before_describ
     assert done_before[0] == (1, JobState.RUNNING)  # the next forward pass is the query's
     assert done_before[1:] == [(4, JobState.SUCCEEDED)] * 3
     assert len(averages.rows()) == len(photo_ids) + 1
+
+
+def test_a_query_does_not_even_wait_for_the_batch_that_is_being_described(
+    averages: Workplace, before_describing: Hook
+) -> None:
+    averages.upload(0)
+    averages.drain()
+    averages.upload(*range(1, 5))
+    answered: list[JobState] = []
+
+    def ask_and_wait(pixels: NDArray[np.uint8]) -> None:
+        if len(pixels) > 1:  # the bulk batch, which goes on only when the query is answered
+            job_id = averages.ask(photo_bytes(99))
+            answered.append(averages.await_end(job_id))
+
+    before_describing(ask_and_wait)
+    averages.drain()
+    assert answered == [JobState.SUCCEEDED]
+    assert len(averages.rows()) == 5
+
+
+def test_nothing_is_described_beside_a_photo_that_is_tried_alone(
+    averages: Workplace, before_describing: Hook
+) -> None:
+    photo_id, job_id = averages.upload_bytes(photo_bytes(0))
+    set_columns(averages.catalog, job_id, alone=True)
+    during: list[JobState] = []
+    asked: list[UUID] = []
+
+    def ask(_: NDArray[np.uint8]) -> None:
+        if not asked:
+            asked.append(averages.ask(photo_bytes(99)))
+            time.sleep(3 * worker_module.QUERY_LOOK_SECONDS)
+            during.append(JobState(averages.job(asked[0]).state))
+
+    before_describing(ask)
+    averages.drain()
+    assert during == [JobState.QUEUED]
+    assert averages.job(asked[0]).state == JobState.SUCCEEDED
+    assert set(averages.rows()) == {photo_id}
 
 
 def test_a_query_goes_between_the_slices_of_a_fit(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
@@ -20,7 +21,7 @@ from shared.catalog.photos import Photo
 from shared.catalog.session import Catalog
 from shared.catalog.vocabularies import Vocabulary
 from shared.chunks import Rows
-from shared.jobs import InProcessHints, Job, JobKind, free_expired_leases
+from shared.jobs import InProcessHints, Job, JobKind, JobState, free_expired_leases
 from shared.jobs.model_changes import cancel_model_change, start_model_change
 from shared.jobs.table import UNFINISHED, get_job
 from shared.objects import FolderStore
@@ -33,6 +34,7 @@ from tests.support.catalog_rows import ask, delete, read_job, set_columns, store
 from tests.support.photos import photo_bytes
 
 ROUNDS = 60  # of draining and stewarding, before a model change that does not end is a failure
+WAIT_SECONDS = 20.0
 FIT = {"clusters": 8, "sample": 100, "seed": 0}
 
 
@@ -118,6 +120,14 @@ class Workplace:
             free_expired_leases(session, self.settings.max_attempts, everyone=True)
 
     # --- what can be seen ---
+
+    def await_end(self, job_id: UUID) -> JobState:
+        """The state in which the job ends, while another thread works on it."""
+        deadline = time.monotonic() + WAIT_SECONDS
+        while (job := self.job(job_id)).state in UNFINISHED:
+            assert time.monotonic() < deadline, f"the job did not end: {job.state}, {job.stage}"
+            time.sleep(0.01)
+        return JobState(job.state)
 
     def job(self, job_id: UUID) -> Job:
         return read_job(self.catalog, job_id)
