@@ -122,6 +122,9 @@ class Catalog:
 def open_catalog(settings: Settings, service: str, limits: Limits | None = None) -> Catalog:
     """The catalog that the settings name, for a service of this name; `limits` are those of
     background work unless given."""
+    # A foreign key may lead to a table whose module the service itself never needs.
+    import shared.catalog.tables  # noqa: F401
+
     return Catalog(
         settings.catalog_url(),
         Pool.of(settings, service),

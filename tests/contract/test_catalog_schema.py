@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import json
+import subprocess
+import sys
+from pathlib import Path
+
 import pytest
 from alembic.autogenerate import compare_metadata
 from alembic.migration import MigrationContext
@@ -10,6 +15,8 @@ import shared.catalog.tables  # noqa: F401
 from shared.catalog.base import Base
 from shared.catalog.schema import migrate
 from shared.catalog.session import Catalog
+
+ROOT = Path(__file__).parents[2]
 
 
 # PostgreSQL alone has it.
@@ -22,6 +29,24 @@ def test_migrations_lead_to_the_tables_that_the_code_describes(catalog: Catalog)
     assert [
         change for change in difference if getattr(change[1], "name", "") not in elsewhere
     ] == []
+
+
+OPEN = """
+import json
+from shared.catalog.base import Base
+from shared.catalog.session import open_catalog
+from shared.settings import Settings
+open_catalog(Settings(), "a service").close()
+print(json.dumps(sorted(Base.metadata.tables)))
+"""
+
+
+def test_whoever_opens_the_catalog_knows_every_table() -> None:
+    # In a process of its own: here the tests have imported them all.
+    opened = subprocess.run(
+        [sys.executable, "-c", OPEN], cwd=ROOT, check=True, capture_output=True, text=True
+    )
+    assert json.loads(opened.stdout) == sorted(Base.metadata.tables)
 
 
 def test_migrating_twice_changes_nothing(catalog: Catalog) -> None:
