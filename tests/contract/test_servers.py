@@ -33,7 +33,7 @@ from tests.support.servers import (
     start_redis,
     start_s3,
 )
-from tests.support.servers.daemon import Daemon
+from tests.support.servers.daemon import Daemon, has_ended
 
 REPOSITORY = Path(__file__).parents[2]
 GONE_SECONDS = 20.0
@@ -187,6 +187,6 @@ def test_servers_end_with_tests_that_are_killed() -> None:
         assert server.is_running()
         tests.send_signal(signal.SIGKILL)
     deadline = time.monotonic() + GONE_SECONDS
-    while psutil.pid_exists(int(pid)) or Path(folder).exists():
+    while not has_ended(server) or Path(folder).exists():
         assert time.monotonic() < deadline, "the server or its folder is still there"
         time.sleep(0.05)

@@ -44,7 +44,8 @@ class PostgresServer:
         """The SQLAlchemy URL of a fresh database, a copy of `template`."""
         name = f"test_{new_id().hex}"
         with psycopg.connect(_plain(self.admin), autocommit=True) as connection:
-            connection.execute(f'CREATE DATABASE "{name}" TEMPLATE "{template}"')
+            # By files: without fsync that is half the work of writing the copy into the log, too.
+            connection.execute(f'CREATE DATABASE "{name}" TEMPLATE "{template}" STRATEGY FILE_COPY')
         return self.admin.set(drivername="postgresql+psycopg", database=name).render_as_string(
             hide_password=False
         )
