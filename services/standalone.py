@@ -39,9 +39,9 @@ from shared.admin_key import AdminKey, admin_key, hash_key, is_loopback, new_loc
 from shared.catalog.connections import Limits
 from shared.catalog.installation import open_own_store
 from shared.catalog.maps import ensure_default_map
+from shared.catalog.open_catalog import open_catalog
 from shared.catalog.schema import migrate
 from shared.catalog.search_workers import forget_dead_workers
-from shared.catalog.session import open_catalog
 from shared.errors import Misconfigured
 from shared.home import announced, lock_home
 from shared.jobs import InProcessHints

@@ -17,8 +17,8 @@ from sqlalchemy.exc import SQLAlchemyError
 from services.cli.configuration import read_settings
 from services.cli.extractor_checks import device_check, extractor_check, memory_check
 from services.cli.output import JsonOption, answers, print_json
+from shared.catalog.open_catalog import open_catalog
 from shared.catalog.photos import Photo
-from shared.catalog.session import open_catalog
 from shared.client import Client
 from shared.errors import Misconfigured, PlacewiseError
 from shared.home import running_server

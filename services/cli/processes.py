@@ -21,9 +21,10 @@ from services.parts import start_part
 from shared.catalog.connections import Limits
 from shared.catalog.installation import ensure_installation, open_own_store
 from shared.catalog.maps import ensure_default_map
+from shared.catalog.open_catalog import open_catalog
 from shared.catalog.schema import migrate as migrate_catalog
 from shared.catalog.schema import wait_for_schema
-from shared.catalog.session import Catalog, open_catalog
+from shared.catalog.session import Catalog
 from shared.errors import Misconfigured
 from shared.search_http import HttpSearch
 from shared.settings import Settings

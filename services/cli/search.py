@@ -18,8 +18,8 @@ def search() -> None:
         # Imported only here: the other commands need no server.
         from services.search.server import search_service
         from shared.catalog.installation import open_own_store
+        from shared.catalog.open_catalog import open_catalog
         from shared.catalog.schema import wait_for_schema
-        from shared.catalog.session import open_catalog
 
         set_log_levels(settings.debug)
         catalog = open_catalog(settings, "search")

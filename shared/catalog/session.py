@@ -20,7 +20,6 @@ from shared.catalog.away import SACRIFICED, sqlstate
 from shared.catalog.base import SQLITE_DISTANCE
 from shared.catalog.connections import Limits, Pool, make_postgres_engine
 from shared.geodesy import distance_m
-from shared.settings import Settings
 
 log = logging.getLogger(__name__)
 
@@ -117,19 +116,6 @@ class Catalog:
         return self._sessions(
             bind=self.engine.execution_options(placewise_limits=self.limits, **options)
         )
-
-
-def open_catalog(settings: Settings, service: str, limits: Limits | None = None) -> Catalog:
-    """The catalog that the settings name, for a service of this name; `limits` are those of
-    background work unless given."""
-    # A foreign key may lead to a table whose module the service itself never needs.
-    import shared.catalog.tables  # noqa: F401
-
-    return Catalog(
-        settings.catalog_url(),
-        Pool.of(settings, service),
-        Limits.of_work(settings) if limits is None else limits,
-    )
 
 
 def _prepare_sqlite(connection: Any, _record: Any) -> None:
