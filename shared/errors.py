@@ -76,6 +76,11 @@ class Unauthorized(PlacewiseError):
     title = "A key is needed"
 
 
+class Forbidden(PlacewiseError):
+    status = 403
+    title = "This caller may not do that"
+
+
 class NotFound(PlacewiseError):
     status = 404
     title = "Not found"

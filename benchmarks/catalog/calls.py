@@ -89,7 +89,8 @@ def _calls(
         ).all()
     ids = list(described)
     client = TestClient(
-        create_app(Gateway(catalog, store, InProcessHints(), AnySearch(ids), settings, NoKeys()))
+        create_app(Gateway(catalog, store, InProcessHints(), AnySearch(ids), settings, NoKeys())),
+        base_url="http://localhost",
     )
     steward = Steward(catalog, store, InProcessHints(), settings)
     # First, because requests read what it has counted; so does it, wherever it has run before.

@@ -8,7 +8,7 @@ from fastapi import Request
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from services.gateway.keys import Keys
-from shared.errors import Unauthorized
+from shared.errors import Forbidden, Unauthorized
 from shared.problems import problem_response
 
 log = logging.getLogger(__name__)
@@ -28,7 +28,9 @@ OPEN_PATHS = frozenset(
 
 
 class KeyCheck:
-    """Answers 401 to a call without a key, whatever it asks for: not even which paths exist."""
+    """Answers 401 to a call without a key, whatever it asks for: not even which paths exist. Where
+    none is needed, 403 to a page of elsewhere.
+    """
 
     def __init__(self, app: ASGIApp, keys: Keys) -> None:
         self._app = app
@@ -38,8 +40,8 @@ class KeyCheck:
         if scope["type"] == "http" and scope["path"] not in OPEN_PATHS:
             request = Request(scope)
             try:
-                self._keys.check(request.headers.get("authorization"))
-            except Unauthorized as error:
+                self._keys.check(request.headers)
+            except (Forbidden, Unauthorized) as error:
                 log.debug("%s %s: %s", request.method, request.url.path, error.code)
                 await problem_response(error, request)(scope, receive, send)
                 return

@@ -115,7 +115,7 @@ def test_nothing_is_acknowledged_that_was_not_stored(
         ensure_default_map(session, settings.extractor)
     search = SearchWorker(catalog, full, settings)
     gateway = Gateway(catalog, full, InProcessHints(), search, settings, NoKeys())
-    client = TestClient(create_app(gateway))
+    client = TestClient(create_app(gateway), base_url="http://localhost")
     answer: httpx2.Response = client.post(
         f"/api/v1{path}",
         files={"file": ("photo.jpg", photo_bytes(1))},

@@ -76,7 +76,9 @@ class House:
         self._extractor = ExtractorWorker(self.catalog, store, settings, "extractor")
         self.requests = self.catalog.limited(Limits(STATEMENT_SECONDS, lock_seconds=1.0))
         gateway = Gateway(self.requests, store, hints, self.search, settings, NoKeys())
-        self.client = TestClient(create_app(gateway), raise_server_exceptions=False)
+        self.client = TestClient(
+            create_app(gateway), base_url="http://localhost", raise_server_exceptions=False
+        )
         self.died = threading.Event()
         self._stop = threading.Event()
         self._parts = [

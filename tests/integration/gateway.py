@@ -36,7 +36,7 @@ class Service:
         self.catalog, self.store = catalog, store
         self.search = SearchWorker(catalog, store, settings)
         gateway = Gateway(catalog, store, InProcessHints(), self.search, settings, NoKeys())
-        self._client = TestClient(create_app(gateway))
+        self._client = TestClient(create_app(gateway), base_url="http://localhost")
         self.make_worker = make_worker
         self._worker: ExtractorWorker | None = None
 

@@ -304,7 +304,7 @@ def test_the_gateways_health_names_shards_without_workers_and_stays_ready(
 ) -> None:
     tier = tier_of(1, 2)
     gateway = Gateway(catalog, store, InProcessHints(), tier.port, settings, NoKeys())
-    with TestClient(create_app(gateway)) as client:
+    with TestClient(create_app(gateway), base_url="http://localhost") as client:
         assert client.get("/api/v1/health").json()["parts"]["search"] == {
             "status": "healthy",
             "detail": f"{len(places.rows)} rows in memory",

@@ -7,10 +7,11 @@ from pathlib import Path
 
 import pytest
 from pydantic import SecretStr, ValidationError
+from starlette.datastructures import Headers
 
 from services.gateway.keys import KnownKeys, NoKeys, read_bearer
 from shared.admin_key import admin_key, admin_key_file, hash_key, is_loopback
-from shared.errors import Misconfigured, Unauthorized
+from shared.errors import Forbidden, Misconfigured, Unauthorized
 from shared.home import announced, running_server, write_private
 from shared.settings import Settings
 
@@ -53,20 +54,54 @@ def test_a_header_without_a_bearer_key_holds_none(header: str | None) -> None:
 
 def test_any_of_the_known_keys_opens_and_no_other() -> None:
     keys = KnownKeys(hash_key(KEY), hash_key("another"))
-    keys.check(f"Bearer {KEY}")
-    keys.check("Bearer another")
+    keys.check(Headers({"authorization": f"Bearer {KEY}"}))
+    keys.check(Headers({"authorization": "Bearer another", "origin": "https://elsewhere.example"}))
     for wrong in (KEY[:-1], KEY + "x", KEY.upper(), hash_key(KEY)):
         with pytest.raises(Unauthorized) as caught:
-            keys.check(f"Bearer {wrong}")
+            keys.check(Headers({"authorization": f"Bearer {wrong}"}))
         assert caught.value.code == "key_unknown"
         assert wrong not in caught.value.detail
     with pytest.raises(Unauthorized):
-        KnownKeys().check(f"Bearer {KEY}")
+        KnownKeys().check(Headers({"authorization": f"Bearer {KEY}"}))
 
 
-def test_without_keys_everyone_may_call() -> None:
-    NoKeys().check(None)
-    NoKeys().check("Bearer whatever")
+LOCAL = [
+    "localhost",
+    "localhost:8000",
+    "LOCALHOST:80",
+    "localhost.",
+    "127.0.0.1:8000",
+    "[::1]:8000",
+]
+
+
+@pytest.mark.parametrize("host", LOCAL)
+def test_without_keys_whoever_calls_this_machine_may(host: str) -> None:
+    NoKeys().check(Headers({"host": host}))
+    NoKeys().check(Headers({"host": host, "authorization": "Bearer whatever"}))
+    NoKeys().check(Headers({"host": host, "origin": f"http://{host}"}))
+
+
+@pytest.mark.parametrize(
+    "said",
+    [
+        {},
+        {"host": ""},
+        {"host": "["},
+        {"host": "evil.example"},  # a name of theirs that leads to this machine
+        {"host": "evil.example:8000", "origin": "http://evil.example:8000"},
+        {"host": "localhost.evil.example"},
+        {"host": "192.168.0.7:8000"},
+        {"host": "localhost:8000", "origin": "https://evil.example"},
+        {"host": "localhost:8000", "origin": "http://localhost:9000"},
+        {"host": "localhost:8000", "origin": "null"},
+        {"host": "localhost:8000", "origin": ""},
+    ],
+)
+def test_without_keys_no_page_of_elsewhere_may_call(said: dict[str, str]) -> None:
+    with pytest.raises(Forbidden) as caught:
+        NoKeys().check(Headers(said))
+    assert caught.value.code == "foreign_page"
 
 
 # --- the key in force ------------------------------------------------------------------------
