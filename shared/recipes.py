@@ -2,6 +2,7 @@
 
     get_recipe("anyloc-vitb14", allow_test_extractors=False)
     get_recipe("anyloc-vitb14:clusters=32,facet=key,layer=9", allow_test_extractors=False)
+    get_recipe("torchhub:/models/mine:my_entry", allow_test_extractors=False)
 
 A name may carry options. Their canonical order is the alphabet's and what equals the extractor's
 own default is left out, so that one extractor has one name wherever it is stored or compared.
@@ -17,9 +18,11 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from shared.errors import Misconfigured
+from shared.torchhub_names import DEFAULT_SIDE, PREFIX, HubEntry, read_hub_name
 
 FACETS = ("query", "key", "value", "token")
 MOST_CLUSTERS = 4096
+TORCHHUB = "torchhub"  # the backbone that is a torch.hub entry
 SLOW = "test-slow"  # the backbone whose width and time are options
 MOST_WIDTH = 131_072
 MOST_MILLISECONDS = 60_000
@@ -33,14 +36,16 @@ class Recipe:
     """Canonical, with the options that differ from the extractor's defaults."""
     backbone: str
     """One of `shared.vision.extractors.BACKBONES`."""
-    width: int
-    """Length of one local feature."""
-    parameters: int
-    """Of the whole backbone, rounded up; each takes 4 bytes."""
+    width: int | None
+    """Length of one local feature; None where only the loaded network tells."""
+    parameters: int | None
+    """Of the whole backbone, rounded up; each takes 4 bytes. None as above."""
     preprocessing: str
-    """One of `shared.vision.preprocessing.PREPROCESSINGS`."""
+    """A name that `shared.vision.preprocessing.get_preprocessing` knows."""
     aggregator: str
-    """`vlad` needs a vocabulary; `avg` is the mean of the local features."""
+    """`vlad` needs a vocabulary; `avg` is the mean of the local features; with `none` the backbone
+    makes one feature of a photo, and that is its descriptor.
+    """
     depth: int | None = None
     """Blocks of a transformer; None where neither layer nor facet can be chosen."""
     layer: int | None = None
@@ -53,6 +58,8 @@ class Recipe:
     """File below `shared/vision/vocabularies/`, learnt on photographs of elsewhere: a new map
     answers with it at once, whatever `clusters` says about later fits.
     """
+    hub: HubEntry | None = None
+    """The torch.hub entry that makes the descriptors, for `torchhub:` names."""
     for_tests: bool = False
     milliseconds: int = 0
     """Time that a photo takes, slept, of an extractor for tests."""
@@ -62,14 +69,19 @@ class Recipe:
         return self.aggregator == "vlad"
 
     @property
-    def dimension(self) -> int:
-        """Length of a descriptor once a fit has made `clusters` centres."""
+    def dimension(self) -> int | None:
+        """Length of a descriptor once a fit has made `clusters` centres; None as for `width`.
+
+        A generation carries its own in any case.
+        """
+        if self.width is None:
+            return None
         return self.width * (self.clusters if self.needs_vocabulary else 1)
 
     @property
-    def local_features(self) -> tuple[int | str | None, ...]:
+    def local_features(self) -> tuple[int | str | HubEntry | None, ...]:
         """Recipes that agree in this can share one loaded backbone."""
-        return (self.backbone, self.width, self.layer, self.facet, self.milliseconds)
+        return (self.backbone, self.width, self.layer, self.facet, self.milliseconds, self.hub)
 
 
 def _anyloc(size: str, *, depth: int, width: int, layer: int, parameters: int) -> Recipe:
@@ -142,15 +154,19 @@ def get_recipe(name: str, *, allow_test_extractors: bool) -> Recipe:
     """The recipe that `name` and its options mean; its own name is the canonical one.
 
     Misconfigured: `unknown_extractor`, `test_extractor` (for tests, and not allowed),
-    `bad_extractor_option` (naming the option, its value, and what is allowed).
+    `bad_extractor_option` (naming the option, its value, and what is allowed), and those of
+    `read_hub_name`. Whether a torch.hub entry may be loaded, `Settings.recipe` knows.
     """
+    if name.startswith(PREFIX):
+        return _hub_recipe(read_hub_name(name))
     base, colon, written = name.partition(":")
     recipe = RECIPES.get(base)
     if recipe is None:
         known = ", ".join(sorted(r.name for r in RECIPES.values() if not r.for_tests))
         raise Misconfigured(
             "unknown_extractor",
-            f"There is no extractor {base!r}. Known: {known} (EXTRACTOR).",
+            f"There is no extractor {base!r}. Known: {known}, and {PREFIX}OWNER/NAME@COMMIT:ENTRY "
+            "(EXTRACTOR).",
         )
     if recipe.for_tests and not allow_test_extractors:
         raise Misconfigured(
@@ -159,6 +175,19 @@ def get_recipe(name: str, *, allow_test_extractors: bool) -> Recipe:
             "Tests set ALLOW_TEST_EXTRACTORS=true.",
         )
     return _with_options(recipe, written) if colon else recipe
+
+
+def _hub_recipe(hub: HubEntry) -> Recipe:
+    usual = hub.height == hub.width == DEFAULT_SIDE
+    return Recipe(
+        name=hub.name,
+        backbone=TORCHHUB,
+        width=None,
+        parameters=None,
+        preprocessing="square224" if usual else f"resize{hub.height}x{hub.width}",
+        aggregator="none",
+        hub=hub,
+    )
 
 
 def _with_options(recipe: Recipe, written: str) -> Recipe:

@@ -15,8 +15,9 @@ from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from shared.errors import Misconfigured
 from shared.predecessor import extractor_of
-from shared.recipes import get_recipe
+from shared.recipes import Recipe, get_recipe
 from shared.shards import Shard
+from shared.torchhub_names import PREFIX, read_hub_name
 
 LEAST_KEY_CHARACTERS = 16
 
@@ -174,6 +175,11 @@ class Settings(BaseSettings):
     allow_test_extractors: bool = Field(
         False, description="lets a map use the tiny extractors that exist for tests"
     )
+    torchhub_allowed: str | None = Field(
+        None,
+        description="torch.hub extractors that maps may use, whose code is executed: exact names, "
+        "separated by blanks: torchhub:OWNER/NAME@COMMIT:ENTRY; unset: none but EXTRACTOR",
+    )
     device: Literal["auto", "cpu", "cuda"] = Field(
         "auto", description="where photos are described; auto takes CUDA where it is"
     )
@@ -285,6 +291,18 @@ class Settings(BaseSettings):
                 )
         return value
 
+    @field_validator("torchhub_allowed")
+    @classmethod
+    def _are_pinned(cls, value: str | None) -> str | None:
+        for name in (value or "").split():
+            if not name.startswith(PREFIX):
+                raise ValueError(f"{name!r} is no torch.hub extractor: {PREFIX}...")
+            try:
+                read_hub_name(name)
+            except Misconfigured as error:
+                raise ValueError(error.detail) from error
+        return value
+
     @field_validator("placewise_home", "upload_dir")
     @classmethod
     def _absolute(cls, value: Path | None) -> Path | None:
@@ -385,6 +403,30 @@ class Settings(BaseSettings):
             vlad_clusters=self.vlad_clusters,
             vlad_desc_dim=self.vlad_desc_dim,
         )
+
+    def recipe(self, name: str) -> Recipe:
+        """The recipe of an extractor that this installation may load.
+
+        Misconfigured as `get_recipe`, and `torchhub_not_allowed` for code that nobody allowed.
+        """
+        recipe = get_recipe(name, allow_test_extractors=self.allow_test_extractors)
+        if recipe.hub is not None and recipe.name not in self.allowed_hub_extractors:
+            raise Misconfigured(
+                "torchhub_not_allowed",
+                f"The extractor {recipe.name} executes code of {recipe.hub.source}, which is not "
+                "allowed here. Whoever runs this Placewise allows it by that exact name in "
+                "TORCHHUB_ALLOWED, for the gateway and the extractors, and starts them anew.",
+            )
+        return recipe
+
+    @property
+    def allowed_hub_extractors(self) -> tuple[str, ...]:
+        """Canonical names of the torch.hub extractors that may be loaded."""
+        allowed = [read_hub_name(name).name for name in (self.torchhub_allowed or "").split()]
+        configured = self.new_map_extractor
+        if configured.startswith(PREFIX):
+            allowed.append(configured)
+        return tuple(dict.fromkeys(allowed))
 
     @property
     def shard(self) -> Shard:

@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 
 from shared.errors import Misconfigured
-from shared.recipes import Recipe, get_recipe
+from shared.recipes import Recipe
 from shared.settings import Settings
 
 PARAMETER_BYTES = 4  # float32
@@ -36,6 +36,8 @@ def memory_check(settings: Settings) -> str:
     from shared.vision.extractors import choose_device
 
     recipe = _recipe(settings)
+    if recipe.parameters is None:
+        return f"{recipe.name} tells its size only when it is loaded"
     device = choose_device(settings.device)
     if device.type == "cuda":
         there, whose = torch.cuda.get_device_properties(device).total_memory, "the GPU"
@@ -68,6 +70,10 @@ def extractor_check(settings: Settings) -> str:
     recipe = _recipe(settings)
     if recipe.depth is not None:
         return _dinov2_check(recipe, settings.dino_weights)
+    if recipe.hub is not None:
+        from shared.vision.torchhub_code import code_at_hand
+
+        code_at_hand(recipe.hub)
     from shared.vision.extractors import Extractor, choose_device
 
     extractor = Extractor(recipe, choose_device(settings.device))
@@ -103,6 +109,4 @@ def _dinov2_check(recipe: Recipe, given: Path | None) -> str:
 
 
 def _recipe(settings: Settings) -> Recipe:
-    return get_recipe(
-        settings.new_map_extractor, allow_test_extractors=settings.allow_test_extractors
-    )
+    return settings.recipe(settings.new_map_extractor)

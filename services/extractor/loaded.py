@@ -13,7 +13,7 @@ from shared.catalog.models import Model, ensure_model
 from shared.catalog.vocabularies import Vocabulary
 from shared.errors import Unavailable
 from shared.objects import ObjectStore
-from shared.recipes import Recipe, get_recipe
+from shared.recipes import Recipe
 from shared.settings import Settings
 from shared.vision.extractors import Extractor, choose_device, spec_fingerprint
 from shared.vision.vocabulary import Centres, decode_centres
@@ -35,7 +35,7 @@ class LoadedModels:
 
     def extractor(self, name: str) -> Extractor:
         """The extractor called `name`, its weights loaded."""
-        recipe = get_recipe(name, allow_test_extractors=self._settings.allow_test_extractors)
+        recipe = self._settings.recipe(name)
         with self._lock:
             found = self._extractors.get(recipe.name)
             if found is None:

@@ -30,7 +30,6 @@ from shared.catalog.vocabularies import standing_of
 from shared.errors import Misconfigured, invalid_field
 from shared.jobs import Job
 from shared.jobs.finish import cancel_all
-from shared.recipes import get_recipe
 
 router = APIRouter(tags=["maps"])
 
@@ -89,10 +88,7 @@ def new_map(gateway: GatewayDep, wanted: NewMap, once: OnceDep) -> MapAnswer:
     """Make an empty map; 409 when the name is taken."""
     settings = gateway.settings
     try:
-        extractor = get_recipe(
-            wanted.extractor or settings.new_map_extractor,
-            allow_test_extractors=settings.allow_test_extractors,
-        ).name
+        extractor = settings.recipe(wanted.extractor or settings.new_map_extractor).name
     except Misconfigured as error:
         raise invalid_field("extractor", error.detail) from None
     with gateway.catalog.write() as session:

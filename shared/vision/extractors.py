@@ -14,12 +14,13 @@ from numpy.typing import NDArray
 from torch.nn.functional import normalize
 
 from shared.errors import Misconfigured
-from shared.recipes import SLOW, Recipe
+from shared.recipes import SLOW, TORCHHUB, Recipe
 from shared.vision.backbones import Backbone
 from shared.vision.backbones.dinov2 import SHAPES, Dinov2
 from shared.vision.backbones.efficientnet_lite0 import EfficientNetLite0
 from shared.vision.backbones.slow import SlowBackbone
 from shared.vision.backbones.tiny import TinyBackbone
+from shared.vision.backbones.torchhub import HubModule
 from shared.vision.decode import DECODER
 from shared.vision.preprocessing import Preprocessing, get_preprocessing
 from shared.vision.vlad import vlad
@@ -35,12 +36,21 @@ def _dinov2(recipe: Recipe, device: torch.device, weights: Path | None) -> Backb
     return Dinov2(size, recipe.layer, recipe.facet, device, weights)
 
 
+def _slow(recipe: Recipe, device: torch.device, _weights: Path | None) -> Backbone:
+    assert recipe.width is not None
+    return SlowBackbone(recipe.width, recipe.milliseconds / 1000, device)
+
+
+def _torchhub(recipe: Recipe, device: torch.device, _weights: Path | None) -> Backbone:
+    assert recipe.hub is not None
+    return HubModule(recipe.hub, device)
+
+
 BACKBONES: dict[str, Callable[[Recipe, torch.device, Path | None], Backbone]] = {
     "efficientnet-lite0": lambda _recipe, device, _weights: EfficientNetLite0(device),
-    SLOW: lambda recipe, device, _weights: SlowBackbone(
-        recipe.width, recipe.milliseconds / 1000, device
-    ),
+    SLOW: _slow,
     "test-tiny": lambda _recipe, device, _weights: TinyBackbone(device),
+    TORCHHUB: _torchhub,
     **{f"dinov2-{size}": _dinov2 for size in SHAPES},
 }
 
@@ -72,12 +82,13 @@ class Extractor:
         """`dino_weights`: DINO_WEIGHTS, for the recipes on DINOv2; None takes timm's on the hub.
         `backbone`: one that is loaded already, of the same `recipe.local_features`.
 
-        Raises Misconfigured (`weights_missing`, `weights_unfit`).
+        Raises Misconfigured (`weights_missing`, `weights_unfit`, `torchhub_unfit`).
         """
         self.recipe = recipe
         self.preprocessing: Preprocessing = get_preprocessing(recipe.preprocessing)
         self.backbone = backbone or BACKBONES[recipe.backbone](recipe, device, dino_weights)
-        assert self.backbone.width == recipe.width, "the recipe tells others the width"
+        told = recipe.width
+        assert told in (None, self.backbone.width), "the recipe tells others the width"
 
     def shipped_vocabulary(self) -> tuple[Centres, dict[str, Any]] | None:
         """The vocabulary that comes with the extractor, with its provenance; None without one."""
@@ -97,10 +108,14 @@ class Extractor:
 
     def spec(self, centres: Centres | None) -> dict[str, Any]:
         """Everything that decides a descriptor's value."""
+        code = {}
+        if isinstance(self.backbone, HubModule):
+            code["code_fingerprint"] = self.backbone.code_fingerprint
         return {
             "extractor": self.recipe.name,
             "backbone": self.backbone.name,
             "backbone_fingerprint": self.backbone.fingerprint,
+            **code,
             "layer": self.backbone.layer,
             "facet": self.backbone.facet,
             "preprocessing": self.preprocessing.as_spec(),

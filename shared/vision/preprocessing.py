@@ -5,6 +5,7 @@ The name and the version are part of the extractor spec: two ways never mix in o
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 
 from PIL import Image
@@ -36,10 +37,17 @@ PREPROCESSINGS = {
 
 
 def get_preprocessing(name: str) -> Preprocessing:
-    try:
+    """The preprocessing of that name; `resizeHEIGHTxWIDTH` is one for each size.
+
+    Misconfigured: `unknown_preprocessing`.
+    """
+    if name in PREPROCESSINGS:
         return PREPROCESSINGS[name]
-    except KeyError:
+    size = re.fullmatch(r"resize([0-9]+)x([0-9]+)", name)
+    if size is None:
         raise Misconfigured(
             "unknown_preprocessing",
-            f"There is no preprocessing {name!r}. Known: {', '.join(sorted(PREPROCESSINGS))}.",
-        ) from None
+            f"There is no preprocessing {name!r}. Known: {', '.join(sorted(PREPROCESSINGS))}, "
+            "resizeHEIGHTxWIDTH.",
+        )
+    return Preprocessing(name, version=1, height=int(size[1]), width=int(size[2]))

@@ -262,6 +262,6 @@ def test_a_network_that_breaks_off_is_an_error_with_the_three_ways(
     def breaks(*_arguments: object) -> str:
         raise httpx2.ReadError("the connection was reset")
 
-    monkeypatch.setattr(huggingface_hub, "hf_hub_download", breaks)
+    monkeypatch.setattr(huggingface_hub, "get_hf_file_metadata", breaks)
     assert "the connection was reset" in refusal(None, "weights_missing")
     assert not offline_cache.exists()

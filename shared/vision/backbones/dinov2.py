@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -181,23 +182,46 @@ def _shapes(vit: Any) -> dict[str, tuple[int, ...]]:
     return {name: tuple(tensor.shape) for name, tensor in vit.state_dict().items()}
 
 
+def weights_fingerprint(size: str, layer: int, facet: str, file: WeightsFile) -> str:
+    """The `fingerprint` of a network with these weights; reads the file, loads no network.
+
+    Misconfigured: `weights_unfit`.
+    """
+    vit = _outline(SHAPES[size], layer, facet)
+    digest = hashlib.sha256()
+    for name, tensor in _tensors(vit, file, SHAPES[size], size):
+        _add(digest, name, tensor)
+    return digest.hexdigest()
+
+
 def _fill(vit: Any, file: WeightsFile, shape: VitShape, size: str, device: torch.device) -> str:
     """Give the outline its tensors; returns their sha256: name-sorted, as float32 bytes."""
-    wanted = _shapes(vit)
-    check_fit(file, wanted, size, shape.registers)
     digest = hashlib.sha256()
     state = {}
+    for name, tensor in _tensors(vit, file, shape, size):
+        _add(digest, name, tensor)
+        state[name] = tensor.to(device)
+    vit.load_state_dict(state, assign=True)
+    return digest.hexdigest()
+
+
+def _tensors(
+    vit: Any, file: WeightsFile, shape: VitShape, size: str
+) -> Iterator[tuple[str, torch.Tensor]]:
+    """What the outline needs of the file, sorted by name, in float32; checked."""
+    wanted = _shapes(vit)
+    check_fit(file, wanted, size, shape.registers)
     for name in sorted(wanted):
         stored = file.read(name)
         if not stored.is_floating_point() or not torch.isfinite(stored).all():
             raise unfit(file.path, f"{name} is not all finite floats", size)
         # Copied: the file may be changed or taken away while the service runs.
-        tensor = torch.empty(stored.shape, dtype=torch.float32).copy_(stored)
-        digest.update(name.encode())
-        digest.update(tensor.numpy().data)
-        state[name] = tensor.to(device)
-    vit.load_state_dict(state, assign=True)
-    return digest.hexdigest()
+        yield name, torch.empty(stored.shape, dtype=torch.float32).copy_(stored)
+
+
+def _add(digest: Any, name: str, tensor: torch.Tensor) -> None:
+    digest.update(name.encode())
+    digest.update(tensor.numpy().data)
 
 
 def _keep_one_third(attention: Any, third: int) -> None:

@@ -25,6 +25,7 @@ from typing import Any
 import torch
 
 from shared.errors import Misconfigured
+from shared.vision.download import OnProgress
 
 HUB_FILE = "model.safetensors"
 META_URL = "https://dl.fbaipublicfiles.com/dinov2/dinov2_{size}/dinov2_{size}_pretrain.pth"
@@ -47,7 +48,8 @@ def three_ways(size: str) -> str:
     cache = f"~/.cache/huggingface/hub/models--{repository.replace('/', '--')}"
     return (
         f"Three ways to get the weights of dinov2-{size}: (1) with internet access and "
-        f"DINO_WEIGHTS unset, timm's {repository} is downloaded from huggingface.co on first use; "
+        f"DINO_WEIGHTS unset, timm's {repository} is downloaded from huggingface.co on first use, "
+        f"or ahead of time by `placewise models fetch anyloc-{size}`; "
         f"(2) download Meta's {META_URL.format(size=size)} and set DINO_WEIGHTS to that file; "
         f"(3) copy {HUB_FILE} of {repository} from another machine ({cache}) and set "
         "DINO_WEIGHTS to the copy."
@@ -69,14 +71,20 @@ class WeightsFile:
         return self.shapes.get("reg_token", (1, 0))[1]
 
 
-def find_weights(size: str, given: Path | None) -> Path:
-    """The file of the weights: the one given, else timm's on the hub, downloaded if need be."""
+def find_weights(
+    size: str, given: Path | None, on_progress: OnProgress = lambda _done, _total: None
+) -> Path:
+    """The file of the weights: the one given, else timm's on the hub, downloaded if need be.
+
+    Misconfigured: `weights_missing`; `download_corrupt` for a file with another hash than the hub
+    names.
+    """
     if given is not None:
         if not given.is_file():
             what = "is not a file" if given.exists() else "does not exist"
             raise _missing(f"DINO_WEIGHTS={given} {what}.", size)
         return given
-    return cached_weights(size) or _download(size)
+    return cached_weights(size) or _download(size, on_progress)
 
 
 def weights_at_hand(size: str, given: Path | None) -> Path:
@@ -101,12 +109,13 @@ def cached_weights(size: str) -> Path | None:
     return Path(found) if isinstance(found, str) else None
 
 
-def _download(size: str) -> Path:
+def _download(size: str, on_progress: OnProgress) -> Path:
     import httpx2
-    import huggingface_hub
+
+    from shared.vision.huggingface import bring_file
 
     try:
-        return Path(huggingface_hub.hf_hub_download(hub_repository(size), HUB_FILE))
+        return bring_file(hub_repository(size), HUB_FILE, on_progress)
     except (OSError, RuntimeError, httpx2.HTTPError) as error:
         raise _missing(
             f"DINO_WEIGHTS is not set, and {hub_repository(size)} can't be downloaded: "

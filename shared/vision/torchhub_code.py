@@ -1,0 +1,234 @@
+"""The code of a torch.hub extractor: brought here at its commit, fingerprinted, executed.
+
+A repository lies where torch.hub itself would put it (`$TORCH_HOME/hub/OWNER_NAME_COMMIT`), so that
+a folder filled by either serves both. Whether its code may run at all is decided before
+(`Settings.recipe`); what runs can do whatever this process can.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import io
+import os
+import re
+import shutil
+import sys
+import tempfile
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from urllib.error import URLError
+
+import httpx2
+import torch
+
+from shared.errors import Misconfigured, PlacewiseError
+from shared.torchhub_names import PREFIX, HubEntry
+from shared.vision.download import OnProgress, download
+
+GITHUB = "https://github.com"
+HUBCONF = "hubconf.py"
+LICENCE_FILES = re.compile(r"(licen[cs]e|copying)([.-].*)?", re.IGNORECASE)
+AWAY = (URLError, httpx2.HTTPError, ConnectionError, TimeoutError)
+
+
+def no_progress(_done: int, _total: int | None) -> None:
+    """For who does not want to see bytes come."""
+
+
+def code_folder(hub: HubEntry) -> Path:
+    """Where the code lies, or would lie once it was brought."""
+    if hub.folder is not None:
+        return Path(hub.folder)
+    assert hub.repository is not None
+    return Path(torch.hub.get_dir(), f"{hub.repository.replace('/', '_')}_{hub.commit}")
+
+
+def bring_code(hub: HubEntry, on_progress: OnProgress = no_progress) -> Path:
+    """The folder of the code; a repository's is downloaded from GitHub if it is not there.
+
+    Misconfigured: `weights_missing` with the three ways to get it, `download_corrupt`.
+    """
+    folder = code_folder(hub)
+    if hub.folder is None and not folder.exists():
+        try:
+            _download_repository(hub, folder, on_progress)
+        except (*AWAY, OSError) as error:
+            raise missing(hub, f"its code can't be downloaded: {_first_line(error)}") from error
+    return code_at_hand(hub)
+
+
+def code_at_hand(hub: HubEntry) -> Path:
+    """As `bring_code`, but what would have to be downloaded is missing."""
+    folder = code_folder(hub)
+    if not (folder / HUBCONF).is_file():
+        raise missing(hub, f"there is no {folder / HUBCONF}")
+    return folder
+
+
+def load_module(
+    hub: HubEntry, folder: Path, on_progress: OnProgress = no_progress
+) -> torch.nn.Module:
+    """Execute the entry of the folder's `hubconf.py` with its arguments.
+
+    Weights that it takes from the network through torch.hub come by `shared.vision.download`.
+    Misconfigured: `weights_missing`, `torchhub_unfit`, `download_corrupt`.
+    """
+    try:
+        with _guarded(folder, on_progress):
+            # From GitHub, too, it is a folder by now: torch.hub's own question whether it is to be
+            # trusted is not asked, and nothing is compared with the repository's branches.
+            load: Any = torch.hub.load  # untyped
+            module = load(str(folder), hub.entry, source="local", **dict(hub.arguments))
+    except PlacewiseError:
+        raise
+    except EOFError as error:
+        raise unfit(
+            hub,
+            "its code asks a question, which nobody is there to answer (torch.hub asks before it "
+            "loads a further repository)",
+        ) from error
+    except (Exception, SystemExit) as error:  # whatever the code of others does
+        said = f"{type(error).__name__}: {_first_line(error)}"
+        if any(isinstance(cause, AWAY) for cause in _chain(error)):
+            raise missing(hub, f"what it needs can't be downloaded: {said}") from error
+        raise unfit(hub, f"loading it ended with {said}") from error
+    if not isinstance(module, torch.nn.Module):
+        raise unfit(hub, f"{hub.entry} returns a {type(module).__name__}, not a torch.nn.Module")
+    return module
+
+
+def code_fingerprint(folder: Path) -> str:
+    """sha256 of every file's path and content; hidden files and bytecode don't count."""
+    digest = hashlib.sha256()
+    for path in sorted(folder.rglob("*")):
+        inside = path.relative_to(folder)
+        skipped = any(part.startswith(".") or part == "__pycache__" for part in inside.parts)
+        if skipped or not path.is_file():
+            continue
+        with path.open("rb") as file:
+            content = hashlib.file_digest(file, "sha256").hexdigest()
+        digest.update(f"{inside.as_posix()}\0{content}\n".encode(errors="surrogateescape"))
+    return digest.hexdigest()
+
+
+def licence(folder: Path) -> str:
+    """What the folder's licence file calls itself, with the file's name; or `none found`."""
+    for path in sorted(folder.iterdir()):
+        if not LICENCE_FILES.fullmatch(path.name) or not path.is_file():
+            continue
+        text = path.read_text(errors="replace")
+        lines = [line.strip() for line in text.splitlines() if line.strip()][:2]
+        named = ", ".join(lines if lines[1:] and lines[1].startswith("Version") else lines[:1])
+        return f"{named[:100]} ({path.name})"
+    return "none found"
+
+
+def missing(hub: HubEntry, reason: str) -> Misconfigured:
+    """The refusal of what is not there."""
+    return Misconfigured(
+        "weights_missing",
+        f"The extractor {hub.name} can't be loaded: {reason}. Three ways to get its code and "
+        f"weights: (1) with internet access, `placewise models fetch {hub.name}`; (2) copy the "
+        f"folder {torch.hub.get_dir()}, with its checkpoints, from a machine that has them "
+        "(TORCH_HOME says where it lies); (3) clone the repository at its commit and name the "
+        f"folder: {PREFIX}/FOLDER:{hub.entry}.",
+    )
+
+
+def unfit(hub: HubEntry, reason: str) -> Misconfigured:
+    """The refusal of what can't be used."""
+    return Misconfigured(
+        "torchhub_unfit",
+        f"The extractor {hub.name} can't be used: {reason}. Three ways out: (1) other arguments of "
+        "the entry, or what its network wants to see, in the name "
+        "(input.size=HEIGHTxWIDTH,input.mean=R/G/B,input.std=R/G/B); (2) another commit, with the "
+        "packages that it needs installed; (3) a copy of the folder, changed by you: "
+        f"{PREFIX}/FOLDER:{hub.entry}.",
+    )
+
+
+@contextlib.contextmanager
+def _guarded(folder: Path, on_progress: OnProgress) -> Iterator[None]:
+    """While code of others is loaded: it asks nothing, prints nothing on stdout, leaves no bytecode
+    in its folder and no module behind that the next repository would take for its own.
+    """
+    torchs_own = torch.hub.download_url_to_file
+
+    def download_url_to_file(
+        url: str, dst: str, hash_prefix: str | None = None, progress: bool = True
+    ) -> None:
+        # torch.hub's own begins anew after a break, and waits without end for a silent server.
+        if not url.startswith(("http://", "https://")):
+            torchs_own(url, dst, hash_prefix, progress)
+            return
+        target = Path(dst).expanduser()
+        download(url, target, sha256=hash_prefix, on_progress=on_progress)
+
+    with (
+        _replaced(sys, "stdin", io.StringIO()),
+        _replaced(sys, "dont_write_bytecode", True),
+        _replaced(torch.hub, "download_url_to_file", download_url_to_file),
+        contextlib.redirect_stdout(sys.stderr),
+    ):
+        try:
+            yield
+        finally:
+            _forget_modules(folder, Path(torch.hub.get_dir()))
+
+
+@contextlib.contextmanager
+def _replaced(owner: Any, name: str, value: object) -> Iterator[None]:
+    before = getattr(owner, name)
+    setattr(owner, name, value)
+    try:
+        yield
+    finally:
+        setattr(owner, name, before)
+
+
+def _forget_modules(*folders: Path) -> None:
+    """Two repositories may both have a `models.py`, and one folder may have changed since."""
+    places = tuple(f"{folder.resolve()}{os.sep}" for folder in folders)
+    for name, module in list(sys.modules.items()):
+        file = getattr(module, "__file__", None)
+        if isinstance(file, str) and os.path.realpath(file).startswith(places):
+            del sys.modules[name]
+
+
+def _download_repository(hub: HubEntry, folder: Path, on_progress: OnProgress) -> None:
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    packed = folder.with_name(f"{folder.name}.zip")
+    url = f"{GITHUB}/{hub.repository}/zipball/{hub.commit}"
+    download(url, packed, on_progress=on_progress)
+    with tempfile.TemporaryDirectory(dir=folder.parent) as unpacked:
+        try:
+            with zipfile.ZipFile(packed) as archive:
+                # GitHub writes the commit there; it is the one thing to compare with.
+                if archive.comment not in (b"", str(hub.commit).encode()):
+                    raise zipfile.BadZipFile(f"it is of the commit {archive.comment.decode()}")
+                archive.extractall(unpacked)  # leaves no folder: zipfile strips roots and ..
+        except zipfile.BadZipFile as error:
+            raise Misconfigured(
+                "download_corrupt",
+                f"{url} is not the archive of that commit: {error}. Nothing of it was kept. Try "
+                f"again, or clone the repository and name its folder: {PREFIX}/FOLDER:{hub.entry}.",
+            ) from error
+        finally:
+            packed.unlink()
+        inside = list(Path(unpacked).iterdir())
+        root = inside[0] if len(inside) == 1 else Path(unpacked)
+        with contextlib.suppress(FileExistsError):  # another process was first
+            shutil.move(root, folder)
+
+
+def _chain(error: BaseException | None) -> Iterator[BaseException]:
+    while error is not None:
+        yield error
+        error = error.__cause__ or error.__context__
+
+
+def _first_line(error: BaseException) -> str:
+    return (str(error).strip() or type(error).__name__).splitlines()[0]

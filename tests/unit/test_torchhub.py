@@ -1,0 +1,245 @@
+"""torch.hub entries as extractors: what they describe, what pins them, and what is refused."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from shared.errors import Misconfigured
+from shared.recipes import get_recipe
+from shared.vision import torchhub_code
+from shared.vision.backbones.torchhub import HubModule
+from shared.vision.extractors import Extractor, spec_fingerprint
+from shared.vision.preprocessing import get_preprocessing
+from tests.support.hub import COMMIT, MIT, NETWORKS, write_hub
+from tests.support.photos import photo_image
+
+CPU = torch.device("cpu")
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    return write_hub(tmp_path / "hub")
+
+
+@pytest.fixture(autouse=True)
+def torch_home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """torch.hub's own folder, empty."""
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
+    return tmp_path / "torch" / "hub"
+
+
+def extractor(folder: Path, entry: str) -> Extractor:
+    recipe = get_recipe(f"torchhub:{folder}:{entry}", allow_test_extractors=False)
+    return Extractor(recipe, CPU)
+
+
+def refusal(folder: Path, entry: str, code: str = "torchhub_unfit") -> str:
+    with pytest.raises(Misconfigured) as caught:
+        extractor(folder, entry)
+    assert caught.value.code == code
+    for way in ("(1)", "(2)", "(3)"):
+        assert way in caught.value.detail
+    return caught.value.detail
+
+
+def pixels_of(made: Extractor, *numbers: int) -> NDArray[np.uint8]:
+    return np.stack([np.asarray(made.preprocessing.apply(photo_image(n))) for n in numbers])
+
+
+# --- what it makes ---------------------------------------------------------------------------
+
+
+def test_descriptors_are_those_of_the_network_on_normalised_pixels(folder: Path) -> None:
+    made = extractor(folder, "colours:dimension=40")
+    pixels = pixels_of(made, 1, 2)
+    rows = made.describe(pixels, None)
+
+    scaled = (pixels / 255 - np.array([0.485, 0.456, 0.406])) / np.array([0.229, 0.224, 0.225])
+    cells = scaled.reshape(2, 8, 28, 8, 28, 3).mean(axis=(2, 4)).transpose(0, 3, 1, 2)
+    draw = torch.Generator().manual_seed(7)
+    projection = torch.randn(192, 40, generator=draw).double().numpy()
+    expected = cells.reshape(2, 192) @ projection
+    expected /= np.linalg.norm(expected, axis=1, keepdims=True)
+    np.testing.assert_allclose(rows, expected, atol=1e-5)
+    assert rows.dtype == np.float32
+
+
+def test_dimension_is_found_by_describing_and_stands_in_the_spec(folder: Path) -> None:
+    made = extractor(folder, "colours:dimension=40,input.size=32x48")
+    spec = made.spec(None)
+    assert (spec["dimension"], made.dimension(None)) == (40, 40)
+    assert (spec["aggregator"], spec["vocabulary_sha256"], spec["facet"]) == ("none", None, None)
+    assert spec["preprocessing"] == {"name": "resize32x48", "version": 1}
+    assert pixels_of(made, 1).shape == (1, 32, 48, 3)
+    assert made.shipped_vocabulary() is None
+
+
+def test_of_several_answers_the_first_is_the_descriptor(folder: Path) -> None:
+    one, both = extractor(folder, "colours"), extractor(folder, "with_attention")
+    pixels = pixels_of(one, 3)
+    np.testing.assert_array_equal(both.describe(pixels, None), one.describe(pixels, None))
+
+
+def test_usual_size_is_the_preprocessing_of_the_other_extractors(folder: Path) -> None:
+    assert extractor(folder, "colours").preprocessing == get_preprocessing("square224")
+
+
+# --- what pins it ----------------------------------------------------------------------------
+
+
+def test_fingerprint_is_the_same_wherever_the_folder_is_loaded_again(folder: Path) -> None:
+    assert extractor(folder, "colours").spec(None) == extractor(folder, "colours").spec(None)
+    assert not list(folder.rglob("*.pyc")), "loading changes nothing in the folder"
+
+
+def test_changed_code_is_another_spec_and_is_what_runs(folder: Path) -> None:
+    before = extractor(folder, "colours")
+    source = folder / "networks.py"
+    source.write_text(NETWORKS.replace("manual_seed(7)", "manual_seed(8)"))  # of the same length
+    after = extractor(folder, "colours")
+    assert spec_fingerprint(after.spec(None)) != spec_fingerprint(before.spec(None))
+    assert after.spec(None)["code_fingerprint"] != before.spec(None)["code_fingerprint"]
+    assert after.backbone.fingerprint != before.backbone.fingerprint
+    pixels = pixels_of(after, 1)
+    assert not np.allclose(after.describe(pixels, None), before.describe(pixels, None))
+
+
+def test_code_that_only_reads_otherwise_is_another_spec_with_the_same_weights(
+    folder: Path,
+) -> None:
+    before = extractor(folder, "colours").spec(None)
+    (folder / "settings.json").write_text("{}")
+    after = extractor(folder, "colours").spec(None)
+    differing = {key for key in before if before[key] != after[key]}
+    assert differing == {"code_fingerprint"}
+
+
+def test_hidden_files_and_bytecode_are_no_code(folder: Path) -> None:
+    before = extractor(folder, "colours").spec(None)
+    for name in (".git/HEAD", "__pycache__/networks.pyc", ".DS_Store"):
+        (folder / name).parent.mkdir(exist_ok=True)
+        (folder / name).write_text("x")
+    assert extractor(folder, "colours").spec(None) == before
+
+
+def test_arguments_and_weights_are_part_of_the_spec(folder: Path) -> None:
+    plain = extractor(folder, "colours").spec(None)
+    scaled = extractor(folder, "colours:scale=2.0").spec(None)
+    assert {key for key in plain if plain[key] != scaled[key]} == {
+        "extractor",
+        "backbone",
+        "backbone_fingerprint",
+    }
+
+
+def test_two_repositories_with_modules_of_one_name_do_not_meet(
+    folder: Path, tmp_path: Path
+) -> None:
+    other = write_hub(tmp_path / "other")
+    (other / "networks.py").write_text(NETWORKS.replace("dimension=24", "dimension=8"))
+    assert "networks" not in sys.modules
+    assert extractor(folder, "prints").dimension(None) == 24
+    assert extractor(other, "prints").dimension(None) == 8
+    assert "networks" not in sys.modules
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "shown"),
+    [
+        ("LICENSE", MIT, "MIT License (LICENSE)"),
+        (
+            "COPYING.txt",
+            "GNU GPL\nVersion 3, 29 June 2007\n...",
+            "GNU GPL, Version 3, 29 June 2007",
+        ),
+        ("licence.md", "\n  Apache License\n  Version 2.0\n", "Apache License, Version 2.0"),
+        ("README.md", "MIT License", "none found"),
+    ],
+)
+def test_licence_of_the_code_is_read_or_said_to_be_missing(
+    tmp_path: Path, name: str, text: str, shown: str
+) -> None:
+    folder = write_hub(tmp_path / "bare", licence=None)
+    (folder / name).write_text(text)
+    assert extractor(folder, "colours").backbone.licence.startswith(shown)
+
+
+# --- what is refused -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("entry", "said"),
+    [
+        ("missing_entry", "missing_entry"),
+        ("fails", "KeyError: 'no such backbone'"),
+        ("colours:depth=3", "depth"),
+        ("a_number", "returns a int"),
+        ("maps", "(2, 4, 224, 224)"),
+        ("not_finite", "NaN"),
+        ("zero", "zero"),
+        ("of_the_batch", "when another one is beside it"),
+        ("one_size", "only 320 x 320 will do"),
+        ("colours:dimension=200000", "200000 dimensions"),
+        ("asks", "asks a question"),
+    ],
+)
+def test_an_entry_that_is_no_extractor_is_refused_with_the_reason(
+    folder: Path, entry: str, said: str
+) -> None:
+    assert said in refusal(folder, entry)
+
+
+def test_the_size_that_a_network_wants_can_be_given(folder: Path) -> None:
+    assert extractor(folder, "one_size:input.size=320x320").dimension(None) == 24
+
+
+def test_missing_packages_are_named(folder: Path) -> None:
+    hubconf = folder / "hubconf.py"
+    hubconf.write_text(hubconf.read_text().replace('["torch"]', '["torch", "no_such_package"]'))
+    assert "no_such_package" in refusal(folder, "colours")
+
+
+def test_code_of_others_prints_nothing_into_an_answer(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    extractor(folder, "prints")
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert "printed by the code of others" in printed.err
+
+
+def test_a_missing_folder_is_an_error_with_the_three_ways(tmp_path: Path) -> None:
+    said = refusal(tmp_path / "gone", "colours", "weights_missing")
+    assert f"there is no {tmp_path / 'gone' / 'hubconf.py'}" in said
+    assert "placewise models fetch torchhub:" in said
+
+
+def test_weights_that_can_not_be_downloaded_are_an_error_with_the_three_ways(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("shared.vision.download.PAUSE_SECONDS", 0)
+    assert "can't be downloaded" in refusal(folder, "from_network", "weights_missing")
+
+
+def test_a_repository_in_torch_hubs_folder_is_taken_without_the_network(
+    folder: Path, torch_home: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torchhub_code, "GITHUB", "http://127.0.0.1:9")
+    monkeypatch.setattr("shared.vision.download.PAUSE_SECONDS", 0)
+    name = f"torchhub:somebody/places@{COMMIT}:colours"
+    recipe = get_recipe(name, allow_test_extractors=False)
+    with pytest.raises(Misconfigured) as caught:
+        Extractor(recipe, CPU)
+    assert caught.value.code == "weights_missing"
+    shutil.copytree(folder, torch_home / f"somebody_places_{COMMIT}")
+    found = Extractor(recipe, CPU)
+    assert found.backbone.card["source"] == f"somebody/places@{COMMIT}"
+    assert isinstance(found.backbone, HubModule)
+    assert found.spec(None)["code_fingerprint"] == torchhub_code.code_fingerprint(folder)
