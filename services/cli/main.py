@@ -25,6 +25,7 @@ COMMANDS = {
     "doctor": ("doctor", "doctor"),
     "maps": ("maps", "app"),
     "vocabulary": ("vocabulary", "app"),
+    "models": ("models", "app"),
     "datasets": ("datasets", "app"),
     "storage": ("storage", "app"),
     "bench": ("bench", "app"),

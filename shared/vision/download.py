@@ -20,7 +20,6 @@ from shared.errors import Misconfigured
 TIMEOUT_SECONDS = 30.0  # without a byte
 TRIES = 5  # in a row that brought nothing
 PAUSE_SECONDS = 1.0  # after the first; twice as long after each further one
-BLOCK_BYTES = 1 << 20
 PARTIAL_CONTENT, RANGE_NOT_SATISFIABLE = 206, 416
 
 OnProgress = Callable[[int, int | None], object]
@@ -96,7 +95,7 @@ def _go_on(client: httpx2.Client, url: str, part: Path, on_progress: OnProgress)
             _remember(etag, answer.headers.get("ETag"))
         with part.open("ab" if resumed else "wb") as file:
             on_progress(done, total)
-            for block in answer.iter_raw(BLOCK_BYTES):
+            for block in answer.iter_raw():
                 file.write(block)
                 done += len(block)
                 on_progress(done, total)

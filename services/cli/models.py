@@ -1,0 +1,147 @@
+"""`placewise models list|fetch`."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.markup import escape
+from rich.progress import (
+    BarColumn,
+    DownloadColumn,
+    Progress,
+    TextColumn,
+    TimeRemainingColumn,
+    TransferSpeedColumn,
+)
+from rich.table import Column, Table
+
+from services.cli.configuration import read_settings
+from services.cli.fingerprints import Known, remember
+from services.cli.output import JsonOption, answers, explained, messages, print_json
+from services.cli.weights_here import Weights, hub_key, listed, look
+from shared.errors import Misconfigured
+from shared.recipes import get_recipe
+from shared.settings import Settings
+from shared.torchhub_names import HubEntry
+
+if TYPE_CHECKING:
+    from shared.vision.download import OnProgress
+
+app = typer.Typer(help="Extractors' weights: what is on this machine, and getting what is not.")
+
+
+@app.command("list")
+def list_(as_json: JsonOption = False) -> None:
+    """Show each extractor with its weights. One that is seen for the first time is read whole."""
+    with explained(as_json):
+        settings = read_settings()
+        with messages.status("Looking for weights") as status:
+
+            def reading(path: Path) -> None:
+                status.update(f"Reading {path} for its fingerprint")
+
+            found = [look(recipe, settings, reading) for recipe in listed(settings)]
+    if as_json:
+        print_json([asdict(weights) for weights in found])
+        return
+    name = Column("extractor", overflow="fold", min_width=23)
+    table = Table(name, "here", "size", Column("from", overflow="fold"), "licence", "fingerprint")
+    for weights in found:
+        table.add_row(
+            escape(weights.extractor),
+            "yes" if weights.here else "no",
+            _megabytes(weights.size_bytes),
+            escape(weights.source),
+            escape(weights.licence),
+            (weights.fingerprint or "")[:12],
+        )
+    answers.print(table)
+
+
+@app.command("fetch")
+def fetch(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="An extractor's name.")],
+    as_json: JsonOption = False,
+) -> None:
+    """Get an extractor's weights ahead of time; a download that broke off goes on.
+
+    A torch.hub entry (torchhub:OWNER/NAME@COMMIT:ENTRY) is executed, which is how its weights come:
+    look at its code first.
+    """
+    with explained(as_json):
+        settings = read_settings()
+        recipe = get_recipe(name, allow_test_extractors=settings.allow_test_extractors)
+        if recipe.for_tests:
+            raise Misconfigured("no_weights", f"The extractor {recipe.name} has no weights.")
+        with _download_bar(recipe.name) as on_progress:
+            dimension = recipe.dimension
+            if recipe.hub is not None:
+                dimension = _fetch_torchhub(recipe.hub, on_progress)
+            elif recipe.depth is not None:
+                _fetch_dinov2(recipe.backbone, settings, on_progress)
+        found = look(recipe, settings)
+        if not found.here:
+            raise Misconfigured("weights_unfit", found.note or "")
+    if as_json:
+        print_json({**asdict(found), "dimension": dimension})
+        return
+    _say(found, dimension)
+    if recipe.hub is not None and recipe.name not in settings.allowed_hub_extractors:
+        answers.print(
+            f"Maps may use it once it is allowed: TORCHHUB_ALLOWED={escape(recipe.name)}",
+            soft_wrap=True,
+        )
+
+
+def _fetch_dinov2(backbone: str, settings: Settings, on_progress: OnProgress) -> None:
+    from shared.vision.backbones.dinov2_weights import find_weights
+
+    find_weights(backbone.removeprefix("dinov2-"), settings.dino_weights, on_progress)
+
+
+def _fetch_torchhub(hub: HubEntry, on_progress: OnProgress) -> int:
+    """Load it once; returns the length of its descriptors."""
+    import torch
+
+    from shared.vision.backbones.torchhub import HubModule
+
+    made = HubModule(hub, torch.device("cpu"), on_progress=on_progress)
+    remember(hub_key(hub, made.code_fingerprint), Known(made.fingerprint, made.card["size_bytes"]))
+    return made.width
+
+
+def _say(found: Weights, dimension: int | None) -> None:
+    for line in (
+        f"{found.extractor}: {dimension} dimensions, {_megabytes(found.size_bytes)} of weights.",
+        f"They are from {found.source}, and lie at {found.path}.",
+        f"Licence: {found.licence}. Fingerprint: {found.fingerprint}.",
+    ):
+        answers.print(escape(line), soft_wrap=True)
+
+
+@contextlib.contextmanager
+def _download_bar(what: str) -> Iterator[OnProgress]:
+    """A bar for what comes from the network, as soon as something comes."""
+    with Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        DownloadColumn(),
+        TransferSpeedColumn(),
+        TimeRemainingColumn(),
+        console=messages,
+    ) as progress:
+        bar = progress.add_task(escape(what), visible=False)
+
+        def show(done: int, total: int | None) -> None:
+            progress.update(bar, completed=done, total=total, visible=True)
+
+        yield show
+
+
+def _megabytes(size_bytes: int | None) -> str:
+    return "" if size_bytes is None else f"{size_bytes / 1e6:.1f} MB"

@@ -1,0 +1,159 @@
+"""Downloads: they go on where they broke off, and what has another hash is refused."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator
+from pathlib import Path
+
+import httpx2
+import numpy as np
+import pytest
+
+from shared.errors import Misconfigured
+from shared.vision import download as download_module
+from shared.vision.download import TRIES, download
+from tests.support.files_server import FilesServer, files_server
+
+CONTENT = np.random.default_rng(0).bytes(5_000_000)
+HASH = hashlib.sha256(CONTENT).hexdigest()
+
+
+@pytest.fixture(autouse=True)
+def _no_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(download_module, "PAUSE_SECONDS", 0)
+
+
+@pytest.fixture
+def server() -> Iterator[FilesServer]:
+    with files_server() as started:
+        started.files["/weights"] = CONTENT
+        yield started
+
+
+@pytest.fixture
+def target(tmp_path: Path) -> Path:
+    return tmp_path / "folder" / "weights.pth"
+
+
+def begun(target: Path) -> Path:
+    return target.with_name("weights.pth.part")
+
+
+def break_off(server: FilesServer, target: Path, after: int = 2_000_000) -> int:
+    """The download ends in an error, as with a network that is gone; bytes that were kept."""
+    server.break_after = [after]
+    server.refuse = []
+    with pytest.raises(httpx2.HTTPError):
+        # The first answer breaks off; every later one brings nothing.
+        download(f"{server.url}/weights", target, on_progress=lambda *_: _refuse_all(server))
+    return begun(target).stat().st_size
+
+
+def _refuse_all(server: FilesServer) -> None:
+    server.refuse = [503] * TRIES
+
+
+def test_a_file_comes_whole_with_its_progress(server: FilesServer, target: Path) -> None:
+    seen: list[tuple[int, int | None]] = []
+    download(
+        f"{server.url}/weights",
+        target,
+        sha256=HASH,
+        on_progress=lambda done, total: seen.append((done, total)),
+    )
+    assert target.read_bytes() == CONTENT
+    assert seen[0] == (0, len(CONTENT))
+    assert seen[-1] == (len(CONTENT), len(CONTENT))
+    assert not begun(target).exists()
+
+
+def test_a_break_costs_only_what_was_not_there_yet(server: FilesServer, target: Path) -> None:
+    server.break_after = [2_000_000, 1_000_000]
+    download(f"{server.url}/weights", target, sha256=HASH)
+    assert target.read_bytes() == CONTENT
+    assert [part for _, part in server.asked] == [None, "bytes=2000000-", "bytes=3000000-"]
+
+
+def test_a_later_call_goes_on_where_an_earlier_one_ended(server: FilesServer, target: Path) -> None:
+    kept = break_off(server, target)
+    assert 0 < kept <= 2_000_000
+    assert not target.exists()
+    server.refuse, server.asked = [], []
+    seen: list[int] = []
+    download(
+        f"{server.url}/weights", target, sha256=HASH, on_progress=lambda done, _: seen.append(done)
+    )
+    assert target.read_bytes() == CONTENT
+    assert server.asked == [("/weights", f"bytes={kept}-")]
+    assert seen[0] == kept
+
+
+def test_a_file_that_has_changed_meanwhile_comes_anew(server: FilesServer, target: Path) -> None:
+    break_off(server, target)
+    server.refuse = []
+    server.files["/weights"] = changed = CONTENT[::-1]
+    download(f"{server.url}/weights", target)
+    assert target.read_bytes() == changed
+
+
+def test_a_server_without_ranges_sends_all_of_it_again(server: FilesServer, target: Path) -> None:
+    server.ranges = False
+    server.break_after = [2_000_000]
+    download(f"{server.url}/weights", target, sha256=HASH)
+    assert target.read_bytes() == CONTENT
+    assert [part for _, part in server.asked] == [None, None]
+
+
+def test_a_download_that_was_complete_is_not_asked_for_again(
+    server: FilesServer, target: Path
+) -> None:
+    break_off(server, target)
+    server.refuse = []
+    begun(target).write_bytes(CONTENT)
+    download(f"{server.url}/weights", target, sha256=HASH)
+    assert target.read_bytes() == CONTENT
+    assert server.asked[-1] == ("/weights", f"bytes={len(CONTENT)}-")
+
+
+def test_more_than_there_is_is_thrown_away(server: FilesServer, target: Path) -> None:
+    break_off(server, target)
+    server.refuse = []
+    begun(target).write_bytes(CONTENT + b"more")
+    download(f"{server.url}/weights", target, sha256=HASH)
+    assert target.read_bytes() == CONTENT
+
+
+@pytest.mark.parametrize("expected", ["0" * 64, "0123abcd"])
+def test_a_file_with_another_hash_is_refused_and_not_kept(
+    server: FilesServer, target: Path, expected: str
+) -> None:
+    with pytest.raises(Misconfigured, match="is not the file that it should be") as caught:
+        download(f"{server.url}/weights", target, sha256=expected)
+    assert caught.value.code == "download_corrupt"
+    assert {path.suffix for path in target.parent.iterdir()} <= {".lock"}
+
+
+def test_the_beginning_of_a_hash_is_enough(server: FilesServer, target: Path) -> None:
+    download(f"{server.url}/weights", target, sha256=HASH[:8].upper())
+    assert target.read_bytes() == CONTENT
+
+
+def test_what_is_not_there_is_asked_for_once(server: FilesServer, target: Path) -> None:
+    with pytest.raises(httpx2.HTTPStatusError, match="404"):
+        download(f"{server.url}/others", target)
+    assert len(server.asked) == 1
+
+
+def test_a_busy_server_is_asked_again(server: FilesServer, target: Path) -> None:
+    server.refuse = [503, 429]
+    download(f"{server.url}/weights", target, sha256=HASH)
+    assert target.read_bytes() == CONTENT
+
+
+def test_a_file_that_is_there_is_not_asked_for(server: FilesServer, target: Path) -> None:
+    target.parent.mkdir()
+    target.write_bytes(b"here")
+    download(f"{server.url}/weights", target, sha256=HASH)
+    assert target.read_bytes() == b"here"
+    assert server.asked == []

@@ -1,0 +1,275 @@
+"""`placewise models`: weights that are here, and weights that are fetched from local servers."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from zipfile import ZipFile
+
+import numpy as np
+import pytest
+import torch
+from typer.testing import CliRunner
+
+from services.cli import models, weights_here
+from shared.settings import Settings
+from shared.vision import download, torchhub_code
+from shared.vision.backbones.dinov2 import SHAPES, Dinov2
+from tests.support.files_server import FilesServer, files_server
+from tests.support.hub import COMMIT, write_hub
+from tests.support.vit import random_weights, save
+
+CPU = torch.device("cpu")
+VITS = "anyloc-vits14:layer=0"
+VITS_FILE = "/timm/vit_small_patch14_dinov2.lvd142m/resolve/main/model.safetensors"
+REPOSITORY = f"torchhub:somebody/places@{COMMIT}:colours"
+
+
+@pytest.fixture(scope="module")
+def vits_weights(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    """What `VITS` needs, as timm's repository has it: about 9 MB."""
+    path = tmp_path_factory.mktemp("weights") / "model.safetensors"
+    return save(random_weights(SHAPES["vits14"], blocks=1), path).read_bytes()
+
+
+@pytest.fixture(autouse=True)
+def caches(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Empty caches of this user."""
+    from huggingface_hub import constants
+
+    monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path / "huggingface"))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
+    monkeypatch.setattr(download, "PAUSE_SECONDS", 0)
+    return tmp_path
+
+
+@pytest.fixture
+def server(monkeypatch: pytest.MonkeyPatch, vits_weights: bytes) -> Iterator[FilesServer]:
+    """What Hugging Face and GitHub are for these tests."""
+    from huggingface_hub import constants
+
+    with files_server() as started:
+        started.files[VITS_FILE] = vits_weights
+        template = f"{started.url}/{{repo_id}}/resolve/{{revision}}/{{filename}}"
+        monkeypatch.setattr(constants, "ENDPOINT", started.url)
+        monkeypatch.setattr(constants, "HUGGINGFACE_CO_URL_TEMPLATE", template)
+        monkeypatch.setattr(torchhub_code, "GITHUB", started.url)
+        yield started
+
+
+def command(*arguments: str, exit_code: int = 0) -> Any:
+    """The JSON that `placewise models ARGUMENTS --json` prints."""
+    result = CliRunner().invoke(models.app, [*arguments, "--json"])
+    assert result.exit_code == exit_code, result.output
+    return json.loads(result.stdout)
+
+
+def listed(name: str) -> dict[str, Any]:
+    found: dict[str, Any] = next(w for w in command("list") if w["extractor"] == name)
+    return found
+
+
+def repository_zip(tmp_path: Path, comment: str = COMMIT) -> bytes:
+    """A commit as GitHub packs it: in a folder of its own, the commit in the comment."""
+    folder = write_hub(tmp_path / "somebody-places-0123456")
+    with ZipFile(tmp_path / "packed.zip", "w") as packed:
+        packed.comment = comment.encode()
+        for path in folder.iterdir():
+            packed.write(path, path.relative_to(tmp_path))
+    return (tmp_path / "packed.zip").read_bytes()
+
+
+# --- list ------------------------------------------------------------------------------------
+
+
+def test_list_says_what_is_here_and_how_to_get_what_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("EXTRACTOR")
+    here = listed("efficientnet-lite0-vlad")
+    assert (here["here"], here["licence"]) == (True, "Apache-2.0")
+    assert here["size_bytes"] == Path(here["path"]).stat().st_size
+    missing = listed("anyloc-vitg14")
+    assert (missing["here"], missing["path"], missing["fingerprint"]) == (False, None, None)
+    assert "timm/vit_giant_patch14_dinov2.lvd142m" in missing["source"]
+    assert "placewise models fetch anyloc-vitg14" in missing["note"]
+    assert not [w for w in command("list") if w["extractor"].startswith("test-")]
+
+
+def test_table_shows_every_extractor() -> None:
+    result = CliRunner().invoke(models.app, ["list"], env={"COLUMNS": "200"})
+    assert result.exit_code == 0, result.output
+    for part in ("efficientnet-lite0-vlad", "18.8 MB", "Apache-2.0", "anyloc-vits14"):
+        assert part in result.output
+
+
+def test_fingerprint_is_that_of_the_spec_and_is_computed_once(
+    caches: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    weights = random_weights(SHAPES["vits14"], blocks=1)
+    file = save(weights, caches / "vits.pth")
+    monkeypatch.setenv("DINO_WEIGHTS", str(file))
+    monkeypatch.setenv("EXTRACTOR", VITS)
+    found = listed(VITS)
+    assert found["fingerprint"] == Dinov2("vits14", 0, "value", CPU, file).fingerprint
+    assert found["source"] == "DINO_WEIGHTS"
+    other = listed("anyloc-vitb14")
+    assert not other["here"]
+    assert "these look like the weights of dinov2-vits14" in other["note"]
+
+    read: list[Path] = []
+    recipe = next(r for r in weights_here.listed(Settings()) if r.name == VITS)
+    assert weights_here.look(recipe, Settings(), read.append).fingerprint == found["fingerprint"]
+    assert read == [], "it is known by now"
+    save({name: 2 * tensor for name, tensor in weights.items()}, file)
+    assert weights_here.look(recipe, Settings(), read.append).fingerprint != found["fingerprint"]
+    assert read == [file]
+
+
+def test_a_broken_memory_of_fingerprints_is_made_anew(caches: Path) -> None:
+    first = listed("efficientnet-lite0-vlad")
+    memory = caches / "cache" / "placewise" / "fingerprints.json"
+    assert first["fingerprint"] in memory.read_text()
+    memory.write_text("{")
+    assert listed("efficientnet-lite0-vlad") == first
+
+
+# --- fetch: DINOv2 ---------------------------------------------------------------------------
+
+
+def test_weights_are_fetched_ahead_of_time(server: FilesServer, vits_weights: bytes) -> None:
+    fetched = command("fetch", VITS)
+    assert Path(fetched["path"]).read_bytes() == vits_weights
+    assert (fetched["here"], fetched["dimension"]) == (True, 64 * 384)
+    backbone = Dinov2("vits14", 0, "value", CPU)
+    assert backbone.fingerprint == fetched["fingerprint"]
+
+    asked = len(server.asked)
+    assert command("fetch", VITS) == fetched
+    assert len(server.asked) == asked, "what is here is not asked for again"
+
+
+def test_an_interrupted_fetch_goes_on_where_it_ended(
+    server: FilesServer, vits_weights: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(download, "TRIES", 1)
+    server.break_after = [5_000_000]
+    refused = command("fetch", VITS, exit_code=1)
+    assert refused["code"] == "weights_missing"
+    server.asked.clear()
+    fetched = command("fetch", VITS)
+    assert Path(fetched["path"]).read_bytes() == vits_weights
+    assert server.asked == [(VITS_FILE, "bytes=5000000-")]
+
+
+def test_a_file_that_is_not_what_the_hub_promises_is_refused(
+    server: FilesServer, caches: Path, vits_weights: bytes
+) -> None:
+    server.promised[VITS_FILE] = vits_weights
+    server.files[VITS_FILE] = vits_weights[:-4] + b"\0\0\0\0"
+    refused = command("fetch", VITS, exit_code=1)
+    assert refused["code"] == "download_corrupt"
+    kept = [p for p in (caches / "huggingface").rglob("*") if p.is_file()]
+    assert [p for p in kept if p.stat().st_size > 0] == []
+    assert not listed("anyloc-vits14")["here"]
+
+
+def test_weights_of_another_network_are_refused_when_they_are_fetched(
+    server: FilesServer, caches: Path
+) -> None:
+    wide = {"cls_token": torch.zeros(1, 1, 768)}
+    server.files[VITS_FILE] = save(wide, caches / "wide.safetensors").read_bytes()
+    refused = command("fetch", VITS, exit_code=1)
+    assert refused["code"] == "weights_unfit"
+    assert "vitb14" in refused["detail"]
+
+
+def test_what_can_not_be_fetched_is_an_error_with_the_three_ways(
+    server: FilesServer,
+) -> None:
+    server.files.clear()
+    assert "Three ways to get the weights" in command("fetch", VITS, exit_code=1)["detail"]
+
+
+# --- fetch: torch.hub ------------------------------------------------------------------------
+
+
+def test_a_repository_is_fetched_at_its_commit_and_tried(
+    server: FilesServer, caches: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    server.files[f"/somebody/places/zipball/{COMMIT}"] = repository_zip(caches)
+    fetched = command("fetch", REPOSITORY)
+    assert fetched["dimension"] == 24
+    assert fetched["licence"] == "MIT License (LICENSE)"
+    assert fetched["size_bytes"] == 192 * 24 * 4
+    assert Path(fetched["path"]) == caches / "torch" / "hub" / f"somebody_places_{COMMIT}"
+    assert [p.name for p in (caches / "torch" / "hub").iterdir() if p.is_dir()] == [
+        f"somebody_places_{COMMIT}"
+    ]
+
+    monkeypatch.setenv("TORCHHUB_ALLOWED", f"{REPOSITORY}  {REPOSITORY}:dimension=8")
+    server.files.clear()
+    found = listed(REPOSITORY)
+    assert (found["here"], found["fingerprint"]) == (True, fetched["fingerprint"])
+    other = listed(f"{REPOSITORY}:dimension=8")
+    assert not other["here"], "its code is here, and was never loaded that way"
+    assert "placewise models fetch" in other["note"]
+
+    (Path(fetched["path"]) / "networks.py").write_text("changed = True")
+    assert not listed(REPOSITORY)["here"]
+
+
+def test_weights_of_an_entry_come_by_a_download_that_goes_on(
+    server: FilesServer, caches: Path
+) -> None:
+    projection = np.random.default_rng(1).standard_normal((192, 24)).astype(np.float32)
+    file = save({"projection": torch.from_numpy(projection)}, caches / "weights.pth")
+    server.files["/weights.pth"] = file.read_bytes()
+    server.break_after = [10_000]
+    folder = write_hub(caches / "hub")
+    hubconf = folder / "hubconf.py"
+    hubconf.write_text(hubconf.read_text().replace("http://127.0.0.1:9", server.url))
+    fetched = command("fetch", f"torchhub:{folder}:from_network")
+    assert fetched["here"]
+    assert server.asked == [("/weights.pth", None), ("/weights.pth", "bytes=10000-")]
+    assert (caches / "torch" / "hub" / "checkpoints" / "weights.pth").exists()
+
+
+def test_weights_with_another_hash_than_the_entry_names_are_refused(
+    server: FilesServer, caches: Path
+) -> None:
+    file = save({"projection": torch.zeros(192, 24)}, caches / "weights.pth")
+    server.files["/weights-01234567.pth"] = file.read_bytes()
+    folder = write_hub(caches / "hub")
+    hubconf = folder / "hubconf.py"
+    named = hubconf.read_text().replace(
+        "http://127.0.0.1:9/weights", f"{server.url}/weights-01234567"
+    )
+    hubconf.write_text(named)
+    refused = command("fetch", f"torchhub:{folder}:from_network:check_hash=true", exit_code=1)
+    assert refused["code"] == "download_corrupt"
+
+
+@pytest.mark.parametrize("packed", ["of another commit", "no archive"])
+def test_an_archive_of_something_else_is_refused(
+    server: FilesServer, caches: Path, packed: str
+) -> None:
+    archive = repository_zip(caches, comment="f" * 40) if packed == "of another commit" else b"<p>"
+    server.files[f"/somebody/places/zipball/{COMMIT}"] = archive
+    assert command("fetch", REPOSITORY, exit_code=1)["code"] == "download_corrupt"
+    assert not (caches / "torch" / "hub" / f"somebody_places_{COMMIT}").exists()
+
+
+def test_fetched_code_says_how_maps_may_use_it(caches: Path) -> None:
+    name = f"torchhub:{write_hub(caches / 'hub', licence=None)}:colours"
+    result = CliRunner().invoke(models.app, ["fetch", name])
+    assert result.exit_code == 0, result.output
+    said = result.output.replace("\n", "")
+    assert f"TORCHHUB_ALLOWED={name}" in said
+    assert "Licence: none found" in said
+
+
+def test_an_extractor_for_tests_has_nothing_to_fetch() -> None:
+    assert command("fetch", "test-tiny-avg", exit_code=1)["code"] == "no_weights"
+    assert command("fetch", "anyloc", exit_code=1)["code"] == "unknown_extractor"
