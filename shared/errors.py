@@ -13,7 +13,7 @@ PlacewiseError
 ├── Unavailable 503             search_behind, chunk_unreadable, ... (may be tried again)
 │   │                       object_store_unavailable, bucket_not_found, ...
 │   └── StorageFull 507         disk_full, object_store_full
-└── Misconfigured 500           weights_missing, home_in_use, ... (an operator must act)
+└── Misconfigured 500           weights_missing, torchhub_unfit, ... (an operator must act)
 
 `shared.errors` knows nothing of HTTP libraries: the gateway turns these into RFC 9457 problems,
 the extractor stores them in `jobs.error`, the command line prints `detail`.

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
 from services.extractor.loaded import MOST_EXTRACTORS, LoadedModels
+from shared.errors import Misconfigured
 from shared.objects import FolderStore
 from shared.settings import Settings
+from tests.support.hub import write_hub
 
 
 @pytest.fixture
@@ -31,3 +35,27 @@ def test_extractors_used_least_lately_are_let_go(models: LoadedModels) -> None:
     for clusters in range(2, MOST_EXTRACTORS + 2):
         models.extractor(f"test-tiny-vlad:clusters={clusters}")
     assert models.extractor("test-tiny-vlad:clusters=1") is not first
+
+
+def test_code_that_is_no_longer_allowed_is_not_executed(
+    store: FolderStore, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    name = f"torchhub:{write_hub(tmp_path / 'hub')}:colours"
+    monkeypatch.setenv("TORCHHUB_ALLOWED", name)
+    assert LoadedModels(store, Settings()).extractor(name).dimension(None) == 24
+    monkeypatch.setenv("TORCHHUB_ALLOWED", f"{name}:dimension=8")
+    with pytest.raises(Misconfigured) as caught:
+        LoadedModels(store, Settings()).extractor(name)
+    assert caught.value.code == "torchhub_not_allowed"
+    assert name in caught.value.detail
+
+
+def test_networks_of_one_folder_share_nothing_unless_all_of_the_name_agrees(
+    store: FolderStore, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    name = f"torchhub:{write_hub(tmp_path / 'hub')}:colours"
+    monkeypatch.setenv("TORCHHUB_ALLOWED", f"{name} {name}:dimension=8")
+    models = LoadedModels(store, Settings())
+    assert models.extractor(f"{name}:dimension=8").dimension(None) == 8
+    assert models.extractor(name).dimension(None) == 24
+    assert models.extractor(name) is models.extractor(name)

@@ -303,3 +303,50 @@ def test_contradictions_are_refused_with_both_values(
 def test_settings_in_force_do_not_change(settings: Settings) -> None:
     with pytest.raises(ValidationError, match="frozen"):
         settings.port = 1  # type: ignore[misc]
+
+
+# --- code of others --------------------------------------------------------------------------
+
+HUB = "torchhub:/models/mine:entry"
+UNPINNED = "torchhub:gmberton/MegaLoc:get_trained_model"
+
+
+def test_torch_hub_entries_are_allowed_by_their_canonical_names(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("TORCHHUB_ALLOWED", f" {HUB}:b=2,a=01\n{HUB} ")
+    settings = Settings()
+    assert settings.allowed_hub_extractors == (f"{HUB}:a=1,b=2", HUB)
+    assert settings.recipe(f"{HUB}:b=02,a=1").name == f"{HUB}:a=1,b=2"
+    with pytest.raises(Misconfigured, match="TORCHHUB_ALLOWED") as caught:
+        settings.recipe(f"{HUB}:a=1")
+    assert caught.value.code == "torchhub_not_allowed"
+
+
+def test_no_torch_hub_entry_is_allowed_unless_someone_says_so() -> None:
+    assert Settings().allowed_hub_extractors == ()
+    with pytest.raises(Misconfigured, match="not allowed here"):
+        Settings().recipe(HUB)
+
+
+def test_the_extractor_of_new_maps_is_allowed_by_being_chosen(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("EXTRACTOR", f"{HUB}:a=01")
+    assert Settings().allowed_hub_extractors == (f"{HUB}:a=1",)
+    assert Settings().recipe(f"{HUB}:a=1").hub is not None
+
+
+@pytest.mark.parametrize(
+    ("variable", "value", "said"),
+    [
+        ("TORCHHUB_ALLOWED", UNPINNED, "git ls-remote"),
+        ("TORCHHUB_ALLOWED", f"{HUB},anyloc-vitb14", "after the repository comes the entry"),
+        ("TORCHHUB_ALLOWED", f"{HUB} anyloc-vitb14", "'anyloc-vitb14' is no torch.hub extractor"),
+        ("EXTRACTOR", UNPINNED, "git ls-remote"),
+    ],
+)
+def test_code_that_is_not_pinned_is_refused_at_the_start(
+    monkeypatch: pytest.MonkeyPatch, variable: str, value: str, said: str
+) -> None:
+    assert said in refusal(monkeypatch, **{variable: value})
