@@ -64,7 +64,8 @@ def code_at_hand(hub: HubEntry) -> Path:
     """As `bring_code`, but what would have to be downloaded is missing."""
     folder = code_folder(hub)
     if not (folder / HUBCONF).is_file():
-        raise missing(hub, f"there is no {folder / HUBCONF}")
+        where = f"there is no {folder / HUBCONF}" if hub.folder else "its code is not here"
+        raise missing(hub, where)
     return folder
 
 
@@ -127,14 +128,27 @@ def licence(folder: Path) -> str:
 
 
 def missing(hub: HubEntry, reason: str) -> Misconfigured:
-    """The refusal of what is not there."""
+    """The refusal of what is not there. Callers of the API read it: it names no folder of this
+    machine that is not in the extractor's name.
+    """
+    cache = "$TORCH_HOME/hub (~/.cache/torch/hub where TORCH_HOME is not set)"
+    fetch = f"with internet access, `placewise models fetch {hub.name}`"
+    if hub.folder is not None:
+        ways = (
+            "(1) bring the folder to that path, on every machine that describes photos; (2) for "
+            f"weights that its code downloads, {fetch}; (3) copy them from a machine that has "
+            f"them: {cache}, the folder checkpoints."
+        )
+    else:
+        ways = (
+            f"(1) {fetch}; (2) copy {cache} with its checkpoints from a machine that has them; "
+            "(3) clone the repository at its commit and name the folder: "
+            f"{PREFIX}/FOLDER:{hub.entry}."
+        )
     return Misconfigured(
         "weights_missing",
         f"The extractor {hub.name} can't be loaded: {reason}. Three ways to get its code and "
-        f"weights: (1) with internet access, `placewise models fetch {hub.name}`; (2) copy the "
-        f"folder {torch.hub.get_dir()}, with its checkpoints, from a machine that has them "
-        "(TORCH_HOME says where it lies); (3) clone the repository at its commit and name the "
-        f"folder: {PREFIX}/FOLDER:{hub.entry}.",
+        f"weights: {ways}",
     )
 
 

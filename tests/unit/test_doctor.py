@@ -15,6 +15,7 @@ from shared.errors import Misconfigured
 from shared.settings import Settings
 from shared.vision.backbones import dinov2
 from shared.vision.backbones.dinov2 import SHAPES
+from tests.support.hub import COMMIT, write_hub
 from tests.support.vit import random_weights, save
 
 GB = 1_000_000_000
@@ -83,6 +84,21 @@ def test_missing_weights_come_with_three_ways_to_get_them(
 
 def test_other_extractors_are_loaded() -> None:
     assert "test-tiny-avg: weights" in extractor_check(Settings())
+
+
+def test_an_entry_of_torch_hub_is_tried_and_never_downloaded(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
+    monkeypatch.setattr("shared.vision.torchhub_code.GITHUB", "unreachable")
+    missing = f"torchhub:somebody/places@{COMMIT}:colours"
+    with pytest.raises(Misconfigured, match="its code is not here") as caught:
+        extractor_check(settings_with(monkeypatch, EXTRACTOR=missing))
+    assert caught.value.code == "weights_missing"
+    assert str(tmp_path) not in caught.value.detail
+    monkeypatch.setenv("EXTRACTOR", f"torchhub:{write_hub(tmp_path / 'hub')}:colours")
+    assert "load" in extractor_check(Settings())
+    assert "tells its size only when it is loaded" in memory_check(Settings())
 
 
 # --- device and memory -----------------------------------------------------------------------
