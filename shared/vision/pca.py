@@ -56,12 +56,12 @@ class Whitening:
     @property
     def dimension(self) -> int:
         """Length of a descriptor before."""
-        return self.directions.shape[1]
+        return int(self.directions.shape[1])
 
     @property
     def kept(self) -> int:
         """Length of a descriptor after."""
-        return self.directions.shape[0]
+        return int(self.directions.shape[0])
 
     @property
     def sha256(self) -> str:

@@ -28,6 +28,9 @@ class FilesServer:
     """What a path's hash is taken of instead of its content."""
     break_after: list[int] = field(default_factory=list)
     """Bytes after which the next answers break off, each once."""
+    stall_after: int | None = None
+    """Bytes after which an answer stands still until `go_on` is set."""
+    go_on: threading.Event = field(default_factory=threading.Event)
     ranges: bool = True
     """Whether it has strong ETags and sends parts."""
     refuse: list[int] = field(default_factory=list)
@@ -90,7 +93,14 @@ class _Handler(BaseHTTPRequestHandler):
             self.close_connection = True
             self.connection.shutdown(2)
             return
-        self.wfile.write(data[begin:])
+        if shown.stall_after is not None:
+            self.wfile.write(data[begin : begin + shown.stall_after])
+            self.wfile.flush()
+            begin += shown.stall_after
+            shown.go_on.wait()
+        # Whoever asked may be dead by now.
+        with contextlib.suppress(ConnectionError):
+            self.wfile.write(data[begin:])
 
 
 @contextlib.contextmanager
@@ -104,6 +114,7 @@ def files_server() -> Iterator[FilesServer]:
     try:
         yield shown
     finally:
+        shown.go_on.set()
         server.shutdown()
         serving.join()
         server.server_close()

@@ -27,13 +27,14 @@ def unit_rows(count: int, dimension: int, seed: int = 0) -> Rows:
     strength = 1 / np.sqrt(1 + np.arange(dimension))
     turned = np.linalg.qr(rng.standard_normal((dimension, dimension)))[0]
     rows = (rng.standard_normal((count, dimension)) * strength) @ turned + 3 * turned[0]
-    rows /= np.linalg.norm(rows, axis=1, keepdims=True)
-    return rows.astype(np.float32)
+    units: Rows = (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32)
+    return units
 
 
 def projected(rows: Rows, by: Whitening) -> Rows:
-    out = whiten(*(torch.from_numpy(array) for array in (rows, by.mean, by.directions)))
-    return out.numpy()
+    tensors = (torch.from_numpy(array) for array in (rows, by.mean, by.directions))
+    out: Rows = whiten(*tensors).numpy()
+    return out
 
 
 def refusal(code: str, rows: Rows, kept: int) -> str:
