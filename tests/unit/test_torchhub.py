@@ -94,7 +94,11 @@ def test_usual_size_is_the_preprocessing_of_the_other_extractors(folder: Path) -
 # --- what pins it ----------------------------------------------------------------------------
 
 
-def test_fingerprint_is_the_same_wherever_the_folder_is_loaded_again(folder: Path) -> None:
+def test_fingerprint_is_the_same_when_the_folder_is_loaded_again(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "dont_write_bytecode", False)
+    monkeypatch.setattr(sys, "pycache_prefix", None)
     assert extractor(folder, "colours").spec(None) == extractor(folder, "colours").spec(None)
     assert not list(folder.rglob("*.pyc")), "loading changes nothing in the folder"
 
