@@ -85,14 +85,11 @@ def load_module(
             module = load(str(folder), hub.entry, source="local", **dict(hub.arguments))
     except PlacewiseError:
         raise
-    except EOFError as error:
-        raise unfit(
-            hub,
-            "its code asks a question, which nobody is there to answer (torch.hub asks before it "
-            "loads a further repository)",
-        ) from error
     except (Exception, SystemExit) as error:  # whatever the code of others does
         said = f"{type(error).__name__}: {_first_line(error)}"
+        if isinstance(error, EOFError) and "reading a line" in said:
+            said += ". It asks a question (as torch.hub does about a further repository), and here "
+            said += "nobody answers"
         if any(isinstance(cause, AWAY) for cause in _chain(error)):
             raise missing(hub, f"what it needs can't be downloaded: {said}") from error
         raise unfit(hub, f"loading it ended with {said}") from error

@@ -191,7 +191,7 @@ def test_licence_of_the_code_is_read_or_said_to_be_missing(
         ("of_the_batch", "when another one is beside it"),
         ("one_size", "only 320 x 320 will do"),
         ("colours:dimension=200000", "200000 dimensions"),
-        ("asks", "asks a question"),
+        ("asks", "It asks a question"),
     ],
 )
 def test_an_entry_that_is_no_extractor_is_refused_with_the_reason(
