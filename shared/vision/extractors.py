@@ -108,14 +108,10 @@ class Extractor:
 
     def spec(self, centres: Centres | None) -> dict[str, Any]:
         """Everything that decides a descriptor's value."""
-        code = {}
-        if isinstance(self.backbone, HubModule):
-            code["code_fingerprint"] = self.backbone.code_fingerprint
-        return {
+        spec: dict[str, Any] = {
             "extractor": self.recipe.name,
             "backbone": self.backbone.name,
             "backbone_fingerprint": self.backbone.fingerprint,
-            **code,
             "layer": self.backbone.layer,
             "facet": self.backbone.facet,
             "preprocessing": self.preprocessing.as_spec(),
@@ -126,6 +122,9 @@ class Extractor:
             "decoder": DECODER,
             "dimension": self.dimension(centres),
         }
+        if isinstance(self.backbone, HubModule):
+            spec["code_fingerprint"] = self.backbone.code_fingerprint
+        return spec
 
     def dimension(self, centres: Centres | None) -> int:
         """Length of a descriptor."""
