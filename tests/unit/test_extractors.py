@@ -40,7 +40,7 @@ def package_photo(name: str) -> Image.Image:
 
 
 def pixels_of(extractor: Extractor, photos: list[Image.Image]) -> NDArray[np.uint8]:
-    return np.stack([np.asarray(extractor.preprocessing.apply(photo)) for photo in photos])
+    return np.stack([extractor.preprocessing.apply(photo) for photo in photos])
 
 
 def views(photo: Image.Image) -> list[Image.Image]:
