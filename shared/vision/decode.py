@@ -11,12 +11,12 @@ import warnings
 from dataclasses import dataclass
 
 import numpy as np
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 from PIL import __version__ as pillow_version
 from PIL.ExifTags import Base
 
 from shared.errors import Unprocessable
-from shared.photo_formats import BROKEN, check_pixels, open_photo
+from shared.photo_formats import ACCEPTED, BROKEN, check_pixels, open_photo
 from shared.vision.preprocessing import Preprocessing
 from shared.vision.resample import Pixels
 
@@ -58,6 +58,11 @@ def decode(data: bytes, preprocessing: Preprocessing, max_pixels: int) -> Decode
                 upright = _upright(image, as_stored)
             pixels = preprocessing.apply(upright if preprocessing.upright else as_stored)
             return Decoded(pixels=pixels, thumbnail=_thumbnail(upright))
+    except UnidentifiedImageError as error:
+        raise Unprocessable(
+            "undecodable_photo",
+            f"The photo can't be decoded: it is not {ACCEPTED}, or its header is damaged.",
+        ) from error
     except BROKEN as error:
         raise Unprocessable(
             "undecodable_photo",

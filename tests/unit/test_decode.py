@@ -92,6 +92,16 @@ def test_every_exif_orientation_comes_out_upright(orientation: int, media: str) 
     assert corners(np.asarray(thumbnail)) == ["red", "green", "blue", "yellow"]
 
 
+@pytest.mark.parametrize("name", ["demo1024", "paper480x640", "round14"])
+def test_published_preprocessings_see_photos_as_they_are_stored(name: str) -> None:
+    published = get_preprocessing(name)
+    on_its_side = turned_photo(photo_image(1), 6, "PNG")
+    decoded = decode(on_its_side, published, PIXELS)
+    as_stored = photo_image(1).transpose(Image.Transpose.ROTATE_90)
+    np.testing.assert_array_equal(decoded.pixels, published.apply(as_stored))
+    assert Image.open(io.BytesIO(decoded.thumbnail)).size == (64, 48), "thumbnails are upright"
+
+
 @pytest.mark.parametrize("media", ["PNG", "TIFF"])
 def test_16_bit_grey_is_scaled_and_not_clipped_to_white(media: str) -> None:
     samples = np.full((20, 30), 0x8000, dtype=np.uint16)
@@ -175,8 +185,9 @@ def test_truncated_photo_is_an_error_and_not_a_grey_picture(media: str) -> None:
 
 
 @pytest.mark.parametrize("data", [b"", b"this is a text\n" * 40, b"\xff\xd8\xff\xe0", b"GIF89a"])
-def test_what_is_no_photo_is_an_error(data: bytes) -> None:
+def test_what_is_no_photo_is_an_error_that_names_what_is_accepted(data: bytes) -> None:
     assert reason(data).code == "undecodable_photo"
+    assert "not JPEG, PNG, WebP, BMP or TIFF" in reason(data).detail
 
 
 def test_formats_that_are_not_accepted_are_not_decoded() -> None:

@@ -7,6 +7,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from shared.vision.vlad import assign, soft_vlad, vlad
+from shared.vision.vocabulary import read_centres
 
 Matrix = NDArray[np.float64]
 
@@ -130,6 +132,27 @@ def test_parity_holds_at_the_size_of_anylocs_published_descriptors() -> None:
     found = vlad(tensor(features), tensor(centres))[0]
     assert found.shape == (49_152,)
     np.testing.assert_allclose(found, expected, atol=1e-5)
+
+
+@pytest.mark.real_photos
+@pytest.mark.parametrize("domain", ["aerial", "indoor", "urban"])
+def test_anylocs_vocabularies_give_rows_of_the_published_dimension(
+    real_photos: Path, domain: str
+) -> None:
+    folder = real_photos / "anyloc-vocabularies"
+    centres = read_centres(folder / f"dinov2_vitg14_l31_value_c32_{domain}.pt")
+    # Features near the real centres, so that most clusters have some.
+    rng = np.random.default_rng(3)
+    near = centres.array[rng.integers(0, 32, 300)] + 0.01 * rng.standard_normal((300, 1536))
+    features = unit(near.astype(np.float64))
+    row = vlad(tensor(features[None]), torch.from_numpy(centres.array))[0]
+    assert row.shape == (49_152,)
+    expected = np.zeros((32, 1536))
+    for k, patch in zip(
+        (features @ unit(centres.array.astype(float)).T).argmax(1), features, strict=True
+    ):
+        expected[k] += patch - centres.array[k]
+    np.testing.assert_allclose(row, unit(unit(expected).reshape(-1)), atol=1e-5)
 
 
 def test_centre_is_subtracted_raw_and_not_normalised() -> None:
