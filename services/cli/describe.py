@@ -26,6 +26,7 @@ from services.cli.output import (
     progress_bar,
     shown,
 )
+from shared.errors import InvalidRequest
 from shared.recipes import get_recipe
 
 
@@ -81,6 +82,12 @@ def describe(
             allow_test_extractors=settings.allow_test_extractors,
         )
         if weights is not None:
+            if recipe.depth is None:
+                raise InvalidRequest(
+                    "weights_unused",
+                    f"The extractor {recipe.name} brings its own weights; --weights is for those "
+                    "on DINOv2.",
+                )
             settings = settings.model_copy(update={"dino_weights": weights.absolute()})
 
         from services.cli.describe_files import describe_files

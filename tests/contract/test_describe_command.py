@@ -185,6 +185,7 @@ def test_interrupted_run_leaves_nothing_behind(
         (["--backbone", "dinov3"], "unknown_backbone", "dinov2_vits14"),
         (["--layer", "3"], "no_extractor", "--layer"),
         (["--backbone", "dinov2_vits14", "--layer", "12"], "bad_extractor_option", "0 to 11"),
+        (["--weights", "{centres}"], "weights_unused", "test-tiny-avg"),
         (["--backbone", "dinov2_vits14"], "vocabulary_missing", "--vocabulary FILE"),
         (["--extractor", "test-tiny-avg", "--vocabulary", "{centres}"], "vocabulary_unfit", "no"),
         (["--extractor", "anyloc-vits14", "--vocabulary", "{centres}"], "vocabulary_unfit", "384"),
