@@ -37,7 +37,9 @@ def describe(
     ],
     extractor: Annotated[
         str | None,
-        typer.Option("--extractor", help="By name, with options as in EXTRACTOR; the default."),
+        typer.Option(
+            "--extractor", help="By name, with options as in EXTRACTOR; left out: of new maps."
+        ),
     ] = None,
     backbone: BackboneOption = None,
     weights: Annotated[
@@ -69,7 +71,7 @@ def describe(
     with explained(as_json):
         settings = read_settings()
         name = extractor_name(
-            extractor,
+            extractor or (settings.new_map_extractor if backbone is None else None),
             backbone,
             layer=layer,
             facet=facet,
@@ -77,10 +79,7 @@ def describe(
             aggregator=aggregator,
             temperature=temperature,
         )
-        recipe = get_recipe(
-            name or settings.new_map_extractor,
-            allow_test_extractors=settings.allow_test_extractors,
-        )
+        recipe = get_recipe(name, allow_test_extractors=settings.allow_test_extractors)
         if weights is not None:
             if recipe.depth is None:
                 raise InvalidRequest(

@@ -45,26 +45,21 @@ TemperatureOption = Annotated[
 
 def extractor_name(
     extractor: str | None, backbone: str | None, **options: str | int | float | None
-) -> str | None:
-    """The extractor's name with the options that are not None; None where nothing is chosen.
+) -> str:
+    """The name of the extractor that has one or the other, with the options that are not None.
 
     InvalidRequest: `unknown_backbone`, `two_extractors`, `no_extractor` (options, but of what?).
     """
-    if backbone is not None:
-        if extractor is not None:
-            raise InvalidRequest(
-                "two_extractors", "--extractor and --backbone say the same thing: give one of them."
-            )
-        if backbone not in BACKBONES:
-            raise InvalidRequest(
-                "unknown_backbone",
-                f"There is no backbone {backbone!r}. Known: {', '.join(BACKBONES)}.",
-            )
-        extractor = BACKBONES[backbone]
-    given = {option: value for option, value in options.items() if value is not None}
-    if extractor is not None:
-        return with_options(extractor, given)
-    if given:
-        named = ", ".join(f"--{option}" for option in given)
+    if extractor is None and backbone is None:
+        named = ", ".join(f"--{option}" for option, value in options.items() if value is not None)
         raise InvalidRequest("no_extractor", f"{named}: say of which --extractor, too.")
-    return None
+    if extractor is not None and backbone is not None:
+        raise InvalidRequest(
+            "two_extractors", "--extractor and --backbone say the same thing: give one of them."
+        )
+    if backbone is not None and backbone not in BACKBONES:
+        raise InvalidRequest(
+            "unknown_backbone",
+            f"There is no backbone {backbone!r}. Known: {', '.join(BACKBONES)}.",
+        )
+    return with_options(extractor or BACKBONES[str(backbone)], options)

@@ -55,7 +55,8 @@ def create(
 ) -> None:
     """Make an empty map."""
     with explained(as_json):
-        extractor = extractor_name(extractor, None, preprocessing=preprocessing)
+        if preprocessing is not None:
+            extractor = extractor_name(extractor, None, preprocessing=preprocessing)
         with connect(server, None, key) as client:
             made = client.create_map(name, extractor)
         if as_json:

@@ -183,7 +183,7 @@ def test_interrupted_run_leaves_nothing_behind(
     [
         (["--extractor", "anyloc-vits14", "--backbone", "dinov2_vits14"], "two_extractors", ""),
         (["--backbone", "dinov3"], "unknown_backbone", "dinov2_vits14"),
-        (["--layer", "3"], "no_extractor", "--layer"),
+        (["--layer", "3"], "bad_extractor_option", "'layer'"),
         (["--backbone", "dinov2_vits14", "--layer", "12"], "bad_extractor_option", "0 to 11"),
         (["--weights", "{centres}"], "weights_unused", "test-tiny-avg"),
         (["--backbone", "dinov2_vits14"], "vocabulary_missing", "--vocabulary FILE"),
