@@ -50,9 +50,9 @@ class Preprocessing:
         return {"name": self.name, "version": self.version}
 
 
-def _square(image: Image.Image, side: int) -> Pixels:
+def _squeeze(image: Image.Image, height: int, width: int) -> Pixels:
     """Aspect not kept: bilinear, antialiased when it shrinks, rounded to whole numbers."""
-    return np.asarray(image.resize((side, side), Image.Resampling.BILINEAR))
+    return np.asarray(image.resize((width, height), Image.Resampling.BILINEAR))
 
 
 def _demo1024(image: Image.Image) -> Pixels:
@@ -112,8 +112,8 @@ def _middle(pixels: Pixels) -> Pixels:
 PREPROCESSINGS = {
     preprocessing.name: preprocessing
     for preprocessing in (
-        Preprocessing("square224", 1, True, 224 * 224, partial(_square, side=224)),
-        Preprocessing("square32", 1, True, 32 * 32, partial(_square, side=32)),
+        Preprocessing("square224", 1, True, 224 * 224, partial(_squeeze, height=224, width=224)),
+        Preprocessing("square32", 1, True, 32 * 32, partial(_squeeze, height=32, width=32)),
         Preprocessing("demo1024", 1, False, 1022 * 1022, _demo1024),
         Preprocessing("paper480x640", 1, False, 476 * 630, _paper480x640),
         Preprocessing("round14", 1, False, ROUND14_MOST_PIXELS, _round14),
