@@ -2,6 +2,7 @@
 
     get_recipe("anyloc-vitb14", allow_test_extractors=False)
     get_recipe("anyloc-vitb14:clusters=32,facet=key,layer=9", allow_test_extractors=False)
+    get_recipe("anyloc-vitg14:preprocessing=paper480x640", allow_test_extractors=False)
     get_recipe("torchhub:/models/mine:my_entry", allow_test_extractors=False)
 
 A name may carry options. Their canonical order is the alphabet's and what equals the extractor's
@@ -13,7 +14,8 @@ Imports no torch: the settings and the gateway choose extractors without loading
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -21,11 +23,14 @@ from shared.errors import Misconfigured
 from shared.torchhub_names import DEFAULT_SIDE, PREFIX, HubEntry, read_hub_name
 
 FACETS = ("query", "key", "value", "token")
+AGGREGATORS = ("vlad", "soft-vlad", "gem", "avg")
+PREPROCESSINGS = ("square224", "demo1024", "paper480x640", "round14")
 MOST_CLUSTERS = 4096
 TORCHHUB = "torchhub"  # the backbone that is a torch.hub entry
 SLOW = "test-slow"  # the backbone whose width and time are options
 MOST_WIDTH = 131_072
 MOST_MILLISECONDS = 60_000
+MOST_TEMPERATURE = 1000
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,8 +48,8 @@ class Recipe:
     preprocessing: str
     """A name that `shared.vision.preprocessing.get_preprocessing` knows."""
     aggregator: str
-    """`vlad` needs a vocabulary; `avg` is the mean of the local features; with `none` the backbone
-    makes one feature of a photo, and that is its descriptor.
+    """One of AGGREGATORS. VLAD, hard or soft, needs a vocabulary; GeM and the mean do without. Or
+    `none`: the backbone makes one feature of a photo, and that is its descriptor.
     """
     depth: int | None = None
     """Blocks of a transformer; None where neither layer nor facet can be chosen."""
@@ -52,6 +57,8 @@ class Recipe:
     """Index of the block that the features come from, counted from 0."""
     facet: str | None = None
     """What is taken from that block: one of FACETS."""
+    temperature: float = 1.0
+    """Of soft VLAD: by what the cosines are multiplied before the softmax."""
     clusters: int = 64
     """Centres that a fit makes unless it says otherwise; any vocabulary's own number goes first."""
     shipped_vocabulary: str | None = None
@@ -66,7 +73,7 @@ class Recipe:
 
     @property
     def needs_vocabulary(self) -> bool:
-        return self.aggregator == "vlad"
+        return self.aggregator in ("vlad", "soft-vlad")
 
     @property
     def dimension(self) -> int | None:
@@ -190,51 +197,83 @@ def _hub_recipe(hub: HubEntry) -> Recipe:
     )
 
 
+def with_options(name: str, options: Mapping[str, object]) -> str:
+    """The name of an extractor, which may carry options, with further ones; None is left out."""
+    written = [f"{option}={value}" for option, value in options.items() if value is not None]
+    if not written:
+        return name
+    return name + ("," if ":" in name else ":") + ",".join(written)
+
+
 def _with_options(recipe: Recipe, written: str) -> Recipe:
     """`recipe` with the options of `option=value,option=value`."""
-    allowed = _allowed_options(recipe)
-    chosen: dict[str, int | str] = {}
+    own = recipe
+    values: dict[str, str] = {}
     for part in written.split(","):
         option, _, value = part.partition("=")
+        if option in values:
+            raise _bad_option(f"The option {option} of {own.name} is given twice.")
+        values[option] = value
+    # First: some options are about one aggregator only.
+    for option in sorted(values, key=lambda option: option != "aggregator"):
+        allowed = _allowed_options(own, recipe)
         if option not in allowed:
             raise _bad_option(
-                f"The extractor {recipe.name} has no option {option!r}. "
-                + (f"Its options: {', '.join(sorted(allowed))}." if allowed else "It has none.")
+                f"The extractor {own.name} has no option {option!r}"
+                + (f" with {recipe.aggregator}" if recipe.aggregator != own.aggregator else "")
+                + (f". Its options: {', '.join(sorted(allowed))}." if allowed else ". It has none.")
             )
-        if option in chosen:
-            raise _bad_option(f"The option {option} of {recipe.name} is given twice.")
         read, expected = allowed[option]
         try:
-            chosen[option] = read(value)
+            recipe = replace(recipe, **{option: read(values[option])})
         except ValueError:
             raise _bad_option(
-                f"The option {option}={value} of {recipe.name} can't be used: "
+                f"The option {option}={values[option]} of {own.name} can't be used: "
                 f"{option} is {expected}."
             ) from None
-    differing = {o: v for o, v in sorted(chosen.items()) if v != getattr(recipe, o)}
+    differing = {
+        option: f"{option}={_text(getattr(recipe, option))}"
+        for option in sorted(values)
+        if getattr(recipe, option) != getattr(own, option)
+    }
     if not differing:
-        return recipe
-    options = ",".join(f"{option}={value}" for option, value in differing.items())
-    changed: dict[str, Any] = {"name": f"{recipe.name}:{options}", **differing}
-    return replace(recipe, **changed)
+        return own
+    return replace(
+        recipe,
+        name=f"{own.name}:{','.join(differing.values())}",
+        shipped_vocabulary=own.shipped_vocabulary if recipe.needs_vocabulary else None,
+    )
 
 
-def _allowed_options(recipe: Recipe) -> dict[str, tuple[Callable[[str], int | str], str]]:
-    """How the recipe's options are read, and what a refusal says is allowed."""
-    allowed: dict[str, tuple[Callable[[str], int | str], str]] = {}
-    if recipe.needs_vocabulary:
+Option = tuple[Callable[[str], Any], str]
+
+
+def _allowed_options(own: Recipe, chosen: Recipe) -> dict[str, Option]:
+    """How options are read, and what a refusal says is allowed: those of the recipe `own`, once
+    its aggregator is that of `chosen`.
+    """
+    allowed: dict[str, Option] = {}
+    if own.needs_vocabulary:
+        allowed["aggregator"] = _one_of(AGGREGATORS)
+        allowed["preprocessing"] = _one_of(PREPROCESSINGS)
+    if chosen.needs_vocabulary:
         allowed["clusters"] = (
             _whole(1, MOST_CLUSTERS),
             f"a whole number from 1 to {MOST_CLUSTERS}",
         )
-    if recipe.depth is not None:
-        last = recipe.depth - 1
-        allowed["facet"] = (_facet, f"one of {', '.join(FACETS)}")
+    if chosen.aggregator == "soft-vlad":
+        allowed["temperature"] = (
+            _temperature,
+            f"a number above 0 and up to {MOST_TEMPERATURE}, such as 0.5",
+        )
+    if own.depth is not None:
+        last = own.depth - 1
+        allowed["facet"] = _one_of(FACETS)
         allowed["layer"] = (
             _whole(0, last),
-            f"a whole number from 0 to {last} ({recipe.backbone} has {recipe.depth} blocks)",
+            f"a whole number from 0 to {last} ({own.backbone} has {own.depth} blocks)",
         )
-    if recipe.backbone == SLOW:
+    if own.backbone == SLOW:
         allowed["milliseconds"] = (
             _whole(0, MOST_MILLISECONDS),
             f"a whole number from 0 to {MOST_MILLISECONDS}, for each photo",
@@ -253,10 +292,27 @@ def _whole(least: int, most: int) -> Callable[[str], int]:
     return read
 
 
-def _facet(value: str) -> str:
-    if value not in FACETS:
+def _one_of(names: tuple[str, ...]) -> Option:
+    def read(value: str) -> str:
+        if value not in names:
+            raise ValueError(value)
+        return value
+
+    return read, f"one of {', '.join(names)}"
+
+
+def _temperature(value: str) -> float:
+    # float() would also take "1e3", "1_0" and "inf"; six digits are written again as they were.
+    if not re.fullmatch(r"[0-9]{1,4}(\.[0-9]{1,6})?", value):
         raise ValueError(value)
-    return value
+    if not 0 < float(value) <= MOST_TEMPERATURE:
+        raise ValueError(value)
+    return float(value)
+
+
+def _text(value: object) -> str:
+    """As the option is written in a canonical name: 2 for 2.0."""
+    return f"{value:.6f}".rstrip("0").rstrip(".") if isinstance(value, float) else str(value)
 
 
 def _bad_option(detail: str) -> Misconfigured:

@@ -155,7 +155,8 @@ class Settings(BaseSettings):
     # How photos are described.
     extractor: str = Field(
         "efficientnet-lite0-vlad",
-        description="extractor of new maps, with options: anyloc-vitb14:layer=9,clusters=32",
+        description="extractor of new maps, with options: "
+        "anyloc-vitb14:layer=9,preprocessing=demo1024",
     )
     dino_model: str | None = Field(
         None, description="extractor of new maps by its DINOv2: dinov2_vits14|vitb14|vitl14|vitg14"

@@ -1,7 +1,8 @@
-"""The `placewise` command: one module per group of commands, all of them clients of a server.
+"""The `placewise` command: one module per group of commands, most of them clients of a server.
 
 When no server is named or running on the folder, a command starts the embedded one for as long as
-it needs it, so that there is one way of doing everything: over HTTP.
+it needs it, so that there is one way of doing everything: over HTTP. `describe` alone keeps nothing
+and needs none.
 """
 
 import os

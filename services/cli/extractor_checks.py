@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from pathlib import Path
 
@@ -10,8 +11,8 @@ from shared.recipes import Recipe
 from shared.settings import Settings
 
 PARAMETER_BYTES = 4  # float32
-# Twice what was measured in the forward pass of ViT-g, the widest, at 224 pixels: the next batch
-# is being decoded meanwhile.
+# Twice what was measured in the forward pass of ViT-g, the widest, at 224 x 224 pixels: the next
+# batch is being decoded meanwhile. Of larger photos, fewer go through in one pass.
 BATCH_PHOTO_BYTES = 40_000_000
 PROCESS_BYTES = 1_000_000_000  # PyTorch, or CUDA's context, before any weights
 CONTAINER_LIMIT = Path("/sys/fs/cgroup/memory.max")
@@ -33,7 +34,8 @@ def memory_check(settings: Settings) -> str:
     """Whether the extractor of new maps fits into the memory of its device: an estimate."""
     import torch
 
-    from shared.vision.extractors import choose_device
+    from shared.vision.extractors import USUAL_PIXELS, choose_device
+    from shared.vision.preprocessing import get_preprocessing
 
     recipe = _recipe(settings)
     if recipe.parameters is None:
@@ -44,7 +46,9 @@ def memory_check(settings: Settings) -> str:
     else:
         there, whose = ram_bytes(), "this machine"
     weights = recipe.parameters * PARAMETER_BYTES
-    batch = settings.batch_photos * BATCH_PHOTO_BYTES
+    # One photo always goes through whole, however large its preprocessing leaves it.
+    one = math.ceil(get_preprocessing(recipe.preprocessing).most_pixels / USUAL_PIXELS)
+    batch = max(settings.batch_photos, one) * BATCH_PHOTO_BYTES
     needed = PROCESS_BYTES + weights + batch
     estimate = (
         f"{recipe.name} takes about {needed / 1e9:.1f} GB (weights {weights / 1e9:.1f}, a batch of "
@@ -53,10 +57,12 @@ def memory_check(settings: Settings) -> str:
     if needed <= there:
         return estimate
     ways = []
-    if PROCESS_BYTES + weights + BATCH_PHOTO_BYTES <= there:
+    if settings.batch_photos > one and PROCESS_BYTES + weights + one * BATCH_PHOTO_BYTES <= there:
         ways.append(f"a smaller BATCH_PHOTOS than {settings.batch_photos}")
     if recipe.depth is not None:
         ways.append("a smaller DINO_MODEL (dinov2_vits14 takes 0.1 GB of weights)")
+    if one > 1:
+        ways.append("EXTRACTOR with the preprocessing square224")
     if device.type == "cuda":
         ways.append("DEVICE=cpu")
     raise Misconfigured("memory_short", f"{estimate}. Set {', or '.join(ways) or 'more memory'}.")

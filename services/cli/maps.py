@@ -9,6 +9,7 @@ import typer
 from rich.table import Table
 
 from services.cli.connect import connect
+from services.cli.extractor_options import PreprocessingOption, extractor_name
 from services.cli.output import JsonOption, KeyOption, ServerOption, answers, explained, print_json
 from shared.errors import Conflict
 
@@ -47,12 +48,15 @@ def create(
     extractor: Annotated[
         str | None, typer.Option(help="How its photos are described; left out: as configured.")
     ] = None,
+    preprocessing: PreprocessingOption = None,
     server: ServerOption = None,
     key: KeyOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Make an empty map."""
     with explained(as_json):
+        if preprocessing is not None:
+            extractor = extractor_name(extractor, None, preprocessing=preprocessing)
         with connect(server, None, key) as client:
             made = client.create_map(name, extractor)
         if as_json:

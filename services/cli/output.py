@@ -11,6 +11,7 @@ from typing import Annotated, Any
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -65,7 +66,8 @@ def explained(as_json: bool) -> Iterator[None]:
         if as_json:
             print_json(error.as_problem())
         else:
-            messages.print(f"[red]{error.code}[/red]: {error.detail}", soft_wrap=True)
+            # What went wrong is no markup: a file's name may hold brackets.
+            messages.print(f"[red]{error.code}[/red]: {escape(error.detail)}", soft_wrap=True)
         raise typer.Exit(1) from error
 
 

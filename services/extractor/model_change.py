@@ -130,7 +130,7 @@ class ModelChanges:
             if not isinstance(outcome, PlacewiseError)
         ]
         if decoded:
-            features = extractor.features(np.stack([photo.pixels for photo in decoded])).cpu()
+            features = extractor.local_features([photo.pixels for photo in decoded])
             budget = max(1, SAMPLE_BYTES // (4 * extractor.backbone.width * len(plan)))
             generator = torch.Generator().manual_seed(job.params["seed"] + begin)
             points = _thin(features, budget, generator)
@@ -300,19 +300,17 @@ class ModelChanges:
         return array
 
 
-def _thin(features: torch.Tensor, budget: int, generator: torch.Generator) -> NDArray[np.float32]:
-    """At most `budget` patches of each photo: (B, patches, width) -> (n, width)."""
-    patches = features.shape[1]
-    if patches <= budget:
-        kept = features
-    else:
-        kept = torch.stack(
-            [
-                f[torch.randperm(patches, generator=generator)[:budget].sort().values]
-                for f in features
-            ]
-        )
-    points: NDArray[np.float32] = kept.flatten(0, 1).numpy()
+def _thin(
+    features: list[torch.Tensor], budget: int, generator: torch.Generator
+) -> NDArray[np.float32]:
+    """At most `budget` patches of each photo: (patches, width) of each -> (n, width) of all."""
+    kept = [
+        one
+        if len(one) <= budget
+        else one[torch.randperm(len(one), generator=generator)[:budget].sort().values]
+        for one in features
+    ]
+    points: NDArray[np.float32] = torch.cat(kept).numpy()
     # A patch without any structure has a zero feature, which no centre can describe.
     structured: NDArray[np.float32] = points[np.linalg.norm(points, axis=1) > 0]
     return structured

@@ -7,25 +7,27 @@ from dataclasses import dataclass, field
 from uuid import UUID
 
 import numpy as np
-from numpy.typing import NDArray
 from sqlalchemy import select
 
 from services.extractor.decoding import DecoderPool
 from services.extractor.target import Target
 from shared.catalog.photos import Photo
 from shared.catalog.session import Catalog
+from shared.chunks import Rows
 from shared.errors import NotFound, PlacewiseError
 from shared.jobs import Job, JobKind
 from shared.objects import ObjectStore
 from shared.objects.keys import query_key, thumbnail_key
 from shared.vision.decode import Decoded
+from shared.vision.extractors import not_finite
+from shared.vision.resample import Pixels
 
 
 @dataclass(slots=True)
 class Batch:
     """Claimed jobs of one kind, map and generation, on their way to a chunk.
 
-    `ready` and the rows of `pixels` belong together; `failed` are jobs whose photo is at fault;
+    `ready` and `decoded` belong together; `failed` are jobs whose photo is at fault;
     `gone` are jobs whose photo was deleted meanwhile.
     """
 
@@ -47,9 +49,20 @@ class Batch:
     def kind(self) -> JobKind:
         return JobKind(self.jobs[0].kind)
 
-    def pixels(self) -> NDArray[np.uint8]:
-        """(ready, height, width, 3)"""
-        return np.stack([decoded.pixels for decoded in self.decoded])
+    def pixels(self) -> list[Pixels]:
+        """Of each of `ready`, (height, width, 3)."""
+        return [decoded.pixels for decoded in self.decoded]
+
+    def refuse_not_finite(self, rows: Rows) -> Rows:
+        """The rows that are finite; the jobs of the others go from `ready` to `failed`."""
+        finite = [bool(np.isfinite(row).all()) for row in rows]
+        if all(finite):
+            return rows
+        found = list(zip(self.ready, self.decoded, finite, strict=True))
+        self.failed += [(job, not_finite()) for job, _, good in found if not good]
+        self.ready = [job for job, _, good in found if good]
+        self.decoded = [decoded for _, decoded, good in found if good]
+        return rows[finite]
 
 
 def prepare(

@@ -40,8 +40,7 @@ def publish(
 ) -> Published:
     """Commit what the batch has come to; `rows` belong to `batch.ready`."""
     started = time.perf_counter()
-    if len(rows) and not np.isfinite(rows).all():
-        raise ValueError("a descriptor is not finite: the backbone or its weights are broken")
+    rows = batch.refuse_not_finite(rows)
     if batch.kind == JobKind.DESCRIBE:
         outcome = _publish_queries(catalog, store, batch, rows)
     else:

@@ -1,6 +1,6 @@
 """From a photo's bytes to its global descriptor. torch lives here and nowhere else in `shared`.
 
-bytes --decode--> RGB pixels (uint8) --backbone--> dense local features --aggregator--> one row
+bytes --decode, preprocessing--> RGB pixels --backbone--> dense local features --aggregator--> row
 
-`decode` and `preprocessing` import no torch: they run in the decoding child processes.
+`decode`, `preprocessing` and `resample` import no torch: they run in the decoding child processes.
 """

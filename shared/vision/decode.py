@@ -11,14 +11,14 @@ import warnings
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 from PIL import __version__ as pillow_version
 from PIL.ExifTags import Base
 
 from shared.errors import Unprocessable
-from shared.photo_formats import BROKEN, check_pixels, open_photo
+from shared.photo_formats import ACCEPTED, BROKEN, check_pixels, open_photo
 from shared.vision.preprocessing import Preprocessing
+from shared.vision.resample import Pixels
 
 THUMBNAIL_PIXELS = 256  # the longer side
 DECODER = f"pillow-{pillow_version}"
@@ -35,17 +35,18 @@ UPRIGHT = {  # by EXIF orientation; 1 is upright already
 
 @dataclass(frozen=True, slots=True)
 class Decoded:
-    pixels: NDArray[np.uint8]
-    """(height, width, 3) RGB, upright, as the preprocessing left it."""
+    pixels: Pixels
+    """(height, width, 3) RGB as the preprocessing left it."""
     thumbnail: bytes
     """JPEG without any metadata, its longer side at most THUMBNAIL_PIXELS."""
 
 
 def decode(data: bytes, preprocessing: Preprocessing, max_pixels: int) -> Decoded:
-    """The photo upright in RGB at the preprocessing's size, and its thumbnail.
+    """The photo in RGB as the preprocessing brings it, and its thumbnail, which is upright.
 
-    Only the first frame is read. Raises Unprocessable (`undecodable_photo`, `too_many_pixels`)
-    with the decoder's own reason.
+    Only the first frame is read. Transparent parts show black, samples of 16 bits keep their upper
+    eight. Raises Unprocessable (`undecodable_photo` with the decoder's own reason,
+    `too_many_pixels`, `photo_too_small`).
     """
     try:
         with warnings.catch_warnings():
@@ -53,9 +54,15 @@ def decode(data: bytes, preprocessing: Preprocessing, max_pixels: int) -> Decode
             with open_photo(io.BytesIO(data)) as image:
                 check_pixels(image, max_pixels)
                 image.load()
-                rgb = _upright(image, _to_rgb(image))
-            pixels = np.asarray(preprocessing.apply(rgb), dtype=np.uint8)
-            return Decoded(pixels=pixels, thumbnail=_thumbnail(rgb))
+                as_stored = _to_rgb(image)
+                upright = _upright(image, as_stored)
+            pixels = preprocessing.apply(upright if preprocessing.upright else as_stored)
+            return Decoded(pixels=pixels, thumbnail=_thumbnail(upright))
+    except UnidentifiedImageError as error:
+        raise Unprocessable(
+            "undecodable_photo",
+            f"The photo can't be decoded: it is not {ACCEPTED}, or its header is damaged.",
+        ) from error
     except BROKEN as error:
         raise Unprocessable(
             "undecodable_photo",
@@ -87,7 +94,13 @@ def _to_rgb(image: Image.Image) -> Image.Image:
         return Image.fromarray((samples >> 8).astype(np.uint8)).convert("RGB")
     if image.mode in ("I", "F"):
         raise ValueError(f"samples of mode {image.mode!r} have no defined brightness range")
-    return image.convert("RGB")
+    if not image.has_transparency_data:
+        return image.convert("RGB")
+    # What lies under full transparency is up to the program that wrote the file: mostly black.
+    seen = image.convert("RGBA")
+    on_black = Image.new("RGB", image.size)
+    on_black.paste(seen, mask=seen.getchannel("A"))
+    return on_black
 
 
 def _thumbnail(rgb: Image.Image) -> bytes:

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch.nn.functional import normalize
 
-from shared.errors import Misconfigured
+from shared.errors import Misconfigured, Unprocessable
 from shared.recipes import SLOW, TORCHHUB, Recipe
 from shared.vision.backbones import Backbone
 from shared.vision.backbones.dinov2 import SHAPES, Dinov2
@@ -22,11 +21,14 @@ from shared.vision.backbones.slow import SlowBackbone
 from shared.vision.backbones.tiny import TinyBackbone
 from shared.vision.backbones.torchhub import HubModule
 from shared.vision.decode import DECODER
+from shared.vision.pooling import average, gem
 from shared.vision.preprocessing import Preprocessing, get_preprocessing
-from shared.vision.vlad import vlad
+from shared.vision.resample import Pixels
+from shared.vision.vlad import soft_vlad, vlad
 from shared.vision.vocabulary import Centres, decode_centres
 
 SHIPPED = Path(__file__).parent / "vocabularies"
+USUAL_PIXELS = 224 * 224  # of a photo, by which the size of a batch is chosen
 
 
 def _dinov2(recipe: Recipe, device: torch.device, weights: Path | None) -> Backbone:
@@ -122,6 +124,8 @@ class Extractor:
             "decoder": DECODER,
             "dimension": self.dimension(centres),
         }
+        if self.recipe.aggregator == "soft-vlad":
+            spec["temperature"] = self.recipe.temperature
         if isinstance(self.backbone, HubModule):
             spec["code_fingerprint"] = self.backbone.code_fingerprint
         return spec
@@ -130,21 +134,79 @@ class Extractor:
         """Length of a descriptor."""
         return self.backbone.width * (centres.clusters if centres else 1)
 
-    def features(self, pixels: NDArray[np.uint8]) -> torch.Tensor:
-        """(B, H, W, 3) uint8 -> (B, patches, width) float32 local features on the device."""
+    def features(self, pixels: Pixels) -> torch.Tensor:
+        """(B, H, W, 3) of one size -> (B, patches, width) float32 local features on the device."""
         return self.backbone.features(torch.from_numpy(np.ascontiguousarray(pixels)))
 
-    def describe(self, pixels: NDArray[np.uint8], centres: Centres | None) -> NDArray[np.float32]:
-        """(B, H, W, 3) uint8 RGB -> (B, dimension) float32 unit rows."""
-        features = self.features(pixels)
-        if self.recipe.needs_vocabulary:
-            if centres is None:
-                raise ValueError(f"{self.recipe.name} needs a vocabulary")
-            on_device = torch.from_numpy(centres.array).to(features.device)
-            rows = vlad(features, on_device)
-        else:
-            rows = normalize(features.mean(dim=1), dim=-1)
-        return rows.cpu().numpy().astype(np.float32, copy=False)
+    def local_features(self, photos: Collection[Pixels]) -> list[torch.Tensor]:
+        """Of each photo, in their order, (patches, width) float32 on the CPU; any sizes."""
+        found: list[torch.Tensor] = [torch.empty(0)] * len(photos)
+        for places, features in self._passes(photos):
+            for place, one in zip(places, features.cpu(), strict=True):
+                found[place] = one
+        return found
+
+    def describe(self, photos: Collection[Pixels], centres: Centres | None) -> NDArray[np.float32]:
+        """Photos (H, W, 3) as `preprocessing` brings them, of any sizes -> (n, dimension) float32.
+
+        Rows in the photos' order, of length 1; or 0, see `shared.vision.vlad`; or NaN throughout
+        where the network's features are not finite: these must not be stored (`not_finite`).
+        """
+        if self.recipe.needs_vocabulary and centres is None:
+            raise ValueError(f"{self.recipe.name} needs a vocabulary")
+        on_device = None
+        if centres is not None:
+            on_device = torch.from_numpy(centres.array).to(self.backbone.device)
+        rows = np.empty((len(photos), self.dimension(centres)), np.float32)
+        for places, features in self._passes(photos):
+            rows[places] = self._aggregate(features, on_device).cpu().numpy()
+        return rows
+
+    def _passes(self, photos: Collection[Pixels]) -> Iterator[tuple[list[int], torch.Tensor]]:
+        """Local features pass by pass: the places of its photos in `photos`, and theirs.
+
+        A pass has photos of one size, and no more pixels than all of them would have at 224 x 224
+        (or else one photo), so that a batch takes memory by its number of photos, not their sizes.
+        """
+        listed = list(photos)
+        of_shape: dict[tuple[int, ...], list[int]] = {}
+        for place, photo in enumerate(listed):
+            of_shape.setdefault(photo.shape, []).append(place)
+        for (height, width, _), places in of_shape.items():
+            at_once = max(1, len(listed) * USUAL_PIXELS // (height * width))
+            for begin in range(0, len(places), at_once):
+                chosen = places[begin : begin + at_once]
+                yield chosen, self.features(np.stack([listed[place] for place in chosen]))
+
+    def _aggregate(self, features: torch.Tensor, centres: torch.Tensor | None) -> torch.Tensor:
+        """(B, patches, width), (K, width) -> (B, dimension)."""
+        match self.recipe.aggregator:
+            case "avg":
+                rows = average(features)
+            case "gem":
+                rows = gem(features)
+            case "vlad":
+                assert centres is not None
+                rows = vlad(features, centres)
+            case "soft-vlad":
+                assert centres is not None
+                rows = soft_vlad(features, centres, self.recipe.temperature)
+            case "none":
+                rows = features[:, 0]
+            case other:
+                raise ValueError(f"there is no aggregator {other!r}")
+        # Said outright: a comparison or a clamp on the way may hide a NaN.
+        finite = torch.isfinite(features).flatten(1).all(dim=1, keepdim=True)
+        return torch.where(finite, rows, torch.nan)
+
+
+def not_finite() -> Unprocessable:
+    """Why a photo whose row is NaN has no descriptor."""
+    return Unprocessable(
+        "features_not_finite",
+        "The network's features of this photo are not finite numbers: it has no descriptor. If "
+        "this is said of many photos, check the weights (`placewise doctor`) and the GPU.",
+    )
 
 
 def spec_fingerprint(spec: dict[str, Any]) -> str:

@@ -1,38 +1,124 @@
 """Named, versioned ways of bringing a photo to the size that a backbone sees.
 
 The name and the version are part of the extractor spec: two ways never mix in one generation.
+
+AnyLoc is published with more than one of them, and its figures belong to the one they were measured
+with. Those scale to [0, 1], normalise by channel and then resize the normalised numbers. Here the
+numbers are resized on the scale from 0 to 255, without rounding or clipping, and normalised once,
+by the backbone: resizing weighs samples with weights of sum 1, so the order makes no difference.
 """
 
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
+import numpy as np
 from PIL import Image
 
-from shared.errors import Misconfigured
+from shared.errors import Misconfigured, Unprocessable
+from shared.vision.resample import BICUBIC, BILINEAR, Pixels, resample
+
+PATCH = 14  # pixels; of DINOv2
+ROUND14_MOST_PIXELS = 4_194_304  # 2048 x 2048: 21,316 patches, which all attend to each other
 
 
 @dataclass(frozen=True, slots=True)
 class Preprocessing:
     name: str
     version: int
-    height: int
-    """pixels"""
-    width: int
-    """pixels"""
+    upright: bool
+    """Whether the photo is turned as its EXIF says. The published ways don't look at EXIF."""
+    most_pixels: int
+    """height x width of what comes out, at most"""
+    bring: Callable[[Image.Image], Pixels]
+    """A function of a module: it travels to the decoding children."""
 
-    def apply(self, image: Image.Image) -> Image.Image:
-        """An RGB image resized, aspect not kept: bilinear, antialiased when it shrinks."""
-        return image.resize((self.width, self.height), Image.Resampling.BILINEAR)
+    def apply(self, image: Image.Image) -> Pixels:
+        """An RGB image -> (H, W, 3), 0 to 255.
+
+        uint8; or float32 where interpolated numbers are kept as they are, which for the cubic may
+        lie a little outside. Photos of different sizes may come out with different H and W.
+
+        Unprocessable: `photo_too_small` where not one patch is left of it, `too_many_pixels` where
+        it keeps its size and that is too much for a network in which every patch sees every other.
+        """
+        return self.bring(image)
 
     def as_spec(self) -> dict[str, str | int]:
         return {"name": self.name, "version": self.version}
 
 
+def _squeeze(image: Image.Image, height: int, width: int) -> Pixels:
+    """Aspect not kept: bilinear, antialiased when it shrinks, rounded to whole numbers."""
+    return np.asarray(image.resize((width, height), Image.Resampling.BILINEAR))
+
+
+def _demo1024(image: Image.Image) -> Pixels:
+    """As AnyLoc's demo/anyloc_vlad_generate.py: where the longer side has more than 1024 pixels it
+    becomes 1024, the other one is rounded down; then the middle, in whole patches.
+
+    Bicubic. Not antialiased: torchvision's default for tensors until release 0.17, and AnyLoc's
+    environment names 0.14.1.
+    """
+    width, height = image.size
+    longest = max(width, height)
+    if longest > 1024:
+        height, width = int(height * 1024 / longest), int(width * 1024 / longest)
+    _check_patches(image, height, width, "demo1024")
+    return _middle(resample(np.asarray(image), height, width, BICUBIC, antialias=False))
+
+
+def _paper480x640(image: Image.Image) -> Pixels:
+    """As AnyLoc's scripts/dino_v2_vlad.py on its data sets: 480 x 640 whatever the aspect, bilinear
+    and, as above, not antialiased; of these the middle 476 x 630, which are 34 x 45 patches.
+    """
+    return _middle(resample(np.asarray(image), 480, 640, BILINEAR, antialias=False))
+
+
+def _round14(image: Image.Image) -> Pixels:
+    """As AnyLoc is run by VPR-methods-evaluation: each side to the nearest multiple of 14, of two
+    as near ones the even multiple; bilinear, antialiased.
+    """
+    height, width = (round(side / PATCH) * PATCH for side in (image.height, image.width))
+    _check_patches(image, height, width, "round14")
+    if height * width > ROUND14_MOST_PIXELS:
+        raise Unprocessable(
+            "too_many_pixels",
+            f"The photo has {image.width} x {image.height} pixels, and round14 keeps its size; it "
+            f"takes up to {ROUND14_MOST_PIXELS} in all. Make it smaller, or use demo1024.",
+        )
+    return resample(np.asarray(image), height, width, BILINEAR, antialias=True)
+
+
+def _check_patches(image: Image.Image, height: int, width: int, name: str) -> None:
+    if min(height, width) < PATCH:
+        raise Unprocessable(
+            "photo_too_small",
+            f"The photo has {image.width} x {image.height} pixels, of which {name} makes {width} x "
+            f"{height}: less than one patch of {PATCH} x {PATCH}. Crop it, or use square224.",
+        )
+
+
+def _middle(pixels: Pixels) -> Pixels:
+    """The middle of the pixels in whole patches; where it lies between two pixels, the even one."""
+    height, width = (side // PATCH * PATCH for side in pixels.shape[:2])
+    top, left = round((pixels.shape[0] - height) / 2), round((pixels.shape[1] - width) / 2)
+    middle: Pixels = pixels[top : top + height, left : left + width].copy()
+    return middle
+
+
 PREPROCESSINGS = {
-    "square224": Preprocessing("square224", version=1, height=224, width=224),
-    "square32": Preprocessing("square32", version=1, height=32, width=32),
+    preprocessing.name: preprocessing
+    for preprocessing in (
+        Preprocessing("square224", 1, True, 224 * 224, partial(_squeeze, height=224, width=224)),
+        Preprocessing("square32", 1, True, 32 * 32, partial(_squeeze, height=32, width=32)),
+        Preprocessing("demo1024", 1, False, 1022 * 1022, _demo1024),
+        Preprocessing("paper480x640", 1, False, 476 * 630, _paper480x640),
+        Preprocessing("round14", 1, False, ROUND14_MOST_PIXELS, _round14),
+    )
 }
 
 
@@ -50,4 +136,7 @@ def get_preprocessing(name: str) -> Preprocessing:
             f"There is no preprocessing {name!r}. Known: {', '.join(sorted(PREPROCESSINGS))}, "
             "resizeHEIGHTxWIDTH.",
         )
-    return Preprocessing(name, version=1, height=int(size[1]), width=int(size[2]))
+    height, width = int(size[1]), int(size[2])
+    return Preprocessing(
+        name, 1, True, height * width, partial(_squeeze, height=height, width=width)
+    )

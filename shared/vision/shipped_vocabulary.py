@@ -57,7 +57,7 @@ def main() -> None:
     points = torch.cat(
         [
             extractor.features(
-                np.stack([np.asarray(extractor.preprocessing.apply(v)) for v in views[i : i + 16]])
+                np.stack([extractor.preprocessing.apply(v) for v in views[i : i + 16]])
             ).flatten(0, 1)
             for i in range(0, len(views), 16)
         ]

@@ -1,13 +1,20 @@
-"""VLAD: hard assignment by cosine, residuals against the raw centres, intra-normalised.
+"""VLAD (Jegou et al. 2010; as AnyLoc, RA-L 2023, writes it), with hard and with soft assignment.
 
-For patches x (L2-normalised) and centres c_k (Jegou et al. 2010; AnyLoc, RA-L 2023):
+For patches x (L2-normalised), centres c_k and weights w of the patches in the clusters:
 
-    label(q) = argmax_k <x_q, c_k / |c_k|>                first best wins
-    v_k      = sum over q with label k of (x_q - c_k)     the centre is NOT normalised here
+    hard:  w_qk = 1 for k = argmax_k <x_q, c_k / |c_k|>, first best wins; else 0
+    soft:  w_qk = softmax over k of temperature * <x_q, c_k / |c_k|>
+    v_k      = sum over q of w_qk (x_q - c_k)             the centre is NOT normalised here
     v_k     <- v_k / |v_k|                                unused clusters stay 0
     row      = [v_0 ... v_{K-1}] / | . |                  cluster-major
 
-The sums are taken as sum(x) - count * c, so memory is O(batch x K x D), never patches x K x D.
+Soft blocks hold the residuals to their own centre. AnyLoc's published code sums the residuals to
+every centre into every block, which the formula does not say, and is not followed in that.
+
+The sums are taken as sum(w x) - sum(w) c, so memory is O(batch x (patches x K + K x D)), never
+patches x K x D. A patch whose feature is zero has no direction: its weight is 0 in every cluster. A
+photo of nothing but such patches has a zero row, which is similar to nothing. A photo with a number
+that is not finite in any feature has a row of NaN.
 """
 
 from __future__ import annotations
@@ -18,15 +25,35 @@ from torch.nn.functional import normalize, one_hot
 
 def assign(features: torch.Tensor, centres: torch.Tensor) -> torch.Tensor:
     """(..., D) features and (K, D) centres -> (...) int64 labels of the most similar centre."""
-    return (features @ normalize(centres, dim=-1).T).argmax(dim=-1)
+    return _cosines(features, centres).argmax(dim=-1)
 
 
 @torch.inference_mode()
 def vlad(features: torch.Tensor, centres: torch.Tensor) -> torch.Tensor:
     """(B, patches, D) L2-normalised float32 features, (K, D) centres -> (B, K * D) unit rows."""
-    clusters = centres.shape[0]
-    members = one_hot(assign(features, centres), clusters).to(features.dtype)  # (B, N, K)
-    sums = members.transpose(1, 2) @ features  # (B, K, D)
-    counts = members.sum(dim=1).unsqueeze(-1)  # (B, K, 1)
-    blocks = normalize(sums - counts * centres, dim=-1)
+    weights = one_hot(assign(features, centres), len(centres)).to(features.dtype)
+    return _sum_residuals(features, centres, weights)
+
+
+@torch.inference_mode()
+def soft_vlad(features: torch.Tensor, centres: torch.Tensor, temperature: float) -> torch.Tensor:
+    """As `vlad`, each patch in every cluster. The higher the temperature, the harder: a patch goes
+    to its best centre alone as it grows, to all of them alike at 0.
+    """
+    weights = (temperature * _cosines(features, centres)).softmax(dim=-1)
+    return _sum_residuals(features, centres, weights)
+
+
+def _cosines(features: torch.Tensor, centres: torch.Tensor) -> torch.Tensor:
+    return features @ normalize(centres, dim=-1).T
+
+
+def _sum_residuals(
+    features: torch.Tensor, centres: torch.Tensor, weights: torch.Tensor
+) -> torch.Tensor:
+    """(B, patches, D), (K, D), (B, patches, K) -> (B, K * D)."""
+    weights = weights * (features != 0).any(dim=-1, keepdim=True)
+    sums = weights.transpose(1, 2) @ features  # (B, K, D)
+    shares = weights.sum(dim=1).unsqueeze(-1)  # (B, K, 1)
+    blocks = normalize(sums - shares * centres, dim=-1)
     return normalize(blocks.flatten(1), dim=-1)

@@ -22,6 +22,7 @@ from shared.errors import PlacewiseError, Unavailable, Unprocessable
 from shared.settings import Settings
 from shared.vision.decode import Decoded
 from shared.vision.preprocessing import Preprocessing, get_preprocessing
+from shared.vision.resample import Pixels
 from tests.support.photos import photo_bytes
 
 SQUARE = get_preprocessing("square32")
@@ -38,7 +39,7 @@ def photo_of(colour: tuple[int, int, int], side: int = 8) -> bytes:
 class Poisoned(Preprocessing):
     """Does to its process what a fault in a decoder could do, if the photo's colour says so."""
 
-    def apply(self, image: Image.Image) -> Image.Image:
+    def apply(self, image: Image.Image) -> Pixels:
         colour: Any = image.getpixel((0, 0))
         if colour == CRASHES:
             os.kill(os.getpid(), signal.SIGSEGV)
@@ -49,7 +50,7 @@ class Poisoned(Preprocessing):
         return super().apply(image)
 
 
-POISONED = Poisoned("poisoned", version=1, height=32, width=32)
+POISONED = Poisoned("poisoned", 1, SQUARE.upright, SQUARE.most_pixels, SQUARE.bring)
 
 
 @contextlib.contextmanager

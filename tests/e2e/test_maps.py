@@ -328,5 +328,10 @@ def test_maps_are_made_filled_asked_and_deleted_by_command(
     kept = run_command("maps", "delete", name, env=env, cwd=tmp_path)
     assert kept.returncode != 0, "nobody said yes"
     assert placewise("maps", "delete", name, "--yes")["deleted_map"] == name
+    chosen = ("--extractor", "test-tiny-vlad", "--preprocessing", "demo1024")
+    other = placewise("maps", "create", next(names), *chosen)
+    assert other["extractor"] == "test-tiny-vlad:preprocessing=demo1024"
+    refused = placewise("maps", "create", next(names), *chosen[2:], code=1)
+    assert refused["code"] == "no_extractor"
     refused = placewise("maps", "create", "not a name", code=1)
     assert refused["code"] == "invalid_field"

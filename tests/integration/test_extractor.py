@@ -13,6 +13,7 @@ from uuid import UUID
 
 import numpy as np
 import pytest
+import torch
 from numpy.typing import NDArray
 from sqlalchemy import func, select
 from sqlalchemy.exc import OperationalError
@@ -35,15 +36,17 @@ from shared.jobs.finish import requeue
 from shared.jobs.table import WaitingFor
 from shared.objects import FolderStore
 from shared.objects.keys import query_vector_key, thumbnail_key
+from shared.vision.backbones.tiny import TinyBackbone
 from shared.vision.decode import decode
 from shared.vision.extractors import Extractor
 from shared.vision.preprocessing import get_preprocessing
+from shared.vision.resample import Pixels
 from shared.vision.vocabulary import Centres, decode_centres
 from tests.integration.workplace import Workplace, expected_row, same
 from tests.support.catalog_rows import end_pauses, expire_lease, set_columns, states
-from tests.support.photos import photo_bytes
+from tests.support.photos import encoded, photo_bytes, photo_image
 
-Describe = Callable[[Extractor, NDArray[np.uint8], Centres | None], NDArray[np.float32]]
+Describe = Callable[[Extractor, list[Pixels], Centres | None], NDArray[np.float32]]
 DAY_SECONDS = 86_400.0
 
 
@@ -54,7 +57,7 @@ def before_describing(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[...
 
     def hook(do: Callable[..., None]) -> None:
         def describe(
-            self: Extractor, pixels: NDArray[np.uint8], centres: Centres | None
+            self: Extractor, pixels: list[Pixels], centres: Centres | None
         ) -> NDArray[np.float32]:
             do(pixels)
             return real(self, pixels, centres)
@@ -67,7 +70,7 @@ def before_describing(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[...
 Hook = Callable[[Callable[..., None]], None]
 
 
-def pixels_of(data: bytes) -> NDArray[np.uint8]:
+def pixels_of(data: bytes) -> Pixels:
     return decode(data, get_preprocessing("square32"), 10**9).pixels
 
 
@@ -206,6 +209,39 @@ def _drain(worker: ExtractorWorker) -> None:
     worker.drain(threading.Event())
 
 
+def test_photos_of_different_sizes_are_described_in_one_batch(
+    workplace_of: Callable[[str], Workplace],
+) -> None:
+    extractor = "test-tiny-vlad:aggregator=gem,preprocessing=demo1024"
+    place = workplace_of(extractor)
+    sizes = [(64, 48), (48, 64), (1500, 900), (64, 48), (10, 10)]
+    photos = [encoded(photo_image(n, *size), "PNG") for n, size in enumerate(sizes)]
+    photo_ids = [place.upload_bytes(photo)[0] for photo in photos]
+    result = place.drain()
+    assert (result.claimed, result.succeeded, result.failed) == (5, 4, 1)
+    rows = place.rows()
+    for photo, photo_id in zip(photos[:4], photo_ids[:4], strict=True):
+        assert same(rows[photo_id], expected_row(extractor, photo))
+    too_small = place.job_of(photo_ids[4])
+    assert too_small.error is not None
+    assert too_small.error["code"] == "photo_too_small"
+    spec = place.active().spec
+    assert spec["preprocessing"] == {"name": "demo1024", "version": 1}
+    assert (spec["aggregator"], spec["dimension"]) == ("gem", 16)
+
+
+def test_vocabulary_is_fitted_on_photos_of_different_sizes(
+    workplace_of: Callable[[str], Workplace],
+) -> None:
+    place = workplace_of("test-tiny-vlad:aggregator=soft-vlad,clusters=2,preprocessing=round14")
+    for number, size in enumerate([(64, 48), (48, 64), (90, 90)]):
+        place.upload_bytes(encoded(photo_image(number, *size), "PNG"))
+    place.fit(clusters=2)
+    generation = place.active()
+    assert (generation.dimension, generation.spec["temperature"]) == (32, 1.0)
+    assert len(place.rows()) == 3
+
+
 # --- crashes ---------------------------------------------------------------------------------
 
 
@@ -215,7 +251,7 @@ def test_a_photo_that_crashes_the_forward_pass_fails_and_harms_no_other(
     poison = pixels_of(photo_bytes(2))
     batches: list[int] = []
 
-    def crash(pixels: NDArray[np.uint8]) -> None:
+    def crash(pixels: list[Pixels]) -> None:
         if any(np.array_equal(one, poison) for one in pixels):
             batches.append(len(pixels))
             raise RuntimeError("CUDA error: an illegal memory access was encountered")
@@ -236,16 +272,31 @@ def test_a_photo_that_crashes_the_forward_pass_fails_and_harms_no_other(
     assert set(averages.rows()) == {photo_ids[0], photo_ids[2]}
 
 
-def test_a_descriptor_that_is_not_finite_is_never_stored(
+def test_a_descriptor_that_is_not_finite_is_refused_and_harms_no_other(
     averages: Workplace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(
-        Extractor, "describe", lambda self, pixels, _: np.full((len(pixels), 16), np.nan, "f4")
-    )
-    (photo_id,) = averages.upload(1)
-    averages.drain()
-    assert averages.job_of(photo_id).state == JobState.FAILED
-    assert averages.keys("chunks/") == set()
+    poison = pixels_of(photo_bytes(2))
+    real = TinyBackbone.features
+
+    def overflow(self: TinyBackbone, pixels: torch.Tensor) -> torch.Tensor:
+        features = real(self, pixels).clone()
+        for photo, found in zip(pixels.numpy(), features, strict=True):
+            if np.array_equal(photo, poison):
+                found[3, 5] = np.inf  # one number of one patch
+        return features
+
+    monkeypatch.setattr(TinyBackbone, "features", overflow)
+    photo_ids = averages.upload(1, 2, 3)
+    result = averages.drain()
+    assert (result.claimed, result.succeeded, result.failed) == (3, 2, 1)
+    refused = averages.job_of(photo_ids[1])
+    assert (refused.state, refused.attempts) == (JobState.FAILED, 0)
+    assert refused.error is not None
+    assert refused.error["code"] == "features_not_finite"
+    rows = averages.rows()
+    assert set(rows) == {photo_ids[0], photo_ids[2]}
+    for number, photo_id in ((1, photo_ids[0]), (3, photo_ids[2])):
+        assert same(rows[photo_id], expected_row("test-tiny-avg", photo_bytes(number)))
 
 
 def test_a_crash_between_chunk_and_commit_leaves_an_orphan_that_is_collected(
@@ -467,7 +518,7 @@ def test_a_query_waits_for_one_batch_at_most(averages: Workplace, before_describ
     asked: list[UUID] = []
     done_before: list[tuple[int, JobState]] = []
 
-    def watch(pixels: NDArray[np.uint8]) -> None:
+    def watch(pixels: list[Pixels]) -> None:
         if asked:
             done_before.append((len(pixels), JobState(averages.job(asked[0]).state)))
         else:  # in the first batch, when the second one is claimed and decoded already
@@ -488,7 +539,7 @@ def test_a_query_does_not_even_wait_for_the_batch_that_is_being_described(
     averages.upload(*range(1, 5))
     answered: list[JobState] = []
 
-    def ask_and_wait(pixels: NDArray[np.uint8]) -> None:
+    def ask_and_wait(pixels: list[Pixels]) -> None:
         if len(pixels) > 1:  # the bulk batch, which goes on only when the query is answered
             job_id = averages.ask(photo_bytes(99))
             answered.append(averages.await_end(job_id))

@@ -184,7 +184,7 @@ def expected_row(extractor: str, data: bytes, centres: Centres | None = None) ->
     """What the extractor makes of the photo, without any of the services."""
     made = Extractor(get_recipe(extractor, allow_test_extractors=True), torch.device("cpu"))
     pixels = decode(data, made.preprocessing, 10**9).pixels
-    row: Rows = made.describe(np.stack([pixels]), centres)[0]
+    row: Rows = made.describe([pixels], centres)[0]
     return row
 
 

@@ -7,6 +7,18 @@ from typing import Any
 
 import numpy as np
 from PIL import Image
+from PIL.ExifTags import Base
+
+UNDO_OF_ORIENTATION = {
+    1: None,
+    2: Image.Transpose.FLIP_LEFT_RIGHT,
+    3: Image.Transpose.ROTATE_180,
+    4: Image.Transpose.FLIP_TOP_BOTTOM,
+    5: Image.Transpose.TRANSPOSE,
+    6: Image.Transpose.ROTATE_90,
+    7: Image.Transpose.TRANSVERSE,
+    8: Image.Transpose.ROTATE_270,
+}
 
 
 def photo_image(number: int, width: int = 64, height: int = 48) -> Image.Image:
@@ -16,16 +28,28 @@ def photo_image(number: int, width: int = 64, height: int = 48) -> Image.Image:
     return coarse.resize((width, height), Image.Resampling.NEAREST)
 
 
+def encoded(image: Image.Image, media: str, **options: Any) -> bytes:
+    """A file of the given Pillow format."""
+    buffer = io.BytesIO()
+    image.save(buffer, media, **options)
+    return buffer.getvalue()
+
+
 def photo_bytes(number: int, media: str = "JPEG", **options: Any) -> bytes:
     """The photo `number` as a file of the given Pillow format."""
-    buffer = io.BytesIO()
-    photo_image(number).save(buffer, media, **options)
-    return buffer.getvalue()
+    return encoded(photo_image(number), media, **options)
 
 
 def near_copy(number: int) -> bytes:
     """The photo `number` a little darker: other bytes, the same place."""
-    buffer = io.BytesIO()
     darker = photo_image(number).point(lambda value: int(value * 0.9))
-    darker.save(buffer, "JPEG", quality=80)
-    return buffer.getvalue()
+    return encoded(darker, "JPEG", quality=80)
+
+
+def turned_photo(upright: Image.Image, orientation: int, media: str, **options: Any) -> bytes:
+    """The photo as a camera held otherwise stores it: turned, and its EXIF saying how."""
+    undo = UNDO_OF_ORIENTATION[orientation]
+    exif = Image.Exif()
+    exif[Base.Orientation] = orientation
+    stored = upright if undo is None else upright.transpose(undo)
+    return encoded(stored, media, exif=exif, **options)

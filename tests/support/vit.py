@@ -93,11 +93,11 @@ def save(weights: Mapping[str, Any], path: Path) -> Path:
 
 
 def plain_forward(
-    weights: Weights, shape: VitShape, pixels: NDArray[np.uint8]
+    weights: Weights, shape: VitShape, pixels: NDArray[np.uint8 | np.float32]
 ) -> list[dict[str, NDArray[np.float64]]]:
     """Each block's facets of the patches, L2-normalised: the whole network, in float64.
 
-    (B, H, W, 3) uint8 -> for each block (B, patches, width) by the facet's name.
+    (B, H, W, 3), 0 to 255 -> for each block (B, patches, width) by the facet's name.
     """
     w = {name: tensor.double().numpy() for name, tensor in weights.items()}
     batch, height, width = pixels.shape[:3]

@@ -18,17 +18,11 @@ from shared.errors import Unprocessable
 from shared.photo_formats import sniff_media_type
 from shared.vision.decode import THUMBNAIL_PIXELS, decode
 from shared.vision.preprocessing import get_preprocessing
-from tests.support.photos import photo_bytes, photo_image
+from tests.support.photos import encoded, photo_bytes, photo_image, turned_photo
 
 SQUARE = get_preprocessing("square32")
 PIXELS = 50_000_000
 LOSSLESS = ("PNG", "BMP", "TIFF")
-
-
-def encoded(image: Image.Image, media: str, **options: Any) -> bytes:
-    buffer = io.BytesIO()
-    image.save(buffer, media, **options)
-    return buffer.getvalue()
 
 
 def mean_colour(data: bytes) -> tuple[int, int, int]:
@@ -66,7 +60,7 @@ def test_every_accepted_format_decodes_to_the_size_of_the_preprocessing(name: st
     decoded = decode(FORMATS[name], SQUARE, PIXELS)
     assert decoded.pixels.shape == (32, 32, 3)
     assert decoded.pixels.dtype == np.uint8
-    expected = np.asarray(SQUARE.apply(photo_image(1)), dtype=float)
+    expected = SQUARE.apply(photo_image(1)).astype(float)
     assert np.abs(decoded.pixels - expected).mean() < 12, "these are not the photo's pixels"
     assert sniff_media_type(FORMATS[name][:16]) is not None
 
@@ -74,19 +68,7 @@ def test_every_accepted_format_decodes_to_the_size_of_the_preprocessing(name: st
 @pytest.mark.parametrize("media", LOSSLESS)
 def test_lossless_formats_keep_every_pixel(media: str) -> None:
     decoded = decode(photo_bytes(3, media), SQUARE, PIXELS)
-    np.testing.assert_array_equal(decoded.pixels, np.asarray(SQUARE.apply(photo_image(3))))
-
-
-UNDO_OF_ORIENTATION = {
-    1: None,
-    2: Image.Transpose.FLIP_LEFT_RIGHT,
-    3: Image.Transpose.ROTATE_180,
-    4: Image.Transpose.FLIP_TOP_BOTTOM,
-    5: Image.Transpose.TRANSPOSE,
-    6: Image.Transpose.ROTATE_90,
-    7: Image.Transpose.TRANSVERSE,
-    8: Image.Transpose.ROTATE_270,
-}
+    np.testing.assert_array_equal(decoded.pixels, SQUARE.apply(photo_image(3)))
 
 
 def corners(pixels: Any) -> list[str]:
@@ -103,15 +85,21 @@ def test_every_exif_orientation_comes_out_upright(orientation: int, media: str) 
     upright.paste((0, 255, 0), (24, 0, 48, 16))
     upright.paste((0, 0, 255), (24, 16, 48, 32))
     upright.paste((255, 255, 0), (0, 16, 24, 32))
-    undo = UNDO_OF_ORIENTATION[orientation]
-    as_the_camera_stores_it = upright.transpose(undo) if undo is not None else upright
-    exif = Image.Exif()
-    exif[Base.Orientation] = orientation
-    decoded = decode(encoded(as_the_camera_stores_it, media, exif=exif), SQUARE, PIXELS)
+    decoded = decode(turned_photo(upright, orientation, media), SQUARE, PIXELS)
     assert corners(decoded.pixels) == ["red", "green", "blue", "yellow"]
     thumbnail = Image.open(io.BytesIO(decoded.thumbnail))
     assert thumbnail.size == (48, 32)
     assert corners(np.asarray(thumbnail)) == ["red", "green", "blue", "yellow"]
+
+
+@pytest.mark.parametrize("name", ["demo1024", "paper480x640", "round14"])
+def test_published_preprocessings_see_photos_as_they_are_stored(name: str) -> None:
+    published = get_preprocessing(name)
+    on_its_side = turned_photo(photo_image(1), 6, "PNG")
+    decoded = decode(on_its_side, published, PIXELS)
+    as_stored = photo_image(1).transpose(Image.Transpose.ROTATE_90)
+    np.testing.assert_array_equal(decoded.pixels, published.apply(as_stored))
+    assert Image.open(io.BytesIO(decoded.thumbnail)).size == (64, 48), "thumbnails are upright"
 
 
 @pytest.mark.parametrize("media", ["PNG", "TIFF"])
@@ -133,11 +121,34 @@ def test_cmyk_jpeg_has_its_colours() -> None:
     assert abs(b - 30) < 8
 
 
-def test_palette_with_transparency_has_the_colours_of_its_palette() -> None:
+def test_palette_with_transparency_has_the_colours_of_its_palette_on_black() -> None:
     image = Image.new("P", (16, 16), 1)
     image.putpalette([0, 0, 0, 10, 200, 90])
     assert mean_colour(encoded(image, "PNG", transparency=0)) == (10, 200, 90)
-    assert mean_colour(encoded(image, "PNG", transparency=bytes([255, 128]))) == (10, 200, 90)
+    assert mean_colour(encoded(image, "PNG", transparency=bytes([255, 128]))) == (5, 100, 45)
+    assert mean_colour(encoded(image, "PNG", transparency=1)) == (0, 0, 0)
+
+
+@pytest.mark.parametrize(
+    ("image", "expected"),
+    [
+        (Image.new("RGBA", (8, 8), (200, 100, 50, 0)), (0, 0, 0)),
+        (Image.new("RGBA", (8, 8), (200, 100, 50, 51)), (40, 20, 10)),
+        (Image.new("LA", (8, 8), (250, 51)), (50, 50, 50)),
+    ],
+)
+def test_transparent_parts_show_black_whatever_lies_under_them(
+    image: Image.Image, expected: tuple[int, int, int]
+) -> None:
+    for media in ("PNG", "WEBP", "TIFF"):
+        assert mean_colour(encoded(image, media, lossless=True)) == expected
+
+
+def test_alpha_that_hides_nothing_changes_no_pixel() -> None:
+    with_alpha = photo_image(4).convert("RGBA")
+    for media in ("PNG", "TIFF"):
+        decoded = decode(encoded(with_alpha, media), SQUARE, PIXELS).pixels
+        np.testing.assert_array_equal(decoded, SQUARE.apply(photo_image(4)))
 
 
 @pytest.mark.parametrize(
@@ -174,8 +185,9 @@ def test_truncated_photo_is_an_error_and_not_a_grey_picture(media: str) -> None:
 
 
 @pytest.mark.parametrize("data", [b"", b"this is a text\n" * 40, b"\xff\xd8\xff\xe0", b"GIF89a"])
-def test_what_is_no_photo_is_an_error(data: bytes) -> None:
+def test_what_is_no_photo_is_an_error_that_names_what_is_accepted(data: bytes) -> None:
     assert reason(data).code == "undecodable_photo"
+    assert "not JPEG, PNG, WebP, BMP or TIFF" in reason(data).detail
 
 
 def test_formats_that_are_not_accepted_are_not_decoded() -> None:

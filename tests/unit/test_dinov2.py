@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,8 @@ from tests.support.vit import (
 
 CPU = torch.device("cpu")
 NETWORKS = {"plain": PLAIN, "swiglu": SWIGLU, "registers": WITH_REGISTERS}
-SIZES = [(224, 224), (126, 70), (518, 518)]
+SIZES = [(224, 224), (126, 70), (322, 476), (518, 518)]
+CLOSE = 1e-4  # of unit vectors, in float32, to the same network in float64
 
 
 @pytest.fixture(scope="module")
@@ -72,6 +74,45 @@ def test_features_are_those_of_a_whole_forward_pass(
         wanted = expected(network, size)[layer][facet]
         assert features.shape == wanted.shape
         np.testing.assert_allclose(features, wanted, atol=2e-5, err_msg=f"layer {layer}")
+
+
+@pytest.mark.parametrize("size", SHAPES)
+def test_features_of_each_published_depth_are_those_of_a_whole_forward_pass(
+    size: str, tmp_path: Path
+) -> None:
+    """All blocks and heads, each head narrowed to 4 numbers; what AnyLoc takes of it."""
+    published, layer = SHAPES[size], RECIPES[f"anyloc-{size}"].layer
+    assert layer is not None
+    shape = replace(published, width=4 * published.heads)
+    weights = random_weights(shape)
+    file = save(weights, tmp_path / "weights.pth")
+    wanted = plain_forward(weights, shape, photos(70, 98))[layer]["value"]
+    features = load(file, shape, layer, "value").features(torch.from_numpy(photos(70, 98)))
+    np.testing.assert_allclose(features, wanted, atol=CLOSE)
+
+
+def test_features_of_the_whole_vits14_are_those_of_a_whole_forward_pass(tmp_path: Path) -> None:
+    """The published size in every number, with random weights; loaded without giving a shape."""
+    shape = SHAPES["vits14"]
+    weights = random_weights(shape)
+    file = save(weights, tmp_path / "weights.pth")
+    wanted = plain_forward(weights, shape, photos(224, 224)[:1])
+    for layer, facet in ((10, "value"), (11, "token")):
+        backbone = Dinov2("vits14", layer, facet, CPU, file)
+        features = backbone.features(torch.from_numpy(photos(224, 224)[:1]))
+        assert tuple(features.shape) == (1, 256, 384)
+        np.testing.assert_allclose(features, wanted[layer][facet], atol=CLOSE)
+
+
+def test_pixels_between_whole_numbers_are_not_rounded(files: dict[str, Path]) -> None:
+    """What a preprocessing interpolated reaches the network as it is, and is normalised once."""
+    backbone = load(files["plain"], PLAIN, 1, "value")
+    whole = torch.from_numpy(photos(126, 70))
+    np.testing.assert_array_equal(backbone.features(whole.float()), backbone.features(whole))
+    between = whole.float() + 0.4
+    wanted = plain_forward(random_weights(PLAIN), PLAIN, between.numpy())[1]["value"]
+    np.testing.assert_allclose(backbone.features(between), wanted, atol=2e-5)
+    assert float((backbone.features(between) - backbone.features(whole)).abs().max()) > 1e-4
 
 
 def test_facets_and_layers_differ_from_each_other() -> None:

@@ -146,6 +146,22 @@ def test_a_batch_that_is_too_large_comes_with_what_to_do(monkeypatch: pytest.Mon
         memory_check(settings)
 
 
+def test_memory_of_one_large_photo_is_counted_whatever_the_batch(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    pretend_gpu(monkeypatch, 6 * GB)
+    settings = settings_with(
+        monkeypatch,
+        EXTRACTOR="anyloc-vitg14:preprocessing=demo1024",
+        DEVICE="cuda",
+        BATCH_PHOTOS="1",
+    )
+    with pytest.raises(Misconfigured, match="preprocessing square224") as caught:
+        memory_check(settings)  # 21 times the pixels of 224 x 224
+    assert "6.4 GB (weights 4.5, a batch of 1 photos 0.8)" in caught.value.detail
+    assert "BATCH_PHOTOS" not in caught.value.detail
+
+
 def test_ram_that_is_too_small_is_found_out(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(extractor_checks, "ram_bytes", lambda: 2 * GB)
     settings = settings_with(monkeypatch, DINO_MODEL="dinov2_vitl14", DEVICE="cpu")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import importlib.util
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +15,10 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from shared.errors import Misconfigured
-from shared.recipes import RECIPES
+from shared.recipes import RECIPES, get_recipe
 from shared.vision.extractors import SHIPPED, Extractor, choose_device, spec_fingerprint
+from shared.vision.pooling import average, gem
+from shared.vision.vlad import soft_vlad, vlad
 from shared.vision.vocabulary import check_centres, decode_centres
 
 CPU = torch.device("cpu")
@@ -40,7 +43,7 @@ def package_photo(name: str) -> Image.Image:
 
 
 def pixels_of(extractor: Extractor, photos: list[Image.Image]) -> NDArray[np.uint8]:
-    return np.stack([np.asarray(extractor.preprocessing.apply(photo)) for photo in photos])
+    return np.stack([extractor.preprocessing.apply(photo) for photo in photos])
 
 
 def views(photo: Image.Image) -> list[Image.Image]:
@@ -80,6 +83,102 @@ def test_spec_says_the_length_of_the_descriptors_that_are_made(tiny: Extractor) 
     rows = tiny.describe(photos, centres)
     assert rows.dtype == np.float32
     assert rows.shape == (2, tiny.spec(centres)["dimension"]) == (2, 80)
+
+
+def test_specs_of_stored_generations_mean_what_they_meant(efficientnet: Extractor) -> None:
+    """A member more would have every photo described anew."""
+    shipped = efficientnet.shipped_vocabulary()
+    assert shipped is not None
+    spec = efficientnet.spec(shipped[0])
+    assert sorted(spec) == [
+        "aggregator", "backbone", "backbone_fingerprint", "clusters", "decoder", "dimension",
+        "extractor", "facet", "layer", "precision", "preprocessing", "vocabulary_sha256",
+    ]  # fmt: skip
+    assert spec["extractor"] == "efficientnet-lite0-vlad"
+    assert spec["preprocessing"] == {"name": "square224", "version": 1}
+    assert spec["aggregator"] == "vlad"
+
+
+def chosen(options: str) -> Extractor:
+    return Extractor(get_recipe(f"test-tiny-vlad:{options}", allow_test_extractors=True), CPU)
+
+
+def test_specs_tell_aggregators_temperatures_and_preprocessings_apart() -> None:
+    centres = check_centres(np.random.default_rng(2).standard_normal((5, 16)).astype(np.float32))
+    specs = [
+        chosen(options).spec(None if "gem" in options or "avg" in options else centres)
+        for options in (
+            "aggregator=vlad", "aggregator=soft-vlad", "aggregator=soft-vlad,temperature=2",
+            "aggregator=gem", "aggregator=avg", "preprocessing=demo1024", "preprocessing=round14",
+        )
+    ]  # fmt: skip
+    assert len({spec_fingerprint({**spec, "extractor": ""}) for spec in specs}) == len(specs)
+    assert [spec["dimension"] for spec in specs[:5]] == [80, 80, 80, 16, 16]
+    assert [spec.get("temperature") for spec in specs[:4]] == [None, 1.0, 2.0, None]
+
+
+AGGREGATIONS: dict[str, Callable[[torch.Tensor, torch.Tensor], torch.Tensor]] = {
+    "aggregator=vlad": vlad,
+    "aggregator=soft-vlad": lambda features, centres: soft_vlad(features, centres, 1.0),
+    "aggregator=soft-vlad,temperature=3.5": lambda features, centres: soft_vlad(
+        features, centres, 3.5
+    ),
+    "aggregator=gem": lambda features, _centres: gem(features),
+    "aggregator=avg": lambda features, _centres: average(features),
+}
+
+
+@pytest.mark.parametrize("options", AGGREGATIONS)
+def test_the_aggregator_of_the_name_is_at_work(options: str) -> None:
+    made = chosen(options)
+    array = np.random.default_rng(2).standard_normal((5, 16)).astype(np.float32)
+    centres = check_centres(array) if made.recipe.needs_vocabulary else None
+    photos = np.random.default_rng(3).integers(0, 256, (2, 32, 32, 3), dtype=np.uint8)
+    expected = AGGREGATIONS[options](made.features(photos), torch.from_numpy(array))
+    assert np.array_equal(made.describe(photos, centres), expected.numpy())
+
+
+@pytest.mark.parametrize("options", AGGREGATIONS)
+@pytest.mark.parametrize("broken", [np.nan, np.inf, -np.inf])
+def test_features_that_are_not_finite_make_a_row_of_nan_and_harm_no_other(
+    options: str, broken: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = chosen(options)
+    array = np.random.default_rng(2).standard_normal((5, 16)).astype(np.float32)
+    centres = check_centres(array) if made.recipe.needs_vocabulary else None
+    photos = np.random.default_rng(3).integers(0, 256, (3, 32, 32, 3), dtype=np.uint8)
+    sound = made.describe(photos, centres)
+    features = made.features(photos).clone()
+    features[1, 2, 3] = broken
+    monkeypatch.setattr(made.backbone, "features", lambda _pixels: features)
+    rows = made.describe(photos, centres)
+    assert np.isnan(rows[1]).all()
+    np.testing.assert_allclose(rows[[0, 2]], sound[[0, 2]], atol=1e-6)
+
+
+def test_photos_of_one_size_pass_together_and_of_large_ones_fewer(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    made = chosen("aggregator=avg")
+    shapes = [(224, 224), (112, 448), (224, 224), (448, 448), (448, 448), (224, 224)]
+    rng = np.random.default_rng(4)
+    photos = [rng.integers(0, 256, (*shape, 3), dtype=np.uint8) for shape in shapes]
+    passes: list[tuple[int, ...]] = []
+    real = made.backbone.features
+
+    def watch(pixels: torch.Tensor) -> torch.Tensor:
+        passes.append(tuple(pixels.shape[:3]))
+        return real(pixels)
+
+    monkeypatch.setattr(made.backbone, "features", watch)
+    together = made.describe(photos, None)
+    assert passes == [(3, 224, 224), (1, 112, 448), (1, 448, 448), (1, 448, 448)]
+    for photo, row in zip(photos, together, strict=True):
+        np.testing.assert_allclose(made.describe([photo], None)[0], row, atol=1e-6)
+    local = made.local_features(photos)
+    assert [len(one) for one in local] == [height * width // 16 for height, width in shapes]
+    for photo, one in zip(photos, local, strict=True):
+        np.testing.assert_allclose(made.features(photo[None])[0], one, atol=1e-6)
 
 
 def test_vlad_without_a_vocabulary_is_refused(tiny: Extractor) -> None:

@@ -8,7 +8,17 @@ import sys
 import pytest
 
 from shared.errors import Misconfigured
-from shared.recipes import RECIPES, Recipe, get_recipe
+from shared.recipes import (
+    AGGREGATORS,
+    PREPROCESSINGS,
+    RECIPES,
+    Recipe,
+    get_recipe,
+    with_options,
+)
+from shared.vision.preprocessing import PREPROCESSINGS as IN_VISION
+
+ANYLOC_OPTIONS = "Its options: aggregator, clusters, facet, layer, preprocessing."
 
 
 def recipe(name: str) -> Recipe:
@@ -77,6 +87,20 @@ def test_options_are_taken() -> None:
         ("anyloc-vitb14:layer=10,facet=token", "facet=token"),
         ("anyloc-vitb14:clusters=0032", "clusters=32"),
         ("anyloc-vitb14:layer=10,facet=value,clusters=64", ""),
+        ("anyloc-vitb14:preprocessing=square224,aggregator=vlad", ""),
+        (
+            "anyloc-vitb14:preprocessing=demo1024,aggregator=gem,layer=9",
+            "aggregator=gem,layer=9,preprocessing=demo1024",
+        ),
+        (
+            "anyloc-vitb14:temperature=02.50,aggregator=soft-vlad",
+            "aggregator=soft-vlad,temperature=2.5",
+        ),
+        ("anyloc-vitb14:temperature=1.0,aggregator=soft-vlad", "aggregator=soft-vlad"),
+        (
+            "anyloc-vitb14:aggregator=soft-vlad,temperature=100",
+            "aggregator=soft-vlad,temperature=100",
+        ),
     ],
 )
 def test_one_extractor_has_one_name(written: str, canonical: str) -> None:
@@ -88,9 +112,9 @@ def test_one_extractor_has_one_name(written: str, canonical: str) -> None:
 @pytest.mark.parametrize(
     ("name", "said"),
     [
-        ("anyloc-vitb14:depth=9", ["'depth'", "clusters, facet, layer"]),
-        ("anyloc-vitb14:", ["''", "clusters, facet, layer"]),
-        ("anyloc-vitb14:layer=9,", ["''", "clusters, facet, layer"]),
+        ("anyloc-vitb14:depth=9", ["'depth'", ANYLOC_OPTIONS]),
+        ("anyloc-vitb14:", ["''", ANYLOC_OPTIONS]),
+        ("anyloc-vitb14:layer=9,", ["''", ANYLOC_OPTIONS]),
         ("anyloc-vitb14:layer", ["layer=", "0 to 11"]),
         ("anyloc-vitb14:layer=12", ["layer=12", "0 to 11", "12 blocks"]),
         ("anyloc-vitg14:layer=40", ["layer=40", "0 to 39"]),
@@ -101,7 +125,15 @@ def test_one_extractor_has_one_name(written: str, canonical: str) -> None:
         ("anyloc-vitb14:clusters=0", ["clusters=0", "1 to 4096"]),
         ("anyloc-vitb14:clusters=4097", ["clusters=4097", "1 to 4096"]),
         ("anyloc-vitb14:layer=9,layer=8", ["layer", "twice"]),
-        ("efficientnet-lite0-vlad:layer=3", ["'layer'", "Its options: clusters."]),
+        ("efficientnet-lite0-vlad:layer=3", ["'layer'", "aggregator, clusters, preprocessing."]),
+        ("anyloc-vitb14:preprocessing=square32", ["square32", "square224, demo1024, paper480x640"]),
+        ("anyloc-vitb14:aggregator=mean", ["aggregator=mean", "vlad, soft-vlad, gem, avg"]),
+        ("anyloc-vitb14:clusters=8,aggregator=gem", ["'clusters' with gem", "aggregator, facet"]),
+        ("anyloc-vitb14:temperature=2", ["'temperature'", ANYLOC_OPTIONS]),
+        *(
+            (f"anyloc-vitb14:aggregator=soft-vlad,temperature={value}", ["above 0 and up to 1000"])
+            for value in ("0", "0.0", "1001", "-1", "inf", "nan", "1e2", "1.2345678", "")
+        ),
     ],
 )
 def test_bad_options_are_named_with_what_is_allowed(name: str, said: list[str]) -> None:
@@ -137,9 +169,34 @@ def test_shipped_vocabulary_begins_a_map_whatever_number_later_fits_make() -> No
     assert recipe("efficientnet-lite0-vlad:clusters=8").shipped_vocabulary == own.shipped_vocabulary
 
 
+def test_aggregators_without_a_vocabulary_have_the_length_of_a_local_feature() -> None:
+    for aggregator in ("gem", "avg"):
+        found = recipe(f"efficientnet-lite0-vlad:aggregator={aggregator}")
+        assert (found.dimension, found.needs_vocabulary) == (112, False)
+        assert found.shipped_vocabulary is None
+    soft = recipe("efficientnet-lite0-vlad:aggregator=soft-vlad")
+    assert (soft.dimension, soft.needs_vocabulary) == (7168, True)
+    assert soft.shipped_vocabulary is not None
+
+
+def test_names_take_further_options() -> None:
+    assert with_options("anyloc-vitb14", {"layer": None}) == "anyloc-vitb14"
+    assert with_options("anyloc-vitb14", {"layer": 9}) == "anyloc-vitb14:layer=9"
+    further = with_options("anyloc-vitb14:layer=9", {"facet": "key", "layer": None})
+    assert further == "anyloc-vitb14:layer=9,facet=key"
+
+
+def test_preprocessings_are_those_that_vision_has() -> None:
+    assert set(IN_VISION) == {*PREPROCESSINGS, "square32"}
+    for found in RECIPES.values():
+        assert found.preprocessing in IN_VISION
+        assert found.aggregator in AGGREGATORS
+
+
 def test_only_what_changes_the_local_features_needs_another_backbone() -> None:
     own = recipe("anyloc-vitb14").local_features
-    assert recipe("anyloc-vitb14:clusters=8").local_features == own
+    for option in ("clusters=8", "aggregator=gem", "preprocessing=demo1024"):
+        assert recipe(f"anyloc-vitb14:{option}").local_features == own
     for other in ("anyloc-vitb14:layer=9", "anyloc-vitb14:facet=key", "anyloc-vits14"):
         assert recipe(other).local_features != own
 

@@ -22,9 +22,7 @@ def extractor(options: str) -> Extractor:
 
 
 def pixels_of(made: Extractor, numbers: range) -> NDArray[np.uint8]:
-    return np.stack(
-        [np.asarray(made.preprocessing.apply(photo_image(number))) for number in numbers]
-    )
+    return np.stack([made.preprocessing.apply(photo_image(number)) for number in numbers])
 
 
 @pytest.mark.parametrize("width", WIDTHS)

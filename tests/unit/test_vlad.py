@@ -1,15 +1,23 @@
-"""VLAD against the published formula, patch by patch (Jegou et al. 2010; AnyLoc, RA-L 2023)."""
+"""VLAD, hard and soft, against the published formula, patch by patch (Jegou et al. 2010; AnyLoc,
+RA-L 2023).
+"""
 
 from __future__ import annotations
 
+import functools
 import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
+from torch.utils._python_dispatch import TorchDispatchMode
 
-from shared.vision.vlad import assign, vlad
+from shared.vision.vlad import assign, soft_vlad, vlad
+from shared.vision.vocabulary import read_centres
 
 Matrix = NDArray[np.float64]
 
@@ -61,6 +69,92 @@ def test_rows_equal_the_formula_computed_patch_by_patch(
     np.testing.assert_allclose(vlad(tensor(features), tensor(centres)), expected, atol=1e-5)
 
 
+def slow_soft_vlad(patches: Matrix, centres: Matrix, temperature: float) -> Matrix:
+    """As `slow_vlad`: every patch in every cluster, with its residual to that cluster's centre."""
+    blocks = np.zeros(centres.shape)
+    for patch in patches:
+        similarities = [float(patch @ centre) / np.linalg.norm(centre) for centre in centres]
+        exponentials = [math.exp(temperature * similarity) for similarity in similarities]
+        for k, centre in enumerate(centres):
+            blocks[k] += exponentials[k] / sum(exponentials) * (patch - centre)
+    row: Matrix = unit(unit(blocks).reshape(-1))
+    return row
+
+
+@pytest.mark.parametrize("temperature", [0.1, 1.0, 10.0])
+@pytest.mark.parametrize(("clusters", "width", "patches"), [(1, 4, 5), (4, 8, 30), (8, 16, 50)])
+def test_soft_rows_equal_the_formula_computed_patch_by_patch(
+    clusters: int, width: int, patches: int, temperature: float
+) -> None:
+    features = some_patches(clusters, 3, patches, width)
+    centres = raw_centres(width, clusters, width)
+    expected = np.stack([slow_soft_vlad(photo, centres, temperature) for photo in features])
+    found = soft_vlad(tensor(features), tensor(centres), temperature)
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+
+
+def test_soft_blocks_hold_residuals_to_their_own_centre_alone() -> None:
+    """AnyLoc's code sums the residuals to all centres into each block, weighed by its cluster."""
+    patches, centres = some_patches(1, 1, 20, 8), raw_centres(2, 4, 8)
+    logits = patches[0] @ unit(centres).T
+    weights = np.exp(logits) / np.exp(logits).sum(axis=1, keepdims=True)
+    residuals = patches[0][:, None] - centres[None]
+    upstream = unit(unit(np.einsum("qk,qcd->kd", weights, residuals)).reshape(-1))
+    ours = soft_vlad(tensor(patches), tensor(centres), 1.0)[0]
+    assert np.abs(ours.numpy() - upstream).max() > 0.05
+
+
+def test_soft_assignment_becomes_hard_as_the_temperature_grows() -> None:
+    features = tensor(some_patches(2, 3, 40, 8))
+    centres = tensor(raw_centres(3, 4, 8))
+    hard = vlad(features, centres)
+    distances = [float((soft_vlad(features, centres, t) - hard).norm()) for t in (1, 10, 10_000)]
+    assert distances == sorted(distances, reverse=True)
+    assert distances[0] > 0.1
+    assert distances[-1] < 1e-3
+
+
+def test_parity_holds_at_the_size_of_anylocs_published_descriptors() -> None:
+    """1,530 patches of 1,536 numbers and 32 centres, with the published centres' lengths."""
+    features = some_patches(9, 1, 1530, 1536)
+    rng = np.random.default_rng(10)
+    centres = unit(rng.standard_normal((32, 1536))) * rng.uniform(0.37, 0.98, (32, 1))
+    similarities = features[0] @ unit(centres).T
+    best = np.sort(similarities, axis=1)
+    clear = best[:, -1] - best[:, -2] > 1e-5  # the others may fall to either in float32
+    assert clear.mean() > 0.99
+    features = features[:, clear]
+    labels = similarities[clear].argmax(axis=1)
+    blocks = np.stack(
+        [(features[0][labels == k] - centres[k]).sum(axis=0) for k in range(len(centres))]
+    )
+    expected = unit(unit(blocks).reshape(-1))
+    found = vlad(tensor(features), tensor(centres))[0]
+    assert found.shape == (49_152,)
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+
+
+@pytest.mark.real_photos
+@pytest.mark.parametrize("domain", ["aerial", "indoor", "urban"])
+def test_anylocs_vocabularies_give_rows_of_the_published_dimension(
+    real_photos: Path, domain: str
+) -> None:
+    folder = real_photos / "anyloc-vocabularies"
+    centres = read_centres(folder / f"dinov2_vitg14_l31_value_c32_{domain}.pt")
+    # Features near the real centres, so that most clusters have some.
+    rng = np.random.default_rng(3)
+    near = centres.array[rng.integers(0, 32, 300)] + 0.01 * rng.standard_normal((300, 1536))
+    features = unit(near.astype(np.float64))
+    row = vlad(tensor(features[None]), torch.from_numpy(centres.array))[0]
+    assert row.shape == (49_152,)
+    expected = np.zeros((32, 1536))
+    for k, patch in zip(
+        (features @ unit(centres.array.astype(float)).T).argmax(1), features, strict=True
+    ):
+        expected[k] += patch - centres.array[k]
+    np.testing.assert_allclose(row, unit(unit(expected).reshape(-1)), atol=1e-5)
+
+
 def test_centre_is_subtracted_raw_and_not_normalised() -> None:
     centres = np.array([[0.5, 0.0], [0.0, 0.1]])
     patches = unit(np.array([[[1.0, 0.2], [1.0, 0.4], [0.1, 1.0]]]))
@@ -107,12 +201,40 @@ def test_blocks_stand_cluster_by_cluster() -> None:
     assert float(torch.linalg.norm(row[3:])) == pytest.approx(1.0)
 
 
-def test_photo_of_zero_patches_gives_finite_numbers() -> None:
+Aggregate = Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
+BOTH = pytest.mark.parametrize(
+    "aggregate", [vlad, functools.partial(soft_vlad, temperature=2.0)], ids=["hard", "soft"]
+)
+
+
+@BOTH
+def test_zero_patches_stay_out_of_the_sums(aggregate: Aggregate) -> None:
+    features, centres = some_patches(5, 2, 7, 8), tensor(raw_centres(6, 4, 8))
+    blank = np.concatenate([np.zeros((2, 3, 8)), features, np.zeros((2, 1, 8))], axis=1)
+    np.testing.assert_allclose(
+        aggregate(tensor(blank), centres), aggregate(tensor(features), centres), atol=1e-6
+    )
+
+
+@BOTH
+def test_photo_of_nothing_but_zero_patches_is_similar_to_nothing(aggregate: Aggregate) -> None:
     features = np.zeros((2, 7, 8))
     features[1] = some_patches(5, 1, 7, 8)[0]
-    rows = vlad(tensor(features), tensor(raw_centres(6, 4, 8)))
-    assert bool(torch.isfinite(rows).all())
+    rows = aggregate(tensor(features), tensor(raw_centres(6, 4, 8)))
+    assert rows[0].tolist() == [0.0] * 32
     assert float(torch.linalg.norm(rows[1])) == pytest.approx(1.0, abs=1e-6)
+
+
+@BOTH
+@pytest.mark.parametrize("broken", [math.nan, math.inf, -math.inf])
+def test_photo_with_a_number_that_is_not_finite_has_a_row_of_nan(
+    aggregate: Aggregate, broken: float
+) -> None:
+    features = tensor(some_patches(5, 3, 7, 8))
+    features[1, 2, 3] = broken
+    rows = aggregate(features, tensor(raw_centres(6, 4, 8)))
+    assert bool(torch.isnan(rows[1]).all())
+    assert bool(torch.isfinite(rows[[0, 2]]).all())
 
 
 def test_patches_that_equal_their_centre_leave_a_zero_row() -> None:
@@ -121,10 +243,32 @@ def test_patches_that_equal_their_centre_leave_a_zero_row() -> None:
     assert rows.tolist() == [[0.0] * 9]
 
 
-def test_rows_do_not_depend_on_the_batch_they_come_in() -> None:
+@BOTH
+def test_rows_do_not_depend_on_the_batch_they_come_in(aggregate: Aggregate) -> None:
     features = tensor(some_patches(7, 9, 40, 16))
     centres = tensor(raw_centres(8, 8, 16))
-    together = vlad(features, centres)
+    together = aggregate(features, centres)
     for size in (1, 2, 4, 5):
-        parts = [vlad(features[i : i + size], centres) for i in range(0, 9, size)]
+        parts = [aggregate(features[i : i + size], centres) for i in range(0, 9, size)]
         np.testing.assert_allclose(torch.cat(parts), together, atol=1e-6)
+
+
+@BOTH
+def test_no_tensor_is_as_large_as_all_residuals(aggregate: Aggregate) -> None:
+    patches, clusters, width = 60, 50, 70
+    features, centres = some_patches(1, 2, patches, width), raw_centres(2, clusters, width)
+    largest = 0
+
+    class Watch(TorchDispatchMode):  # type: ignore[no-untyped-call]
+        def __torch_dispatch__(
+            self, func: Any, types: Any, args: Any = (), kwargs: Any = None
+        ) -> Any:
+            nonlocal largest
+            found = func(*args, **(kwargs or {}))
+            if isinstance(found, torch.Tensor):
+                largest = max(largest, found.numel())
+            return found
+
+    with Watch():  # type: ignore[no-untyped-call]
+        aggregate(tensor(features), tensor(centres))
+    assert largest == 2 * max(patches * width, clusters * width)

@@ -26,7 +26,10 @@ class Backbone(Protocol):
     """Where `features` runs and where its answer lies."""
 
     def features(self, pixels: torch.Tensor) -> torch.Tensor:
-        """(B, H, W, 3) uint8 RGB -> (B, patches, width) float32, each patch L2-normalised.
+        """(B, H, W, 3) RGB, 0 to 255 -> (B, patches, width) float32, each patch L2-normalised.
+
+        `pixels` are uint8, or float32 where a preprocessing left them unrounded; they are
+        normalised by channel here, and nowhere before.
 
         A patch whose feature is zero stays zero.
         """
@@ -35,7 +38,7 @@ class Backbone(Protocol):
 def normalise_pixels(
     pixels: torch.Tensor, mean: tuple[float, ...], std: tuple[float, ...]
 ) -> torch.Tensor:
-    """(B, H, W, 3) uint8 -> (B, 3, H, W) float32, ((x / 255) - mean) / std by channel."""
+    """(B, H, W, 3), 0 to 255 -> (B, 3, H, W) float32, ((x / 255) - mean) / std by channel."""
     scaled = pixels.permute(0, 3, 1, 2).to(torch.float32) / 255.0
     shape = (1, 3, 1, 1)
     centre = torch.tensor(mean, device=pixels.device).view(shape)

@@ -1,0 +1,107 @@
+"""`placewise describe PHOTOS... --out FILE.npy`: descriptors of photos, without a server."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from services.cli.configuration import read_settings
+from services.cli.extractor_options import (
+    AggregatorOption,
+    BackboneOption,
+    FacetOption,
+    LayerOption,
+    PreprocessingOption,
+    TemperatureOption,
+    extractor_name,
+)
+from services.cli.output import (
+    JsonOption,
+    answers,
+    explained,
+    print_json,
+    progress_bar,
+    shown,
+)
+from shared.errors import InvalidRequest
+from shared.recipes import get_recipe
+
+
+def describe(
+    photos: Annotated[list[Path], typer.Argument(metavar="PHOTOS...", help="Files, in order.")],
+    out: Annotated[
+        Path, typer.Option("--out", metavar="FILE.npy", help="What to write: a row for each photo.")
+    ],
+    extractor: Annotated[
+        str | None,
+        typer.Option(
+            "--extractor", help="By name, with options as in EXTRACTOR; left out: of new maps."
+        ),
+    ] = None,
+    backbone: BackboneOption = None,
+    weights: Annotated[
+        Path | None,
+        typer.Option("--weights", help="DINOv2's weights: .pth, .pt or .safetensors."),
+    ] = None,
+    layer: LayerOption = None,
+    facet: FacetOption = None,
+    preprocessing: PreprocessingOption = None,
+    aggregator: AggregatorOption = None,
+    temperature: TemperatureOption = None,
+    vocabulary: Annotated[
+        Path | None,
+        typer.Option(
+            "--vocabulary",
+            exists=True,
+            dir_okay=False,
+            help="Cluster centres of VLAD: .npy, or AnyLoc's c_centers.pt.",
+        ),
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Write the descriptors of photos into a .npy file: float32, a row for each, in their order.
+
+    A photo that can't be described is named, and then no file is written at all.
+    """
+    # Read when torch is loaded, which is below; see services/cli/__init__.py.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    with explained(as_json):
+        settings = read_settings()
+        name = extractor_name(
+            extractor or (settings.new_map_extractor if backbone is None else None),
+            backbone,
+            layer=layer,
+            facet=facet,
+            preprocessing=preprocessing,
+            aggregator=aggregator,
+            temperature=temperature,
+        )
+        recipe = get_recipe(name, allow_test_extractors=settings.allow_test_extractors)
+        if weights is not None:
+            if recipe.depth is None:
+                raise InvalidRequest(
+                    "weights_unused",
+                    f"The extractor {recipe.name} brings its own weights; --weights is for those "
+                    "on DINOv2.",
+                )
+            settings = settings.model_copy(update={"dino_weights": weights.absolute()})
+
+        from services.cli.describe_files import describe_files
+
+        with progress_bar() as progress:
+            bar = progress.add_task("describing", total=len(photos))
+            found = describe_files(
+                photos, out, recipe, vocabulary, settings, lambda n: progress.advance(bar, n)
+            )
+    if as_json:
+        print_json(found.as_json())
+        return
+    answers.print(
+        f"{found.rows} rows of {found.spec['dimension']} numbers are in {shown(out)} "
+        f"({recipe.name}, {found.seconds['total']:.1f} s).",
+        soft_wrap=True,
+        markup=False,
+    )

@@ -1,0 +1,74 @@
+"""GeM and the mean against their formulas, number by number."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from shared.vision.pooling import average, gem
+
+Matrix = NDArray[np.float64]
+Aggregate = Callable[[torch.Tensor], torch.Tensor]
+
+
+def some_features(seed: int, photos: int = 3, patches: int = 40, width: int = 16) -> torch.Tensor:
+    values = np.random.default_rng(seed).standard_normal((photos, patches, width))
+    unit = values / np.linalg.norm(values, axis=-1, keepdims=True)
+    return torch.from_numpy(unit.astype(np.float32))
+
+
+def slow_average(patches: Matrix) -> Matrix:
+    row = np.array([math.fsum(column) / len(column) for column in patches.T])
+    found: Matrix = row / np.linalg.norm(row)
+    return found
+
+
+def slow_gem(patches: Matrix) -> Matrix:
+    """(N, D) -> (D,): the cubic mean of what is at least 1e-6, of Radenovic et al."""
+    row = np.array(
+        [
+            (math.fsum(max(value, 1e-6) ** 3 for value in column) / len(column)) ** (1 / 3)
+            for column in patches.T
+        ]
+    )
+    found: Matrix = row / np.linalg.norm(row)
+    return found
+
+
+BOTH = pytest.mark.parametrize(
+    ("aggregate", "formula"), [(average, slow_average), (gem, slow_gem)], ids=["avg", "gem"]
+)
+
+
+@BOTH
+def test_rows_equal_the_formula(aggregate: Aggregate, formula: Callable[[Matrix], Matrix]) -> None:
+    features = some_features(1)
+    expected = np.stack([formula(photo) for photo in features.double().numpy()])
+    np.testing.assert_allclose(aggregate(features), expected, atol=1e-6)
+
+
+def test_gem_lies_between_the_mean_and_the_largest_and_differs_from_both() -> None:
+    features = some_features(2).abs()
+    rows = gem(features)
+    for other in (average(features), torch.nn.functional.normalize(features.amax(dim=1), dim=-1)):
+        assert float((rows - other).norm(dim=1).min()) > 0.01
+
+
+@pytest.mark.parametrize("aggregate", [average, gem])
+def test_zero_patches_stay_out(aggregate: Aggregate) -> None:
+    features = some_features(3)
+    blank = torch.cat([torch.zeros(3, 5, 16), features], dim=1)
+    np.testing.assert_allclose(aggregate(blank), aggregate(features), atol=1e-6)
+    assert aggregate(torch.zeros(1, 4, 16)).tolist() == [[0.0] * 16]
+
+
+@pytest.mark.parametrize("aggregate", [average, gem])
+def test_rows_do_not_depend_on_the_batch(aggregate: Aggregate) -> None:
+    features = some_features(4, photos=5)
+    alone = torch.cat([aggregate(features[i : i + 1]) for i in range(5)])
+    np.testing.assert_allclose(aggregate(features), alone, atol=1e-6)
