@@ -28,7 +28,7 @@ def begin_upload(server: ServerProcess, data: bytes) -> tuple[socket.socket, byt
     url = server.client.base_url
     slow = socket.create_connection((url.host, url.port or 80), timeout=30)
     slow.sendall(
-        b"POST /api/v1/upload HTTP/1.1\r\nHost: placewise\r\nConnection: close\r\n"
+        b"POST /api/v1/upload HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n"
         b"Content-Type: multipart/form-data; boundary=b\r\n"
         + f"Content-Length: {len(body)}\r\n\r\n".encode()
     )
