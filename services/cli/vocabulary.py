@@ -66,7 +66,8 @@ def fit(
     """
     with explained(as_json):
         if folder is not None:
-            _only_for("a map", {"--map": map_name, "--server": server, "--key": key})
+            # Not --server and --key: the environment may hold them for all commands.
+            _only_for("a map", {"--map": map_name})
             if out is None:
                 raise InvalidRequest("bad_out", "Say where to write: --out FILE.npz")
             _fit_folder(folder, out, extractor, clusters, sample, seed, as_json)
@@ -128,16 +129,15 @@ def list_(
             return
         # Ids are folded, never cut: they are there to be copied.
         name = Column("vocabulary", overflow="fold", min_width=36)
-        table = Table("", name, "origin", "K x D", "photos", "learnt with", "sha256", "made")
+        table = Table("", name, "origin", "clusters", "dimension", "photos", "made")
         for v in found:
             table.add_row(
                 "*" if v["vocabulary_id"] in active else "",
-                v["vocabulary_id"],
+                f"{v['vocabulary_id']}\n{_learnt_with(v['provenance'])}\nsha256 {v['sha256'][:12]}",
                 v["origin"],
-                f"{v['clusters']} x {v['dimension']}",
+                str(v["clusters"]),
+                str(v["dimension"]),
                 str(v["provenance"].get("photos", "")),
-                _learnt_with(v["provenance"]),
-                v["sha256"][:12],
                 v["created_at"],
             )
         answers.print(table)
@@ -145,7 +145,7 @@ def list_(
 
 def _learnt_with(provenance: Json) -> str:
     if "backbone" not in provenance:
-        return "unknown"
+        return "of unknown origin"
     pixels = provenance["preprocessing"]
     parts = (provenance["backbone"], provenance["layer"], provenance["facet"], pixels["name"])
     return " ".join(str(part) for part in parts if part is not None)

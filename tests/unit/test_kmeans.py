@@ -22,7 +22,7 @@ def seeds_of(points: torch.Tensor, clusters: int, seed: int) -> torch.Tensor:
 def walk(points: torch.Tensor, centres: torch.Tensor, batch: int) -> Pass:
     """A pass of Lloyd's, in batches."""
     one = Pass.begin(centres)
-    for part in points.split(batch):
+    for part in torch.split(points, batch):
         one.see(part, centres)
     return one
 
@@ -86,7 +86,7 @@ def test_after_each_mini_batch_a_centre_is_the_mean_of_what_it_was_given() -> No
     centres = seeds_of(points, 5, seed=0)
     one = Pass.begin(centres)
     given_to: list[list[torch.Tensor]] = [[] for _ in range(5)]
-    for part in points.split(50):
+    for part in torch.split(points, 50):
         for point, label in zip(part, assign(part, centres).tolist(), strict=True):
             given_to[label].append(point)
         one.see(part, centres)
