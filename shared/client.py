@@ -250,7 +250,7 @@ class Client:
         return self._call("POST", "/vocabularies", json=wanted)
 
     def import_vocabulary(self, file: Path) -> Json:
-        """Start switching to the vocabulary in a `.npy` file."""
+        """Start switching to the vocabulary in a `.npz` or `.npy` file."""
         return self._send_file("/vocabularies/import", file)
 
     def vocabularies(self) -> list[Json]:

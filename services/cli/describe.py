@@ -57,7 +57,7 @@ def describe(
             "--vocabulary",
             exists=True,
             dir_okay=False,
-            help="Cluster centres of VLAD: .npy, or AnyLoc's c_centers.pt.",
+            help="Of VLAD: .npz of `vocabulary fit`, .npy, or AnyLoc's c_centers.pt.",
         ),
     ] = None,
     as_json: JsonOption = False,

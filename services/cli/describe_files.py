@@ -4,28 +4,24 @@ after the other. Imports torch.
 
 from __future__ import annotations
 
-import contextlib
-import os
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 
 from services.cli.output import shown
-from services.extractor.decoding import DecoderPool
-from shared.errors import InvalidRequest, Misconfigured, PlacewiseError, Unprocessable
+from services.cli.photo_files import decoded_batches, whole_or_nothing
+from shared.errors import Misconfigured, PlacewiseError, Unprocessable
 from shared.recipes import Recipe
 from shared.settings import Settings
-from shared.vision.decode import Decoded
 from shared.vision.extractors import Extractor, choose_device, not_finite
-from shared.vision.vocabulary import Centres, check_centres, read_centres
-
-Outcome = Decoded | PlacewiseError
+from shared.vision.provenance import check_fits
+from shared.vision.vocabulary import Centres
+from shared.vision.vocabulary_file import VocabularyFile, read_vocabulary
 
 
 @dataclass(slots=True)
@@ -65,23 +61,20 @@ def describe_files(
     `vocabulary_missing`, `out_unwritable`, and what loading the extractor raises.
     """
     started = time.perf_counter()
-    centres = _own_centres(recipe, vocabulary)
+    own = _own_vocabulary(recipe, vocabulary)
     extractor = Extractor(
         recipe, choose_device(settings.device), dino_weights=settings.dino_weights
     )
-    if recipe.needs_vocabulary and centres is None:
-        shipped = extractor.shipped_vocabulary()
-        assert shipped is not None, "asked of the recipe before"
-        centres = shipped[0]
+    centres = _centres(extractor, own)
     described = DescribedFiles(out, extractor.spec(centres), len(photos))
     described.seconds["load"] = time.perf_counter() - started
     shape = (len(photos), extractor.dimension(centres))
     refused: list[tuple[Path, PlacewiseError]] = []
-    with _whole_or_nothing(out) as file:
+    with whole_or_nothing(out) as file:
         np.lib.format.write_array_header_1_0(
             file, {"descr": "<f4", "fortran_order": False, "shape": shape}
         )
-        for batch in _decoded(photos, extractor, settings, described.seconds):
+        for batch in decoded_batches(photos, extractor.preprocessing, settings, described.seconds):
             pixels = []
             for photo, outcome in batch:
                 if isinstance(outcome, PlacewiseError):
@@ -103,14 +96,14 @@ def describe_files(
     return described
 
 
-def _own_centres(recipe: Recipe, vocabulary: Path | None) -> Centres | None:
-    """Those of the file; None where the recipe does without, or brings its own."""
+def _own_vocabulary(recipe: Recipe, vocabulary: Path | None) -> VocabularyFile | None:
+    """The file's; None where the recipe does without, or brings its own."""
     if vocabulary is not None:
         if not recipe.needs_vocabulary:
             raise Unprocessable(
                 "vocabulary_unfit", f"The extractor {recipe.name} uses no vocabulary."
             )
-        return check_centres(read_centres(vocabulary).array, width=recipe.width)
+        return read_vocabulary(vocabulary)
     if recipe.needs_vocabulary and recipe.shipped_vocabulary is None:
         raise Misconfigured(
             "vocabulary_missing",
@@ -120,66 +113,15 @@ def _own_centres(recipe: Recipe, vocabulary: Path | None) -> Centres | None:
     return None
 
 
-def _decoded(
-    photos: Sequence[Path],
-    extractor: Extractor,
-    settings: Settings,
-    seconds: defaultdict[str, float],
-) -> Iterator[list[tuple[Path, Outcome]]]:
-    """Batches in the order of the photos; the next one is read while this one is described."""
-    decoders = DecoderPool(settings)
-
-    def read(begin: int) -> list[tuple[Path, Outcome]]:
-        begun = time.perf_counter()
-        chosen = photos[begin : begin + settings.batch_photos]
-        contents = [_content(photo) for photo in chosen]
-        outcomes = iter(
-            decoders.decode(
-                [content for content in contents if isinstance(content, bytes)],
-                extractor.preprocessing,
-            )
-        )
-        found: list[tuple[Path, Outcome]] = [
-            (photo, next(outcomes) if isinstance(content, bytes) else content)
-            for photo, content in zip(chosen, contents, strict=True)
-        ]
-        seconds["decode"] += time.perf_counter() - begun
-        return found
-
-    with contextlib.closing(decoders), ThreadPoolExecutor(1) as reader:
-        begins = range(0, len(photos), settings.batch_photos)
-        ahead = reader.submit(read, 0)
-        for begin in begins[1:]:
-            batch, ahead = ahead.result(), reader.submit(read, begin)
-            yield batch
-        yield ahead.result()
-
-
-def _content(photo: Path) -> bytes | PlacewiseError:
-    try:
-        return photo.read_bytes()
-    except OSError as error:
-        return InvalidRequest("photo_unreadable", f"It can't be read: {error.strerror}.")
-
-
-@contextlib.contextmanager
-def _whole_or_nothing(out: Path) -> Iterator[BinaryIO]:
-    """A file that takes its name when the block has ended well; else nothing is left of it."""
-    partial = out.with_name(f".{out.name}.{os.getpid()}.partial")
-    try:
-        with partial.open("wb") as file:
-            yield file
-            file.flush()
-            os.fsync(file.fileno())
-        partial.replace(out)
-    except OSError as error:
-        raise Misconfigured(
-            "out_unwritable", f"{shown(out)} can't be written: {error.strerror}."
-        ) from error
-    finally:
-        # Where even the folder is missing, there is nothing to take away.
-        with contextlib.suppress(OSError):
-            partial.unlink(missing_ok=True)
+def _centres(extractor: Extractor, own: VocabularyFile | None) -> Centres | None:
+    if own is not None:
+        check_fits(own.provenance, own.centres, extractor)
+        return own.centres
+    if not extractor.recipe.needs_vocabulary:
+        return None
+    shipped = extractor.shipped_vocabulary()
+    assert shipped is not None, "asked of the recipe before"
+    return shipped[0]
 
 
 def _refusal(refused: list[tuple[Path, PlacewiseError]], photos: int) -> Unprocessable:

@@ -18,10 +18,11 @@ from services.cli.output import (
     ServerOption,
     explained,
     messages,
+    print_faults,
     print_json,
     progress_bar,
 )
-from services.cli.upload_many import FitOption, UpdateOption, print_faults, upload_many
+from services.cli.upload_many import FitOption, UpdateOption, upload_many
 from shared.client import Json
 
 DESCRIPTORS_NOTE = (

@@ -17,12 +17,13 @@ from services.cli.output import (
     ServerOption,
     explained,
     messages,
+    print_faults,
     print_json,
     progress_bar,
 )
 from services.cli.photo_places import find_photos
 from services.cli.upload_archive import check_archive, upload_archive
-from services.cli.upload_many import FitOption, UpdateOption, print_faults, upload_many
+from services.cli.upload_many import FitOption, UpdateOption, upload_many
 from shared.catalog.photos import PhotoRole
 from shared.client import Json
 from shared.errors import InvalidRequest

@@ -17,13 +17,13 @@ from shared.recipes import RECIPES
 from shared.vision.backbones.base import normalise_pixels
 from shared.vision.backbones.efficientnet_lite0 import MEAN, STD
 from shared.vision.extractors import Extractor, choose_device
-from shared.vision.kmeans import MAX_ITERATIONS, TOLERANCE, iterate, seed_centres
+from shared.vision.fit_photos import fit_photos
+from shared.vision.patches import choose_photos
 from shared.vision.vlad import vlad
 
 EXTRACTOR = "efficientnet-lite0-vlad"
 BATCH = 16
 FIT_PHOTOS = 300
-FIT_PATCHES_PER_PHOTO = 98
 SEED = 0
 
 Rows = NDArray[np.float32]
@@ -52,24 +52,18 @@ class NetworkRungs:
         self._shipped = torch.from_numpy(shipped[0].array).to(device)
         self._fitted = self._fit(database)
 
-    @torch.inference_mode()
     def _fit(self, database: Sequence[Path]) -> torch.Tensor:
-        """(clusters, width) centres learnt from evenly spaced photos of the database."""
-        chosen = [database[int(i)] for i in np.linspace(0, len(database) - 1, FIT_PHOTOS)]
-        generator = torch.Generator().manual_seed(SEED)
-        parts = []
-        for pixels in self._batches(list(dict.fromkeys(chosen))):
-            features = self.extractor.features(pixels)
-            for one in features:
-                order = torch.randperm(len(one), generator=generator)[:FIT_PATCHES_PER_PHOTO]
-                parts.append(one[order.to(one.device)])
-        points = torch.cat(parts)
-        centres = seed_centres(points, self.extractor.recipe.clusters, SEED)
-        for _ in range(MAX_ITERATIONS):
-            centres, movement = iterate(points, centres)
-            if movement <= TOLERANCE:
-                break
-        return centres
+        """(clusters, width) centres, learnt as a map learns its own."""
+        chosen = choose_photos(len(database), FIT_PHOTOS, self.extractor.backbone.width, SEED)
+        photos = [database[number] for number in chosen]
+        fitted = fit_photos(
+            self.extractor,
+            (list(pixels) for pixels in self._batches(photos)),
+            len(photos),
+            clusters=self.extractor.recipe.clusters,
+            seed=SEED,
+        )
+        return torch.from_numpy(fitted.centres.array).to(self.extractor.backbone.device)
 
     @torch.inference_mode()
     def describe(self, paths: Sequence[Path], advance: Callable[[int], None]) -> dict[str, Rows]:

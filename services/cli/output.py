@@ -80,3 +80,16 @@ def progress_bar() -> Progress:
         TimeElapsedColumn(),
         console=messages,
     )
+
+
+def print_faults(report: dict[str, Any], *words: str) -> None:
+    """What is listed under each of the words, with its reason."""
+    for word in words:
+        if report[word]:
+            messages.print(f"{len(report[word])} {word}:")
+        for item in report[word]:
+            name = f" ({item['filename']})" if "filename" in item else ""
+            messages.print(
+                f"[red]{word}[/red] {escape(item['path'] + name)}: {escape(item['reason'])}",
+                soft_wrap=True,
+            )

@@ -34,6 +34,19 @@ def find_photos(
     Raises InvalidRequest for a table that names a photo that is not there, and for coordinates
     that can't be read.
     """
+    paths = photo_paths(folder)
+    said = _read_table(folder, table, set(paths)) if table else {}
+    found = []
+    for path in paths:
+        fields = fields_of_name(path.name, utm_zone)
+        if places_by_folder and path.parent != folder:
+            fields["place"] = path.parent.name
+        found.append(FoundPhoto(path, {**fields, **said.get(path, {})}))
+    return found
+
+
+def photo_paths(folder: Path) -> list[Path]:
+    """Every photo below the folder, in order; InvalidRequest (`no_photos`) where there is none."""
     paths = sorted(
         path
         for path in folder.rglob("*")
@@ -46,14 +59,7 @@ def find_photos(
             "no_photos",
             f"There is no photo ({', '.join(sorted(PHOTO_SUFFIXES))}) below {folder}.",
         )
-    said = _read_table(folder, table, set(paths)) if table else {}
-    found = []
-    for path in paths:
-        fields = fields_of_name(path.name, utm_zone)
-        if places_by_folder and path.parent != folder:
-            fields["place"] = path.parent.name
-        found.append(FoundPhoto(path, {**fields, **said.get(path, {})}))
-    return found
+    return paths
 
 
 def _read_table(folder: Path, table: Path, paths: set[Path]) -> dict[Path, dict[str, str]]:

@@ -107,19 +107,6 @@ def fit_if_worth_it(client: Client, stats: Json, progress: Progress) -> tuple[Js
     return client.stats(), vocabulary
 
 
-def print_faults(report: Json, *words: str) -> None:
-    """What is listed under each of the words, with its reason."""
-    for word in words:
-        if report[word]:
-            messages.print(f"{len(report[word])} {word}:")
-        for item in report[word]:
-            name = f" ({item['filename']})" if "filename" in item else ""
-            messages.print(
-                f"[red]{word}[/red] {escape(item['path'] + name)}: {escape(item['reason'])}",
-                soft_wrap=True,
-            )
-
-
 def _upload_all(
     client: Client, photos: list[FoundPhoto], update: bool
 ) -> Iterator[tuple[FoundPhoto, Json | PlacewiseError]]:

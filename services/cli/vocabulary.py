@@ -18,31 +18,63 @@ from services.cli.output import (
     ServerOption,
     answers,
     explained,
+    print_faults,
     print_json,
     progress_bar,
 )
 from services.cli.wait import wait_with_bar
 from shared.client import Client, Json
+from shared.errors import InvalidRequest
+from shared.recipes import MOST_CLUSTERS
 
 app = typer.Typer(help="VLAD's cluster centres: fit them on the map's own photos, import, list.")
 
 
 @app.command("fit")
 def fit(
-    clusters: Annotated[
-        int | None, typer.Option(min=1, help="Cluster centres; default: the extractor's.")
+    folder: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="[DIR]",
+            exists=True,
+            file_okay=False,
+            help="Learn from the photos below it instead of the map's, without a server.",
+        ),
     ] = None,
-    sample: Annotated[int | None, typer.Option(min=1, help="Photos to learn from.")] = None,
-    seed: Annotated[int | None, typer.Option(min=0)] = None,
+    out: Annotated[
+        Path | None, typer.Option(metavar="FILE.npz", help="With DIR: what to write.")
+    ] = None,
+    extractor: Annotated[
+        str | None, typer.Option(help="With DIR: by name; default: the one of new maps.")
+    ] = None,
+    clusters: Annotated[
+        int | None,
+        typer.Option(min=1, max=MOST_CLUSTERS, help="Cluster centres; default: the extractor's."),
+    ] = None,
+    sample: Annotated[
+        int | None, typer.Option(min=1, help="Photos to learn from at most; default 1000.")
+    ] = None,
+    seed: Annotated[int | None, typer.Option(min=0, max=2**31 - 1)] = None,
     map_name: MapOption = None,
     server: ServerOption = None,
     key: KeyOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Learn a vocabulary from the map's photos, describe all of them anew, switch."""
-    wanted = {"clusters": clusters, "sample": sample, "seed": seed}
-    given = {name: value for name, value in wanted.items() if value is not None}
+    """Learn a vocabulary from the map's photos, describe all of them anew, switch.
+
+    With DIR: learn it from a folder, and write it to a file that `import` takes.
+    """
     with explained(as_json):
+        if folder is not None:
+            # Not --server and --key: the environment may hold them for all commands.
+            _only_for("a map", {"--map": map_name})
+            if out is None:
+                raise InvalidRequest("bad_out", "Say where to write: --out FILE.npz")
+            _fit_folder(folder, out, extractor, clusters, sample, seed, as_json)
+            return
+        _only_for("a folder (vocabulary fit DIR)", {"--out": out, "--extractor": extractor})
+        wanted = {"clusters": clusters, "sample": sample, "seed": seed}
+        given = {name: value for name, value in wanted.items() if value is not None}
         with connect(server, map_name, key) as client, progress_bar() as progress:
             job = fit_and_wait(client, given, progress)
         _print_change(job, as_json)
@@ -52,7 +84,11 @@ def fit(
 def import_(
     file: Annotated[
         Path,
-        typer.Argument(exists=True, dir_okay=False, help=".npy, or AnyLoc's c_centers.pt"),
+        typer.Argument(
+            exists=True,
+            dir_okay=False,
+            help=".npz of `vocabulary fit DIR`, .npy, or AnyLoc's c_centers.pt",
+        ),
     ],
     map_name: MapOption = None,
     server: ServerOption = None,
@@ -60,21 +96,18 @@ def import_(
     as_json: JsonOption = False,
 ) -> None:
     """Bring a vocabulary, describe all photos with it, switch."""
-    from shared.vision.vocabulary import (
-        encode_centres,
-        read_centres,
-    )  # torch takes seconds
+    from shared.vision.vocabulary_file import read_vocabulary  # torch takes seconds
 
     with explained(as_json):
-        data = encode_centres(read_centres(file))
+        brought = read_vocabulary(file)
         with (
             tempfile.TemporaryDirectory() as folder,
             connect(server, map_name, key) as client,
             progress_bar() as progress,
         ):
-            plain = Path(folder, f"{file.stem}.npy")
-            plain.write_bytes(data)
-            started = client.import_vocabulary(plain)
+            checked = Path(folder, f"{file.stem}{brought.suffix}")
+            checked.write_bytes(brought.encode())
+            started = client.import_vocabulary(checked)
             job = wait_with_bar(client, started["job_id"], progress, "vocabulary")
         _print_change(job, as_json)
 
@@ -100,7 +133,7 @@ def list_(
         for v in found:
             table.add_row(
                 "*" if v["vocabulary_id"] in active else "",
-                v["vocabulary_id"],
+                f"{v['vocabulary_id']}\n{_learnt_with(v['provenance'])}\nsha256 {v['sha256'][:12]}",
                 v["origin"],
                 str(v["clusters"]),
                 str(v["dimension"]),
@@ -108,6 +141,54 @@ def list_(
                 v["created_at"],
             )
         answers.print(table)
+
+
+def _learnt_with(provenance: Json) -> str:
+    if "backbone" not in provenance:
+        return "of unknown origin"
+    pixels = provenance["preprocessing"]
+    parts = (provenance["backbone"], provenance["layer"], provenance["facet"], pixels["name"])
+    return " ".join(str(part) for part in parts if part is not None)
+
+
+def _only_for(what: str, options: dict[str, object]) -> None:
+    """InvalidRequest (`options_contradict`) where one is given."""
+    if wrong := [name for name, value in options.items() if value is not None]:
+        raise InvalidRequest("options_contradict", f"{', '.join(wrong)}: only for a fit on {what}.")
+
+
+def _fit_folder(
+    folder: Path,
+    out: Path,
+    extractor: str | None,
+    clusters: int | None,
+    sample: int | None,
+    seed: int | None,
+    as_json: bool,
+) -> None:
+    from services.cli.fit_folder import fit_folder  # torch takes seconds
+
+    with progress_bar() as progress:
+        fitted = fit_folder(
+            folder,
+            out,
+            extractor=extractor,
+            clusters=clusters,
+            sample=sample,
+            seed=seed,
+            progress=progress,
+        )
+    if as_json:
+        print_json(fitted)
+        return
+    print_faults(fitted, "refused")
+    about = fitted["provenance"]
+    answers.print(
+        f"{fitted['file']}: {fitted['clusters']} clusters of {fitted['dimension']} dimensions from "
+        f"{about['photos']} photos, mean cosine {about['mean_cosine']:.4f}.",
+        soft_wrap=True,
+        markup=False,
+    )
 
 
 def fit_and_wait(client: Client, wanted: dict[str, int], progress: Progress) -> Json:

@@ -91,7 +91,10 @@ def fit_vocabulary(
     operation_id="import_vocabulary",
     status_code=202,
     response_model=JobStarted,
-    openapi_extra=describe_form("a `.npy` file of (clusters, dimension) floats"),
+    openapi_extra=describe_form(
+        "a `.npz` file of `placewise vocabulary fit DIR`, or a `.npy` file of "
+        "(clusters, dimension) floats"
+    ),
     dependencies=[ROOM_FOR_JOBS],
 )
 async def import_vocabulary(
@@ -102,9 +105,10 @@ async def import_vocabulary(
     room: RoomDep,
     map_name: MapName = DEFAULT_MAP,
 ) -> JobStarted:
-    """Bring a vocabulary, a `.npy` file of (clusters, dimension) floats, and switch to it.
+    """Bring a vocabulary, a `.npz` or `.npy` file, and switch to it.
 
-    The extractor checks it; one that does not fit ends the job as `failed` with the reason.
+    The extractor checks it; one that does not fit, or that a `.npz` says was learnt from other
+    features than the extractor makes, ends the job as `failed` with the reason.
     """
     with room.receiving(Kind.UPLOAD):
         received = await receive_file(

@@ -217,7 +217,11 @@ class VocabularyAnswer(Answer):
     clusters: int
     dimension: int
     sha256: str
-    provenance: dict[str, Any]
+    provenance: dict[str, Any] = Field(
+        description="what it was learnt with: `backbone`, `backbone_fingerprint`, `layer`, "
+        "`facet`, `preprocessing`, and of a fit `photos`, `seed` and more; `learnt_with: unknown` "
+        "where the imported file does not say"
+    )
     created_at: datetime
 
     @classmethod

@@ -23,7 +23,10 @@ class VocabularyOrigin(StrEnum):
 
 
 class Vocabulary(Base):
-    """(clusters, dimension) float32 centres under `object_key`, as a `.npy` file."""
+    """(clusters, dimension) float32 centres under `object_key`, as a `.npy` file.
+
+    `provenance` is what `shared.vision.provenance` says of them.
+    """
 
     __tablename__ = "vocabularies"
 

@@ -21,7 +21,8 @@ from PIL import Image
 
 from shared.recipes import RECIPES
 from shared.vision.extractors import SHIPPED, Extractor, choose_device
-from shared.vision.kmeans import MAX_ITERATIONS, TOLERANCE, iterate, seed_centres
+from shared.vision.fit import TOLERANCE
+from shared.vision.kmeans import Pass, Seeding
 from shared.vision.vocabulary import check_centres, encode_centres
 
 # Photographs only: no drawings, scans, microscope or depth pictures, none of them generated.
@@ -47,6 +48,7 @@ PACKAGES = {"sklearn": "scikit-learn", "skimage": "scikit-image"}
 SCALES = (1.0, 0.6, 0.35)  # of the photograph's shorter side
 STEPS = 4  # views along each side, at every scale below the whole
 SEED = 0
+MOST_PASSES = 100
 
 
 def main() -> None:
@@ -62,11 +64,7 @@ def main() -> None:
             for i in range(0, len(views), 16)
         ]
     )
-    centres = seed_centres(points, recipe.clusters, SEED)
-    iterations, movement = 0, float("inf")
-    while iterations < MAX_ITERATIONS and movement > TOLERANCE:
-        centres, movement = iterate(points, centres)
-        iterations += 1
+    centres, iterations = _find_centres(points, recipe.clusters)
     checked = check_centres(centres.numpy(), width=extractor.backbone.width)
     provenance = {
         "backbone": extractor.backbone.name,
@@ -96,6 +94,25 @@ def main() -> None:
     target.write_bytes(encode_centres(checked))
     target.with_suffix(".json").write_text(json.dumps(provenance, indent=2) + "\n")
     print(f"{checked.clusters} centres from {len(points)} patches of {len(views)} views: {target}")
+
+
+def _find_centres(points: torch.Tensor, clusters: int) -> tuple[torch.Tensor, int]:
+    """(clusters, D) centres and the passes that they took: all points fit into memory, so that
+    Lloyd's passes over all of them do without mini-batches.
+    """
+    seeding = Seeding(points, SEED)
+    while len(seeding.chosen) < clusters:
+        seeding.next()
+    centres = seeding.centres()
+    passes, movement = 0, float("inf")
+    while passes < MOST_PASSES and movement > TOLERANCE:
+        one = Pass.begin(centres)
+        one.see(points, centres)
+        moved = one.end(centres)
+        movement = float(((moved - centres) ** 2).sum())
+        centres = moved
+        passes += 1
+    return centres, passes
 
 
 def photographs() -> list[Path]:

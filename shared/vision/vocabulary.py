@@ -1,4 +1,4 @@
-"""Vocabulary files: reading them, and refusing what would silently spoil every descriptor."""
+"""Cluster centres: reading them, and refusing what would silently spoil every descriptor."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import struct
 import tokenize
 import zipfile
 from dataclasses import dataclass
-from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,30 +79,40 @@ def check_centres(array: NDArray[np.float32], *, width: int | None = None) -> Ce
 
 def encode_centres(centres: Centres) -> bytes:
     """The centres as the bytes of a `.npy` file."""
-    buffer = io.BytesIO()
-    np.save(buffer, centres.array, allow_pickle=False)
-    return buffer.getvalue()
+    return encode_array(centres.array)
 
 
 def decode_centres(data: bytes, *, width: int | None = None) -> Centres:
     """The centres in the bytes of a `.npy` file, checked."""
     try:
-        _check_promise(data)
-        array = np.load(io.BytesIO(data), allow_pickle=False)
+        array = decode_array(data)
     except NO_ARRAY as error:
         raise Unprocessable(
             "vocabulary_unfit",
             "This is not a NumPy .npy file of cluster centres, or not a whole one.",
         ) from error
-    if not isinstance(array, np.ndarray):
-        raise Unprocessable("vocabulary_unfit", "This is an .npz archive; a .npy file is needed.")
     return check_centres(array, width=width)
+
+
+def encode_array(array: NDArray[Any]) -> bytes:
+    """The array as the bytes of a `.npy` file."""
+    buffer = io.BytesIO()
+    np.save(buffer, array, allow_pickle=False)
+    return buffer.getvalue()
+
+
+def decode_array(data: bytes) -> NDArray[Any]:
+    """The array in the bytes of a `.npy` file; one of NO_ARRAY for anything else.
+
+    Nothing is unpickled, and no more is allocated than there are bytes.
+    """
+    _check_promise(data)
+    array: NDArray[Any] = np.lib.format.read_array(io.BytesIO(data), allow_pickle=False)
+    return array
 
 
 def _check_promise(data: bytes) -> None:
     """ValueError when a `.npy` header promises other bytes than follow: none are allocated."""
-    if not data.startswith(np.lib.format.MAGIC_PREFIX):
-        return  # an archive, or no array at all: np.load says which
     buffer = io.BytesIO(data)
     major, _ = np.lib.format.read_magic(buffer)
     read = (
@@ -113,28 +123,3 @@ def _check_promise(data: bytes) -> None:
         raise Unprocessable("vocabulary_unfit", "This file holds pickled objects, not numbers.")
     if math.prod(shape) * dtype.itemsize != len(data) - buffer.tell():
         raise ValueError("the header does not fit the data")
-
-
-def read_centres(path: Path) -> Centres:
-    """The centres in a `.npy` file or in AnyLoc's `c_centers.pt` (a bare tensor)."""
-    if path.suffix != ".pt":
-        return decode_centres(path.read_bytes())
-    import pickle
-
-    import torch
-
-    try:
-        tensor = torch.load(path, map_location="cpu", weights_only=True)
-    except (pickle.UnpicklingError, RuntimeError, AssertionError, *NO_ARRAY) as error:
-        raise Unprocessable(
-            "vocabulary_unfit", f"{path.name} is not a file of tensors: {error}"
-        ) from error
-    if not isinstance(tensor, torch.Tensor):
-        raise Unprocessable(
-            "vocabulary_unfit",
-            f"{path.name} holds a {type(tensor).__name__}, not one tensor.",
-        )
-    tensor = tensor.detach().to_dense()
-    if tensor.is_floating_point():
-        tensor = tensor.to(torch.float32)  # NumPy has no bfloat16
-    return check_centres(tensor.numpy())

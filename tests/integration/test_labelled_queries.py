@@ -8,13 +8,14 @@ from uuid import UUID
 import pytest
 from sqlalchemy import select
 
-from services.extractor.model_change import ModelChanges
+from services.extractor.fit_vocabulary import FitVocabulary
 from services.steward.compact import compact
 from services.steward.model_changes import fit_maps_that_wait
 from shared.catalog.maps import bump_version, lock_map
 from shared.catalog.photos import Photo, PhotoRole
 from shared.jobs import Job, JobKind, JobState
 from shared.objects.keys import work_key
+from shared.vision.extractors import Extractor
 from tests.integration.gateway import Service
 from tests.integration.workplace import FIT, Workplace
 from tests.support.photos import near_copy, photo_bytes
@@ -57,13 +58,13 @@ def test_a_vocabulary_is_learnt_from_database_photos_alone(
     photo_ids = vlads.upload(*range(8))
     become(vlads, PhotoRole.QUERY, *photo_ids[::2])
     seen: list[str] = []
-    real = ModelChanges._sample
+    real = FitVocabulary._sample
 
-    def sample(self: ModelChanges, job: Job) -> None:
+    def sample(self: FitVocabulary, job: Job, extractor: Extractor) -> None:
         seen[:] = json.loads(vlads.store.get(work_key(job.id, "plan.json")))
-        real(self, job)
+        real(self, job, extractor)
 
-    monkeypatch.setattr(ModelChanges, "_sample", sample)
+    monkeypatch.setattr(FitVocabulary, "_sample", sample)
     vlads.fit()
     assert {UUID(photo_id) for photo_id in seen} == set(photo_ids[1::2])
     assert vlads.vocabulary(vlads.active().vocabulary_id).provenance["photos"] == 4

@@ -1,4 +1,4 @@
-"""k-means: the same centres from the same seed, and every cluster used."""
+"""The steps of k-means: seeds, mini-batches, passes, and what becomes of empty clusters."""
 
 from __future__ import annotations
 
@@ -6,82 +6,101 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from torch.nn.functional import normalize
 
-from shared.vision.kmeans import MAX_ITERATIONS, TOLERANCE, iterate, seed_centres
+from shared.vision.kmeans import Pass, Seeding
 from shared.vision.vlad import assign
+from tests.support.points import unit_points
 
 
-def some_points(seed: int, count: int, width: int) -> torch.Tensor:
-    generator = torch.Generator().manual_seed(seed)
-    return normalize(torch.randn(count, width, generator=generator), dim=1)
+def seeds_of(points: torch.Tensor, clusters: int, seed: int) -> torch.Tensor:
+    seeding = Seeding(points, seed)
+    while len(seeding.chosen) < clusters:
+        seeding.next()
+    return seeding.centres()
 
 
-def run(points: torch.Tensor, centres: torch.Tensor, most: int) -> tuple[torch.Tensor, int]:
-    """Up to `most` steps, until the centres have settled."""
-    for done in range(1, most + 1):
-        centres, movement = iterate(points, centres)
-        if movement <= TOLERANCE:
-            return centres, done
-    return centres, most
-
-
-def test_one_seed_gives_one_result() -> None:
-    points = some_points(1, 300, 6)
-    first, _ = run(points, seed_centres(points, 7, seed=5), MAX_ITERATIONS)
-    again, _ = run(points, seed_centres(points, 7, seed=5), MAX_ITERATIONS)
-    other, _ = run(points, seed_centres(points, 7, seed=6), MAX_ITERATIONS)
-    assert torch.equal(first, again)
-    assert not torch.equal(first, other)
-
-
-def test_iterations_cut_into_pieces_give_the_same_centres() -> None:
-    points = some_points(2, 400, 8)
-    begin = seed_centres(points, 9, seed=0)
-    at_once, steps = run(points, begin, MAX_ITERATIONS)
-    assert steps > 3, "the example should need several steps"
-    pieces, left = begin, steps
-    while left:
-        piece = min(2, left)
-        # What is kept between two slices goes through a NumPy file.
-        pieces = torch.from_numpy(pieces.numpy().copy())
-        for _ in range(piece):
-            pieces, _ = iterate(points, pieces)
-        left -= piece
-    assert torch.equal(pieces, at_once)
+def walk(points: torch.Tensor, centres: torch.Tensor, batch: int) -> Pass:
+    """A pass of Lloyd's, in batches."""
+    one = Pass.begin(centres)
+    for part in torch.split(points, batch):
+        one.see(part, centres)
+    return one
 
 
 def test_seeds_are_points_and_all_different() -> None:
-    points = some_points(3, 50, 4)
-    seeds = seed_centres(points, 20, seed=1)
+    points = unit_points(3, 50, 4)
+    seeds = seeds_of(points, 20, seed=1)
     rows = {tuple(point.tolist()) for point in points}
     assert {tuple(seed.tolist()) for seed in seeds} <= rows
     assert len({tuple(seed.tolist()) for seed in seeds}) == 20
+    assert not torch.equal(seeds, seeds_of(points, 20, seed=2))
 
 
-def test_separated_clusters_are_found() -> None:
-    generator = torch.Generator().manual_seed(4)
-    truth = torch.eye(5)
-    noise = 0.05 * torch.randn(5, 40, 5, generator=generator)
-    points = normalize((truth[:, None] + noise).flatten(0, 1), dim=1)
-    centres, _ = run(points, seed_centres(points, 5, seed=0), MAX_ITERATIONS)
-    labels = assign(points, centres).reshape(5, 40)
-    assert all(len(set(group.tolist())) == 1 for group in labels)
-    assert len(set(labels[:, 0].tolist())) == 5
+def test_more_seeds_than_distinct_points_repeat_them() -> None:
+    points = unit_points(9, 3, 4)
+    assert seeds_of(points, 6, seed=0).shape == (6, 4)
 
 
-def test_centres_are_plain_means_and_not_normalised_again() -> None:
+def test_seeding_goes_on_where_it_was_interrupted() -> None:
+    points = unit_points(4, 60, 5)
+    at_once = seeds_of(points, 12, seed=3)
+    first = Seeding(points, seed=3)
+    for _ in range(5):
+        first.next()
+    second = Seeding.resume(
+        points,
+        chosen=list(first.chosen),
+        distances=first.distances.clone(),
+        generator_state=first.generator.get_state(),
+    )
+    while len(second.chosen) < 12:
+        second.next()
+    assert torch.equal(second.centres(), at_once)
+
+
+def test_a_pass_ends_with_plain_means_that_are_not_normalised_again() -> None:
     points = torch.tensor([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0]])
-    moved, movement = iterate(points, torch.tensor([[0.7, 0.7], [-1.0, 0.0]]))
-    assert moved.tolist() == [[0.5, 0.5], [-1.0, 0.0]]
-    assert movement == pytest.approx(2 * 0.2**2)
+    centres = torch.tensor([[0.7, 0.7], [-1.0, 0.0]])
+    one = walk(points, centres, batch=2)
+    assert one.end(centres).tolist() == [[0.5, 0.5], [-1.0, 0.0]]
+    assert one.counts.tolist() == [2, 1]
+    assert one.similarity == pytest.approx(2 * 0.5**0.5 + 1)
 
 
-def test_empty_cluster_takes_the_point_that_its_own_centre_describes_worst() -> None:
-    points = normalize(torch.tensor([[1.0, 0.0], [1.0, 0.1], [1.0, -0.1], [0.6, 0.8]]), dim=1)
+@pytest.mark.parametrize("batch", [1, 7, 64, 1000])
+def test_a_pass_is_the_same_in_batches_of_any_size(batch: int) -> None:
+    points = unit_points(5, 300, 6)
+    centres = torch.cat([points[:8], torch.full((1, 6), -9.0)])
+    whole = walk(points, centres, batch=300)
+    cut = walk(points, centres, batch=batch)
+    assert torch.equal(cut.counts, whole.counts)
+    torch.testing.assert_close(cut.end(centres), whole.end(centres))
+    expected = torch.stack(
+        [points[assign(points, centres) == k].mean(dim=0) for k in range(len(centres) - 1)]
+    )
+    torch.testing.assert_close(cut.end(centres)[:-1], expected)
+
+
+def test_after_each_mini_batch_a_centre_is_the_mean_of_what_it_was_given() -> None:
+    points = unit_points(6, 400, 4)
+    centres = seeds_of(points, 5, seed=0)
+    one = Pass.begin(centres)
+    given_to: list[list[torch.Tensor]] = [[] for _ in range(5)]
+    for part in torch.split(points, 50):
+        for point, label in zip(part, assign(part, centres).tolist(), strict=True):
+            given_to[label].append(point)
+        one.see(part, centres)
+        centres = one.means(centres)
+    torch.testing.assert_close(centres, torch.stack([torch.stack(g).mean(dim=0) for g in given_to]))
+
+
+def test_an_empty_cluster_takes_the_point_that_its_own_centre_describes_worst() -> None:
+    points = torch.nn.functional.normalize(
+        torch.tensor([[1.0, 0.0], [1.0, 0.1], [0.6, 0.8], [1.0, -0.1]]), dim=1
+    )
     nobody = torch.tensor([[1.0, 0.0], [-1.0, 0.0]])
-    moved, _ = iterate(points, nobody)
-    assert torch.equal(moved[1], points[3])
+    for batch in (1, 2, 4):
+        assert torch.equal(walk(points, nobody, batch).end(nobody)[1], points[2])
 
 
 @settings(max_examples=25, deadline=None)
@@ -89,21 +108,9 @@ def test_empty_cluster_takes_the_point_that_its_own_centre_describes_worst() -> 
 def test_no_cluster_is_left_empty_when_there_are_enough_distinct_points(
     seed: int, clusters: int, copies: int
 ) -> None:
-    points = some_points(seed, 3 * clusters, 4).repeat(copies, 1)
+    points = unit_points(seed, 3 * clusters, 4).repeat(copies, 1)
     # The worst start: every centre the same, so that all but one are empty.
-    centres, _ = run(points, points[:1].repeat(clusters, 1), MAX_ITERATIONS)
+    centres = points[:1].repeat(clusters, 1)
+    for _ in range(60):
+        centres = walk(points, centres, batch=25).end(centres)
     assert len(set(assign(points, centres).tolist())) == clusters
-
-
-def test_points_that_are_all_equal_give_finite_centres() -> None:
-    points = normalize(torch.ones(30, 4), dim=1)
-    centres, _ = run(points, seed_centres(points, 5, seed=0), MAX_ITERATIONS)
-    assert centres.shape == (5, 4)
-    assert bool(torch.isfinite(centres).all())
-
-
-def test_more_clusters_than_points_do_not_crash() -> None:
-    points = some_points(9, 3, 4)
-    centres, _ = run(points, seed_centres(points, 3, seed=0), MAX_ITERATIONS)
-    assert bool(torch.isfinite(centres).all())
-    assert seed_centres(points, 6, seed=0).shape == (6, 4)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from shared.vision.vlad import assign, soft_vlad, vlad
-from shared.vision.vocabulary import read_centres
+from shared.vision.vocabulary_file import read_vocabulary
 
 Matrix = NDArray[np.float64]
 
@@ -140,7 +140,7 @@ def test_anylocs_vocabularies_give_rows_of_the_published_dimension(
     real_photos: Path, domain: str
 ) -> None:
     folder = real_photos / "anyloc-vocabularies"
-    centres = read_centres(folder / f"dinov2_vitg14_l31_value_c32_{domain}.pt")
+    centres = read_vocabulary(folder / f"dinov2_vitg14_l31_value_c32_{domain}.pt").centres
     # Features near the real centres, so that most clusters have some.
     rng = np.random.default_rng(3)
     near = centres.array[rng.integers(0, 32, 300)] + 0.01 * rng.standard_normal((300, 1536))

@@ -1,4 +1,4 @@
-"""Vocabulary files: what is read, and everything that is refused before it spoils a descriptor."""
+"""Cluster centres: what is read, and everything that is refused before it spoils a descriptor."""
 
 from __future__ import annotations
 
@@ -6,17 +6,14 @@ import hashlib
 import io
 import pickle
 import struct
-import zipfile
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from numpy.typing import NDArray
 
 from shared.errors import Unprocessable
-from shared.vision.vocabulary import check_centres, decode_centres, encode_centres, read_centres
+from shared.vision.vocabulary import check_centres, decode_centres, encode_centres
 
 
 def good_centres(clusters: int = 4, width: int = 6) -> NDArray[np.float32]:
@@ -145,80 +142,3 @@ def test_files_that_are_no_array_are_refused(name: str) -> None:
         decode_centres(junk_files()[name])
     assert caught.value.code == "vocabulary_unfit"
     assert not Untrustworthy.unpickled
-
-
-def test_archive_is_refused_by_name() -> None:
-    with pytest.raises(Unprocessable, match=r"\.npz archive"):
-        decode_centres(junk_files()["an archive"])
-
-
-def test_npy_file_is_read(tmp_path: Path) -> None:
-    path = tmp_path / "centres.npy"
-    path.write_bytes(npy(good_centres()))
-    np.testing.assert_array_equal(read_centres(path).array, good_centres())
-
-
-def test_anyloc_tensor_file_is_read(tmp_path: Path) -> None:
-    path = tmp_path / "c_centers.pt"
-    torch.save(torch.from_numpy(good_centres(32, 24)), path)
-    found = read_centres(path)
-    assert (found.clusters, found.dimension) == (32, 24)
-    np.testing.assert_array_equal(found.array, good_centres(32, 24))
-
-
-def test_parameter_and_half_precision_tensors_are_read(tmp_path: Path) -> None:
-    path = tmp_path / "c_centers.pt"
-    torch.save(torch.nn.Parameter(torch.from_numpy(good_centres())), path)
-    np.testing.assert_array_equal(read_centres(path).array, good_centres())
-    torch.save(torch.from_numpy(good_centres()).bfloat16(), path)
-    np.testing.assert_allclose(read_centres(path).array, good_centres(), atol=0.02)
-
-
-def test_tensor_file_holding_a_dictionary_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "c_centers.pt"
-    torch.save({"centres": torch.ones(2, 3)}, path)
-    with pytest.raises(Unprocessable, match="holds a dict, not one tensor"):
-        read_centres(path)
-
-
-def test_tensor_of_whole_numbers_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "c_centers.pt"
-    torch.save(torch.arange(6).reshape(2, 3), path)
-    with pytest.raises(Unprocessable, match="not floating point"):
-        read_centres(path)
-
-
-def broken_tensor_files() -> dict[str, bytes]:
-    whole = io.BytesIO()
-    torch.save(torch.from_numpy(good_centres()), whole)
-    empty = io.BytesIO()
-    with zipfile.ZipFile(empty, "w"):
-        pass
-    return {
-        "nothing": b"",
-        "text": b"hello",
-        "truncated": whole.getvalue()[:-200],
-        "an empty archive": empty.getvalue(),
-        "a pickle that runs code": pickle.dumps(Untrustworthy(), protocol=2),
-    }
-
-
-@pytest.mark.parametrize("name", broken_tensor_files())
-def test_broken_tensor_files_are_refused_and_run_nothing(name: str, tmp_path: Path) -> None:
-    path = tmp_path / "c_centers.pt"
-    path.write_bytes(broken_tensor_files()[name])
-    with pytest.raises(Unprocessable) as caught:
-        read_centres(path)
-    assert caught.value.code == "vocabulary_unfit"
-    assert not Untrustworthy.unpickled
-
-
-@pytest.mark.real_photos
-def test_published_anyloc_vocabularies_load(real_photos: Path) -> None:
-    files = sorted((real_photos / "anyloc-vocabularies").glob("*.pt"))
-    assert len(files) == 3
-    for file in files:
-        found = read_centres(file)
-        assert (found.clusters, found.dimension) == (32, 1536), file.name
-        lengths = np.linalg.norm(found.array, axis=1)
-        assert lengths.min() < 0.7, "AnyLoc's centres are means of unit vectors, not unit vectors"

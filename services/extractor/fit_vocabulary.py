@@ -1,0 +1,177 @@
+"""FIT: learn a vocabulary from the map's own photos, a slice at a time.
+
+    plan      which photos, in which order             -> plan.json
+    sample    some patches of the next few of them     -> patches-*.f32
+    cluster   steps of `shared.vision.fit`             -> fit.npz
+
+The names are objects under `work/<job>/`. Nothing of a fit is kept in the worker's memory.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from uuid import UUID
+
+from sqlalchemy import select
+
+from services.extractor.decoding import DecoderPool
+from services.extractor.loaded import LoadedModels
+from services.extractor.new_generation import begin_with_new, extractor_of, go_on
+from shared.catalog.photos import Photo, PhotoRole, live_photos
+from shared.catalog.session import Catalog
+from shared.catalog.vocabularies import VocabularyOrigin
+from shared.errors import Conflict, NotFound, PlacewiseError, Unprocessable
+from shared.jobs import Job
+from shared.objects import ObjectStore
+from shared.objects.keys import work_key
+from shared.settings import Settings
+from shared.vision.extractors import Extractor
+from shared.vision.fit import Fit
+from shared.vision.patches import PatchStore, choose_photos
+from shared.vision.provenance import of_fit
+
+SLICE_SECONDS = 1.0  # about the time of a batch: what a query may have to wait
+
+
+class FitVocabulary:
+    """Does one slice of a fit at a time."""
+
+    def __init__(
+        self,
+        catalog: Catalog,
+        store: ObjectStore,
+        models: LoadedModels,
+        decoders: DecoderPool,
+        settings: Settings,
+    ) -> None:
+        self._catalog = catalog
+        self._store = store
+        self._models = models
+        self._decoders = decoders
+        self._settings = settings
+
+    def slice(self, job: Job) -> None:
+        """The next slice, by the job's stage; PlacewiseError when it can't go on."""
+        extractor = extractor_of(self._catalog, self._models, job)
+        if not extractor.recipe.needs_vocabulary:
+            raise Unprocessable(
+                "vocabulary_unfit",
+                f"The extractor {extractor.recipe.name} uses no vocabulary: "
+                "there is nothing to fit.",
+            )
+        if job.stage is None:
+            self._plan(job, extractor)
+        elif job.stage == "sample":
+            self._sample(job, extractor)
+        else:
+            self._cluster(job, extractor)
+
+    def _plan(self, job: Job, extractor: Extractor) -> None:
+        """Choose the photos to learn from: reproducible from the seed and the photos' ids."""
+        with self._catalog.read() as session:
+            photo_ids = session.scalars(
+                select(Photo.id)
+                .where(
+                    Photo.map_id == job.map_id,
+                    Photo.deleted_at.is_(None),
+                    Photo.role == PhotoRole.DATABASE,
+                )
+                .order_by(Photo.id)
+            ).all()
+        if not photo_ids:
+            raise Conflict(
+                "no_photos",
+                "The map has no photos to learn a vocabulary from. Upload some first.",
+            )
+        chosen = choose_photos(
+            len(photo_ids), job.params["sample"], extractor.backbone.width, job.params["seed"]
+        )
+        plan = [str(photo_ids[number]) for number in chosen]
+        self._store.put(work_key(job.id, "plan.json"), json.dumps(plan).encode())
+        clusters = job.params["clusters"] or extractor.recipe.clusters
+        go_on(
+            self._catalog,
+            job,
+            stage="sample",
+            params={**job.params, "clusters": clusters, "sampled": 0, "described": 0},
+            progress_total=len(plan) + len(photo_ids),
+        )
+
+    def _sample(self, job: Job, extractor: Extractor) -> None:
+        """Patches of the next few photos of the plan."""
+        plan = json.loads(self._store.get(work_key(job.id, "plan.json")))
+        begin = job.params["sampled"]
+        chosen = [UUID(photo_id) for photo_id in plan[begin : begin + self._settings.batch_photos]]
+        decoded = [
+            outcome
+            for outcome in self._decoders.decode(self._read(chosen), extractor.preprocessing)
+            if not isinstance(outcome, PlacewiseError)
+        ]
+        if decoded:
+            features = extractor.local_features([photo.pixels for photo in decoded])
+            self._patches(job, extractor).add(features, begin, len(plan), job.params["seed"])
+        sampled = begin + len(chosen)
+        go_on(
+            self._catalog,
+            job,
+            stage="sample" if sampled < len(plan) else "cluster",
+            params={
+                **job.params,
+                "sampled": sampled,
+                "described": job.params["described"] + len(decoded),
+            },
+            progress_done=sampled,
+        )
+
+    def _read(self, photo_ids: list[UUID]) -> list[bytes]:
+        """The photos that are there: a sample does not depend on those deleted since."""
+        with self._catalog.read() as session:
+            live = live_photos(session, photo_ids)
+        photos = []
+        for photo_id in photo_ids:
+            if photo_id in live:
+                try:
+                    photos.append(self._store.get(live[photo_id].object_key))
+                except NotFound:
+                    continue
+        return photos
+
+    def _cluster(self, job: Job, extractor: Extractor) -> None:
+        """Steps for about a second; when they are done, the vocabulary and its generation."""
+        params = job.params
+        patches = self._patches(job, extractor).open()
+        fit = Fit(patches, params["clusters"], params["seed"])
+        kept = work_key(job.id, "fit.npz")
+        if params.get("clustering"):
+            fit.resume(self._store.get(kept))
+        until = time.monotonic() + SLICE_SECONDS
+        while not fit.done:  # at least one step, however slow it is
+            fit.step()
+            if time.monotonic() >= until:
+                break
+        if not fit.done:
+            self._store.put(kept, fit.save())
+            go_on(self._catalog, job, stage="cluster", params={**params, "clustering": True})
+            return
+        centres = fit.centres()
+        provenance = of_fit(
+            extractor,
+            centres,
+            fit,
+            clusters_asked=params["clusters"],
+            photos=params["described"],
+            seed=params["seed"],
+        )
+        begin_with_new(
+            self._catalog,
+            self._store,
+            job,
+            extractor,
+            centres,
+            VocabularyOrigin.FITTED,
+            provenance,
+        )
+
+    def _patches(self, job: Job, extractor: Extractor) -> PatchStore:
+        return PatchStore(self._store, work_key(job.id, "patches-"), extractor.backbone.width)

@@ -1,0 +1,58 @@
+"""Model changes to centres that are there: in a file that was brought, or in the map already."""
+
+from __future__ import annotations
+
+from uuid import UUID
+
+from services.extractor.loaded import LoadedModels
+from services.extractor.new_generation import begin_with_known, begin_with_new, extractor_of
+from shared.catalog.session import Catalog
+from shared.catalog.vocabularies import VocabularyOrigin, get_vocabulary
+from shared.errors import Unprocessable
+from shared.jobs import Job
+from shared.objects import ObjectStore
+from shared.vision.provenance import check_fits
+from shared.vision.vocabulary_file import decode_vocabulary
+
+
+class TakeVocabulary:
+    """One slice each: nothing is calculated."""
+
+    def __init__(self, catalog: Catalog, store: ObjectStore, models: LoadedModels) -> None:
+        self._catalog = catalog
+        self._store = store
+        self._models = models
+
+    def from_file(self, job: Job) -> None:
+        """IMPORT: the vocabulary in the file under `object_key`; Unprocessable
+        (`vocabulary_unfit`) when the map's extractor can't use it.
+        """
+        extractor = extractor_of(self._catalog, self._models, job)
+        brought = decode_vocabulary(self._store.get(job.params["object_key"]))
+        check_fits(brought.provenance, brought.centres, extractor)
+        begin_with_new(
+            self._catalog,
+            self._store,
+            job,
+            extractor,
+            brought.centres,
+            VocabularyOrigin.IMPORTED,
+            {**brought.provenance, "imported_from": job.params["filename"]},
+        )
+
+    def of_map(self, job: Job) -> None:
+        """SWITCH: the vocabulary `vocabulary_id` of the map, or None for extractors without one."""
+        extractor = extractor_of(self._catalog, self._models, job)
+        if job.params["vocabulary_id"] is None:
+            if extractor.recipe.needs_vocabulary:
+                raise Unprocessable(
+                    "vocabulary_unfit",
+                    f"The extractor {extractor.recipe.name} needs a vocabulary.",
+                )
+            begin_with_known(self._catalog, job, extractor, None, None)
+            return
+        with self._catalog.read() as session:
+            vocabulary = get_vocabulary(session, job.map_id, UUID(job.params["vocabulary_id"]))
+        centres = self._models.centres(vocabulary)
+        check_fits(vocabulary.provenance, centres, extractor)
+        begin_with_known(self._catalog, job, extractor, centres, vocabulary.id)

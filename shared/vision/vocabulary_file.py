@@ -1,0 +1,136 @@
+"""Vocabularies as files that people keep and send.
+
+- `.npz`, as `placewise vocabulary fit DIR --out` writes it: an uncompressed NumPy archive of
+  `centres`, (clusters, dimension) float32, and `provenance`, one string of JSON.
+  `numpy.load` reads it without pickle.
+- `.npy`: the centres alone.
+- `.pt`: the centres alone, as one tensor: AnyLoc's `c_centers.pt`.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from shared.errors import Unprocessable
+from shared.vision.provenance import UNKNOWN, Provenance, is_known
+from shared.vision.vocabulary import (
+    NO_ARRAY,
+    Centres,
+    check_centres,
+    decode_array,
+    decode_centres,
+    encode_array,
+    encode_centres,
+)
+
+CENTRES, PROVENANCE = "centres", "provenance"
+MEMBERS = {f"{CENTRES}.npy", f"{PROVENANCE}.npy"}
+MOST_PROVENANCE_BYTES = 100_000
+LONG_AGO = (1980, 1, 1, 0, 0, 0)  # no clock in the file: equal vocabularies are equal bytes
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class VocabularyFile:
+    centres: Centres
+    provenance: Provenance
+
+    @property
+    def suffix(self) -> str:
+        """`.npz`; `.npy` where the provenance is unknown."""
+        return ".npz" if is_known(self.provenance) else ".npy"
+
+    def encode(self) -> bytes:
+        """The bytes of a file of that kind."""
+        if self.suffix == ".npy":
+            return encode_centres(self.centres)
+        text = json.dumps(self.provenance, sort_keys=True, ensure_ascii=False)
+        buffer = io.BytesIO()
+        with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
+            for name, array in ((CENTRES, self.centres.array), (PROVENANCE, np.array(text))):
+                archive.writestr(zipfile.ZipInfo(f"{name}.npy", LONG_AGO), encode_array(array))
+        return buffer.getvalue()
+
+
+def decode_vocabulary(data: bytes) -> VocabularyFile:
+    """The vocabulary in the bytes of a `.npz` or `.npy` file, checked.
+
+    Raises Unprocessable (`vocabulary_unfit`).
+    """
+    if not data.startswith(b"PK"):
+        return VocabularyFile(decode_centres(data), UNKNOWN)
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            members = {info.filename: _read(archive, info) for info in archive.infolist()}
+    except (*NO_ARRAY, NotImplementedError, RuntimeError) as error:
+        raise _refuse(f"it can't be read ({error})") from error
+    if set(members) != MEMBERS:
+        raise _refuse(f"it holds {', '.join(sorted(members)) or 'nothing'}")
+    centres = decode_centres(members[f"{CENTRES}.npy"])
+    provenance = _decode_provenance(members[f"{PROVENANCE}.npy"])
+    if provenance.get("sha256") != centres.sha256:
+        raise _refuse("its provenance belongs to other centres (the hash differs)")
+    return VocabularyFile(centres, provenance)
+
+
+def read_vocabulary(path: Path) -> VocabularyFile:
+    """The vocabulary in a `.npz`, `.npy` or `.pt` file, checked; Unprocessable as above."""
+    if path.suffix != ".pt":
+        return decode_vocabulary(path.read_bytes())
+    return VocabularyFile(_read_tensor(path), UNKNOWN)
+
+
+def _read(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> bytes:
+    if info.compress_type != zipfile.ZIP_STORED or info.file_size != info.compress_size:
+        raise ValueError(f"{info.filename} is compressed")  # it could swell without end
+    return archive.read(info)
+
+
+def _decode_provenance(data: bytes) -> Provenance:
+    if len(data) > MOST_PROVENANCE_BYTES:
+        raise _refuse("its provenance is too long")
+    try:
+        array = decode_array(data)
+        text = array.item() if array.dtype.kind == "U" and array.size == 1 else ""
+        found: Any = json.loads(text)
+    except (*NO_ARRAY, RecursionError) as error:
+        raise _refuse(f"its provenance can't be read ({error})") from error
+    if not isinstance(found, dict) or not is_known(found):
+        raise _refuse("its provenance does not say what it was learnt with")
+    return found
+
+
+def _refuse(reason: str) -> Unprocessable:
+    return Unprocessable(
+        "vocabulary_unfit",
+        f"This .npz is not a vocabulary as `placewise vocabulary fit DIR --out` writes it: "
+        f"{reason}.",
+    )
+
+
+def _read_tensor(path: Path) -> Centres:
+    import pickle
+
+    import torch
+
+    try:
+        tensor = torch.load(path, map_location="cpu", weights_only=True)
+    except (pickle.UnpicklingError, RuntimeError, AssertionError, *NO_ARRAY) as error:
+        raise Unprocessable(
+            "vocabulary_unfit", f"{path.name} is not a file of tensors: {error}"
+        ) from error
+    if not isinstance(tensor, torch.Tensor):
+        raise Unprocessable(
+            "vocabulary_unfit",
+            f"{path.name} holds a {type(tensor).__name__}, not one tensor.",
+        )
+    tensor = tensor.detach().to_dense()
+    if tensor.is_floating_point():
+        tensor = tensor.to(torch.float32)  # NumPy has no bfloat16
+    return check_centres(tensor.numpy())

@@ -1,0 +1,133 @@
+"""`placewise vocabulary fit DIR` and back: a vocabulary from a folder into a map."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from shared.vision.vocabulary_file import VocabularyFile, read_vocabulary
+from tests.support.photos import photo_bytes
+from tests.support.server import ServerProcess, environment, run_command
+
+SETTINGS = {"extractor": "test-tiny-vlad", "auto_fit_photos": 10_000}
+WIDTH = 16  # of the tiny extractor's local features
+PHOTOS = 9
+
+
+@dataclass(slots=True)
+class Folder:
+    """Photos in a folder, one of which no one can decode, and commands that run beside it."""
+
+    path: Path
+    server: ServerProcess
+
+    def run(self, *arguments: str | Path) -> subprocess.CompletedProcess[str]:
+        env = environment(self.server.home, **SETTINGS)
+        return run_command("vocabulary", *arguments, env=env, cwd=self.path)
+
+    def json(self, *arguments: str | Path, code: int = 0) -> Any:
+        run = self.run(*arguments, "--json")
+        assert run.returncode == code, run.stderr + run.stdout
+        assert "Traceback" not in run.stderr
+        return json.loads(run.stdout)
+
+
+@pytest.fixture(scope="module")
+def folder(server: ServerProcess, tmp_path_factory: pytest.TempPathFactory) -> Folder:
+    path = tmp_path_factory.mktemp("vocabularies")
+    (path / "photos" / "below").mkdir(parents=True)
+    for number in range(PHOTOS):
+        name = f"below/{number}.jpg" if number % 2 else f"{number}.jpg"
+        (path / "photos" / name).write_bytes(photo_bytes(number))
+    (path / "photos" / "broken.jpg").write_bytes(b"\xff\xd8\xff no photo")
+    assert server.upload(photo_bytes(100)).status_code == 202
+    return Folder(path, server)
+
+
+@pytest.fixture(scope="module")
+def fitted(folder: Folder) -> Any:
+    """What `vocabulary fit photos --out city.npz` said."""
+    return folder.json("fit", "photos", "--out", "city.npz", "--clusters", "5", "--seed", "3")
+
+
+def test_a_folders_vocabulary_is_written_with_its_provenance(folder: Folder, fitted: Any) -> None:
+    found = read_vocabulary(folder.path / "city.npz")
+    assert (fitted["file"], fitted["clusters"], fitted["dimension"]) == ("city.npz", 5, WIDTH)
+    assert found.centres.array.shape == (5, WIDTH)
+    assert found.provenance == fitted["provenance"]
+    said = found.provenance
+    assert (said["photos"], said["patches"], said["seed"]) == (PHOTOS, PHOTOS * 64, 3)
+    assert (said["backbone"], said["sha256"]) == ("test-tiny", found.centres.sha256)
+    (refused,) = fitted["refused"]
+    assert refused["path"] == "photos/broken.jpg"
+    assert "decoded" in refused["reason"]
+
+
+def test_the_same_fit_gives_the_same_file_and_fewer_photos_another(
+    folder: Folder, fitted: Any
+) -> None:
+    common = ("fit", "photos", "--clusters", "5", "--seed", "3")
+    again = folder.run(*common, "--out", "again.npz")
+    assert again.returncode == 0, again.stderr
+    assert "5 clusters of 16 dimensions from 9 photos, mean cosine 0." in again.stdout
+    assert "broken.jpg" in again.stderr
+    written = (folder.path / "again.npz").read_bytes()
+    assert written == (folder.path / "city.npz").read_bytes()
+    fewer = folder.json(*common, "--out", "fewer.npz", "--sample", "6")
+    assert fewer["provenance"]["photos"] <= 6
+    assert fewer["provenance"]["sha256"] != fitted["provenance"]["sha256"]
+
+
+def test_a_map_takes_the_file_and_lists_where_it_comes_from(folder: Folder, fitted: Any) -> None:
+    job = folder.json("import", "city.npz")
+    assert job["result"]["clusters"] == 5
+    listed = folder.json("list")
+    assert (listed[0]["origin"], listed[0]["active"]) == ("imported", True)
+    assert listed[0]["provenance"] == {**fitted["provenance"], "imported_from": "city.npz"}
+    assert listed[0]["sha256"] == fitted["provenance"]["sha256"]
+
+    np.save(folder.path / "bare.npy", np.eye(4, WIDTH, dtype=np.float32))
+    folder.json("import", "bare.npy")
+    assert folder.json("list")[0]["provenance"]["learnt_with"] == "unknown"
+    shown = folder.run("list").stdout
+    for part in ("test-tiny projection square32", "of unknown origin", listed[0]["sha256"][:12]):
+        assert part in shown, shown
+
+
+def test_a_file_of_another_extractor_is_refused_by_the_map(folder: Folder, fitted: Any) -> None:
+    found = read_vocabulary(folder.path / "city.npz")
+    other = VocabularyFile(found.centres, {**found.provenance, "layer": "another"})
+    (folder.path / "other.npz").write_bytes(other.encode())
+    problem = folder.json("import", "other.npz", code=1)
+    assert problem["code"] == "vocabulary_unfit"
+    assert "layer another" in problem["detail"]
+    assert "layer projection" in problem["detail"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "said"),
+    [
+        (("fit", "photos"), "bad_out", "--out FILE.npz"),
+        (("fit", "photos", "--out", "city.npy"), "bad_out", ".npz"),
+        (("fit", "photos", "--out", "a.npz", "--map", "b"), "options_contradict", "--map"),
+        (("fit", "--out", "a.npz"), "options_contradict", "--out"),
+        (
+            ("fit", "photos", "--out", "a.npz", "--extractor", "test-tiny-avg"),
+            "vocabulary_unfit",
+            "uses no vocabulary",
+        ),
+    ],
+)
+def test_a_fit_that_can_not_be_is_refused_before_it_begins(
+    folder: Folder, arguments: tuple[str, ...], code: str, said: str
+) -> None:
+    problem = folder.json(*arguments, code=1)
+    assert problem["code"] == code
+    assert said in problem["detail"]
+    assert not (folder.path / "a.npz").exists()

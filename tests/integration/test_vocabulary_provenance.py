@@ -1,0 +1,120 @@
+"""What a map's vocabularies say of themselves, and which files it takes."""
+
+from __future__ import annotations
+
+from typing import Any
+from uuid import UUID
+
+import numpy as np
+
+from shared.catalog.vocabularies import Vocabulary
+from shared.jobs import JobKind, JobState
+from shared.objects.keys import new_vocabulary_key
+from shared.recipes import get_recipe
+from shared.vision.extractors import Extractor, choose_device
+from shared.vision.provenance import Provenance, of_features
+from shared.vision.vocabulary import check_centres, decode_centres, encode_centres
+from shared.vision.vocabulary_file import VocabularyFile
+from tests.integration.workplace import FIT, Workplace
+
+WIDTH = 16  # of the tiny backbone's local features
+
+
+def tiny_features() -> Provenance:
+    recipe = get_recipe("test-tiny-vlad", allow_test_extractors=True)
+    return of_features(Extractor(recipe, choose_device("cpu")))
+
+
+def vocabulary_file(**provenance: Any) -> bytes:
+    """Five centres in a file, learnt with the tiny features unless told otherwise."""
+    centres = check_centres(np.random.default_rng(3).standard_normal((5, WIDTH)).astype(np.float32))
+    said = {**tiny_features(), "photos": 40, "sha256": centres.sha256, **provenance}
+    return VocabularyFile(centres, said).encode()
+
+
+def import_file(workplace: Workplace, data: bytes, name: str) -> UUID:
+    key = new_vocabulary_key()
+    workplace.store.put(key, data)
+    return workplace.start(JobKind.IMPORT, object_key=key, filename=name)
+
+
+def active_vocabulary(workplace: Workplace) -> Vocabulary:
+    return workplace.vocabulary(workplace.active().vocabulary_id)
+
+
+def test_a_fitted_vocabulary_says_how_it_was_learnt(vlads: Workplace) -> None:
+    vlads.upload(*range(6))
+    vlads.upload_bytes(b"nobody can decode this")
+    assert vlads.fit(clusters=4, seed=5).state == JobState.SUCCEEDED
+    found = active_vocabulary(vlads)
+    cosine = found.provenance.pop("mean_cosine")
+    passes = found.provenance.pop("passes")
+    assert found.provenance == {
+        **tiny_features(),
+        "clusters": 4,
+        "clusters_asked": 4,
+        "photos": 6,
+        "patches": 6 * 64,
+        "seed": 5,
+        "sha256": found.sha256,
+    }
+    assert 0 < cosine < 1
+    assert 10 < passes <= 20
+
+
+def test_an_imported_vocabulary_keeps_what_its_file_says(vlads: Workplace) -> None:
+    vlads.upload(1)
+    job = vlads.finish(import_file(vlads, vocabulary_file(note="Turin"), "turin.npz"))
+    assert job.state == JobState.SUCCEEDED
+    found = active_vocabulary(vlads)
+    assert (found.origin, found.standing, found.clusters) == ("imported", "foreign", 5)
+    assert found.provenance == {
+        **tiny_features(),
+        "photos": 40,
+        "sha256": found.sha256,
+        "note": "Turin",
+        "imported_from": "turin.npz",
+    }
+    assert decode_centres(vlads.store.get(found.object_key)).sha256 == found.sha256
+
+
+def test_a_file_of_bare_centres_is_marked_as_of_unknown_origin(vlads: Workplace) -> None:
+    vlads.upload(1)
+    centres = check_centres(np.eye(3, WIDTH, dtype=np.float32))
+    job = vlads.finish(import_file(vlads, encode_centres(centres), "c_centers.npy"))
+    assert job.state == JobState.SUCCEEDED
+    assert active_vocabulary(vlads).provenance == {
+        "learnt_with": "unknown",
+        "imported_from": "c_centers.npy",
+    }
+
+
+def test_a_vocabulary_of_other_weights_is_refused_with_both_specs(vlads: Workplace) -> None:
+    vlads.upload(*range(6))
+    assert vlads.fit().state == JobState.SUCCEEDED
+    before = vlads.active().id
+    other = vocabulary_file(backbone="dinov2-vits14", backbone_fingerprint="cd" * 32, layer="10")
+    job = vlads.finish(import_file(vlads, other, "vits14.npz"))
+    assert job.state == JobState.FAILED
+    assert job.error is not None
+    assert job.error["code"] == "vocabulary_unfit"
+    assert "dinov2-vits14 (weights cdcdcdcdcdcd), layer 10" in job.error["detail"]
+    assert "test-tiny-vlad makes test-tiny (weights" in job.error["detail"]
+    assert job.error["learnt_with"]["backbone"] == "dinov2-vits14"
+    assert job.error["extractor_makes"] == tiny_features()
+    assert vlads.active().id == before
+
+
+def test_a_switch_to_a_vocabulary_of_former_weights_is_refused(vlads: Workplace) -> None:
+    vlads.upload(*range(6))
+    assert vlads.fit().state == JobState.SUCCEEDED
+    first = vlads.active().vocabulary_id
+    assert vlads.fit(**{**FIT, "seed": 1}).state == JobState.SUCCEEDED
+    with vlads.catalog.write() as session:
+        kept = session.get_one(Vocabulary, first)
+        kept.provenance = {**kept.provenance, "backbone_fingerprint": "ef" * 32}
+    job = vlads.finish(vlads.start(JobKind.SWITCH, vocabulary_id=str(first)))
+    assert job.state == JobState.FAILED
+    assert job.error is not None
+    assert job.error["code"] == "vocabulary_unfit"
+    assert "efefefefefef" in job.error["detail"]
