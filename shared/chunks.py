@@ -3,6 +3,8 @@
 `<chunk>.npy` is a C-contiguous (rows, dimension) array, float32, each row L2-normalised.
 `<chunk>.json` says what the rows are (spec, photo ids in row order, hash), so that a lost catalog
 can be rebuilt from the object store.
+`<chunk>.codes` holds the codes that search begins with (`shared.codes`), of chunks that are long
+enough to need any.
 """
 
 from __future__ import annotations
@@ -16,12 +18,18 @@ from uuid import UUID
 
 import numpy as np
 from numpy.typing import NDArray
+from typing_extensions import Buffer
 
 from shared.errors import Unavailable
 from shared.objects import ObjectStore
 
 Rows = NDArray[np.float32]
 Row = NDArray[np.float32]
+
+# From these on, codes lie beside a chunk: below, search compares rows as fast, or makes the few
+# codes in no time.
+CODED_DIMENSION = 7000
+CODED_BYTES = 8_000_000
 
 HEADER_BYTES = 1024  # what is read to find out where the rows begin: NumPy's header has 128
 
@@ -45,6 +53,11 @@ def manifest_key(object_key: str) -> str:
     return object_key.removesuffix(".npy") + ".json"
 
 
+def codes_key(object_key: str) -> str:
+    """The key of the codes beside a chunk."""
+    return object_key.removesuffix(".npy") + ".codes"
+
+
 def encode_rows(rows: Rows) -> bytes:
     """(n, dimension) float32 rows as the bytes of a `.npy` file."""
     if rows.dtype != np.float32 or rows.ndim != 2:
@@ -54,9 +67,9 @@ def encode_rows(rows: Rows) -> bytes:
     return buffer.getvalue()
 
 
-def decode_rows(data: bytes) -> Rows:
-    """The rows of a `.npy` file, read-only, sharing memory with `data`."""
-    shape, offset = _read_header(data)
+def decode_rows(data: Buffer) -> Rows:
+    """The rows of a `.npy` file, sharing memory with `data`."""
+    shape, offset = _read_header(bytes(memoryview(data)[:HEADER_BYTES]))
     return np.frombuffer(data, dtype=np.float32, offset=offset).reshape(shape)
 
 
@@ -85,7 +98,7 @@ def write_chunk(
 ) -> WrittenChunk:
     """Put the chunk and its manifest into the store; the catalog does not know of them yet.
 
-    The manifest goes first: a chunk object never lies there without its description.
+    The chunk goes last: it never lies there without its description.
     """
     if len(photo_ids) != len(rows):
         raise ValueError(f"{len(rows)} rows for {len(photo_ids)} photos")
@@ -103,6 +116,10 @@ def write_chunk(
         "photo_ids": [str(photo_id) for photo_id in photo_ids],
     }
     store.put(manifest_key(key), json.dumps(manifest).encode())
+    if rows.shape[1] >= CODED_DIMENSION and rows.nbytes >= CODED_BYTES:
+        from shared.codes.stored import encode_codes  # numba takes a while to load
+
+        store.put(codes_key(key), encode_codes(rows, sha256))
     store.put(key, data)
     return WrittenChunk(object_key=key, rows=len(rows), size_bytes=len(data), sha256=sha256)
 
@@ -111,13 +128,18 @@ def read_chunk(store: ObjectStore, object_key: str, sha256: str) -> Rows:
     """The chunk's rows, checked against the catalog's hash; Unavailable when they differ."""
     data = store.get(object_key)
     if hashlib.sha256(data).hexdigest() != sha256:
-        raise Unavailable(
-            "chunk_corrupt",
-            f"The chunk {object_key} is not what was written (its hash differs). "
-            "Restore the object from a backup, or describe its photos again.",
-            object_key=object_key,
-        )
+        raise corrupt(object_key)
     return decode_rows(data)
+
+
+def corrupt(object_key: str) -> Unavailable:
+    """A chunk's bytes are not those of its hash."""
+    return Unavailable(
+        "chunk_corrupt",
+        f"The chunk {object_key} is not what was written (its hash differs). "
+        "Restore the object from a backup, or describe its photos again.",
+        object_key=object_key,
+    )
 
 
 def read_row(store: ObjectStore, object_key: str, row: int) -> Row:
@@ -148,6 +170,7 @@ def _read(file: BinaryIO, size: int) -> bytes:
 
 
 def delete_chunk(store: ObjectStore, object_key: str) -> None:
-    """Remove the chunk and its manifest."""
+    """Remove the chunk, its codes and its manifest."""
     store.delete(object_key)
+    store.delete(codes_key(object_key))
     store.delete(manifest_key(object_key))

@@ -7,6 +7,7 @@ between machines it is HTTP, with a map's slots spread over shards (`shared.sear
 
 from __future__ import annotations
 
+from enum import StrEnum
 from typing import Protocol
 from uuid import UUID
 
@@ -16,8 +17,18 @@ from shared.photo_filter import EVERYTHING, PhotoFilter
 from shared.shards import WHOLE
 
 EXHAUSTIVE = "exhaustive"  # every row was compared exactly
-CERTIFICATES = (EXHAUSTIVE,)
+BOUND = "bound"  # no row that was left out can reach the answer, whatever it holds
+STATISTICAL = "statistical"  # the same but for a chance of about 1 in 10^8
+NONE = "none"  # the search ended early: better rows may be missing
+CERTIFICATES = (EXHAUSTIVE, BOUND, STATISTICAL, NONE)
 """How an answer can have been reached, strongest first."""
+
+
+class Mode(StrEnum):
+    """How to search."""
+
+    AUTO = "auto"  # whichever reads less
+    DENSE = "dense"  # compare every row exactly
 
 
 class _Message(BaseModel):
@@ -42,6 +53,11 @@ class SearchRequest(_Message):
     photos: PhotoFilter = EVERYTHING
     min_score: float | None = None
     exclude: tuple[UUID, ...] = ()
+    mode: Mode = Mode.AUTO
+    most_rows: int | None = Field(None, ge=0)
+    """Give up once so many rows were compared exactly, and say so (`none`)."""
+    most_seconds: float | None = Field(None, gt=0)
+    """Give up after this time."""
 
 
 class Hit(_Message):
@@ -56,8 +72,13 @@ class SearchResponse(_Message):
     hits: tuple[Hit, ...]
     certificate: str
     """How the answer was reached, one of CERTIFICATES."""
+    certified_k: int = 0
+    """So many of the first hits are certain: all of them, unless the search ended early."""
     rows_scanned: int
     rows_reranked: int
+    """Of them, those whose whole rows were read."""
+    max_z: float | None = None
+    """The largest error of an estimate from codes, in its standard deviations; None without."""
     snapshot_version: int
     missing: tuple[str, ...] = ()
     """Whose photos can't be in the answer: objects that could not be read, and shards (`shard

@@ -14,6 +14,7 @@ from pydantic import Field, SecretStr, field_validator, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from shared.errors import Misconfigured
+from shared.machine import ram_bytes
 from shared.predecessor import extractor_of
 from shared.recipes import Recipe, get_recipe
 from shared.shards import Shard
@@ -251,6 +252,13 @@ class Settings(BaseSettings):
     )
     search_wait_seconds: float = Field(5.0, gt=0, description="longest wait for `min_version`")
 
+    search_memory_budget: int | None = Field(
+        None,
+        ge=0,
+        description="bytes of codes and rows that search holds in memory; unset: half of the "
+        "machine's, or of what its container may use",
+    )
+
     # How search is spread over machines (`placewise search`, which listens on HOST and PORT, too).
     search_shard: str = Field(
         "0/1", description="what this search worker holds: 1/3 is the second of three shards"
@@ -433,6 +441,14 @@ class Settings(BaseSettings):
     def shard(self) -> Shard:
         """The part of every generation that this process's search worker holds."""
         return Shard.parse(self.search_shard)
+
+    def search_cache(self, shard: Shard) -> Path:
+        """Where the search worker of a shard keeps what it fetches from a bucket."""
+        return self.placewise_home / "search-cache" / str(shard).replace("/", "-of-")
+
+    @property
+    def search_memory_bytes(self) -> int:
+        return ram_bytes() // 2 if self.search_memory_budget is None else self.search_memory_budget
 
     @property
     def search_addresses(self) -> tuple[str, ...]:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-import os
 from pathlib import Path
 
 from shared.errors import Misconfigured
+from shared.machine import ram_bytes
 from shared.recipes import Recipe
 from shared.settings import Settings
 
@@ -15,7 +15,6 @@ PARAMETER_BYTES = 4  # float32
 # batch is being decoded meanwhile. Of larger photos, fewer go through in one pass.
 BATCH_PHOTO_BYTES = 40_000_000
 PROCESS_BYTES = 1_000_000_000  # PyTorch, or CUDA's context, before any weights
-CONTAINER_LIMIT = Path("/sys/fs/cgroup/memory.max")
 
 
 def device_check(settings: Settings) -> str:
@@ -87,16 +86,6 @@ def extractor_check(settings: Settings) -> str:
     return f"{recipe.name}: weights {extractor.backbone.fingerprint[:12]} load, " + (
         f"{shipped[0].clusters} shipped centres" if shipped else "no shipped vocabulary"
     )
-
-
-def ram_bytes() -> int:
-    """The memory that this process may have: the machine's, or less in a container."""
-    machine = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    try:
-        limit = CONTAINER_LIMIT.read_text().strip()
-    except OSError:
-        return machine
-    return min(machine, int(limit)) if limit.isdigit() else machine  # "max" is no limit
 
 
 def _dinov2_check(recipe: Recipe, given: Path | None) -> str:

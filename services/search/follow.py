@@ -3,23 +3,27 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from uuid import UUID
 
 from sqlalchemy import select
 
-from services.search.snapshot import LoadedChunk, PhotoColumns, Snapshot
-from shared.catalog.chunks import Chunk, live_chunks, live_facts
+from services.search.load import Loader, hold, part_bytes
+from services.search.memory import Memory
+from services.search.photo_columns import PhotoColumns
+from services.search.snapshot import LoadedChunk, Snapshot
+from shared.catalog.chunks import live_chunks, live_facts
 from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.maps import Map
 from shared.catalog.photos import PhotoFacts, changed_since
 from shared.catalog.session import Catalog
-from shared.chunks import read_chunk
+from shared.chunks import CODED_DIMENSION
 from shared.errors import NotFound, Unavailable
-from shared.objects import ObjectStore
 from shared.shards import WHOLE, Shard
 
 log = logging.getLogger(__name__)
+
+CODED_FROM_BYTES = 64_000_000  # of rows: less is compared faster as it is
 
 FOLLOWED = (GenerationState.ACTIVE, GenerationState.BUILDING)
 
@@ -45,7 +49,8 @@ def wanted_versions(catalog: Catalog) -> dict[UUID, Wanted]:
 
 def advance(
     catalog: Catalog,
-    store: ObjectStore,
+    loader: Loader,
+    memory: Memory,
     generation_id: UUID,
     old: Snapshot | None,
     shard: Shard = WHOLE,
@@ -59,6 +64,7 @@ def advance(
     with catalog.read() as session:
         generation = session.get(Generation, generation_id)
         if generation is None:
+            memory.forget(generation_id)
             return None
         version = session.get_one(Map, generation.map_id).version
         chunks = [c for c in live_chunks(session, generation_id) if shard.owns(c.slot)]
@@ -75,29 +81,37 @@ def advance(
             loaded.append(_changed(known[chunk.id], changes))
             continue
         try:
-            loaded.append(_load(store, chunk, facts_of[chunk.id]))
+            stored = loader.rows(chunk)
         except (Unavailable, NotFound, ValueError, OSError) as error:
             log.error("chunk %s can't be served: %s", chunk.object_key, error)
             missing.append(chunk.object_key)
+            continue
+        photos = PhotoColumns.of(len(stored.rows), facts_of[chunk.id])
+        loaded.append(LoadedChunk(chunk.id, chunk.object_key, stored.rows, photos, stored=stored))
+    if sum(chunk.rows.nbytes for chunk in loaded) >= CODED_FROM_BYTES:
+        loaded = [_coded(loader, chunk) for chunk in loaded]
+    sizes = part_bytes(loaded)
+    parts = memory.parts_held(generation_id, sizes)
     return Snapshot(
         generation_id=generation_id,
         map_id=generation.map_id,
         version=version,
-        chunks=tuple(loaded),
+        chunks=tuple(hold(chunk, parts) for chunk in loaded),
         missing=tuple(missing),
-        live_rows=sum(int(chunk.photos.findable.sum()) for chunk in loaded),
-        by_key={chunk.object_key: chunk for chunk in loaded},
+        resident_bytes=sum(sizes[:parts]),
     )
 
 
-def _load(store: ObjectStore, chunk: Chunk, facts: list[tuple[int, PhotoFacts]]) -> LoadedChunk:
-    rows = read_chunk(store, chunk.object_key, chunk.sha256)
-    return LoadedChunk(chunk.id, chunk.object_key, rows, PhotoColumns.of(len(rows), facts))
+def _coded(loader: Loader, chunk: LoadedChunk) -> LoadedChunk:
+    """The chunk with its codes, where rows of this length have any."""
+    stored = chunk.stored
+    if stored is None or stored.codes is not None or stored.rows.shape[1] < CODED_DIMENSION:
+        return chunk
+    codes = loader.codes(chunk.object_key, stored)
+    return replace(chunk, codes=codes, stored=replace(stored, codes=codes))
 
 
 def _changed(chunk: LoadedChunk, changes: dict[UUID, PhotoFacts]) -> LoadedChunk:
     """The chunk with what has changed of its photos; itself when nothing has."""
     photos = chunk.photos.changed(changes) if changes else chunk.photos
-    if photos is chunk.photos:
-        return chunk
-    return LoadedChunk(chunk.chunk_id, chunk.object_key, chunk.rows, photos)
+    return chunk if photos is chunk.photos else replace(chunk, photos=photos)

@@ -1,49 +1,53 @@
-"""Which rows of a chunk may be answered: the filter of a search as a mask."""
+"""Which rows may be answered: the filter of a search as a mask."""
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from uuid import UUID
 
 import numpy as np
 from numpy.typing import NDArray
 
-from services.search.snapshot import PhotoColumns, as_microseconds
+from services.search.photo_columns import LOW, JoinedColumns, PhotoColumns, as_microseconds
 from shared.geodesy import distances_m
 from shared.photo_filter import Box, PhotoFilter
 
 Mask = NDArray[np.bool_]
+Columns = PhotoColumns | JoinedColumns
 
 
-def select(photos: PhotoColumns, wanted: PhotoFilter, exclude: Collection[UUID]) -> Mask:
+def select(photos: Columns, wanted: PhotoFilter, exclude: Collection[UUID]) -> Mask:
     """(n,) bool: findable photos that pass the filter and are not excluded.
 
-    The same photos that `catalog.metadata_search.filter_conditions` lets pass in SQL.
+    The same photos that `catalog.metadata_search.filter_conditions` lets pass in SQL. What reads
+    an index goes first; what computes is computed for the rows that are left.
     """
     mask = photos.findable.copy()
-    if wanted.near is not None:
-        here = wanted.near
-        away = distances_m(here.latitude, here.longitude, photos.latitude, photos.longitude)
-        mask &= away <= here.radius_m  # False for NaN: without coordinates
-    if wanted.box is not None:
-        mask &= _inside(photos, wanted.box)
+    if wanted.ids is not None:
+        mask &= _one_of(photos, wanted.ids)
+    if wanted.place is not None:
+        mask &= _among(photos.rows_by_place, wanted.place, len(mask))
+    for tag in wanted.tags:
+        mask &= _among(photos.rows_by_tag, tag, len(mask))
+    if exclude:
+        mask &= ~_one_of(photos, exclude)
     if wanted.captured_after is not None:
         mask &= photos.captured_at >= as_microseconds(wanted.captured_after)
     if wanted.captured_before is not None:
         mask &= photos.captured_at <= as_microseconds(wanted.captured_before)
-    if wanted.place is not None:
-        mask &= photos.place == wanted.place
-    if wanted.ids is not None:
-        mask &= _one_of(photos, wanted.ids)
-    if wanted.tags:
-        tags = frozenset(wanted.tags)
-        mask &= np.fromiter((tags <= has for has in photos.tags), bool, len(mask))
-    if exclude:
-        mask &= ~_one_of(photos, exclude)
+    if wanted.box is not None:
+        mask &= _inside(photos, wanted.box)
+    if wanted.near is not None:
+        here = wanted.near
+        left = np.flatnonzero(mask)
+        away = distances_m(
+            here.latitude, here.longitude, photos.latitude[left], photos.longitude[left]
+        )
+        mask[left] = away <= here.radius_m  # False for NaN: without coordinates
     return mask
 
 
-def _inside(photos: PhotoColumns, box: Box) -> Mask:
+def _inside(photos: Columns, box: Box) -> Mask:
     longitude = np.abs(photos.latitude) == 90.0
     for west, east in box.longitude_ranges():
         longitude |= (photos.longitude >= west) & (photos.longitude <= east)
@@ -51,6 +55,17 @@ def _inside(photos: PhotoColumns, box: Box) -> Mask:
     return inside
 
 
-def _one_of(photos: PhotoColumns, ids: Collection[UUID]) -> Mask:
+def _among(rows: Mapping[str, NDArray[np.intp]], text: str, count: int) -> Mask:
+    mask = np.zeros(count, bool)
+    if text in rows:
+        mask[rows[text]] = True
+    return mask
+
+
+def _one_of(photos: Columns, ids: Collection[UUID]) -> Mask:
+    ends = np.array([id_.int & LOW for id_ in ids], np.uint64)
+    mask = np.isin(photos.id_ends, ends)
+    found = np.flatnonzero(mask)
     wanted = frozenset(ids)
-    return np.fromiter((id_ in wanted for id_ in photos.photo_id), bool, len(photos.photo_id))
+    mask[found] = np.fromiter((id_ in wanted for id_ in photos.ids(found)), bool, len(found))
+    return mask

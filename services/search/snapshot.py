@@ -2,93 +2,56 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, fields
-from datetime import UTC, datetime
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
 from uuid import UUID
 
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.catalog.photos import PhotoFacts
+from services.search.local_files import Mapped
+from services.search.photo_columns import JoinedColumns, PhotoColumns
 from shared.chunks import Rows
 
-EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
-NEVER = np.datetime64("NaT", "us")
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PhotoColumns:
-    """What is known of the photo of each of a chunk's n rows: arrays of length n.
-
-    A row without a live photo has `photo_id` None. `findable`: live, and not a labelled query.
-    """
-
-    photo_id: NDArray[np.object_]
-    findable: NDArray[np.bool_]
-    latitude: NDArray[np.float64]
-    """Degrees; NaN where the photo has no coordinates."""
-    longitude: NDArray[np.float64]
-    captured_at: NDArray[np.datetime64]
-    """UTC, microseconds; NaT where unknown."""
-    place: NDArray[np.object_]
-    tags: NDArray[np.object_]
-    """A frozenset of texts a row."""
-
-    @classmethod
-    def of(cls, rows: int, facts: Iterable[tuple[int, PhotoFacts]]) -> PhotoColumns:
-        """(row, photo) pairs as columns of `rows` rows; rows without a photo are dead."""
-        columns = cls(
-            photo_id=np.full(rows, None, dtype=object),
-            findable=np.zeros(rows, dtype=bool),
-            latitude=np.full(rows, np.nan),
-            longitude=np.full(rows, np.nan),
-            captured_at=np.full(rows, NEVER),
-            place=np.full(rows, None, dtype=object),
-            tags=np.full(rows, frozenset(), dtype=object),
-        )
-        for row, photo in facts:
-            columns._set(row, photo)
-        return columns
-
-    def changed(self, changes: Mapping[UUID, PhotoFacts]) -> PhotoColumns:
-        """The columns with what has changed; itself when none of the photos is here."""
-        here = [(row, changes[id_]) for row, id_ in enumerate(self.photo_id) if id_ in changes]
-        if not here:
-            return self
-        copy = PhotoColumns(*(getattr(self, column.name).copy() for column in fields(self)))
-        for row, photo in here:
-            copy._set(row, photo)
-        return copy
-
-    def _set(self, row: int, photo: PhotoFacts) -> None:
-        self.photo_id[row] = photo.photo_id
-        self.findable[row] = photo.findable
-        self.latitude[row] = np.nan if photo.latitude is None else photo.latitude
-        self.longitude[row] = np.nan if photo.longitude is None else photo.longitude
-        self.captured_at[row] = as_microseconds(photo.captured_at)
-        self.place[row] = photo.place
-        self.tags[row] = frozenset(photo.tags)
-
-
-def as_microseconds(when: datetime | None) -> np.datetime64:
-    """An aware datetime as NumPy's UTC microseconds."""
-    if when is None:
-        return NEVER
-    return np.datetime64(when.astimezone(UTC).replace(tzinfo=None), "us")
+if TYPE_CHECKING:  # numba takes a while to load, and small maps need no codes
+    from services.search.cascade import Blocks
+    from shared.codes.signs import SignCodes
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoadedChunk:
-    """Rows in memory, (n, dimension) float32, and what is known of their photos."""
+    """A chunk's rows, (n, dimension) float32, and what is known of their photos."""
 
     chunk_id: UUID
     object_key: str
     rows: Rows
     photos: PhotoColumns
+    codes: SignCodes | None = None
+    """None while search does without."""
+    stored: StoredChunk | None = None
+    """Where rows and codes lie on the disk; None for rows that were never there."""
+
+    def read_ahead(self, row: int) -> None:
+        """Say that a row is read next, where it is mapped from a file."""
+        if self.stored is not None and self.rows is self.stored.rows:
+            size_bytes = self.rows.strides[0]
+            begin = self.stored.file.size_bytes - self.rows.nbytes  # a header goes before
+            self.stored.file.read_ahead(begin + row * size_bytes, size_bytes)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class StoredChunk:
+    """A chunk's files, mapped into memory."""
+
+    file: Mapped
+    rows: Rows
+    sha256: str
+    codes: SignCodes | None = None
+
+
+@dataclass(frozen=True, eq=False)
 class Snapshot:
     """A generation's chunks at `version` of its map; `missing` names objects that can't be read."""
 
@@ -97,10 +60,43 @@ class Snapshot:
     version: int
     chunks: tuple[LoadedChunk, ...]
     missing: tuple[str, ...] = ()
-    live_rows: int = 0
-    by_key: Mapping[str, LoadedChunk] = field(default_factory=dict)
-    """The loaded chunks by their object's key."""
+    resident_bytes: int = 0
+    """Of rows and codes that are held in memory; the rest is mapped from files."""
+
+    @cached_property
+    def by_key(self) -> Mapping[str, LoadedChunk]:
+        """The loaded chunks by their object's key."""
+        return {chunk.object_key: chunk for chunk in self.chunks}
+
+    @cached_property
+    def photos(self) -> JoinedColumns:
+        """Of the rows of all chunks, one after the other."""
+        return JoinedColumns([chunk.photos for chunk in self.chunks])
+
+    @cached_property
+    def live_rows(self) -> int:
+        return int(self.photos.findable.sum())
 
     @property
-    def resident_bytes(self) -> int:
+    def row_bytes(self) -> int:
         return sum(chunk.rows.nbytes for chunk in self.chunks)
+
+    @cached_property
+    def coded(self) -> bool:
+        """Whether every chunk has its codes."""
+        return bool(self.chunks) and all(chunk.codes is not None for chunk in self.chunks)
+
+    def read_ahead(self, rows: NDArray[np.int64]) -> None:
+        """Say that these rows are read next, where they are mapped from a file."""
+        first = self.photos.first
+        chunks = np.searchsorted(first, rows, side="right") - 1
+        inside = rows - first[chunks]
+        for number, row in zip(chunks.tolist(), inside.tolist(), strict=True):
+            self.chunks[number].read_ahead(row)
+
+    @cached_property
+    def blocks(self) -> Blocks:
+        """Where the codes and rows of a coded snapshot lie."""
+        from services.search.cascade import Blocks
+
+        return Blocks.of(self.chunks)

@@ -10,17 +10,20 @@ from uuid import UUID
 
 from sqlalchemy.exc import SQLAlchemyError
 
+from services.search.answer import Question, answer
 from services.search.follow import FOLLOWED, advance, wanted_versions
 from services.search.lag import Lags
+from services.search.load import Loader
+from services.search.memory import Memory
 from services.search.query_row import QueryRows, expired
-from services.search.scan import top_k
+from services.search.select import select
 from services.search.snapshot import Snapshot
 from shared.catalog.away import Outage
 from shared.catalog.generations import GenerationState
 from shared.catalog.session import Catalog
 from shared.errors import Unavailable
 from shared.objects import ObjectStore
-from shared.search_protocol import EXHAUSTIVE, Hit, SearchRequest, SearchResponse, SearchStatus
+from shared.search_protocol import SearchRequest, SearchResponse, SearchStatus
 from shared.settings import Settings
 from shared.shards import WHOLE, Shard
 
@@ -43,8 +46,9 @@ class SearchWorker:
         self.shard = shard
         self.lags = Lags()
         self._catalog = catalog
-        self._store = store
         self._settings = settings
+        self._loader = Loader(store, settings.search_cache(shard))
+        self._memory = Memory(settings.search_memory_bytes)
         self._rows = QueryRows(store)
         self._snapshots: dict[UUID, Snapshot] = {}
         self._swap = threading.Lock()  # held for a moment, never while something is read
@@ -84,25 +88,31 @@ class SearchWorker:
             if snapshot is None or snapshot.version < now.version or snapshot.missing:
                 self._advance(generation_id, now.version)
             self.lags.level(generation_id, looked_at)
+        for generation_id in self._snapshots.keys() - wanted.keys():
+            self._memory.forget(generation_id)
         with self._swap:
             self._snapshots = {k: v for k, v in self._snapshots.items() if k in wanted}
             self._loading = {k: v for k, v in self._loading.items() if k in wanted or v.locked()}
 
     def search(self, request: SearchRequest) -> SearchResponse:
         snapshot = self._snapshot(request.generation_id, request.min_version)
-        hits, scanned, reranked = top_k(
-            snapshot.chunks,
-            self._rows.find(snapshot, request),
-            request.k,
+        query = self._rows.find(snapshot, request)
+        asked = select(snapshot.photos, request.photos, request.exclude)
+        question = Question(
+            k=request.k,
             min_score=request.min_score,
-            wanted=request.photos,
-            exclude=frozenset(request.exclude),
+            mode=request.mode,
+            most_rows=request.most_rows,
+            most_seconds=request.most_seconds,
         )
+        found = answer(snapshot, query, asked, question)
         return SearchResponse(
-            hits=tuple(Hit(photo_id=photo_id, score=score) for photo_id, score in hits),
-            certificate=EXHAUSTIVE,
-            rows_scanned=scanned,
-            rows_reranked=reranked,
+            hits=found.hits,
+            certificate=found.certificate,
+            certified_k=found.certified_k,
+            rows_scanned=found.rows_scanned,
+            rows_reranked=found.rows_reranked,
+            max_z=found.max_z,
             snapshot_version=snapshot.version,
             missing=snapshot.missing,
         )
@@ -147,7 +157,7 @@ class SearchWorker:
             old = self._snapshots.get(generation_id)
             if old is not None and old.version >= version and not old.missing:
                 return old  # another thread loaded it while this one waited
-            new = advance(self._catalog, self._store, generation_id, old, self.shard)
+            new = advance(self._catalog, self._loader, self._memory, generation_id, old, self.shard)
             if new is not None:
                 with self._swap:
                     self._snapshots = {**self._snapshots, generation_id: new}

@@ -23,7 +23,7 @@ from shared.catalog.maps import bump_version, lock_map
 from shared.catalog.photos import Photo
 from shared.catalog.session import Catalog
 from shared.catalog.vocabularies import Vocabulary
-from shared.chunks import delete_chunk
+from shared.chunks import codes_key, delete_chunk, manifest_key
 from shared.jobs.batches import BatchItem
 from shared.jobs.table import MODEL_CHANGES, UNFINISHED, Job, JobKind, JobState
 from shared.objects import ObjectStore
@@ -275,9 +275,9 @@ def _known_thumbnails(session: Session, keys: list[str]) -> Iterable[str]:
 
 
 def _known_chunks(session: Session, keys: list[str]) -> Iterable[str]:
-    arrays = {key.removesuffix(".json").removesuffix(".npy") + ".npy" for key in keys}
+    arrays = {key.rpartition(".")[0] + ".npy" for key in keys}
     known = session.scalars(select(Chunk.object_key).where(Chunk.object_key.in_(arrays)))
-    return [name for key in known for name in (key, key.removesuffix(".npy") + ".json")]
+    return [name for key in known for name in (key, manifest_key(key), codes_key(key))]
 
 
 def _known_vocabularies(session: Session, keys: list[str]) -> Iterable[str]:

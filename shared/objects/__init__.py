@@ -8,7 +8,7 @@
 | `incoming/<upload>` | what a caller sent straight to the bucket, until the upload is completed |
 | `archives/<uuid>` | an uploaded archive, until its photos are in |
 | `thumbnails/<photo>` | its thumbnail, JPEG |
-| `chunks/<generation>/<chunk>.npy`, `.json` | descriptor rows, and what they are |
+| `chunks/<generation>/<chunk>.npy`, `.json`, `.codes` | descriptor rows, what they are, codes |
 | `vocabularies/<uuid>.npy` | VLAD centres |
 | `queries/<job>`, `queries/<job>.npy` | a query photo that is not stored, and its descriptor |
 | `work/<job>/...` | what a sliced job keeps between its slices |

@@ -81,6 +81,9 @@ class FolderStore:
             file.seek(begin)
             return file.read(size_bytes)
 
+    def file(self, key: str) -> Path | None:
+        return self.path(key)
+
     def head(self, key: str) -> ObjectInfo | None:
         try:
             status = self.path(key).stat()

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import datetime
+from pathlib import Path
 from typing import BinaryIO, Protocol
 
 
@@ -66,6 +67,10 @@ class ObjectStore(Protocol):
     def read_range(self, key: str, begin: int, size_bytes: int) -> bytes:
         """Up to `size_bytes` from the offset `begin`, fewer only where the object ends before; for
         readers that rest between two ranges longer than a server keeps a connection."""
+
+    def file(self, key: str) -> Path | None:
+        """The file that an object is, where objects are files of this machine: it may be read and
+        mapped, never written. None elsewhere."""
 
     def head(self, key: str) -> ObjectInfo | None: ...
 

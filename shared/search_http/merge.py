@@ -6,15 +6,18 @@ import heapq
 from collections.abc import Iterable, Mapping, Sequence
 from uuid import UUID
 
-from shared.search_protocol import CERTIFICATES, Hit, SearchResponse, SearchStatus
+from shared.search_protocol import CERTIFICATES, NONE, Hit, SearchResponse, SearchStatus
 from shared.shards import Shard
 
 
 def merge(answers: Sequence[SearchResponse], k: int, away: Iterable[Shard] = ()) -> SearchResponse:
     """The first `k` hits of all, and what has to be known of the way to them: the sums, the least
     version, the weakest certificate. `away` are the shards that are missing, and are named."""
+    hits = _first(k, answers)
     return SearchResponse(
-        hits=tuple(_first(k, answers)),
+        hits=tuple(hits),
+        certified_k=_certified(hits, answers),
+        max_z=max((answer.max_z for answer in answers if answer.max_z is not None), default=None),
         certificate=max((answer.certificate for answer in answers), key=_weakness),
         rows_scanned=sum(answer.rows_scanned for answer in answers),
         rows_reranked=sum(answer.rows_reranked for answer in answers),
@@ -36,6 +39,17 @@ def _first(k: int, answers: Sequence[SearchResponse]) -> list[Hit]:
         # Two shards may be at two versions, between which a photo was described anew.
         found.setdefault(hit.photo_id, hit)
     return list(found.values())
+
+
+def _certified(hits: Sequence[Hit], answers: Sequence[SearchResponse]) -> int:
+    """How many of the first hits no shard may have a better one for: a shard that gave up vouches
+    for what scores at least as high as the last hit that it is certain of."""
+    sure = -1.0
+    for answer in answers:
+        if answer.certified_k < len(answer.hits) or answer.certificate == NONE:
+            last = answer.certified_k - 1
+            sure = max(sure, answer.hits[last].score if last >= 0 else 2.0)
+    return sum(hit.score >= sure for hit in hits)
 
 
 def _weakness(certificate: str) -> int:

@@ -9,8 +9,8 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as some
 from sqlalchemy import delete, select
 
+from services.search.photo_columns import PhotoColumns
 from services.search.select import select as select_rows
-from services.search.snapshot import PhotoColumns
 from shared.catalog.metadata_search import MetadataFilter, filter_conditions, search_metadata
 from shared.catalog.photos import Photo, PhotoFacts, PhotoRole
 from shared.catalog.session import Catalog

@@ -10,8 +10,10 @@ import pytest
 import torch
 
 from services.cli import extractor_checks
-from services.cli.extractor_checks import device_check, extractor_check, memory_check, ram_bytes
+from services.cli.extractor_checks import device_check, extractor_check, memory_check
+from shared import machine
 from shared.errors import Misconfigured
+from shared.machine import ram_bytes
 from shared.settings import Settings
 from shared.vision.backbones import dinov2
 from shared.vision.backbones.dinov2 import SHAPES
@@ -173,9 +175,9 @@ def test_ram_that_is_too_small_is_found_out(monkeypatch: pytest.MonkeyPatch) -> 
 
 def test_ram_of_a_container_is_its_limit(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     limit = tmp_path / "memory.max"
-    monkeypatch.setattr(extractor_checks, "CONTAINER_LIMIT", limit)
-    machine = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    assert ram_bytes() == machine
-    for written, expected in (("max\n", machine), ("1000000\n", 1_000_000), ("9" * 30, machine)):
+    monkeypatch.setattr(machine, "CONTAINER_LIMIT", limit)
+    whole = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    assert ram_bytes() == whole
+    for written, expected in (("max\n", whole), ("1000000\n", 1_000_000), ("9" * 30, whole)):
         limit.write_text(written)
         assert ram_bytes() == expected

@@ -12,9 +12,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from services.search.scan import FLOAT32_MARGIN, top_k
-from services.search.snapshot import LoadedChunk, PhotoColumns
+from services.search.answer import DECIMALS, Answer, Question, answer
+from services.search.photo_columns import PhotoColumns
+from services.search.scan import FLOAT32_MARGIN
+from services.search.select import select
+from services.search.snapshot import LoadedChunk, Snapshot
 from shared.ids import new_id
+from shared.photo_filter import EVERYTHING
 from tests.support.photo_facts import facts_of
 
 Rows = NDArray[np.float32]
@@ -56,7 +60,7 @@ def brute_force(
     exact = query.astype(np.float64)
     exact /= np.linalg.norm(exact)
     scored = [
-        (-float(np.clip(row.astype(np.float64) @ exact, -1, 1)), photo(number))
+        (-round(float(np.clip(row.astype(np.float64) @ exact, -1, 1)), DECIMALS), photo(number))
         for row, number in zip(rows, numbers, strict=True)
         if number not in dead
     ]
@@ -70,7 +74,18 @@ def hits_of(
     min_score: float | None = None,
     exclude: frozenset[UUID] = frozenset(),
 ) -> list[tuple[UUID, float]]:
-    return top_k(chunks, query, k, min_score=min_score, exclude=exclude)[0]
+    found = ask(chunks, query, Question(k, min_score), exclude)
+    return [(hit.photo_id, hit.score) for hit in found.hits]
+
+
+def ask(
+    chunks: list[LoadedChunk],
+    query: Rows,
+    question: Question,
+    exclude: frozenset[UUID] = frozenset(),
+) -> Answer:
+    snapshot = Snapshot(new_id(), new_id(), 1, tuple(chunks))
+    return answer(snapshot, query, select(snapshot.photos, EVERYTHING, exclude), question)
 
 
 @settings(max_examples=80, deadline=None)
@@ -108,10 +123,12 @@ def test_answers_equal_brute_force_with_order_and_ties(
         return
     chunks = split(rows, pieces, numbers, dead)
     expected = brute_force(rows, numbers, query, k, dead)
-    found, scanned, reranked = top_k(chunks, query, k)
-    assert found == expected
-    assert scanned == count - len(dead)
-    assert len(expected) <= reranked <= scanned
+    found = ask(chunks, query, Question(k))
+    assert [(hit.photo_id, hit.score) for hit in found.hits] == expected
+    assert found.certificate == "exhaustive"
+    assert found.certified_k == len(expected)
+    assert found.rows_scanned == count - len(dead)
+    assert len(expected) <= found.rows_reranked <= found.rows_scanned
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -139,7 +156,7 @@ def test_scores_equal_exact_arithmetic() -> None:
         products = (
             Fraction(float(a)) * Fraction(float(b)) for a, b in zip(row, query, strict=True)
         )
-        assert score == pytest.approx(float(sum(products)) / length, abs=1e-14)
+        assert score == pytest.approx(float(sum(products)) / length, abs=1e-12)
 
 
 def test_margin_covers_what_float32_sums_err_at_98304_dimensions() -> None:
@@ -196,9 +213,10 @@ def test_fewer_rows_than_asked_are_all_answered() -> None:
 
 def test_nothing_loaded_answers_nothing() -> None:
     query = unit_rows(1, 1, 4)[0]
-    assert top_k([], query, 5) == ([], 0, 0)
+    nothing = Answer((), "exhaustive", 0, 0, 0)
+    assert ask([], query, Question(5)) == nothing
     empty = chunk_of(np.empty((0, 4), dtype=np.float32), [])
-    assert top_k([empty], query, 5) == ([], 0, 0)
+    assert ask([empty], query, Question(5)) == nothing
 
 
 def test_empty_chunk_between_others_shifts_nothing() -> None:

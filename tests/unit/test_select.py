@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as some
 
+from services.search.photo_columns import PhotoColumns
 from services.search.select import select
-from services.search.snapshot import PhotoColumns
 from shared.catalog.photos import PhotoFacts, PhotoRole
 from shared.photo_filter import EVERYTHING, Box, Circle, PhotoFilter
 from tests.support.photo_facts import facts_of

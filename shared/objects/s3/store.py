@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from datetime import UTC
+from pathlib import Path
 from typing import BinaryIO
 
 from minio.commonconfig import REPLACE, CopySource
@@ -46,6 +47,9 @@ class S3Store:
 
     def read_range(self, key: str, begin: int, size_bytes: int) -> bytes:
         return read_range(self.bucket, check_key(key), begin, size_bytes)
+
+    def file(self, key: str) -> Path | None:
+        return None
 
     def head(self, key: str) -> ObjectInfo | None:
         check_key(key)

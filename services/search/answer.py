@@ -1,0 +1,117 @@
+"""One query on one snapshot: which way to search, and what can be said of the answer."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from uuid import UUID
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.search.scan import scan
+from services.search.snapshot import Snapshot
+from shared.search_protocol import EXHAUSTIVE, NONE, STATISTICAL, Hit, Mode
+
+# One row in ten million is further off: then the codes are not trusted.
+MOST_Z = 5.5
+
+# Equal rows are equal however they were added up, and then the photos' ids decide.
+DECIMALS = 12
+
+# Fewer rows are compared exactly at once: as many as the codes would leave anyway.
+FEW_ROWS = 64
+
+Rows = NDArray[np.int64]
+Scores = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Question:
+    """The `k` most similar rows, of those that score at least `min_score`; and when to give up."""
+
+    k: int
+    min_score: float | None = None
+    mode: Mode = Mode.AUTO
+    most_rows: int | None = None
+    most_seconds: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """Hits in order, and how they were found, as `SearchResponse` tells it."""
+
+    hits: tuple[Hit, ...]
+    certificate: str
+    certified_k: int
+    rows_scanned: int
+    rows_reranked: int
+    max_z: float | None = None
+
+
+def answer(
+    snapshot: Snapshot,
+    query: NDArray[np.float32],
+    asked: NDArray[np.bool_],
+    question: Question,
+) -> Answer:
+    """Ask with a row, (dimension,) float32 of any length, for the snapshot's rows of `asked`, (n,).
+
+    A query of zeros is similar to nothing.
+    """
+    selected = int(np.count_nonzero(asked))
+    if not selected or not query.any():
+        return Answer((), EXHAUSTIVE, 0, 0, 0)
+    if snapshot.coded and question.mode == Mode.AUTO and selected > FEW_ROWS + 4 * question.k:
+        found = _by_codes(snapshot, query, asked, question)
+        if found is not None:
+            return found
+    rows, scores = scan(snapshot.chunks, query, question.k, asked)
+    hits = _ranked(snapshot, rows, scores, question)
+    return Answer(hits, EXHAUSTIVE, len(hits), selected, len(rows))
+
+
+def _by_codes(
+    snapshot: Snapshot, query: NDArray[np.float32], asked: NDArray[np.bool_], question: Question
+) -> Answer | None:
+    """None when an estimate was further off than chance explains."""
+    from services.search.cascade import Budget, CodedQuery, Refinement, glance
+    from shared.codes.rotation import rotation
+
+    until = question.most_seconds and time.monotonic() + question.most_seconds
+    coded = CodedQuery.of(query, rotation(len(query)))
+    first = glance(snapshot.blocks, coded, asked)
+    refinement = Refinement(
+        snapshot.blocks, coded, question.k, question.min_score, snapshot.read_ahead
+    )
+    found = refinement.search(first, Budget(question.most_rows, until))
+    if found.max_z > MOST_Z:
+        return None
+    hits = _ranked(snapshot, found.rows, found.scores, question)
+    certified = sum(hit.score > found.unseen for hit in hits)
+    return Answer(
+        hits,
+        STATISTICAL if found.whole else NONE,
+        certified,
+        found.scanned,
+        len(found.rows),
+        found.max_z,
+    )
+
+
+def _ranked(snapshot: Snapshot, rows: Rows, scores: Scores, question: Question) -> tuple[Hit, ...]:
+    """By score, highest first, ties by photo id."""
+    scores = np.clip(np.round(scores, DECIMALS), -1.0, 1.0)
+    if question.min_score is not None:
+        enough = scores >= question.min_score
+        rows, scores = rows[enough], scores[enough]
+    if len(rows) > question.k:
+        kth = np.partition(scores, len(scores) - question.k)[len(scores) - question.k]
+        best = scores >= kth
+        rows, scores = rows[best], scores[best]
+    ranked: list[tuple[float, UUID]] = sorted(
+        (-score, photo_id)
+        for score, photo_id in zip(scores.tolist(), snapshot.photos.ids(rows), strict=True)
+        if photo_id is not None
+    )
+    return tuple(Hit(photo_id=photo_id, score=-score) for score, photo_id in ranked[: question.k])

@@ -1,0 +1,373 @@
+"""Exact top-k by sign codes: most rows are told apart from the best by a few of their bits.
+
+1. The first bits of every row are compared with the query's. The rows that look best are compared
+   exactly: their k-th score is a floor for the answer.
+2. A row goes on to the next level while its estimate, plus BOUND standard deviations, reaches the
+   floor: more bits, then all bits, then all bits weighted with the query (`shared.codes.signs`).
+3. What is left is compared exactly, best estimate first. The floor rises on the way, and the first
+   row whose bound does not reach it ends the search.
+
+The scores are exact. That none is missed rests on the bound: an error of more than BOUND standard
+deviations of a random rotation, 1 in 10^9 for a row. Each row that is compared exactly also shows
+how far off its estimates were: `max_z`, in standard deviations.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.search.kernels import (
+    NOT_ASKED,
+    PLANES,
+    distances,
+    distances_at,
+    in_planes,
+    products_at,
+    squares,
+    weighted_at,
+)
+from services.search.snapshot import LoadedChunk
+from shared.codes.rotation import Rotation, rotation
+from shared.codes.signs import WORD, Words, level_words
+
+BOUND = 6.0
+FIRST_LOOK = 64  # rows whose whole codes are looked at early, for a floor
+FEW = 4 * FIRST_LOOK
+STEP = 8  # rows compared exactly between two looks at the floor
+
+Addresses = NDArray[np.uint64]
+Indices = NDArray[np.int64]
+Scores = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Blocks:
+    """Where the codes and the rows of n photos lie, in c blocks; who makes it keeps them alive."""
+
+    dimension: int
+    first: NDArray[np.int64]
+    """(c + 1,): the number of each block's first row; the last is n."""
+    levels: tuple[Addresses, ...]
+    """(c,) for each level of the codes: where the block's begin."""
+    rows: Addresses
+    """(c,): where the block's float32 rows begin."""
+    norms: NDArray[np.float32]
+    """(n,): |x|_1 of each rotated row; 0 for a row of zeros."""
+    zeros: Indices
+    """The rows of zeros."""
+    kept: object = None
+    """What has to live as long."""
+
+    @classmethod
+    def of(cls, chunks: Sequence[LoadedChunk]) -> Blocks:
+        """Those of chunks that have their codes."""
+        codes = [chunk.codes for chunk in chunks]
+        norms = np.concatenate([code.norms for code in codes])
+        return cls(
+            dimension=chunks[0].rows.shape[1],
+            first=np.cumsum([0, *(len(chunk.rows) for chunk in chunks)]),
+            levels=tuple(map(_addresses, zip(*(code.levels for code in codes), strict=True))),
+            rows=_addresses([chunk.rows for chunk in chunks]),
+            norms=norms,
+            zeros=np.flatnonzero(norms == 0),
+            kept=chunks,
+        )
+
+    def __len__(self) -> int:
+        return int(self.first[-1])
+
+    def at(self, begins: Addresses, indices: Indices, bytes_each: int) -> Addresses:
+        """The addresses of these rows in blocks that begin at `begins`."""
+        block = np.searchsorted(self.first, indices, side="right") - 1
+        inside = (indices - self.first[block]).astype(np.uint64)
+        return begins[block] + inside * np.uint64(bytes_each)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CodedQuery:
+    """A query as the codes need it."""
+
+    row: NDArray[np.float32]
+    """(dimension,) as it was asked, of any length but 0."""
+    norm: float
+    bits: Words
+    """(words,)"""
+    planes: Words
+    """(PLANES, words): bit p of the whole number, 0 to 2^PLANES - 1, that each number of the
+    rotated query is brought to."""
+    low: float
+    step: float
+    """A whole number w stands for low + step * w."""
+    total: float
+    """The sum of what they stand for."""
+    share: float
+    """Their product with the rotated unit query, by which products with them are divided."""
+    blur: float
+    """How far off they are, squared, once they are divided so."""
+
+    @classmethod
+    def of(cls, row: NDArray[np.float32], turn: Rotation) -> CodedQuery:
+        rotated = turn.rotate(row[np.newaxis])[0]
+        bits = np.empty(turn.padded // WORD, np.uint64)
+        planes = np.empty((PLANES, len(bits)), np.uint64)
+        low, step, total, product, square = in_planes(rotated, bits, planes)
+        norm = math.sqrt(squares(row))
+        return cls(
+            row=row,
+            norm=norm,
+            bits=bits,
+            planes=planes,
+            low=low,
+            step=step,
+            total=total,
+            share=product / norm,
+            blur=max(0.0, square * norm**2 / product**2 - 1.0),
+        )
+
+
+def _addresses(arrays: Iterable[NDArray[Any]]) -> Addresses:
+    return np.array([array.ctypes.data for array in arrays], np.uint64)
+
+
+@dataclass(slots=True)
+class Budget:
+    """When to give up: an answer that was cut short says so."""
+
+    rows: int | None = None
+    """So many are compared exactly, and no more."""
+    until: float | None = None
+    """Of time.monotonic()."""
+
+    def spent(self, rows: int) -> bool:
+        if self.rows is not None and rows >= self.rows:
+            return True
+        return self.until is not None and time.monotonic() >= self.until
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Found:
+    """Every row that was compared exactly, and what is known of the others."""
+
+    rows: Indices
+    scores: Scores
+    """Cosines, float64; not sorted."""
+    scanned: int
+    max_z: float
+    """The largest error of an estimate, in its standard deviations, of the rows compared."""
+    unseen: float
+    """No other row reaches more than this (up to BOUND); -inf where none can matter."""
+
+    @property
+    def whole(self) -> bool:
+        """Whether it did not end early."""
+        return self.unseen == -math.inf
+
+    @classmethod
+    def nothing(cls, first: Glance, unseen: float) -> Found:
+        """Given up before any row was compared exactly."""
+        scanned = int(first.counts.sum())
+        return cls(np.empty(0, np.int64), np.empty(0), scanned, 0.0, unseen)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Glance:
+    """How many of the first bits of every row differ from a query's."""
+
+    distances: NDArray[np.uint16]
+    """(n,); NOT_ASKED for rows that were not asked for."""
+    counts: NDArray[np.int64]
+    """(bits + 1,): how many rows have each distance."""
+
+    def nearest(self, wanted: int) -> Indices:
+        """About `wanted` rows of the smallest distances: more where many are equal."""
+        reached = np.searchsorted(np.cumsum(self.counts), min(wanted, int(self.counts.sum())))
+        return np.flatnonzero(self.distances <= reached)[: 4 * wanted]
+
+
+def glance(blocks: Blocks, query: CodedQuery, asked: NDArray[np.bool_]) -> Glance:
+    """Compare the first bits of the rows that are asked for, (n,) bool."""
+    words = level_words(rotation(blocks.dimension).padded)[0]
+    found = np.empty(len(blocks), np.uint16)
+    counts = np.zeros(words * WORD + 1, np.int64)
+    bits = query.bits[:words]
+    distances(blocks.levels[0], blocks.first, asked, bits, 0, len(blocks), found, counts)
+    return Glance(found, counts)
+
+
+def hamming_deviation(bits: int, padded: int) -> float:
+    """Standard deviation, at most, of the cosine from `bits` of `padded` signs on both sides.
+
+    (pi / 2) sqrt((1 - (2 / pi)^2 bits / padded) / bits): the signs of one rotation know of each
+    other, the more of them are compared.
+    """
+    return math.pi / 2 * math.sqrt((1 - (2 / math.pi) ** 2 * bits / padded) / bits)
+
+
+class Refinement:
+    """From a glance at every row to the k best."""
+
+    def __init__(
+        self,
+        blocks: Blocks,
+        query: CodedQuery,
+        k: int,
+        least: float | None,
+        read_ahead: Callable[[Indices], None],
+    ) -> None:
+        """`least`: rows below this score are not wanted. `read_ahead` is told of rows before they
+        are compared exactly."""
+        self._blocks = blocks
+        self._query = query
+        self._k = k
+        self._floor = -math.inf if least is None else least  # what a row has to reach to matter
+        self._read_ahead = read_ahead
+        self._padded = rotation(blocks.dimension).padded
+        self._words = level_words(self._padded)
+        self._ends = np.cumsum(self._words)
+        self._estimated = _Estimates.none()
+
+    def search(self, first: Glance, budget: Budget) -> Found:
+        """Go through the levels with what the first one has shown."""
+        self._raise_floor(first.nearest(max(FIRST_LOOK, self._k)))
+        rows = np.flatnonzero(first.distances <= self._limit(0))
+        differ = first.distances[rows].astype(np.int64)
+        last = len(self._words) - 1
+        for level in range(1, last + 1):
+            if level == last and len(rows) <= FEW:
+                break  # weighing all their bits takes no longer than counting the rest of them
+            self._count(rows, level, differ)
+            rows, differ = self._prune(rows, level, differ)
+            if len(rows) > FEW:  # a better floor spares more than it costs
+                best = np.argpartition(differ, FIRST_LOOK)[:FIRST_LOOK]
+                self._raise_floor(rows[best])
+                rows, differ = self._prune(rows, level, differ)
+            if budget.spent(0):
+                return Found.nothing(first, self._reach(level, differ))
+        zeros = self._blocks.zeros
+        rows = np.union1d(rows, zeros[first.distances[zeros] != NOT_ASKED])
+        return self._compare(self._estimate(rows), first, budget)
+
+    def _limit(self, level: int) -> int:
+        """The largest number of differing bits that may still be a row above the floor."""
+        bits = int(self._ends[level]) * WORD
+        least = self._floor - BOUND * hamming_deviation(bits, self._padded)
+        return int(bits / math.pi * math.acos(min(1.0, max(-1.0, least))))
+
+    def _reach(self, level: int, differ: Indices) -> float:
+        """The most that rows with so many differing bits can score."""
+        if not len(differ):
+            return -math.inf
+        bits = int(self._ends[level]) * WORD
+        nearest = math.cos(math.pi * int(differ.min()) / bits)
+        return nearest + BOUND * hamming_deviation(bits, self._padded)
+
+    def _count(self, rows: Indices, level: int, differ: Indices) -> None:
+        """Add the bits of a level that differ."""
+        begin, end = int(self._ends[level - 1]), int(self._ends[level])
+        at = self._blocks.at(self._blocks.levels[level], rows, 8 * (end - begin))
+        distances_at(at, self._query.bits[begin:end], differ)
+
+    def _prune(self, rows: Indices, level: int, differ: Indices) -> tuple[Indices, Indices]:
+        kept = differ <= self._limit(level)
+        return rows[kept], differ[kept]
+
+    def _raise_floor(self, rows: Indices) -> None:
+        """To what the k-th best of the rows estimated so far reaches at least."""
+        self._estimate(rows)
+        least = self._estimated.scores - BOUND * self._estimated.deviations
+        if len(least) >= self._k:
+            kth = float(np.partition(least, len(least) - self._k)[len(least) - self._k])
+            self._floor = max(self._floor, kth)
+
+    def _estimate(self, rows: Indices) -> _Estimates:
+        """The scores of these rows, estimated from their whole codes, and kept."""
+        new = np.setdiff1d(rows, self._estimated.rows, assume_unique=True)
+        if len(new):
+            self._estimated = self._estimated.joined(self._weigh(new))
+        return self._estimated.of(rows)
+
+    def _weigh(self, rows: Indices) -> _Estimates:
+        query = self._query
+        sums = np.zeros((len(rows), 2), np.int64)
+        begin = 0
+        for level, words in enumerate(self._words):
+            at = self._blocks.at(self._blocks.levels[level], rows, 8 * words)
+            weighted_at(at, query.planes[:, begin : begin + words], sums)
+            begin += words
+        norms = self._blocks.norms[rows].astype(np.float64)
+        zero = norms == 0.0
+        norms[zero] = 1.0
+        signed = 2 * (query.low * sums[:, 0] + query.step * sums[:, 1]) - query.total
+        scores = signed / (query.share * norms)
+        flat = norms**2 / self._padded
+        variances = (1 / flat - 1) / (self._padded - 1) + query.blur / (flat * self._padded)
+        deviations = np.sqrt(np.maximum(variances, 0.0))
+        scores[zero] = deviations[zero] = 0.0
+        return _Estimates(rows, scores, deviations)
+
+    def _compare(self, left: _Estimates, first: Glance, budget: Budget) -> Found:
+        """Compare what may matter exactly, best first."""
+        reach = left.scores + BOUND * left.deviations
+        order = np.argsort(-reach, kind="stable")
+        order = order[: np.count_nonzero(reach >= self._floor)]
+        rows, reach = left.rows[order], reach[order]
+        scores = np.empty(len(rows))
+        done, unseen = 0, -math.inf
+        while done < len(rows) and reach[done] >= self._floor:
+            if budget.spent(done):
+                unseen = float(reach[done])
+                break
+            # The first k are needed in any case.
+            upto = min(len(rows), max(self._k, done + STEP), budget.rows or len(rows))
+            self._read_ahead(rows[done:upto])
+            at = self._blocks.at(self._blocks.rows, rows[done:upto], 4 * self._blocks.dimension)
+            products_at(at, self._query.row, scores[done:upto])
+            scores[done:upto] /= self._query.norm
+            done = upto
+            if done >= self._k:
+                kth = float(np.partition(scores[:done], done - self._k)[done - self._k])
+                self._floor = max(self._floor, kth)
+        errors = np.abs(scores[:done] - left.scores[order[:done]])
+        sure = left.deviations[order[:done]]
+        return Found(
+            rows=rows[:done],
+            scores=scores[:done],
+            scanned=int(first.counts.sum()),
+            max_z=float(np.max(errors / np.where(sure > 0, sure, np.inf), initial=0.0)),
+            unseen=unseen,
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Estimates:
+    """Estimated scores of rows, with their standard deviations; 0 and 0 for rows of zeros."""
+
+    rows: Indices
+    """Rising."""
+    scores: Scores
+    deviations: Scores
+
+    @classmethod
+    def none(cls) -> _Estimates:
+        return cls(np.empty(0, np.int64), np.empty(0), np.empty(0))
+
+    def joined(self, others: _Estimates) -> _Estimates:
+        rows = np.concatenate([self.rows, others.rows])
+        order = np.argsort(rows)
+        return _Estimates(
+            rows[order],
+            np.concatenate([self.scores, others.scores])[order],
+            np.concatenate([self.deviations, others.deviations])[order],
+        )
+
+    def of(self, rows: Indices) -> _Estimates:
+        """Of some of these rows."""
+        at = np.searchsorted(self.rows, rows)
+        return _Estimates(rows, self.scores[at], self.deviations[at])

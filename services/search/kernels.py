@@ -1,0 +1,184 @@
+"""The compiled loops of a search: over codes, and over rows, wherever in memory they lie.
+
+Rows lie in many arrays, some of them files mapped into memory; so the loops take addresses. Who
+calls keeps the arrays alive. They hold no lock of the interpreter.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numba as nb
+import numpy as np
+from numba import types
+from numba.extending import intrinsic
+from numpy.typing import NDArray
+
+# `reassoc` lets sums run in vector lanes; each row is still added up in one fixed order.
+FAST = {"reassoc", "contract", "nsz"}
+
+NOT_ASKED = 65_535  # more than any distance
+PLANES = 4  # `weighted_at` is written for so many
+
+Words = NDArray[np.uint64]
+Addresses = NDArray[np.uint64]
+
+
+@intrinsic
+def _popcount(_typing: Any, value: types.Type) -> Any:
+    """The number of ones of a uint64."""
+
+    def generate(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
+        return builder.ctpop(arguments[0])
+
+    return types.uint64(types.uint64), generate
+
+
+def _pointer_to(element: types.Type) -> Any:
+    @intrinsic
+    def pointer(_typing: Any, _address: types.Type) -> Any:
+        """The address as a pointer."""
+
+        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+            kind = context.get_value_type(signature.return_type)
+            return builder.inttoptr(arguments[0], kind)
+
+        return types.CPointer(element)(types.uint64), generate
+
+    return pointer
+
+
+_words_at = _pointer_to(types.uint64)
+_floats_at = _pointer_to(types.float32)
+_bytes_at = _pointer_to(types.int8)
+
+
+@nb.njit(nogil=True, cache=True, fastmath=FAST)
+def distances(
+    blocks: Addresses,
+    first: NDArray[np.int64],
+    asked: NDArray[np.bool_],
+    query: Words,
+    begin: int,
+    end: int,
+    out: NDArray[np.uint16],
+    counts: NDArray[np.int64],
+) -> None:
+    """How many bits differ, of the rows `begin` to `end` of all blocks together.
+
+    blocks (c,): where each block's codes begin, rows of the query's length one after the other.
+    first (c + 1,): the number of each block's first row. asked (rows,): the others are passed
+    over, and get NOT_ASKED. out (rows,). counts (bits + 1,): how many rows have each distance,
+    added to what is there.
+    """
+    words = query.shape[0]
+    block = np.searchsorted(first, begin, side="right") - 1
+    while begin < end:
+        upto = min(end, first[block + 1])
+        codes = nb.carray(_words_at(blocks[block]), (first[block + 1] - first[block], words))
+        for row in range(begin, upto):
+            if not asked[row]:
+                out[row] = NOT_ASKED
+                continue
+            code = codes[row - first[block]]
+            differ = np.uint64(0)
+            for i in range(words):
+                differ += _popcount(code[i] ^ query[i])
+            out[row] = differ
+            counts[differ] += 1
+        begin = upto
+        block += 1
+
+
+@nb.njit(nogil=True, cache=True, fastmath=FAST)
+def distances_at(addresses: Addresses, query: Words, out: NDArray[np.int64]) -> None:
+    """Add to `out` how many bits differ of the code at each address."""
+    words = query.shape[0]
+    for number in range(addresses.shape[0]):
+        code = nb.carray(_words_at(addresses[number]), (words,))
+        differ = np.uint64(0)
+        for i in range(words):
+            differ += _popcount(code[i] ^ query[i])
+        out[number] += np.int64(differ)
+
+
+@nb.njit(nogil=True, cache=True, fastmath=FAST)
+def weighted_at(addresses: Addresses, planes: Words, out: NDArray[np.int64]) -> None:
+    """Add to out (n, 2), of the code at each address: its ones, and the sum over its ones of the
+    whole numbers of which planes (PLANES, words) hold the bits."""
+    words = planes.shape[1]
+    for number in range(addresses.shape[0]):
+        code = nb.carray(_words_at(addresses[number]), (words,))
+        ones = units = twos = fours = eights = np.uint64(0)
+        for i in range(words):
+            word = code[i]
+            ones += _popcount(word)
+            units += _popcount(word & planes[0, i])
+            twos += _popcount(word & planes[1, i])
+            fours += _popcount(word & planes[2, i])
+            eights += _popcount(word & planes[3, i])
+        out[number, 0] += np.int64(ones)
+        out[number, 1] += np.int64(units + 2 * twos + 4 * fours + 8 * eights)
+
+
+@nb.njit(nogil=True, cache=True, fastmath=FAST)
+def products_at(addresses: Addresses, query: NDArray[np.float32], out: NDArray[np.float64]) -> None:
+    """The products of float32 rows with the query, in float64: each term is exact, and the sums
+    of equal rows are equal."""
+    for number in range(addresses.shape[0]):
+        row = nb.carray(_floats_at(addresses[number]), query.shape)
+        total = 0.0
+        for i in range(query.shape[0]):
+            total += np.float64(row[i]) * np.float64(query[i])
+        out[number] = total
+
+
+@nb.njit(nogil=True, cache=True, fastmath=FAST)
+def squares(row: NDArray[np.float32]) -> float:
+    """The sum of a row's squares, in float64."""
+    total = 0.0
+    for i in range(row.shape[0]):
+        total += np.float64(row[i]) * np.float64(row[i])
+    return total
+
+
+@nb.njit(nogil=True, cache=True, fastmath=FAST)
+def in_planes(
+    numbers: NDArray[np.float32], signs: Words, planes: Words
+) -> tuple[float, float, float, float, float]:
+    """The signs of (64 n,) float32 numbers, and the numbers rounded to 2^PLANES steps.
+
+    signs (n,): bit j of word i is 1 where number 64 i + j is not negative. planes (PLANES, n): the
+    same bits of a whole number w, 0 to 2^PLANES - 1, for which low + step w is nearest.
+    Returns low, step, and of these rounded numbers: the sum, the product with the numbers, the sum
+    of squares.
+    """
+    low, high = numbers[0], numbers[0]
+    for i in range(numbers.shape[0]):
+        low, high = min(low, numbers[i]), max(high, numbers[i])
+    step = (high - low) / np.float32(2**PLANES - 1)
+    inverse = np.float32(1.0) / step
+    total = product = square = 0.0
+    whole = np.empty(64, np.uint8)
+    for i in range(planes.shape[1]):
+        part = numbers[64 * i : 64 * i + 64]
+        sums = sums_of_products = sums_of_squares = np.float32(0.0)
+        for j in range(64):
+            nearest = np.int32((part[j] - low) * inverse + np.float32(0.5))
+            rounded = np.float32(nearest) * step + low
+            whole[j] = np.uint8(nearest) | (np.uint8(part[j] >= 0) << np.uint8(PLANES))
+            sums += rounded
+            sums_of_products += rounded * part[j]
+            sums_of_squares += rounded * rounded
+        total += sums
+        product += sums_of_products
+        square += sums_of_squares
+        for plane in range(PLANES + 1):
+            word = np.uint64(0)
+            for j in range(64):
+                word |= (np.uint64(whole[j] >> plane) & np.uint64(1)) << np.uint64(j)
+            if plane < PLANES:
+                planes[plane, i] = word
+            else:
+                signs[i] = word
+    return low, step, total, product, square

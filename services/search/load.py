@@ -1,0 +1,119 @@
+"""A chunk from its files to what search holds of it."""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Collection
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.search.local_files import LocalFiles
+from services.search.snapshot import LoadedChunk, StoredChunk
+from shared.catalog.chunks import Chunk
+from shared.chunks import codes_key, decode_rows
+from shared.errors import NotFound
+from shared.objects import ObjectStore
+
+if TYPE_CHECKING:
+    from shared.codes.signs import SignCodes
+
+log = logging.getLogger(__name__)
+
+Number = TypeVar("Number", bound=np.generic)
+
+
+class Loader:
+    """Opens the chunks of an object store."""
+
+    def __init__(self, store: ObjectStore, folder: Path) -> None:
+        """`folder` is for objects that are no files of this machine, and for missing codes."""
+        self._store = store
+        self._files = LocalFiles(store, folder)
+
+    def rows(self, chunk: Chunk) -> StoredChunk:
+        """The chunk without codes. Unavailable, NotFound, OSError or ValueError: it can't be read.
+
+        Its hash was checked.
+        """
+        file = self._files.map(chunk.object_key, chunk.sha256)
+        return StoredChunk(file, decode_rows(file.memory), chunk.sha256)
+
+    def codes(self, object_key: str, stored: StoredChunk) -> SignCodes:
+        """The chunk's codes: those beside it, or made from its rows where there are none."""
+        from shared.codes.stored import decode_codes, encode_codes
+
+        def kept(target: Path) -> None:
+            _write(target, self._store.get(codes_key(object_key)))
+
+        def made(target: Path) -> None:
+            _write(target, encode_codes(stored.rows, stored.sha256))
+
+        name = f"{stored.sha256}.codes"
+        for make in (kept, made):
+            try:
+                file = self._files.made(name, make)
+                rows, dimension = stored.rows.shape
+                return decode_codes(
+                    file.memory, rows=rows, dimension=dimension, chunk_sha256=stored.sha256
+                )
+            except NotFound:
+                continue
+            except ValueError as error:
+                log.warning("the codes of %s are made again: %s", object_key, error)
+                self._files.remove(name)
+        raise AssertionError("codes that were just made are those of the rows")
+
+    def keep_only(self, sha256s: Collection[str]) -> None:
+        """Remove the files of all other chunks."""
+        self._files.keep_only({f"{one}{end}" for one in sha256s for end in (".npy", ".codes")})
+
+
+def hold(chunk: LoadedChunk, parts: int) -> LoadedChunk:
+    """The chunk with its first so many parts in memory, the others mapped (`Memory`)."""
+    stored = chunk.stored
+    if stored is None:
+        return chunk
+    levels = stored.codes.levels if stored.codes else ()
+    rows = _held(stored.rows, chunk.rows, parts > len(levels))
+    codes = None
+    if stored.codes is not None:
+        now = chunk.codes.levels if chunk.codes else levels
+        codes = replace(
+            stored.codes,
+            levels=tuple(
+                _held(level, there, parts > number)
+                for number, (level, there) in enumerate(zip(levels, now, strict=True))
+            ),
+            norms=np.array(stored.codes.norms),  # 4 bytes a row: always
+        )
+    return replace(chunk, rows=rows, codes=codes)
+
+
+def part_bytes(chunks: Collection[LoadedChunk]) -> list[int]:
+    """The sizes of the parts that these chunks have together."""
+    sizes: list[int] = []
+    for chunk in chunks:
+        levels = chunk.codes.levels if chunk.codes else ()
+        for number, part in enumerate((*levels, chunk.rows)):
+            if number == len(sizes):
+                sizes.append(0)
+            sizes[number] += part.nbytes
+    return sizes
+
+
+def _held(stored: NDArray[Number], now: NDArray[Number], wanted: bool) -> NDArray[Number]:
+    if not wanted:
+        return stored
+    return np.array(stored) if now is stored else now
+
+
+def _write(target: Path, data: bytes) -> None:
+    with target.open("wb") as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())

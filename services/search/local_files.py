@@ -1,0 +1,120 @@
+"""Objects as files of this machine, mapped into memory: the operating system reads what is used.
+
+Where objects are files already, they are mapped where they lie. Elsewhere they are fetched into a
+cache folder, which any number of search workers of this machine may share.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import logging
+import mmap
+import os
+import sys
+import time
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
+from pathlib import Path
+
+from shared.chunks import corrupt
+from shared.ids import new_id
+from shared.objects import ObjectStore
+
+log = logging.getLogger(__name__)
+
+PIECE_BYTES = 1 << 20
+LEFT_OVER_SECONDS = 3600.0  # a file that is still being written then: its writer was killed
+
+# From Python 3.13 on a mapping need not hold a file descriptor: many chunks would use them up.
+OPTIONS = {"trackfd": False} if sys.version_info >= (3, 13) else {}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Mapped:
+    """A file's bytes; the file may be deleted while they are used."""
+
+    memory: mmap.mmap
+
+    @property
+    def size_bytes(self) -> int:
+        return len(self.memory)
+
+    def read_ahead(self, begin: int, size_bytes: int) -> None:
+        """Say that these bytes are read next: many at once cost little more than one."""
+        first = begin - begin % mmap.PAGESIZE
+        self.memory.madvise(mmap.MADV_WILLNEED, first, begin + size_bytes - first)
+
+
+class LocalFiles:
+    """The store's objects as mapped files."""
+
+    def __init__(self, store: ObjectStore, folder: Path) -> None:
+        """`folder` is made when something is fetched."""
+        self._store = store
+        self._folder = folder
+
+    def map(self, key: str, sha256: str) -> Mapped:
+        """The object, whose hash was checked: when it was fetched, or now where it is a file.
+
+        Unavailable (`chunk_corrupt`) when it is another; NotFound and Unavailable of the store.
+        """
+        file = self._store.file(key)
+        if file is None:
+            return self.made(f"{sha256}.npy", lambda target: self._fetch(key, sha256, target))
+        with self._store.open(key) as opened:
+            mapped = _map(opened.fileno())
+        if hashlib.sha256(mapped.memory).hexdigest() != sha256:
+            raise corrupt(key)
+        return mapped
+
+    def made(self, name: str, make: Callable[[Path], None]) -> Mapped:
+        """The file of this name in the folder; where there is none, `make` writes one.
+
+        It is there whole or not at all, also after a power cut.
+        """
+        path = self._folder / name
+        with contextlib.suppress(FileNotFoundError), path.open("rb") as file:
+            return _map(file.fileno())
+        self._folder.mkdir(parents=True, exist_ok=True)
+        partial = self._folder / f"{new_id()}.partial"
+        try:
+            make(partial)
+            with partial.open("rb") as file:
+                mapped = _map(file.fileno())
+            partial.replace(path)
+        finally:
+            partial.unlink(missing_ok=True)
+        return mapped
+
+    def remove(self, name: str) -> None:
+        (self._folder / name).unlink(missing_ok=True)
+
+    def keep_only(self, names: Collection[str]) -> None:
+        """Remove what is in the folder under other names; what is mapped stays readable."""
+        if not self._folder.is_dir():
+            return
+        long_ago = time.time() - LEFT_OVER_SECONDS
+        for path in self._folder.iterdir():
+            with contextlib.suppress(FileNotFoundError):
+                if path.suffix == ".partial":
+                    unwanted = path.stat().st_mtime < long_ago
+                else:
+                    unwanted = path.name not in names
+                if unwanted:
+                    path.unlink()
+
+    def _fetch(self, key: str, sha256: str, target: Path) -> None:
+        digest = hashlib.sha256()
+        with self._store.open(key) as source, target.open("wb") as file:
+            while piece := source.read(PIECE_BYTES):
+                digest.update(piece)
+                file.write(piece)
+            if digest.hexdigest() != sha256:
+                raise corrupt(key)
+            file.flush()
+            os.fsync(file.fileno())
+
+
+def _map(descriptor: int) -> Mapped:
+    return Mapped(mmap.mmap(descriptor, 0, access=mmap.ACCESS_READ, **OPTIONS))

@@ -1,0 +1,190 @@
+"""What search knows of photos, in columns: one entry for each row of a chunk."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields
+from datetime import UTC, datetime
+from functools import cached_property
+from typing import Any
+from uuid import UUID
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared.catalog.photos import PhotoFacts
+
+EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+NEVER = np.datetime64("NaT", "us")
+LOW = (1 << 64) - 1
+
+
+@dataclass(frozen=True, eq=False)
+class PhotoColumns:
+    """What is known of the photo of each of a chunk's n rows: arrays of length n.
+
+    A row without a live photo has `photo_id` None. `findable`: live, and not a labelled query.
+    """
+
+    photo_id: NDArray[np.object_]
+    findable: NDArray[np.bool_]
+    latitude: NDArray[np.float64]
+    """Degrees; NaN where the photo has no coordinates."""
+    longitude: NDArray[np.float64]
+    captured_at: NDArray[np.datetime64]
+    """UTC, microseconds; NaT where unknown."""
+    place: NDArray[np.object_]
+    tags: NDArray[np.object_]
+    """A frozenset of texts a row."""
+
+    @classmethod
+    def of(cls, rows: int, facts: Iterable[tuple[int, PhotoFacts]]) -> PhotoColumns:
+        """(row, photo) pairs as columns of `rows` rows; rows without a photo are dead."""
+        columns = cls(
+            photo_id=np.full(rows, None, dtype=object),
+            findable=np.zeros(rows, dtype=bool),
+            latitude=np.full(rows, np.nan),
+            longitude=np.full(rows, np.nan),
+            captured_at=np.full(rows, NEVER),
+            place=np.full(rows, None, dtype=object),
+            tags=np.full(rows, frozenset(), dtype=object),
+        )
+        for row, photo in facts:
+            columns._set(row, photo)
+        return columns
+
+    def __len__(self) -> int:
+        return len(self.findable)
+
+    @cached_property
+    def id_ends(self) -> NDArray[np.uint64]:
+        """The low 64 bits of each id, almost all of them drawn at random; 0 for dead rows."""
+        low = (0 if id_ is None else id_.int & LOW for id_ in self.photo_id)
+        return np.fromiter(low, np.uint64, len(self.photo_id))
+
+    def ids(self, rows: NDArray[np.int64]) -> list[UUID | None]:
+        """The photos of these rows; None for dead ones."""
+        return list(self.photo_id[rows])
+
+    @cached_property
+    def rows_by_tag(self) -> Mapping[str, NDArray[np.intp]]:
+        return _rows_by((tag, row) for row, tags in enumerate(self.tags) for tag in tags)
+
+    @cached_property
+    def rows_by_place(self) -> Mapping[str, NDArray[np.intp]]:
+        return _rows_by((place, row) for row, place in enumerate(self.place) if place is not None)
+
+    def changed(self, changes: Mapping[UUID, PhotoFacts]) -> PhotoColumns:
+        """The columns with what has changed; itself when none of the photos is here."""
+        here = [(row, changes[id_]) for row, id_ in enumerate(self.photo_id) if id_ in changes]
+        if not here:
+            return self
+        copy = PhotoColumns(*(getattr(self, column.name).copy() for column in fields(self)))
+        for row, photo in here:
+            copy._set(row, photo)
+        return copy
+
+    def _set(self, row: int, photo: PhotoFacts) -> None:
+        self.photo_id[row] = photo.photo_id
+        self.findable[row] = photo.findable
+        self.latitude[row] = np.nan if photo.latitude is None else photo.latitude
+        self.longitude[row] = np.nan if photo.longitude is None else photo.longitude
+        self.captured_at[row] = as_microseconds(photo.captured_at)
+        self.place[row] = photo.place
+        self.tags[row] = frozenset(photo.tags)
+
+
+@dataclass(frozen=True, eq=False)
+class JoinedColumns:
+    """The columns of several chunks, one after the other; each is joined when it is asked for."""
+
+    parts: Sequence[PhotoColumns]
+
+    def __len__(self) -> int:
+        return int(self.first[-1])
+
+    @cached_property
+    def first(self) -> NDArray[np.int64]:
+        """(chunks + 1,): the number of each chunk's first row; the last is the number of rows."""
+        return np.cumsum([0, *(len(part) for part in self.parts)])
+
+    @cached_property
+    def findable(self) -> NDArray[np.bool_]:
+        return self._joined([part.findable for part in self.parts], np.bool_)
+
+    @cached_property
+    def latitude(self) -> NDArray[np.float64]:
+        return self._joined([part.latitude for part in self.parts], np.float64)
+
+    @cached_property
+    def longitude(self) -> NDArray[np.float64]:
+        return self._joined([part.longitude for part in self.parts], np.float64)
+
+    @cached_property
+    def captured_at(self) -> NDArray[np.datetime64]:
+        return self._joined([part.captured_at for part in self.parts], NEVER.dtype)
+
+    @cached_property
+    def id_ends(self) -> NDArray[np.uint64]:
+        return self._joined([part.id_ends for part in self.parts], np.uint64)
+
+    @cached_property
+    def rows_by_tag(self) -> Mapping[str, NDArray[np.intp]]:
+        return _JoinedRows([part.rows_by_tag for part in self.parts], self.first)
+
+    @cached_property
+    def rows_by_place(self) -> Mapping[str, NDArray[np.intp]]:
+        return _JoinedRows([part.rows_by_place for part in self.parts], self.first)
+
+    def ids(self, rows: NDArray[np.int64]) -> list[UUID | None]:
+        """The photos of these rows; None for dead ones."""
+        chunks = np.searchsorted(self.first, rows, side="right") - 1
+        inside = rows - self.first[chunks]
+        return [
+            self.parts[chunk].photo_id[row]
+            for chunk, row in zip(chunks.tolist(), inside.tolist(), strict=True)
+        ]
+
+    @staticmethod
+    def _joined(parts: list[NDArray[Any]], dtype: Any) -> NDArray[Any]:
+        return np.concatenate(parts) if parts else np.empty(0, dtype)
+
+
+class _JoinedRows(Mapping[str, NDArray[np.intp]]):
+    """Rows by a text, of several chunks: found chunk by chunk, when they are asked for."""
+
+    def __init__(
+        self, parts: list[Mapping[str, NDArray[np.intp]]], first: NDArray[np.int64]
+    ) -> None:
+        self._parts = parts
+        self._first = first
+
+    def __getitem__(self, text: str) -> NDArray[np.intp]:
+        found = [
+            part[text] + begin
+            for part, begin in zip(self._parts, self._first, strict=False)
+            if text in part
+        ]
+        if not found:
+            raise KeyError(text)
+        return np.concatenate(found)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(set().union(*self._parts))
+
+    def __len__(self) -> int:
+        return len(set().union(*self._parts))
+
+
+def _rows_by(pairs: Iterable[tuple[str, int]]) -> dict[str, NDArray[np.intp]]:
+    found: dict[str, list[int]] = {}
+    for text, row in pairs:
+        found.setdefault(text, []).append(row)
+    return {text: np.array(rows, np.intp) for text, rows in found.items()}
+
+
+def as_microseconds(when: datetime | None) -> np.datetime64:
+    """An aware datetime as NumPy's UTC microseconds."""
+    if when is None:
+        return NEVER
+    return np.datetime64(when.astimezone(UTC).replace(tzinfo=None), "us")
