@@ -19,8 +19,6 @@ MOST_Z = 5.5
 # Equal rows are equal however they were added up, and then the photos' ids decide.
 DECIMALS = 12
 
-# Fewer rows are compared exactly at once: as many as the codes would leave anyway.
-FEW_ROWS = 64
 
 Rows = NDArray[np.int64]
 Scores = NDArray[np.float64]
@@ -62,13 +60,20 @@ def answer(
     selected = int(np.count_nonzero(asked))
     if not selected or not query.any():
         return Answer((), EXHAUSTIVE, 0, 0, 0)
-    if snapshot.coded and question.mode == Mode.AUTO and selected > FEW_ROWS + 4 * question.k:
+    by_codes = question.mode == Mode.AUTO and worth_codes(selected, question.k)
+    if by_codes and snapshot.coded:
         found = _by_codes(snapshot, query, asked, question)
         if found is not None:
             return found
     rows, scores = scan(snapshot.chunks, query, question.k, asked)
     hits = _ranked(snapshot, rows, scores, question)
     return Answer(hits, EXHAUSTIVE, len(hits), selected, len(rows))
+
+
+def worth_codes(selected: int, k: int) -> bool:
+    """Whether codes spare anything: they leave about twice k rows to compare, and cost as much as
+    some dozens."""
+    return selected > 64 + 4 * k
 
 
 def _by_codes(

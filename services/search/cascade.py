@@ -68,7 +68,9 @@ class Blocks:
     @classmethod
     def of(cls, chunks: Sequence[LoadedChunk]) -> Blocks:
         """Those of chunks that have their codes."""
-        codes = [chunk.codes for chunk in chunks]
+        codes = [chunk.codes for chunk in chunks if chunk.codes is not None]
+        if len(codes) < len(chunks):
+            raise ValueError("a chunk has no codes")
         norms = np.concatenate([code.norms for code in codes])
         return cls(
             dimension=chunks[0].rows.shape[1],

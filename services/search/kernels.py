@@ -14,8 +14,7 @@ from numba import types
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-# `reassoc` lets sums run in vector lanes; each row is still added up in one fixed order.
-FAST = {"reassoc", "contract", "nsz"}
+from shared.codes.compiled import IN_LANES, compiled
 
 NOT_ASKED = 65_535  # more than any distance
 PLANES = 4  # `weighted_at` is written for so many
@@ -53,7 +52,7 @@ _floats_at = _pointer_to(types.float32)
 _bytes_at = _pointer_to(types.int8)
 
 
-@nb.njit(nogil=True, cache=True, fastmath=FAST)
+@compiled(IN_LANES)
 def distances(
     blocks: Addresses,
     first: NDArray[np.int64],
@@ -90,7 +89,7 @@ def distances(
         block += 1
 
 
-@nb.njit(nogil=True, cache=True, fastmath=FAST)
+@compiled(IN_LANES)
 def distances_at(addresses: Addresses, query: Words, out: NDArray[np.int64]) -> None:
     """Add to `out` how many bits differ of the code at each address."""
     words = query.shape[0]
@@ -102,7 +101,7 @@ def distances_at(addresses: Addresses, query: Words, out: NDArray[np.int64]) -> 
         out[number] += np.int64(differ)
 
 
-@nb.njit(nogil=True, cache=True, fastmath=FAST)
+@compiled(IN_LANES)
 def weighted_at(addresses: Addresses, planes: Words, out: NDArray[np.int64]) -> None:
     """Add to out (n, 2), of the code at each address: its ones, and the sum over its ones of the
     whole numbers of which planes (PLANES, words) hold the bits."""
@@ -121,7 +120,7 @@ def weighted_at(addresses: Addresses, planes: Words, out: NDArray[np.int64]) -> 
         out[number, 1] += np.int64(units + 2 * twos + 4 * fours + 8 * eights)
 
 
-@nb.njit(nogil=True, cache=True, fastmath=FAST)
+@compiled(IN_LANES)
 def products_at(addresses: Addresses, query: NDArray[np.float32], out: NDArray[np.float64]) -> None:
     """The products of float32 rows with the query, in float64: each term is exact, and the sums
     of equal rows are equal."""
@@ -133,7 +132,7 @@ def products_at(addresses: Addresses, query: NDArray[np.float32], out: NDArray[n
         out[number] = total
 
 
-@nb.njit(nogil=True, cache=True, fastmath=FAST)
+@compiled(IN_LANES)
 def squares(row: NDArray[np.float32]) -> float:
     """The sum of a row's squares, in float64."""
     total = 0.0
@@ -142,7 +141,7 @@ def squares(row: NDArray[np.float32]) -> float:
     return total
 
 
-@nb.njit(nogil=True, cache=True, fastmath=FAST)
+@compiled(IN_LANES)
 def in_planes(
     numbers: NDArray[np.float32], signs: Words, planes: Words
 ) -> tuple[float, float, float, float, float]:

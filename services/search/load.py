@@ -99,10 +99,10 @@ def part_bytes(chunks: Collection[LoadedChunk]) -> list[int]:
     sizes: list[int] = []
     for chunk in chunks:
         levels = chunk.codes.levels if chunk.codes else ()
-        for number, part in enumerate((*levels, chunk.rows)):
+        for number, size_bytes in enumerate((*(one.nbytes for one in levels), chunk.rows.nbytes)):
             if number == len(sizes):
                 sizes.append(0)
-            sizes[number] += part.nbytes
+            sizes[number] += size_bytes
     return sizes
 
 

@@ -1,23 +1,18 @@
-"""The fast Walsh-Hadamard transform, compiled, and how the compiled code is kept.
-
-Compiled by numba on first use and kept in its cache (`NUMBA_CACHE_DIR`, or beside the file).
-"""
+"""The fast Walsh-Hadamard transform."""
 
 from __future__ import annotations
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float32]
+from shared.codes.compiled import IN_ORDER, compiled
 
-# Without `reassoc`: what is added in which order stays as it is written.
-FAST = {"contract", "nsz"}
+Floats = NDArray[np.float32]
 
 NEAR = 1024  # a stride: twice as many numbers are 8 KiB
 
 
-@nb.njit(nogil=True, cache=True, fastmath=FAST)
+@compiled(IN_ORDER)
 def _radix4(a: Floats, b: Floats, c: Floats, d: Floats) -> None:
     """Two stages at once, on four neighbouring runs of equal length."""
     for j in range(a.shape[0]):
@@ -26,13 +21,13 @@ def _radix4(a: Floats, b: Floats, c: Floats, d: Floats) -> None:
         a[j], b[j], c[j], d[j] = p + q, p - q, r + s, r - s
 
 
-@nb.njit(nogil=True, cache=True, fastmath=FAST)
+@compiled(IN_ORDER)
 def _radix2(a: Floats, b: Floats) -> None:
     for j in range(a.shape[0]):
         a[j], b[j] = a[j] + b[j], a[j] - b[j]
 
 
-@nb.njit(nogil=True, cache=True, fastmath=FAST)
+@compiled(IN_ORDER)
 def _strides_4_and_8(x: Floats) -> None:
     groups = x.reshape(-1, 16)
     for j in range(groups.shape[0]):
@@ -43,7 +38,7 @@ def _strides_4_and_8(x: Floats) -> None:
             groups[j, i + 8], groups[j, i + 12] = r + s, r - s
 
 
-@nb.njit(nogil=True, cache=True, fastmath=FAST)
+@compiled(IN_ORDER)
 def _strides_1_and_2(x: Floats) -> None:
     groups = x.reshape(-1, 4)
     for j in range(groups.shape[0]):
@@ -53,7 +48,7 @@ def _strides_1_and_2(x: Floats) -> None:
         groups[j, 2], groups[j, 3] = r + s, r - s
 
 
-@nb.njit(nogil=True, cache=True, fastmath=FAST)
+@compiled(IN_ORDER)
 def _wide_strides(x: Floats, stride: int, least: int) -> int:
     """The stages of these strides, two at a time, down to `least`; the next stride."""
     while stride >= 2 * least:
@@ -65,7 +60,7 @@ def _wide_strides(x: Floats, stride: int, least: int) -> int:
     return stride
 
 
-@nb.njit(nogil=True, cache=True, fastmath=FAST)
+@compiled(IN_ORDER)
 def hadamard(x: Floats) -> None:
     """Multiply x, (n,) float32, by the n x n Hadamard matrix (Sylvester's, unscaled), in place.
 

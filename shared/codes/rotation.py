@@ -24,11 +24,11 @@ import math
 from dataclasses import dataclass
 from functools import lru_cache
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.codes.hadamard import FAST, hadamard
+from shared.codes.compiled import IN_ORDER, compiled
+from shared.codes.hadamard import hadamard
 
 SEED = 20_240_611
 ROUNDS = 2
@@ -91,13 +91,13 @@ def _block(dimension: int, blocks: int) -> int:
     return 1 << (needed - 1).bit_length()
 
 
-@nb.njit(nogil=True, cache=True, fastmath=FAST)
+@compiled(IN_ORDER)
 def _times(x: Floats, factors: Floats) -> None:
     for j in range(x.shape[0]):
         x[j] *= factors[j]
 
 
-@nb.njit(nogil=True, cache=True, fastmath=FAST)
+@compiled(IN_ORDER)
 def _mix(x: Floats, total: Floats) -> None:
     """(n, b): each column minus 2/n times its sum; `total` (b,) is room for the sums."""
     blocks, block = x.shape
@@ -113,7 +113,7 @@ def _mix(x: Floats, total: Floats) -> None:
             row[j] -= share * total[j]
 
 
-@nb.njit(nogil=True, cache=True, fastmath=FAST)
+@compiled(IN_ORDER)
 def _rotate(rows: Floats, signs: Floats, runs: NDArray[np.int64], blocks: int, out: Floats) -> None:
     dimension = rows.shape[1]
     before = np.empty(out.shape[1], np.float32)

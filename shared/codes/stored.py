@@ -48,6 +48,8 @@ def decode_codes(data: Any, *, rows: int, dimension: int, chunk_sha256: str) -> 
     view = memoryview(data)
     line, _, _ = bytes(view[:MOST_HEADER_BYTES]).partition(b"\n")
     header = json.loads(line)  # a JSONDecodeError is a ValueError
+    if not isinstance(header, dict):
+        raise ValueError("no codes: the file begins otherwise")
     made = _made(dimension)
     expected = {**made, "rows": rows, "chunk_sha256": chunk_sha256}
     wrong = [name for name, value in expected.items() if header.get(name) != value]

@@ -42,6 +42,7 @@ from shared.objects import FolderStore, ObjectStore
 from shared.photo_filter import Box, Circle, PhotoFilter
 from shared.search_protocol import SearchPort, SearchRequest, SearchResponse
 from shared.settings import Settings
+from tests.support.codes import always_by_codes
 from tests.support.search_tier import SearchTier
 
 DIMENSION = 12
@@ -240,6 +241,9 @@ class SearchPortContract:
     def places(self, catalog: Catalog, store: FolderStore) -> SmallMap:
         return SmallMap(catalog, store)
 
+    certificate = "exhaustive"
+    """How the answers are reached."""
+
     def test_order_and_scores_equal_brute_force(self, places: SmallMap, port: OpenPort) -> None:
         for seed, count in enumerate((1, 30, 7)):
             places.add(unit_rows(seed, count), slot=seed // 2, dead=seed)
@@ -251,7 +255,7 @@ class SearchPortContract:
                 assert_answers(response, places.brute_force(vector, k))
         assert response.snapshot_version == places.version
         assert response.missing == ()
-        assert response.certificate == "exhaustive"
+        assert response.certificate == self.certificate
         assert response.rows_scanned == 35  # dead rows are not compared
 
     def test_equal_scores_come_in_the_order_of_the_photos(
@@ -325,7 +329,8 @@ class SearchPortContract:
                 response = search.search(places.request(places.query(vector), k=k, **filters))
                 assert_answers(response, places.brute_force(vector, k, passing))
                 assert response.rows_scanned == len(passing)
-                assert response.certificate == "exhaustive"
+                certificate = self.certificate if passing else "exhaustive"
+                assert response.certificate == certificate
 
     def test_a_filter_that_lets_one_of_thousands_pass_finds_it(
         self, places: SmallMap, port: OpenPort
@@ -661,6 +666,16 @@ class TestSearchWorker(SearchPortContract):
         assert worker.status().rows == 10
 
 
+class TestSearchWorkerByCodes(TestSearchWorker):
+    """The same promises where rows are told apart by their codes first."""
+
+    certificate = "statistical"
+
+    @pytest.fixture(autouse=True)
+    def by_codes(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        always_by_codes(monkeypatch)
+
+
 class TestSearchOverHttp(SearchPortContract):
     """The same promises, with HTTP between and the map's slots spread over workers."""
 
@@ -777,7 +792,12 @@ def migrated(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("migrated")
-def test_no_order_of_adding_deleting_and_merging_attaches_a_score_to_another_photo() -> None:
+@pytest.mark.parametrize("by_codes", [False, True], ids=["dense", "by codes"])
+def test_no_order_of_adding_deleting_and_merging_attaches_a_score_to_another_photo(
+    by_codes: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if by_codes:
+        always_by_codes(monkeypatch)
     run_state_machine_as_test(
         AddDeleteMerge,
         settings=how(

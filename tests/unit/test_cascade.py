@@ -1,0 +1,216 @@
+"""Search by codes against brute force in float64: the same rows, in the same order."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+from uuid import UUID
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from services.search import answer as answer_module
+from services.search.answer import DECIMALS, Answer, Question, answer
+from services.search.photo_columns import PhotoColumns
+from services.search.snapshot import LoadedChunk, Snapshot
+from shared.codes.signs import sign_codes
+from shared.ids import new_id
+from shared.search_protocol import Mode
+from tests.support.photo_facts import facts_of
+
+DIMENSION = 7168
+
+Rows = NDArray[np.float32]
+
+
+@pytest.fixture(autouse=True)
+def by_codes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(answer_module, "worth_codes", lambda selected, k: True)
+
+
+def photo(number: int) -> UUID:
+    return UUID(int=number + 1)
+
+
+def snapshot_of(rows: Rows, pieces: int = 3) -> Snapshot:
+    bounds = np.linspace(0, len(rows), pieces + 1).astype(int)
+    chunks = [
+        LoadedChunk(
+            new_id(),
+            f"chunks/{a}.npy",
+            rows[a:b],
+            PhotoColumns.of(b - a, [(row - a, facts_of(photo(row))) for row in range(a, b)]),
+            sign_codes(rows[a:b]),
+        )
+        for a, b in pairwise(bounds.tolist())
+    ]
+    return Snapshot(new_id(), new_id(), 1, tuple(chunks))
+
+
+def brute_force(
+    rows: Rows, query: Rows, k: int, asked: NDArray[np.bool_], min_score: float = -2.0
+) -> list[tuple[UUID, float]]:
+    exact = query.astype(np.float64)
+    exact /= np.linalg.norm(exact)
+    scores = np.round([row.astype(np.float64) @ exact for row in rows], DECIMALS)
+    scored = [
+        (-min(1.0, score), photo(number))
+        for number, score in enumerate(scores.tolist())
+        if asked[number] and score >= min_score
+    ]
+    return [(photo_id, -score) for score, photo_id in sorted(scored)[:k]]
+
+
+def hits_of(found: Answer) -> list[tuple[UUID, float]]:
+    return [(hit.photo_id, hit.score) for hit in found.hits]
+
+
+def places(seed: int, count: int, dimension: int = DIMENSION) -> Rows:
+    """Rows in neighbourhoods: some places were photographed many times."""
+    rng = np.random.default_rng(seed)
+    centres = rng.standard_normal((max(1, count // 5), dimension))
+    near = centres[rng.integers(len(centres), size=count)]
+    rows = near + rng.uniform(0.1, 3.0, size=(count, 1)) * rng.standard_normal((count, dimension))
+    found: Rows = (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32)
+    return found
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    seed=st.integers(0, 2**31),
+    count=st.integers(1, 300),
+    pieces=st.integers(1, 4),
+    k=st.sampled_from([1, 2, 10, 100, 400]),
+    asked_share=st.sampled_from([1.0, 0.5, 0.02]),
+    matched=st.booleans(),
+    duplicates=st.integers(0, 30),
+    zeros=st.integers(0, 3),
+    floor=st.booleans(),
+)
+def test_answers_equal_brute_force_with_order_and_ties(
+    seed: int,
+    count: int,
+    pieces: int,
+    k: int,
+    asked_share: float,
+    matched: bool,
+    duplicates: int,
+    zeros: int,
+    floor: bool,
+) -> None:
+    rng = np.random.default_rng(seed)
+    rows = places(seed, count)
+    for _ in range(duplicates):
+        a, b = rng.integers(0, count, 2)
+        rows[a] = rows[b]
+    rows[rng.integers(0, count, zeros)] = 0
+    query = rng.standard_normal(DIMENSION).astype(np.float32)
+    if matched:
+        query = query * np.float32(0.005) + rows[rng.integers(count)]
+    asked = rng.random(count) < asked_share
+    min_score = 0.1 if floor else None
+    found = answer(snapshot_of(rows, pieces), query, asked, Question(k, min_score))
+    assert hits_of(found) == brute_force(rows, query, k, asked, -2.0 if not floor else 0.1)
+    if asked.any():
+        assert found.certificate == "statistical"
+        assert found.certified_k == len(found.hits)
+        assert found.rows_scanned == int(asked.sum())
+        assert found.max_z is not None
+        assert found.max_z < 5.5
+
+
+@pytest.mark.parametrize("dimension", [64, 100, 8192, 49_152])
+def test_rows_of_any_length_are_searched(dimension: int) -> None:
+    rows = places(3, 60, dimension)
+    everything = np.ones(60, bool)
+    for query in rows[:3]:
+        found = answer(snapshot_of(rows), query, everything, Question(7))
+        assert hits_of(found) == brute_force(rows, query, 7, everything)
+        assert found.certificate == "statistical"
+
+
+def test_most_rows_are_never_read_when_the_place_is_in_the_map() -> None:
+    rows = places(1, 2000)
+    query = rows[77] + np.float32(0.002) * places(9, 1)[0]
+    found = answer(snapshot_of(rows), query, np.ones(2000, bool), Question(1))
+    assert found.hits[0].photo_id == photo(77)
+    assert found.rows_scanned == 2000
+    assert found.rows_reranked < 50
+
+
+def test_query_of_any_length_gives_the_same_answer() -> None:
+    rows = places(2, 100)
+    everything = np.ones(100, bool)
+    snapshot = snapshot_of(rows)
+    found = [answer(snapshot, rows[5] * np.float32(s), everything, Question(5)) for s in (1, 64)]
+    assert hits_of(found[0]) == hits_of(found[1])
+    nothing = answer(snapshot, np.zeros(DIMENSION, np.float32), everything, Question(5))
+    assert nothing.hits == ()
+
+
+def test_dense_mode_compares_every_row() -> None:
+    rows = places(4, 150)
+    everything = np.ones(150, bool)
+    question = Question(9, mode=Mode.DENSE)
+    found = answer(snapshot_of(rows), rows[0], everything, question)
+    assert found.certificate == "exhaustive"
+    assert found.max_z is None
+    assert hits_of(found) == brute_force(rows, rows[0], 9, everything)
+
+
+def test_few_rows_are_compared_without_codes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.undo()
+    rows = places(4, 300)
+    asked = np.zeros(300, bool)
+    asked[:50] = True
+    assert answer(snapshot_of(rows), rows[0], asked, Question(3)).certificate == "exhaustive"
+    everything = answer(snapshot_of(rows), rows[0], ~np.zeros(300, bool), Question(3))
+    assert everything.certificate == "statistical"
+
+
+def test_codes_that_lie_are_found_out_and_every_row_is_compared() -> None:
+    rows = places(6, 200)
+    snapshot = snapshot_of(rows, 1)
+    (chunk,) = snapshot.chunks
+    assert chunk.codes is not None
+    wrong = LoadedChunk(
+        chunk.chunk_id, chunk.object_key, chunk.rows, chunk.photos, sign_codes(rows[::-1].copy())
+    )
+    lying = Snapshot(new_id(), new_id(), 1, (wrong,))
+    everything = np.ones(200, bool)
+    found = answer(lying, rows[3], everything, Question(10))
+    assert found.certificate == "exhaustive"
+    assert hits_of(found) == brute_force(rows, rows[3], 10, everything)
+
+
+@pytest.mark.parametrize("most_rows", [0, 1, 5, 12])
+def test_search_that_gives_up_says_so_and_of_how_many_hits_it_is_certain(most_rows: int) -> None:
+    rows = places(8, 400)
+    everything = np.ones(400, bool)
+    query = rows[3] + np.float32(0.5) * places(19, 1)[0]
+    found = answer(snapshot_of(rows), query, everything, Question(20, most_rows=most_rows))
+    assert found.certificate == "none"
+    assert found.rows_reranked <= most_rows
+    exact = brute_force(rows, query, 20, everything)
+    assert found.certified_k <= len(found.hits)
+    assert hits_of(found)[: found.certified_k] == exact[: found.certified_k]
+
+
+def test_search_that_runs_out_of_time_says_so() -> None:
+    rows = places(8, 400)
+    found = answer(snapshot_of(rows), rows[3], np.ones(400, bool), Question(20, most_seconds=1e-9))
+    assert found.certificate == "none"
+    assert found.certified_k <= len(found.hits) < 20
+
+
+def test_nothing_that_matters_left_out_is_no_giving_up() -> None:
+    rows = places(8, 400)
+    found = answer(
+        snapshot_of(rows), rows[3], np.ones(400, bool), Question(1, 0.999, most_rows=400)
+    )
+    assert found.certificate == "statistical"
+    assert [hit.photo_id for hit in found.hits] == [photo(3)]
+    assert math.isclose(found.hits[0].score, 1.0, abs_tol=1e-6)
