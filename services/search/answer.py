@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from services.search.scan import scan
 from services.search.snapshot import Snapshot
+from services.search.together import Glances
 from shared.search_protocol import EXHAUSTIVE, NONE, STATISTICAL, Hit, Mode
 
 # One row in ten million is further off: then the codes are not trusted.
@@ -52,6 +53,7 @@ def answer(
     query: NDArray[np.float32],
     asked: NDArray[np.bool_],
     question: Question,
+    glances: Glances,
 ) -> Answer:
     """Ask with a row, (dimension,) float32 of any length, for the snapshot's rows of `asked`, (n,).
 
@@ -62,7 +64,7 @@ def answer(
         return Answer((), EXHAUSTIVE, 0, 0, 0)
     by_codes = question.mode == Mode.AUTO and worth_codes(selected, question.k)
     if by_codes and snapshot.coded:
-        found = _by_codes(snapshot, query, asked, question)
+        found = _by_codes(snapshot, query, asked, question, glances)
         if found is not None:
             return found
     rows, scores = scan(snapshot.chunks, query, question.k, asked)
@@ -77,15 +79,19 @@ def worth_codes(selected: int, k: int) -> bool:
 
 
 def _by_codes(
-    snapshot: Snapshot, query: NDArray[np.float32], asked: NDArray[np.bool_], question: Question
+    snapshot: Snapshot,
+    query: NDArray[np.float32],
+    asked: NDArray[np.bool_],
+    question: Question,
+    glances: Glances,
 ) -> Answer | None:
     """None when an estimate was further off than chance explains."""
-    from services.search.cascade import Budget, CodedQuery, Refinement, glance
+    from services.search.cascade import Budget, CodedQuery, Refinement
     from shared.codes.rotation import rotation
 
     until = question.most_seconds and time.monotonic() + question.most_seconds
     coded = CodedQuery.of(query, rotation(len(query)))
-    first = glance(snapshot.blocks, coded, asked)
+    first = glances.glance(snapshot.blocks, coded, asked)
     refinement = Refinement(
         snapshot.blocks, coded, question.k, question.min_score, snapshot.read_ahead
     )

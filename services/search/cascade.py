@@ -33,6 +33,7 @@ from services.search.kernels import (
     squares,
     weighted_at,
 )
+from services.search.parts import in_parts
 from services.search.snapshot import LoadedChunk
 from shared.codes.rotation import Rotation, rotation
 from shared.codes.signs import WORD, Words, level_words
@@ -193,14 +194,25 @@ class Glance:
         return np.flatnonzero(self.distances <= reached)[: 4 * wanted]
 
 
-def glance(blocks: Blocks, query: CodedQuery, asked: NDArray[np.bool_]) -> Glance:
-    """Compare the first bits of the rows that are asked for, (n,) bool."""
+def glance(
+    blocks: Blocks, queries: Sequence[CodedQuery], asked: Sequence[NDArray[np.bool_]]
+) -> list[Glance]:
+    """Compare the first bits of the rows that each query asks for, (n,) bool: one way through
+    memory for all queries, each of which sees what it would see alone."""
     words = level_words(rotation(blocks.dimension).padded)[0]
-    found = np.empty(len(blocks), np.uint16)
-    counts = np.zeros(words * WORD + 1, np.int64)
-    bits = query.bits[:words]
-    distances(blocks.levels[0], blocks.first, asked, bits, 0, len(blocks), found, counts)
-    return Glance(found, counts)
+    bits = np.stack([query.bits[:words] for query in queries])
+    masks = np.stack(asked)
+    found = np.empty((len(queries), len(blocks)), np.uint16)
+    counts: list[NDArray[np.int64]] = []
+
+    def part(begin: int, end: int) -> None:
+        own = np.zeros((len(queries), words * WORD + 1), np.int64)
+        distances(blocks.levels[0], blocks.first, masks, bits, begin, end, found, own)
+        counts.append(own)
+
+    in_parts(part, len(blocks), 8 * words)
+    total = np.sum(counts, axis=0)
+    return [Glance(distance, count) for distance, count in zip(found, total, strict=True)]
 
 
 def hamming_deviation(bits: int, padded: int) -> float:
@@ -274,7 +286,8 @@ class Refinement:
         """Add the bits of a level that differ."""
         begin, end = int(self._ends[level - 1]), int(self._ends[level])
         at = self._blocks.at(self._blocks.levels[level], rows, 8 * (end - begin))
-        distances_at(at, self._query.bits[begin:end], differ)
+        bits = self._query.bits[begin:end]
+        in_parts(lambda i, j: distances_at(at[i:j], bits, differ[i:j]), len(rows), 8 * len(bits))
 
     def _prune(self, rows: Indices, level: int, differ: Indices) -> tuple[Indices, Indices]:
         kept = differ <= self._limit(level)
@@ -301,7 +314,8 @@ class Refinement:
         begin = 0
         for level, words in enumerate(self._words):
             at = self._blocks.at(self._blocks.levels[level], rows, 8 * words)
-            weighted_at(at, query.planes[:, begin : begin + words], sums)
+            planes = np.ascontiguousarray(query.planes[:, begin : begin + words])
+            _add_weighted(at, planes, sums)
             begin += words
         norms = self._blocks.norms[rows].astype(np.float64)
         zero = norms == 0.0
@@ -345,6 +359,12 @@ class Refinement:
             max_z=float(np.max(errors / np.where(sure > 0, sure, np.inf), initial=0.0)),
             unseen=unseen,
         )
+
+
+def _add_weighted(at: Addresses, planes: Words, sums: Indices) -> None:
+    words = planes.shape[1]
+    # Five times the work of a glance at as many bytes.
+    in_parts(lambda i, j: weighted_at(at[i:j], planes, sums[i:j]), len(at), 5 * 8 * words)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -57,34 +57,36 @@ def distances(
     blocks: Addresses,
     first: NDArray[np.int64],
     asked: NDArray[np.bool_],
-    query: Words,
+    queries: Words,
     begin: int,
     end: int,
     out: NDArray[np.uint16],
     counts: NDArray[np.int64],
 ) -> None:
-    """How many bits differ, of the rows `begin` to `end` of all blocks together.
+    """How many bits of q queries differ from the rows `begin` to `end` of all blocks together.
 
-    blocks (c,): where each block's codes begin, rows of the query's length one after the other.
-    first (c + 1,): the number of each block's first row. asked (rows,): the others are passed
-    over, and get NOT_ASKED. out (rows,). counts (bits + 1,): how many rows have each distance,
-    added to what is there.
+    blocks (c,): where each block's codes begin, rows of the queries' length one after the other.
+    first (c + 1,): the number of each block's first row. asked (q, rows): the others are passed
+    over, and get NOT_ASKED. queries (q, words). out (q, rows). counts (q, bits + 1): how many rows
+    have each distance, added to what is there.
     """
-    words = query.shape[0]
+    words = queries.shape[1]
     block = np.searchsorted(first, begin, side="right") - 1
     while begin < end:
         upto = min(end, first[block + 1])
         codes = nb.carray(_words_at(blocks[block]), (first[block + 1] - first[block], words))
         for row in range(begin, upto):
-            if not asked[row]:
-                out[row] = NOT_ASKED
-                continue
             code = codes[row - first[block]]
-            differ = np.uint64(0)
-            for i in range(words):
-                differ += _popcount(code[i] ^ query[i])
-            out[row] = differ
-            counts[differ] += 1
+            for number in range(queries.shape[0]):
+                if not asked[number, row]:
+                    out[number, row] = NOT_ASKED
+                    continue
+                query = queries[number]
+                differ = np.uint64(0)
+                for i in range(words):
+                    differ += _popcount(code[i] ^ query[i])
+                out[number, row] = differ
+                counts[number, differ] += 1
         begin = upto
         block += 1
 

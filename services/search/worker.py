@@ -18,6 +18,7 @@ from services.search.memory import Memory
 from services.search.query_row import QueryRows, expired
 from services.search.select import select
 from services.search.snapshot import Snapshot
+from services.search.together import Glances
 from shared.catalog.away import Outage
 from shared.catalog.generations import GenerationState
 from shared.catalog.session import Catalog
@@ -48,6 +49,7 @@ class SearchWorker:
         self._catalog = catalog
         self._settings = settings
         self._loader = Loader(store, settings.search_cache(shard))
+        self._glances = Glances()
         self._memory = Memory(settings.search_memory_bytes)
         self._rows = QueryRows(store)
         self._snapshots: dict[UUID, Snapshot] = {}
@@ -105,7 +107,7 @@ class SearchWorker:
             most_rows=request.most_rows,
             most_seconds=request.most_seconds,
         )
-        found = answer(snapshot, query, asked, question)
+        found = answer(snapshot, query, asked, question, self._glances)
         return SearchResponse(
             hits=found.hits,
             certificate=found.certificate,

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
+from typing import Any
 from uuid import UUID
 
 import numpy as np
@@ -13,13 +15,17 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from services.search import answer as answer_module
-from services.search.answer import DECIMALS, Answer, Question, answer
+from services.search import cascade
+from services.search.answer import DECIMALS, Answer, Question
+from services.search.cascade import glance
 from services.search.photo_columns import PhotoColumns
 from services.search.snapshot import LoadedChunk, Snapshot
+from services.search.together import Glances
 from shared.codes.signs import sign_codes
 from shared.ids import new_id
 from shared.search_protocol import Mode
 from tests.support.photo_facts import facts_of
+from tests.support.servers.handle import wait_until
 
 DIMENSION = 7168
 
@@ -62,6 +68,10 @@ def brute_force(
         if asked[number] and score >= min_score
     ]
     return [(photo_id, -score) for score, photo_id in sorted(scored)[:k]]
+
+
+def answer(snapshot: Snapshot, query: Rows, asked: NDArray[np.bool_], question: Question) -> Answer:
+    return answer_module.answer(snapshot, query, asked, question, Glances())
 
 
 def hits_of(found: Answer) -> list[tuple[UUID, float]]:
@@ -214,3 +224,35 @@ def test_nothing_that_matters_left_out_is_no_giving_up() -> None:
     assert found.certificate == "statistical"
     assert [hit.photo_id for hit in found.hits] == [photo(3)]
     assert math.isclose(found.hits[0].score, 1.0, abs_tol=1e-6)
+
+
+def test_queries_that_come_together_get_the_answers_that_they_get_alone(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    rows = places(12, 500)
+    snapshot = snapshot_of(rows)
+    rng = np.random.default_rng(1)
+    queries = [rows[row] + np.float32(0.3) * places(row, 1)[0] for row in range(24)]
+    asked = [rng.random(500) < rng.choice([1.0, 0.3]) for _ in queries]
+    questions = [Question(int(rng.choice([1, 5, 30]))) for _ in queries]
+    alone = [answer(snapshot, *one) for one in zip(queries, asked, questions, strict=True)]
+    glances = Glances()
+
+    def first_waits(*arguments: Any) -> Any:
+        if glances.rounds == 1:
+            wait_until(lambda: glances.waiting == 23, 30, lambda: None, "23 other queries")
+        return glance(*arguments)
+
+    monkeypatch.setattr(cascade, "glance", first_waits)
+    with ThreadPoolExecutor(len(queries)) as threads:
+        together = list(
+            threads.map(
+                lambda *one: answer_module.answer(snapshot, *one, glances),
+                queries,
+                asked,
+                questions,
+            )
+        )
+    assert together == alone
+    assert glances.queries == 24
+    assert glances.rounds == 2, "the first goes alone, and all others in one round after it"

@@ -17,6 +17,7 @@ from services.search.photo_columns import PhotoColumns
 from services.search.scan import FLOAT32_MARGIN
 from services.search.select import select
 from services.search.snapshot import LoadedChunk, Snapshot
+from services.search.together import Glances
 from shared.ids import new_id
 from shared.photo_filter import EVERYTHING
 from tests.support.photo_facts import facts_of
@@ -85,7 +86,9 @@ def ask(
     exclude: frozenset[UUID] = frozenset(),
 ) -> Answer:
     snapshot = Snapshot(new_id(), new_id(), 1, tuple(chunks))
-    return answer(snapshot, query, select(snapshot.photos, EVERYTHING, exclude), question)
+    return answer(
+        snapshot, query, select(snapshot.photos, EVERYTHING, exclude), question, Glances()
+    )
 
 
 @settings(max_examples=80, deadline=None)
