@@ -32,7 +32,8 @@ class Mode(StrEnum):
 
 
 class _Message(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    # Of an answer, what a newer worker adds is passed over.
+    model_config = ConfigDict(frozen=True)
 
 
 class SearchRequest(_Message):
@@ -43,6 +44,9 @@ class SearchRequest(_Message):
     indexed or deleted sees it in the answer. `exclude` names photos that must not be answered
     (the query itself).
     """
+
+    # What is asked has to be understood: a filter that is passed over would be a wrong answer.
+    model_config = ConfigDict(extra="forbid")
 
     map_id: UUID
     generation_id: UUID
@@ -94,6 +98,24 @@ class Lag(_Message):
     """Whether the generation is the active one; False for one that is only being built."""
 
 
+class Part(_Message):
+    """One part of what a generation is searched by: a level of its codes, or its rows."""
+
+    name: str
+    size_bytes: int
+    resident: bool
+    """Held in memory; else mapped from files, of which the system keeps what it has room for."""
+
+
+class Held(_Message):
+    """What is held of one generation."""
+
+    rows: int
+    """With those of deleted photos."""
+    dimension: int
+    parts: tuple[Part, ...]
+
+
 class SearchStatus(_Message):
     """How far a worker has followed: rows and bytes in memory, version by generation.
 
@@ -103,7 +125,11 @@ class SearchStatus(_Message):
     shard: str = str(WHOLE)
     rows: int
     resident_bytes: int
+    mapped_bytes: int = 0
+    """What is not resident."""
     versions: dict[UUID, int]
+    held: dict[UUID, Held] = {}
+    """Empty for several workers together."""
     incomplete: tuple[UUID, ...] = ()
     """Generations of which a chunk can't be read."""
     missing: tuple[str, ...]

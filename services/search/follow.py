@@ -8,7 +8,7 @@ from uuid import UUID
 
 from sqlalchemy import select
 
-from services.search.load import Loader, hold, part_bytes
+from services.search.load import Loader, hold, parts_of
 from services.search.memory import Memory
 from services.search.photo_columns import PhotoColumns
 from services.search.snapshot import LoadedChunk, Snapshot
@@ -19,6 +19,7 @@ from shared.catalog.photos import PhotoFacts, changed_since
 from shared.catalog.session import Catalog
 from shared.chunks import CODED_DIMENSION
 from shared.errors import NotFound, Unavailable
+from shared.search_protocol import Part
 from shared.shards import WHOLE, Shard
 
 log = logging.getLogger(__name__)
@@ -90,15 +91,18 @@ def advance(
         loaded.append(LoadedChunk(chunk.id, chunk.object_key, stored.rows, photos, stored=stored))
     if sum(chunk.rows.nbytes for chunk in loaded) >= CODED_FROM_BYTES:
         loaded = [_coded(loader, chunk) for chunk in loaded]
-    sizes = part_bytes(loaded)
-    parts = memory.parts_held(generation_id, sizes)
+    parts = parts_of(loaded)
+    held = memory.parts_held(generation_id, [size_bytes for _, size_bytes in parts])
     return Snapshot(
         generation_id=generation_id,
         map_id=generation.map_id,
         version=version,
-        chunks=tuple(hold(chunk, parts) for chunk in loaded),
+        chunks=tuple(hold(chunk, held) for chunk in loaded),
         missing=tuple(missing),
-        resident_bytes=sum(sizes[:parts]),
+        parts=tuple(
+            Part(name=name, size_bytes=size_bytes, resident=number < held)
+            for number, (name, size_bytes) in enumerate(parts)
+        ),
     )
 
 

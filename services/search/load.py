@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
@@ -94,16 +94,15 @@ def hold(chunk: LoadedChunk, parts: int) -> LoadedChunk:
     return replace(chunk, rows=rows, codes=codes)
 
 
-def part_bytes(chunks: Collection[LoadedChunk]) -> list[int]:
-    """The sizes of the parts that these chunks have together."""
-    sizes: list[int] = []
+def parts_of(chunks: Sequence[LoadedChunk]) -> list[tuple[str, int]]:
+    """The parts that these chunks have together, with their sizes in bytes."""
+    sizes: dict[str, int] = {}
     for chunk in chunks:
         levels = chunk.codes.levels if chunk.codes else ()
-        for number, size_bytes in enumerate((*(one.nbytes for one in levels), chunk.rows.nbytes)):
-            if number == len(sizes):
-                sizes.append(0)
-            sizes[number] += size_bytes
-    return sizes
+        for number, level in enumerate(levels):
+            name = f"codes {number}"
+            sizes[name] = sizes.get(name, 0) + level.nbytes
+    return [*sizes.items(), ("rows", sum(chunk.rows.nbytes for chunk in chunks))]
 
 
 def _held(stored: NDArray[Number], now: NDArray[Number], wanted: bool) -> NDArray[Number]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from prometheus_client import CollectorRegistry, Counter, Histogram, generate_latest
-from prometheus_client.core import GaugeMetricFamily
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 from prometheus_client.metrics_core import Metric
 from prometheus_client.registry import Collector
 
@@ -14,6 +14,9 @@ from shared.search_protocol import SearchResponse
 
 # From a small map in memory to a scan of a full shard, and to the longest wait for a version.
 SECONDS = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0)
+
+# An answer looks at some dozens of rows. From 5.5 on the codes are not trusted (`answer.py`).
+DEVIATIONS = (1.0, 2.0, 3.0, 4.0, 5.0, 5.5)
 
 
 class SearchMetrics:
@@ -38,12 +41,33 @@ class SearchMetrics:
             "Descriptor rows that were compared with a query.",
             registry=self._registry,
         )
+        self._reranked = Counter(
+            "placewise_search_rows_reranked",
+            "Of them, those whose whole rows were read.",
+            registry=self._registry,
+        )
+        self._certificates = Counter(
+            "placewise_search_answers",
+            "Answers by how they were reached.",
+            ["certificate"],
+            registry=self._registry,
+        )
+        self._deviations = Histogram(
+            "placewise_search_max_z",
+            "Largest error of an answer's estimates from codes, in standard deviations.",
+            buckets=DEVIATIONS,
+            registry=self._registry,
+        )
         self._registry.register(_Snapshots(worker))
 
     def answered(self, response: SearchResponse, seconds: float) -> None:
         self._searches.labels("answered").inc()
         self._seconds.observe(seconds)
         self._rows.inc(response.rows_scanned)
+        self._reranked.inc(response.rows_reranked)
+        self._certificates.labels(response.certificate).inc()
+        if response.max_z is not None:
+            self._deviations.observe(response.max_z)
 
     def refused(self, code: str) -> None:
         self._searches.labels(code).inc()
@@ -64,6 +88,17 @@ class _Snapshots(Collector):
         prefix = "placewise_search"
         yield GaugeMetricFamily(
             f"{prefix}_resident_bytes", "Bytes of descriptors in memory.", status.resident_bytes
+        )
+        yield GaugeMetricFamily(
+            f"{prefix}_mapped_bytes", "Bytes of descriptors on disk.", status.mapped_bytes
+        )
+        yield CounterMetricFamily(
+            f"{prefix}_code_scans", "Ways through the first codes.", self._worker.together.rounds
+        )
+        yield CounterMetricFamily(
+            f"{prefix}_code_scan_queries",
+            "Queries that went through the first codes, together or alone.",
+            self._worker.together.queries,
         )
         yield GaugeMetricFamily(f"{prefix}_rows", "Rows that can be answered.", status.rows)
         yield GaugeMetricFamily(

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from services.search.local_files import Mapped
 from services.search.photo_columns import JoinedColumns, PhotoColumns
 from shared.chunks import Rows
+from shared.search_protocol import Held, Part
 
 if TYPE_CHECKING:  # numba takes a while to load, and small maps need no codes
     from services.search.cascade import Blocks
@@ -60,8 +61,8 @@ class Snapshot:
     version: int
     chunks: tuple[LoadedChunk, ...]
     missing: tuple[str, ...] = ()
-    resident_bytes: int = 0
-    """Of rows and codes that are held in memory; the rest is mapped from files."""
+    parts: tuple[Part, ...] = ()
+    """What lies in memory, and what is mapped from files."""
 
     @cached_property
     def by_key(self) -> Mapping[str, LoadedChunk]:
@@ -77,9 +78,10 @@ class Snapshot:
     def live_rows(self) -> int:
         return int(self.photos.findable.sum())
 
-    @property
-    def row_bytes(self) -> int:
-        return sum(chunk.rows.nbytes for chunk in self.chunks)
+    @cached_property
+    def held(self) -> Held:
+        dimension = self.chunks[0].rows.shape[1] if self.chunks else 0
+        return Held(rows=len(self.photos), dimension=dimension, parts=self.parts)
 
     @cached_property
     def coded(self) -> bool:

@@ -119,13 +119,21 @@ class SearchWorker:
             missing=snapshot.missing,
         )
 
+    @property
+    def together(self) -> Glances:
+        """How often queries went through the codes, and how many together."""
+        return self._glances
+
     def status(self) -> SearchStatus:
         snapshots = self._snapshots
         versions = {key: snapshot.version for key, snapshot in snapshots.items()}
+        parts = [part for snapshot in snapshots.values() for part in snapshot.parts]
         return SearchStatus(
             shard=str(self.shard),
             rows=sum(snapshot.live_rows for snapshot in snapshots.values()),
-            resident_bytes=sum(snapshot.resident_bytes for snapshot in snapshots.values()),
+            resident_bytes=sum(part.size_bytes for part in parts if part.resident),
+            mapped_bytes=sum(part.size_bytes for part in parts if not part.resident),
+            held={key: snapshot.held for key, snapshot in snapshots.items()},
             versions=versions,
             incomplete=tuple(key for key, snapshot in snapshots.items() if snapshot.missing),
             missing=tuple(key for snapshot in snapshots.values() for key in snapshot.missing),

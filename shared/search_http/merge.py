@@ -42,11 +42,11 @@ def _first(k: int, answers: Sequence[SearchResponse]) -> list[Hit]:
 
 
 def _certified(hits: Sequence[Hit], answers: Sequence[SearchResponse]) -> int:
-    """How many of the first hits no shard may have a better one for: a shard that gave up vouches
-    for what scores at least as high as the last hit that it is certain of."""
+    """How many of the first hits are certain: a shard that ended early vouches for what scores at
+    least as high as the last hit that it is certain of itself."""
     sure = -1.0
     for answer in answers:
-        if answer.certified_k < len(answer.hits) or answer.certificate == NONE:
+        if _weakness(answer.certificate) >= CERTIFICATES.index(NONE):
             last = answer.certified_k - 1
             sure = max(sure, answer.hits[last].score if last >= 0 else 2.0)
     return sum(hit.score >= sure for hit in hits)
@@ -66,6 +66,7 @@ def merge_status(shards: Mapping[Shard, SearchStatus], away: Iterable[Shard] = (
     return SearchStatus(
         rows=sum(status.rows for status in found),
         resident_bytes=sum(status.resident_bytes for status in found),
+        mapped_bytes=sum(status.mapped_bytes for status in found),
         versions={key: min(status.versions[key] for status in found) for key in common},
         incomplete=tuple(sorted({key for status in found for key in status.incomplete})),
         missing=tuple(key for status in found for key in status.missing),

@@ -34,7 +34,8 @@ def ask(
         "POST",
         f"{url}/search",
         timeout_seconds,
-        content=request.model_dump_json(),
+        # Without what is not asked for: an older worker would not know its name.
+        content=request.model_dump_json(exclude_defaults=True),
         headers={"Content-Type": "application/json"},
     )
     return _read(SearchResponse, url, body)

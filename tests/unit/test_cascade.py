@@ -244,15 +244,14 @@ def test_queries_that_come_together_get_the_answers_that_they_get_alone(
         return glance(*arguments)
 
     monkeypatch.setattr(cascade, "glance", first_waits)
-    with ThreadPoolExecutor(len(queries)) as threads:
-        together = list(
-            threads.map(
-                lambda *one: answer_module.answer(snapshot, *one, glances),
-                queries,
-                asked,
-                questions,
-            )
+
+    def ask(number: int) -> Answer:
+        return answer_module.answer(
+            snapshot, queries[number], asked[number], questions[number], glances
         )
+
+    with ThreadPoolExecutor(len(queries)) as threads:
+        together = list(threads.map(ask, range(len(queries))))
     assert together == alone
     assert glances.queries == 24
     assert glances.rounds == 2, "the first goes alone, and all others in one round after it"

@@ -10,7 +10,15 @@ from hypothesis import strategies as st
 
 from shared.ids import new_id
 from shared.search_http.merge import merge, merge_status
-from shared.search_protocol import EXHAUSTIVE, Hit, Lag, SearchResponse, SearchStatus
+from shared.search_protocol import (
+    EXHAUSTIVE,
+    NONE,
+    STATISTICAL,
+    Hit,
+    Lag,
+    SearchResponse,
+    SearchStatus,
+)
 from shared.shards import Shard
 
 
@@ -70,6 +78,38 @@ def test_the_sums_the_least_version_and_all_that_is_missing_are_told() -> None:
 def test_the_weakest_certificate_counts() -> None:
     assert merge([answer(), answer()], 1).certificate == EXHAUSTIVE
     assert merge([answer(), answer(certificate="of the future")], 1).certificate == "of the future"
+
+
+@given(data=st.data(), of=st.integers(1, 4), k=st.integers(1, 12))
+def test_what_is_certain_when_shards_end_early_is_what_they_would_have_found(
+    data: st.DataObject, of: int, k: int
+) -> None:
+    some_scores = st.lists(st.integers(-100, 100).map(lambda cent: cent / 100), max_size=10)
+    everything: list[tuple[int, float]] = []
+    answers = []
+    for shard in range(of):
+        hits = [(100 * shard + n, score) for n, score in enumerate(data.draw(some_scores))]
+        everything += hits
+        seen = [hit for hit in hits if data.draw(st.booleans())]
+        unseen = max((score for _, score in set(hits) - set(seen)), default=-2.0)
+        certain = sum(score > unseen for _, score in seen)
+        certificate = STATISTICAL if len(seen) == len(hits) else NONE
+        answers.append(answer(*seen, certified_k=certain, certificate=certificate))
+    merged = merge(answers, k)
+    truth = sorted(everything, key=lambda hit: (-hit[1], hit[0]))[:k]
+    assert ranked(merged)[: merged.certified_k] == truth[: merged.certified_k]
+    if all(one.certificate != NONE for one in answers):
+        assert merged.certified_k == len(truth)
+
+
+def test_largest_error_of_an_estimate_is_told_and_none_where_nothing_was_estimated() -> None:
+    assert merge([answer(), answer()], 1).max_z is None
+    assert merge([answer(max_z=1.5), answer(), answer(max_z=3.0)], 1).max_z == 3.0
+
+
+def test_what_a_newer_worker_adds_to_its_answer_is_passed_over() -> None:
+    told = answer((1, 0.5)).model_dump(mode="json") | {"of_the_future": 1}
+    assert ranked(SearchResponse.model_validate(told)) == [(1, 0.5)]
 
 
 def test_a_generation_is_there_once_every_shard_has_it() -> None:
