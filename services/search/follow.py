@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass, replace
+from pathlib import Path
 from uuid import UUID
 
 from sqlalchemy import select
@@ -19,6 +20,7 @@ from shared.catalog.photos import PhotoFacts, changed_since
 from shared.catalog.session import Catalog
 from shared.chunks import CODED_DIMENSION
 from shared.errors import NotFound, Unavailable
+from shared.objects import ObjectStore
 from shared.search_protocol import Part
 from shared.shards import WHOLE, Shard
 
@@ -50,7 +52,8 @@ def wanted_versions(catalog: Catalog) -> dict[UUID, Wanted]:
 
 def advance(
     catalog: Catalog,
-    loader: Loader,
+    store: ObjectStore,
+    folder: Path,
     memory: Memory,
     generation_id: UUID,
     old: Snapshot | None,
@@ -60,8 +63,9 @@ def advance(
     the generation is gone.
 
     Reads the catalog in one consistent transaction. A chunk that can't be read, or whose hash
-    differs, is named in `missing`, and the rest is served.
+    differs, is named in `missing`, and the rest is served. Files are kept below `folder`.
     """
+    loader = Loader(store, folder / str(generation_id))
     with catalog.read() as session:
         generation = session.get(Generation, generation_id)
         if generation is None:
@@ -91,6 +95,7 @@ def advance(
         loaded.append(LoadedChunk(chunk.id, chunk.object_key, stored.rows, photos, stored=stored))
     if sum(chunk.rows.nbytes for chunk in loaded) >= CODED_FROM_BYTES:
         loaded = [_coded(loader, chunk) for chunk in loaded]
+    loader.keep_only(loaded)
     parts = parts_of(loaded)
     held = memory.parts_held(generation_id, [size_bytes for _, size_bytes in parts])
     return Snapshot(

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import logging
 import os
+import shutil
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
+from uuid import UUID
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,10 +30,11 @@ Number = TypeVar("Number", bound=np.generic)
 
 
 class Loader:
-    """Opens the chunks of an object store."""
+    """Opens the chunks of one generation."""
 
     def __init__(self, store: ObjectStore, folder: Path) -> None:
-        """`folder` is for objects that are no files of this machine, and for missing codes."""
+        """`folder` is the generation's own: for objects that are no files of this machine, and for
+        codes that are missing."""
         self._store = store
         self._files = LocalFiles(store, folder)
 
@@ -68,9 +71,19 @@ class Loader:
                 self._files.remove(name)
         raise AssertionError("codes that were just made are those of the rows")
 
-    def keep_only(self, sha256s: Collection[str]) -> None:
+    def keep_only(self, chunks: Collection[LoadedChunk]) -> None:
         """Remove the files of all other chunks."""
-        self._files.keep_only({f"{one}{end}" for one in sha256s for end in (".npy", ".codes")})
+        hashes = [chunk.stored.sha256 for chunk in chunks if chunk.stored is not None]
+        self._files.keep_only({f"{one}{end}" for one in hashes for end in (".npy", ".codes")})
+
+
+def remove_others(folder: Path, generation_ids: Collection[UUID]) -> None:
+    """Remove what loaders have kept below `folder` of generations that are gone."""
+    known = {str(generation_id) for generation_id in generation_ids}
+    for path in folder.iterdir() if folder.is_dir() else ():
+        if path.name not in known:
+            log.info("removing what was kept of generation %s", path.name)
+            shutil.rmtree(path, ignore_errors=True)
 
 
 def hold(chunk: LoadedChunk, parts: int) -> LoadedChunk:

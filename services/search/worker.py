@@ -13,7 +13,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from services.search.answer import Question, answer
 from services.search.follow import FOLLOWED, advance, wanted_versions
 from services.search.lag import Lags
-from services.search.load import Loader
+from services.search.load import remove_others
 from services.search.memory import Memory
 from services.search.query_row import QueryRows, expired
 from services.search.select import select
@@ -48,7 +48,8 @@ class SearchWorker:
         self.lags = Lags()
         self._catalog = catalog
         self._settings = settings
-        self._loader = Loader(store, settings.search_cache(shard))
+        self._store = store
+        self._folder = settings.search_cache(shard)
         self._glances = Glances()
         self._memory = Memory(settings.search_memory_bytes)
         self._rows = QueryRows(store)
@@ -92,6 +93,7 @@ class SearchWorker:
             self.lags.level(generation_id, looked_at)
         for generation_id in self._snapshots.keys() - wanted.keys():
             self._memory.forget(generation_id)
+        remove_others(self._folder, wanted.keys())
         with self._swap:
             self._snapshots = {k: v for k, v in self._snapshots.items() if k in wanted}
             self._loading = {k: v for k, v in self._loading.items() if k in wanted or v.locked()}
@@ -167,7 +169,15 @@ class SearchWorker:
             old = self._snapshots.get(generation_id)
             if old is not None and old.version >= version and not old.missing:
                 return old  # another thread loaded it while this one waited
-            new = advance(self._catalog, self._loader, self._memory, generation_id, old, self.shard)
+            new = advance(
+                self._catalog,
+                self._store,
+                self._folder,
+                self._memory,
+                generation_id,
+                old,
+                self.shard,
+            )
             if new is not None:
                 with self._swap:
                     self._snapshots = {**self._snapshots, generation_id: new}

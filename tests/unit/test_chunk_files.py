@@ -1,0 +1,266 @@
+"""Chunks as files of this machine: fetched once, checked, mapped; codes beside them or made."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import BinaryIO
+from uuid import UUID
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+import shared.codes.stored
+from services.search.load import Loader, hold, parts_of, remove_others
+from services.search.memory import Memory, held
+from services.search.photo_columns import PhotoColumns
+from services.search.snapshot import LoadedChunk, StoredChunk
+from shared.catalog.chunks import Chunk
+from shared.chunks import CODED_BYTES, codes_key, delete_chunk, write_chunk
+from shared.codes.signs import sign_codes
+from shared.errors import Unavailable
+from shared.ids import new_id
+from shared.objects import FolderStore
+
+DIMENSION = 7168
+MANY = CODED_BYTES // (4 * DIMENSION) + 1
+
+Rows = NDArray[np.float32]
+
+
+class Bucket(FolderStore):
+    """Objects that are no files of this machine; counts how often one is opened."""
+
+    opened = 0
+
+    def file(self, key: str) -> Path | None:
+        return None
+
+    def open(self, key: str) -> BinaryIO:
+        self.opened += 1
+        return super().open(key)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    return tmp_path / "cache" / "generation"
+
+
+@pytest.fixture(params=["folder", "bucket"])
+def store(request: pytest.FixtureRequest, tmp_path: Path) -> FolderStore:
+    kind = FolderStore if request.param == "folder" else Bucket
+    return kind(tmp_path / "objects")
+
+
+def unit_rows(count: int) -> Rows:
+    rows = np.random.default_rng(count).standard_normal((count, DIMENSION), np.float32)
+    found: Rows = rows / np.linalg.norm(rows, axis=1, keepdims=True)
+    return found
+
+
+def written(store: FolderStore, rows: Rows) -> Chunk:
+    generation_id, chunk_id = new_id(), new_id()
+    chunk = write_chunk(
+        store,
+        generation_id=generation_id,
+        chunk_id=chunk_id,
+        rows=rows,
+        photo_ids=[new_id() for _ in rows],
+        spec={},
+    )
+    return Chunk(
+        id=chunk_id,
+        generation_id=generation_id,
+        object_key=chunk.object_key,
+        rows=chunk.rows,
+        sha256=chunk.sha256,
+    )
+
+
+def test_rows_are_those_that_were_written(store: FolderStore, folder: Path) -> None:
+    rows = unit_rows(5)
+    stored = Loader(store, folder).rows(written(store, rows))
+    np.testing.assert_array_equal(stored.rows, rows)
+    assert not stored.rows.flags.writeable
+    stored.file.read_ahead(5000, 100_000)
+
+
+def test_rows_stay_readable_when_the_object_and_its_copy_are_deleted(
+    store: FolderStore, folder: Path
+) -> None:
+    rows = unit_rows(5)
+    chunk = written(store, rows)
+    loader = Loader(store, folder)
+    stored = loader.rows(chunk)
+    delete_chunk(store, chunk.object_key)
+    loader.keep_only([])
+    np.testing.assert_array_equal(stored.rows, rows)
+
+
+@pytest.mark.parametrize("damage", [lambda data: data[:-7], lambda data: data[:-1] + b"?"])
+def test_damaged_chunk_is_refused_by_its_hash_and_served_once_it_is_repaired(
+    store: FolderStore, folder: Path, damage: Callable[[bytes], bytes]
+) -> None:
+    chunk = written(store, unit_rows(5))
+    whole = store.get(chunk.object_key)
+    store.put(chunk.object_key, damage(whole))
+    loader = Loader(store, folder)
+    with pytest.raises(Unavailable) as caught:
+        loader.rows(chunk)
+    assert caught.value.code == "chunk_corrupt"
+    assert chunk.object_key in caught.value.detail
+    assert not list(folder.glob("*"))
+    store.put(chunk.object_key, whole)
+    assert len(loader.rows(chunk).rows) == 5
+
+
+def test_objects_of_a_bucket_are_fetched_once(tmp_path: Path, folder: Path) -> None:
+    store = Bucket(tmp_path / "objects")
+    chunk = written(store, unit_rows(5))
+    for _ in range(3):
+        Loader(store, folder).rows(chunk)
+    assert store.opened == 1
+
+
+def test_files_of_a_folder_are_not_copied(tmp_path: Path, folder: Path) -> None:
+    store = FolderStore(tmp_path / "objects")
+    Loader(store, folder).rows(written(store, unit_rows(5)))
+    assert not folder.exists()
+
+
+def test_only_the_files_of_chunks_that_are_searched_are_kept(tmp_path: Path, folder: Path) -> None:
+    store = Bucket(tmp_path / "objects")
+    loader = Loader(store, folder)
+    kept, dropped = (loader.rows(written(store, unit_rows(n))) for n in (3, 4))
+    (folder / "old.partial").touch()
+    long_ago = time.time() - 7200
+    os.utime(folder / "old.partial", (long_ago, long_ago))
+    (folder / "new.partial").touch()
+    loader.keep_only([loaded(kept)])
+    assert {path.name for path in folder.iterdir()} == {f"{kept.sha256}.npy", "new.partial"}
+    assert len(dropped.rows) == 4
+    other = folder.with_name(str(new_id()))
+    other.mkdir()
+    mine = new_id()
+    folder.rename(folder.with_name(str(mine)))
+    remove_others(folder.parent, [mine])
+    assert [path.name for path in folder.parent.iterdir()] == [str(mine)]
+
+
+def loaded(stored: StoredChunk) -> LoadedChunk:
+    photos = PhotoColumns.of(len(stored.rows), [])
+    return LoadedChunk(new_id(), "chunks/a.npy", stored.rows, photos, stored.codes, stored)
+
+
+def test_codes_lie_beside_a_long_chunk_and_beside_no_short_one(store: FolderStore) -> None:
+    assert store.head(codes_key(written(store, unit_rows(MANY)).object_key)) is not None
+    short = written(store, unit_rows(MANY - 2))
+    assert store.head(codes_key(short.object_key)) is None
+    delete_chunk(store, short.object_key)
+
+
+def test_deleting_a_chunk_deletes_its_codes(store: FolderStore) -> None:
+    chunk = written(store, unit_rows(MANY))
+    delete_chunk(store, chunk.object_key)
+    assert list(store.list("")) == []
+
+
+def test_codes_that_lie_beside_a_chunk_are_not_made_again(
+    store: FolderStore, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rows = unit_rows(MANY)
+    chunk = written(store, rows)
+    monkeypatch.delattr(shared.codes.stored, "sign_codes")
+    loader = Loader(store, folder)
+    codes = loader.codes(chunk.object_key, loader.rows(chunk))
+    for level, expected in zip(codes.levels, sign_codes(rows).levels, strict=True):
+        np.testing.assert_array_equal(level, expected)
+
+
+def test_codes_that_are_missing_are_made_once(
+    store: FolderStore, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rows = unit_rows(6)
+    chunk = written(store, rows)
+    for _ in range(2):
+        loader = Loader(store, folder)
+        codes = loader.codes(chunk.object_key, loader.rows(chunk))
+        np.testing.assert_array_equal(codes.levels[0], sign_codes(rows).levels[0])
+        monkeypatch.delattr(shared.codes.stored, "sign_codes", raising=False)
+
+
+@pytest.mark.parametrize("where", ["beside the chunk", "kept here"])
+def test_damaged_codes_are_made_again_and_the_chunk_is_served(
+    store: FolderStore, folder: Path, where: str
+) -> None:
+    rows = unit_rows(MANY)
+    chunk = written(store, rows)
+    key = codes_key(chunk.object_key)
+    whole = store.get(key)
+    if where == "kept here":
+        loader = Loader(store, folder)
+        loader.codes(chunk.object_key, loader.rows(chunk))
+        (kept,) = folder.glob("*.codes")
+        kept.write_bytes(whole[:-1] + b"?")
+    else:
+        store.put(key, whole[:-1] + b"?")
+    loader = Loader(store, folder)
+    codes = loader.codes(chunk.object_key, loader.rows(chunk))
+    np.testing.assert_array_equal(codes.levels[-1], sign_codes(rows).levels[-1])
+
+
+def test_parts_are_held_in_memory_or_mapped_and_hold_the_same(
+    store: FolderStore, folder: Path
+) -> None:
+    rows = unit_rows(6)
+    chunk = written(store, rows)
+    loader = Loader(store, folder)
+    stored = loader.rows(chunk)
+    codes = loader.codes(chunk.object_key, stored)
+    stored = StoredChunk(stored.file, stored.rows, stored.sha256, codes)
+    one = loaded(stored)
+    assert parts_of([one, one]) == [("codes 0", 2 * 6 * 896), ("rows", 2 * 6 * 4 * DIMENSION)]
+    for parts in (0, 1, 2, 1, 0):
+        one = hold(one, parts)
+        assert one.codes is not None
+        assert (one.codes.levels[0] is codes.levels[0]) == (parts < 1)
+        assert (one.rows is stored.rows) == (parts < 2)
+        np.testing.assert_array_equal(one.rows, rows)
+        np.testing.assert_array_equal(one.codes.levels[0], codes.levels[0])
+        one.read_ahead(5)
+    again = hold(hold(one, 2), 2)
+    assert hold(again, 2).rows is again.rows, "what is in memory is not copied again"
+
+
+@given(
+    wanted=st.dictionaries(st.uuids(), st.lists(st.integers(0, 50), max_size=4), max_size=4),
+    budget=st.integers(0, 300),
+)
+def test_no_more_than_the_budget_is_held_and_what_would_fit_is(
+    wanted: dict[UUID, list[int]], budget: int
+) -> None:
+    counts = held(wanted, budget)
+    left = budget - sum(sum(wanted[key][:count]) for key, count in counts.items())
+    assert left >= 0
+    for key, count in counts.items():
+        assert count == len(wanted[key]) or wanted[key][count] > left
+
+
+def test_first_parts_of_all_go_before_the_second_part_of_any() -> None:
+    first, second = new_id(), new_id()
+    assert held({first: [10, 50], second: [10, 5]}, 60) == {first: 1, second: 2}
+    assert held({first: [10, 40], second: [10, 5]}, 60) == {first: 2, second: 1}
+
+
+def test_what_a_forgotten_generation_held_is_free_for_others() -> None:
+    memory = Memory(100)
+    first, second = new_id(), new_id()
+    assert memory.parts_held(first, [60, 30]) == 2
+    assert memory.parts_held(second, [60]) == 0
+    memory.forget(first)
+    assert memory.parts_held(second, [60]) == 1
