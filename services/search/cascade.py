@@ -18,6 +18,7 @@ import math
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -36,7 +37,7 @@ from services.search.kernels import (
 from services.search.parts import in_parts
 from services.search.snapshot import LoadedChunk
 from shared.codes.rotation import Rotation, rotation
-from shared.codes.signs import WORD, Words, level_words
+from shared.codes.signs import WORD, Words, level_words, sign_codes
 
 BOUND = 6.0
 FIRST_LOOK = 64  # rows whose whole codes are looked at early, for a floor
@@ -213,6 +214,26 @@ def glance(
     in_parts(part, len(blocks), 8 * words)
     total = np.sum(counts, axis=0)
     return [Glance(distance, count) for distance, count in zip(found, total, strict=True)]
+
+
+@cache
+def warm_up() -> None:
+    """Have everything compiled that a search calls, so that no query waits for it."""
+    row = np.full(4096, 1 / 64, np.float32)
+    codes = sign_codes(row[np.newaxis])
+    blocks = Blocks(
+        dimension=len(row),
+        first=np.array([0, 1]),
+        levels=tuple(_addresses([level]) for level in codes.levels),
+        rows=_addresses([row]),
+        norms=codes.norms,
+        zeros=np.empty(0, np.int64),
+        kept=(codes, row),
+    )
+    query = CodedQuery.of(row, rotation(len(row)))
+    (first,) = glance(blocks, [query], [np.ones(1, bool)])
+    distances_at(np.empty(0, np.uint64), query.bits, np.empty(0, np.int64))
+    Refinement(blocks, query, 1, None, lambda _: None).search(first, Budget())
 
 
 def hamming_deviation(bits: int, padded: int) -> float:

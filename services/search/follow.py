@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from uuid import UUID
@@ -95,6 +96,7 @@ def advance(
         loaded.append(LoadedChunk(chunk.id, chunk.object_key, stored.rows, photos, stored=stored))
     if sum(chunk.rows.nbytes for chunk in loaded) >= CODED_FROM_BYTES:
         loaded = [_coded(loader, chunk) for chunk in loaded]
+        _warm_up(loaded)
     loader.keep_only(loaded)
     parts = parts_of(loaded)
     held = memory.parts_held(generation_id, [size_bytes for _, size_bytes in parts])
@@ -118,6 +120,13 @@ def _coded(loader: Loader, chunk: LoadedChunk) -> LoadedChunk:
         return chunk
     codes = loader.codes(chunk.object_key, stored)
     return replace(chunk, codes=codes, stored=replace(stored, codes=codes))
+
+
+def _warm_up(chunks: Sequence[LoadedChunk]) -> None:
+    if any(chunk.codes is not None for chunk in chunks):
+        from services.search.cascade import warm_up
+
+        warm_up()
 
 
 def _changed(chunk: LoadedChunk, changes: dict[UUID, PhotoFacts]) -> LoadedChunk:

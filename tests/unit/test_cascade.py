@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from services.search import answer as answer_module
-from services.search import cascade
+from services.search import cascade, kernels
 from services.search.answer import DECIMALS, Answer, Question
 from services.search.cascade import glance
 from services.search.photo_columns import PhotoColumns
@@ -255,3 +255,13 @@ def test_queries_that_come_together_get_the_answers_that_they_get_alone(
     assert together == alone
     assert glances.queries == 24
     assert glances.rounds == 2, "the first goes alone, and all others in one round after it"
+
+
+def test_after_warming_up_nothing_is_left_to_compile() -> None:
+    cascade.warm_up()
+    loops = [one for one in vars(kernels).values() if hasattr(one, "signatures")]
+    before = {loop.py_func.__name__: len(loop.signatures) for loop in loops}
+    assert min(before.values()) == 1, before
+    rows = places(3, 400, 98_304)
+    answer(snapshot_of(rows), rows[0], np.ones(400, bool), Question(300))
+    assert {loop.py_func.__name__: len(loop.signatures) for loop in loops} == before
