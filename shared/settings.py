@@ -184,6 +184,11 @@ class Settings(BaseSettings):
     device: Literal["auto", "cpu", "cuda"] = Field(
         "auto", description="where photos are described; auto takes CUDA where it is"
     )
+    precision: Literal["auto", "float32", "bfloat16"] = Field(
+        "auto",
+        description="what new generations are computed in; auto takes bfloat16 for DINOv2 on CUDA, "
+        "and float32 for all else",
+    )
     dino_weights: Path | None = Field(
         None,
         description="DINOv2's weights: a .pth, .pt or .safetensors file; unset: timm's on the hub",

@@ -19,6 +19,7 @@ from shared.errors import Misconfigured, PlacewiseError, Unprocessable
 from shared.recipes import Recipe
 from shared.settings import Settings
 from shared.vision.extractors import Extractor, choose_device, not_finite
+from shared.vision.precision import choose_precision
 from shared.vision.provenance import check_fits
 from shared.vision.vocabulary import Centres
 from shared.vision.vocabulary_file import VocabularyFile, read_vocabulary
@@ -62,8 +63,12 @@ def describe_files(
     """
     started = time.perf_counter()
     own = _own_vocabulary(recipe, vocabulary)
+    device = choose_device(settings.device)
     extractor = Extractor(
-        recipe, choose_device(settings.device), dino_weights=settings.dino_weights
+        recipe,
+        device,
+        precision=choose_precision(settings.precision, recipe, device),
+        dino_weights=settings.dino_weights,
     )
     centres = _centres(extractor, own)
     described = DescribedFiles(out, extractor.spec(centres), len(photos))

@@ -22,6 +22,7 @@ from shared.settings import Settings
 from shared.vision.extractors import Extractor, choose_device
 from shared.vision.fit_photos import fit_photos
 from shared.vision.patches import choose_photos
+from shared.vision.precision import choose_precision
 from shared.vision.resample import Pixels
 
 SAMPLE_PHOTOS = 1000  # as a map's fit learns from, unless told otherwise
@@ -81,7 +82,13 @@ def fit_folder(
 
 
 def _load(recipe: Recipe, settings: Settings) -> Extractor:
-    return Extractor(recipe, choose_device(settings.device), dino_weights=settings.dino_weights)
+    device = choose_device(settings.device)
+    return Extractor(
+        recipe,
+        device,
+        precision=choose_precision(settings.precision, recipe, device),
+        dino_weights=settings.dino_weights,
+    )
 
 
 def _pixels(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections import OrderedDict
+from collections import OrderedDict, defaultdict
 from uuid import UUID
 
 from sqlalchemy.orm import Session
@@ -16,6 +16,8 @@ from shared.objects import ObjectStore
 from shared.recipes import Recipe
 from shared.settings import Settings
 from shared.vision.extractors import Extractor, choose_device, spec_fingerprint
+from shared.vision.passes import PassLimit
+from shared.vision.precision import PRECISIONS, Precision, choose_precision
 from shared.vision.vocabulary import Centres, decode_centres
 
 MOST_EXTRACTORS = 2  # a large backbone takes gigabytes of GPU memory
@@ -31,25 +33,66 @@ class LoadedModels:
         self._lock = threading.RLock()
         self._device = choose_device(settings.device)
         self._extractors: OrderedDict[str, Extractor] = OrderedDict()
+        # Of what was loaded once: to run out of memory again for each time would cost photos time.
+        self._limits: defaultdict[tuple[object, ...], PassLimit] = defaultdict(PassLimit)
         self._centres: OrderedDict[UUID, Centres] = OrderedDict()
 
-    def extractor(self, name: str) -> Extractor:
-        """The extractor called `name`, its weights loaded."""
+    def extractor(self, name: str, precision: Precision | None = None) -> Extractor:
+        """The extractor called `name`, its weights loaded.
+
+        `precision` is that of a generation that is there (see `of_generation`); left out, that of
+        new ones: PRECISION.
+        """
         recipe = self._settings.recipe(name)
+        if precision is None:
+            precision = choose_precision(self._settings.precision, recipe, self._device)
         with self._lock:
             found = self._extractors.get(recipe.name)
             if found is None:
-                found = self._extractors[recipe.name] = self._load(recipe)
+                found = self._extractors[recipe.name] = self._load(recipe, precision)
             self._extractors.move_to_end(recipe.name)
             while len(self._extractors) > MOST_EXTRACTORS:
                 self._extractors.popitem(last=False)
-            return found
+            return found.at(precision)
 
-    def _load(self, recipe: Recipe) -> Extractor:
+    def of_generation(self, generation: Generation) -> Extractor:
+        """The extractor of a generation in the precision that it was begun in, whatever PRECISION
+        says and whatever device this is: rows of two precisions never mix.
+
+        Unavailable (`spec_differs`) for a precision that this release does not know.
+        """
+        precision = generation.spec["precision"]
+        if precision not in PRECISIONS:
+            raise Unavailable(
+                "spec_differs",
+                f"Generation {generation.id} was made in {precision}, which this worker can't do: "
+                f"it knows {' and '.join(PRECISIONS)}. Upgrade it, or start a model change "
+                "(POST /api/v1/generations).",
+                generation_id=str(generation.id),
+            )
+        return self.extractor(generation.extractor, precision)
+
+    def _load(self, recipe: Recipe, precision: Precision) -> Extractor:
+        limit = self._limits[recipe.local_features]
         for loaded in self._extractors.values():
             if loaded.recipe.local_features == recipe.local_features:
-                return Extractor(recipe, self._device, backbone=loaded.backbone)
-        return Extractor(recipe, self._device, dino_weights=self._settings.dino_weights)
+                return Extractor(
+                    recipe,
+                    self._device,
+                    precision=precision,
+                    backbone=loaded.backbone,
+                    limit=limit,
+                )
+        made = Extractor(
+            recipe,
+            self._device,
+            precision=precision,
+            dino_weights=self._settings.dino_weights,
+            limit=limit,
+        )
+        if self._device.type == "cuda":
+            made.warm_up(self._settings.batch_photos)
+        return made
 
     def centres(self, vocabulary: Vocabulary) -> Centres:
         """The vocabulary's centres, checked against the catalog's hash."""

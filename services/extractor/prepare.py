@@ -53,6 +53,11 @@ class Batch:
         """Of each of `ready`, (height, width, 3)."""
         return [decoded.pixels for decoded in self.decoded]
 
+    def refuse(self, place: int, error: PlacewiseError) -> None:
+        """The job at that place of `ready` goes to `failed`."""
+        del self.decoded[place]
+        self.failed.append((self.ready.pop(place), error))
+
     def refuse_not_finite(self, rows: Rows) -> Rows:
         """The rows that are finite; the jobs of the others go from `ready` to `failed`."""
         finite = [bool(np.isfinite(row).all()) for row in rows]

@@ -36,7 +36,7 @@ def renew_outdated_generations(catalog: Catalog, models: LoadedModels) -> int:
     started = 0
     for generation, vocabulary in found:
         try:
-            extractor = models.extractor(generation.extractor)
+            extractor = models.of_generation(generation)
             spec = extractor.spec(models.centres(vocabulary) if vocabulary else None)
         except PlacewiseError as error:
             log.error("generation %s can't be checked: %s", generation.id, error.detail)

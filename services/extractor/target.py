@@ -52,7 +52,7 @@ def find_target(
         if first is None:
             return None
         generation, vocabulary = first
-    extractor = models.extractor(generation.extractor)
+    extractor = models.of_generation(generation)
     centres = models.centres(vocabulary) if vocabulary else None
     # A query's row is compared once and thrown away: another decoder release is close enough.
     check_spec(generation, extractor, centres, decoder_matters=job.kind != JobKind.DESCRIBE)

@@ -50,7 +50,9 @@ class Poisoned(Preprocessing):
         return super().apply(image)
 
 
-POISONED = Poisoned("poisoned", 1, SQUARE.upright, SQUARE.most_pixels, SQUARE.bring)
+POISONED = Poisoned(
+    "poisoned", 1, SQUARE.upright, SQUARE.most_pixels, SQUARE.usual_size, SQUARE.bring
+)
 
 
 @contextlib.contextmanager
