@@ -15,8 +15,8 @@ import pytest
 from sqlalchemy import func, select
 
 from services.extractor.loaded import LoadedModels
+from services.extractor.publish import publish
 from services.extractor.renew import renew_outdated_generations
-from services.extractor.worker import ExtractorWorker
 from services.gateway import upload as upload_module
 from services.steward import delete_maps as delete_maps_module
 from services.steward.collect import collect_orphans
@@ -227,16 +227,15 @@ def before_publishing(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[],
     """Has something done when a batch is described and not published yet."""
 
     def meanwhile(do: Callable[[], object]) -> None:
-        real = ExtractorWorker._describe
         calls = iter([do])
 
-        def describe(self: ExtractorWorker, batch: Any) -> Any:
+        def act_and_publish(*arguments: Any) -> Any:
             for act in calls:
                 act()
                 break
-            return real(self, batch)
+            return publish(*arguments)
 
-        monkeypatch.setattr(ExtractorWorker, "_describe", describe)
+        monkeypatch.setattr("services.extractor.worker.publish", act_and_publish)
 
     return meanwhile
 
