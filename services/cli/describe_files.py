@@ -19,6 +19,7 @@ from shared.errors import Misconfigured, PlacewiseError, Unprocessable
 from shared.recipes import Recipe
 from shared.settings import Settings
 from shared.vision.extractors import Extractor, choose_device, not_finite
+from shared.vision.passes import PhotoDoesNotFit
 from shared.vision.precision import choose_precision
 from shared.vision.provenance import check_fits
 from shared.vision.vocabulary import Centres
@@ -88,12 +89,16 @@ def describe_files(
                     pixels.append(outcome.pixels)
             if not refused:  # after a refusal, the rest is read for what else can't be described
                 begun = time.perf_counter()
-                rows = extractor.describe(pixels, centres)
+                try:
+                    rows = extractor.describe(pixels, centres)
+                except PhotoDoesNotFit as error:
+                    refused.append((batch[error.place][0], error))
+                else:
+                    for (photo, _), row in zip(batch, rows, strict=True):
+                        if not np.isfinite(row).all():
+                            refused.append((photo, not_finite()))
+                    file.write(np.ascontiguousarray(rows, "<f4").tobytes())
                 described.seconds["describe"] += time.perf_counter() - begun
-                for (photo, _), row in zip(batch, rows, strict=True):
-                    if not np.isfinite(row).all():
-                        refused.append((photo, not_finite()))
-                file.write(np.ascontiguousarray(rows, "<f4").tobytes())
             advance(len(batch))
         if refused:
             raise _refusal(refused, len(photos))
