@@ -153,11 +153,13 @@ class SearchWorker:
 def _ranked(snapshot: Snapshot, row: Row, request: SearchRequest) -> tuple[list[Hit], int, int]:
     """The hits, the rows scanned, the rows scored again."""
     exclude = frozenset(request.exclude)
-    query, weighted = unit(row), _weighted(row, request.word_weights)
-    if query is not None and weighted is not None:
+    weighted = _weighted(row, request.word_weights)
+    if weighted is not None:
+        plain_query = unit(row)
+        assert plain_query is not None, "a query with a weighted word has a length"
         found, scanned, reranked = weighted_top_k(
             snapshot.chunks,
-            query,
+            plain_query,
             weighted,
             request.k,
             min_score=request.min_score,
