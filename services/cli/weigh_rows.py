@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.datasets.utm_names import position_of_name
+from shared.datasets.utm_names import fields_of_name
 from shared.estimate.places import Spot
 from shared.word_weights.learn import Moments, Taught, nothing_taught, weigh, word_products
 from shared.word_weights.pairs import choose_pairs
@@ -20,7 +20,8 @@ Rows = NDArray[np.float32]
 def learn_weights(database: Rows, names: Sequence[str], words: int) -> list[float] | None:
     """One weight for each of the words of (n, words * width) rows, of photos with these @UTM@
     names; None where they have too few pairs to learn from."""
-    spots = [Spot(*(position_of_name(name) or (None, None)), None) for name in names]
+    said = [fields_of_name(name, None) for name in names]
+    spots = [Spot(float(one["latitude"]), float(one["longitude"]), None) for one in said]
     chosen = choose_pairs(spots, SEED, len(names))
     if not chosen.is_enough:
         return None

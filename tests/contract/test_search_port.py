@@ -296,7 +296,11 @@ class SearchPortContract:
         weighted /= np.linalg.norm(weighted)
         exact = vector.astype(np.float64) / np.linalg.norm(vector.astype(np.float64))
         by_weight = sorted(
-            (-float(row.astype(np.float64) @ weighted), photo_id, float(row @ exact))
+            (
+                -float(row.astype(np.float64) @ weighted),
+                photo_id,
+                float(row.astype(np.float64) @ exact),
+            )
             for photo_id, row in places.rows.items()
         )
         assert [hit[1] for hit in by_weight] != [hit[0] for hit in places.brute_force(vector, 30)]
@@ -307,8 +311,10 @@ class SearchPortContract:
             expected = [hit for hit in by_weight if least is None or hit[2] >= least][:k]
             assert len(answer.hits) == len(expected) > 0
             assert [hit.photo_id for hit in answer.hits] == [hit[1] for hit in expected]
-            found = [(hit.weighted_score, hit.score) for hit in answer.hits]
-            np.testing.assert_allclose(found, [(-hit[0], hit[2]) for hit in expected], atol=1e-7)
+            by = [hit.weighted_score for hit in answer.hits]
+            assert by == pytest.approx([-hit[0] for hit in expected], abs=1e-12)
+            plain = [hit.score for hit in answer.hits]
+            assert plain == pytest.approx([hit[2] for hit in expected], abs=1e-12)
             assert answer.rows_scanned == 30
 
     def test_query_without_any_weighted_word_is_ranked_plainly_and_says_so(

@@ -26,7 +26,7 @@ from shared.catalog.vocabularies import VocabularyOrigin, add_vocabulary
 from shared.chunks import write_chunk
 from shared.ids import new_id
 from shared.jobs import Job, JobKind, JobState, Priority
-from shared.objects import FolderStore
+from shared.objects import ObjectStore
 from shared.settings import Settings
 from shared.word_weights.record import Outcome, WordWeights, stored_word_weights
 from tests.integration.gateway import Service
@@ -34,6 +34,7 @@ from tests.support.catalog_rows import add_generation, add_photo, read_job
 from tests.support.problems import problem
 
 WORDS, WIDTH = 4, 8
+TRIED = 60  # photos
 DEGREES_PER_M = math.degrees(1 / 6_371_008.8)
 Rows = NDArray[np.float32]
 
@@ -58,7 +59,7 @@ class City:
     """A map with a vocabulary of its own, whose rows are laid out by hand."""
 
     catalog: Catalog
-    store: FolderStore
+    store: ObjectStore
     map_id: UUID
     generation_id: UUID
     photos: list[UUID]
@@ -104,7 +105,7 @@ class City:
         return evaluator.evaluate_next(threading.Event())
 
     def start(self, **params: Any) -> UUID:
-        wanted = {"sample": 1000, "seed": 0, "generation_id": str(self.generation_id)}
+        wanted = {"sample": TRIED, "seed": 0, "generation_id": str(self.generation_id)}
         with self.catalog.write() as session:
             job = Job(
                 id=new_id(),
@@ -175,18 +176,18 @@ def rooms(places: int, views: int = 3) -> list[dict[str, Any]]:
 
 @pytest.mark.parametrize("spots", [street, rooms])
 def test_words_that_tell_places_apart_are_weighted_and_kept(city: City, spots: Any) -> None:
-    city.publish(rows_of_places(60, 3, told=True), spots(60))
+    city.publish(rows_of_places(40, 3, told=True), spots(40))
     record = city.learn()
     assert record.outcome == Outcome.KEPT
     assert record.taught_by == ("coordinates" if spots is street else "places")
     assert len(record.weights) == WORDS
-    assert min(record.weights[:2]) > 4 * max(record.weights[2:])
+    assert min(record.weights[:2]) > 2 * max(record.weights[2:])
     held_out = record.held_out
     assert held_out is not None
-    assert held_out.without["queries"] == held_out.weighted["queries"] == 180
+    assert held_out.without["queries"] == held_out.weighted["queries"] == TRIED
     assert held_out.weighted["R@1"] > held_out.without["R@1"]
     assert held_out.better - held_out.worse == round(
-        180 * (held_out.weighted["R@1"] - held_out.without["R@1"])
+        TRIED * (held_out.weighted["R@1"] - held_out.without["R@1"])
     )
     assert held_out.chance < 0.05
     assert record.calibration is not None
@@ -196,7 +197,7 @@ def test_words_that_tell_places_apart_are_weighted_and_kept(city: City, spots: A
 
 
 def test_weights_that_raise_nothing_are_not_kept(city: City) -> None:
-    city.publish(rows_of_places(60, 3, told=False), street(60))
+    city.publish(rows_of_places(40, 3, told=False), street(40))
     record = city.learn()
     assert (record.outcome, record.applied, record.calibration) == (Outcome.NOT_KEPT, (), None)
     assert len(record.weights) == WORDS
@@ -215,18 +216,18 @@ def test_too_few_pairs_are_no_error_and_are_told_in_numbers(city: City) -> None:
 def test_a_burst_is_left_out_with_the_photo_that_is_tried(city: City) -> None:
     """Each place is a burst of three within 2 m, and three more 10 m on. A photo's burst is its
     twin: it would be found first in any case."""
-    rows = rows_of_places(60, 2, told=True)
+    rows = rows_of_places(40, 2, told=True)
     spots = [
         {"latitude": (200 * place + 10 * view + twin) * DEGREES_PER_M, "longitude": 7.0}
-        for place in range(60)
+        for place in range(40)
         for view in range(2)
         for twin in range(3)
     ]
     city.publish(np.repeat(rows, 3, axis=0), spots)
     record = city.learn()
     assert record.held_out is not None
-    assert record.held_out.without["queries"] == 360
-    assert record.held_out.without["R@1"] < 0.9
+    assert record.held_out.without["queries"] == TRIED
+    assert record.held_out.without["R@1"] < 0.9, "a twin was found"
     assert record.outcome == Outcome.KEPT
 
 
@@ -234,7 +235,7 @@ def test_the_same_seed_learns_the_same_however_little_memory_there_is(
     city: City, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for part in range(3):
-        city.publish(rows_of_places(60, 3, told=True)[part::3], [*street(60)][part::3])
+        city.publish(rows_of_places(40, 3, told=True)[part::3], [*street(40)][part::3])
     first, again, other = city.learn(), city.learn(), city.learn(seed=1)
     assert first == again
     assert first.weights != other.weights
@@ -245,9 +246,9 @@ def test_the_same_seed_learns_the_same_however_little_memory_there_is(
 
 
 def test_chunks_merged_and_photos_deleted_since_change_no_row_of_another(city: City) -> None:
-    rows, spots = rows_of_places(60, 3, told=True), street(60)
-    for begin in range(0, 180, 45):
-        city.publish(rows[begin : begin + 45], spots[begin : begin + 45])
+    rows, spots = rows_of_places(40, 3, told=True), street(40)
+    for begin in range(0, 120, 30):
+        city.publish(rows[begin : begin + 30], spots[begin : begin + 30])
     before = city.learn()
     assert merge_slot(city.catalog, city.store, city.generation_id, 0)
     collect_superseded_chunks(city.catalog, city.store, grace_seconds=0)
@@ -255,7 +256,7 @@ def test_chunks_merged_and_photos_deleted_since_change_no_row_of_another(city: C
 
 
 def test_rows_that_can_not_be_read_end_the_learning_and_keep_nothing(city: City) -> None:
-    city.publish(rows_of_places(60, 3, told=True), street(60))
+    city.publish(rows_of_places(40, 3, told=True), street(40))
     key = next(i.key for i in city.store.list("chunks/") if i.key.endswith(".npy"))
     city.store.put(key, city.store.get(key)[:-200])
     job_id = city.start()
@@ -306,7 +307,7 @@ def queued(city: City, word_weights: bool = True) -> str | None:
 def test_weights_are_learnt_by_themselves_after_the_evaluation_and_when_the_map_has_grown(
     city: City,
 ) -> None:
-    city.publish(rows_of_places(60, 3, told=True), street(60))
+    city.publish(rows_of_places(40, 3, told=True), street(40))
     assert queued(city) == JobKind.EVALUATE
     assert queued(city, word_weights=False) is None
     assert queued(city) == JobKind.WORD_WEIGHTS
@@ -322,7 +323,7 @@ def test_weights_are_learnt_by_themselves_after_the_evaluation_and_when_the_map_
 
 
 def test_a_foreign_vocabulary_is_not_weighed_by_itself(city: City, service: Service) -> None:
-    city.publish(rows_of_places(60, 3, told=True), street(60))
+    city.publish(rows_of_places(40, 3, told=True), street(40))
     with service.catalog.write() as session:
         foreign = add_vocabulary(
             session,
@@ -341,7 +342,7 @@ def test_a_foreign_vocabulary_is_not_weighed_by_itself(city: City, service: Serv
 def test_an_evaluation_measures_both_rankings_and_renews_what_their_scores_mean(
     city: City,
 ) -> None:
-    city.publish(rows_of_places(60, 3, told=True), street(60))
+    city.publish(rows_of_places(40, 3, told=True), street(40))
     record = city.learn()
     assert queued(city) == JobKind.EVALUATE
     with city.catalog.read() as session:
@@ -363,7 +364,7 @@ def test_an_evaluation_measures_both_rankings_and_renews_what_their_scores_mean(
 
 
 def test_answers_rank_by_the_weights_and_say_so(city: City, service: Service) -> None:
-    city.publish(rows_of_places(60, 3, told=True), street(60))
+    city.publish(rows_of_places(40, 3, told=True), street(40))
     path = f"/similarity/{city.photos[7]}"
     before = service.json("POST", path, params={"top_k": 20})
     assert before["word_weights"] == "none"
@@ -393,12 +394,12 @@ def test_answers_rank_by_the_weights_and_say_so(city: City, service: Service) ->
 def test_the_least_score_is_of_the_plain_cosine_and_fills_up_the_answer(
     city: City, service: Service
 ) -> None:
-    city.publish(rows_of_places(60, 3, told=True), street(60))
+    city.publish(rows_of_places(40, 3, told=True), street(40))
     city.learn()
     path = f"/similarity/{city.photos[7]}"
-    off = service.json("POST", path, params={"top_k": 60, "word_weights": False})
+    off = service.json("POST", path, params={"top_k": 40, "word_weights": False})
     least = off["similar_images"][-1]["similarity_score"]
-    found = service.json("POST", path, params={"top_k": 60, "min_score": least})
+    found = service.json("POST", path, params={"top_k": 40, "min_score": least})
     assert {i["image_id"] for i in found["similar_images"]} == {
         i["image_id"] for i in off["similar_images"]
     }
@@ -409,7 +410,7 @@ def test_the_least_score_is_of_the_plain_cosine_and_fills_up_the_answer(
 def test_the_estimate_is_judged_by_what_its_own_ranking_has_taught(
     city: City, service: Service
 ) -> None:
-    city.publish(rows_of_places(60, 3, told=True), street(60))
+    city.publish(rows_of_places(40, 3, told=True), street(40))
     record = city.learn()
     assert record.calibration is not None
     threshold = f"{record.calibration.support_threshold:.4f}"
