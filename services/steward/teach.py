@@ -18,6 +18,7 @@ from shared.word_weights.learn import Moments, Taught, nothing_taught, word_prod
 from shared.word_weights.pairs import Lesson
 
 LESSON_BYTES = 64_000_000  # of rows in memory: 160 photos at 98,304 dimensions
+LEAST_ROWS = 8  # however long they are: the far pairs come from the same photos
 
 # A chunk's rows are unit vectors (or zero): with a norm further off than this, a row is damaged.
 NORM_MARGIN = 1e-3
@@ -25,7 +26,7 @@ NORM_MARGIN = 1e-3
 
 def rows_at_once(dimension: int) -> int:
     """How many photos a lesson may have."""
-    return LESSON_BYTES // (dimension * np.dtype(np.float32).itemsize)
+    return max(LEAST_ROWS, LESSON_BYTES // (dimension * np.dtype(np.float32).itemsize))
 
 
 def teach(

@@ -76,7 +76,7 @@ def choose_pairs(spots: Sequence[Spot], seed: int, rows_at_once: int) -> Curricu
     """
     found = []
     for by in TaughtBy:
-        curriculum = _choose(spots, by, np.random.default_rng(seed), max(2, rows_at_once))
+        curriculum = _choose(spots, by, np.random.default_rng(seed), rows_at_once)
         if curriculum.is_enough:
             return curriculum
         found.append(curriculum)
