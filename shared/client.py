@@ -212,7 +212,7 @@ class Client:
     ) -> Json:
         """The photos most similar to a stored one, of those that pass the filters: `near`
         ("LAT,LON,RADIUS_M"), `box` ("S,W,N,E"), `captured_after`, `captured_before`, `place`,
-        `tags` and `ids` (separated by commas)."""
+        `tags` and `ids` (separated by commas); `word_weights=False` ranks by the plain cosine."""
         params = _given(top_k=top_k, min_score=min_score, **filters)
         return self._call("POST", f"/similarity/{file_id}", params=params)
 
@@ -264,6 +264,15 @@ class Client:
     def evaluate(self, **wanted: int) -> Json:
         """Start an evaluation of the map; `sample` and `seed` may be given."""
         return self._call("POST", "/evaluations", json=wanted)
+
+    def learn_word_weights(self, generation_id: UUID | str, **wanted: int) -> Json:
+        """Start learning the weights of the active generation's words; `sample` and `seed` may be
+        given."""
+        return self._call("POST", f"/generations/{generation_id}/word-weights", json=wanted)
+
+    def word_weights(self, generation_id: UUID | str) -> Json:
+        """What the map's places have taught of the generation's words."""
+        return self._call("GET", f"/generations/{generation_id}/word-weights")
 
     def evaluations(self, limit: int = 50) -> list[Json]:
         """The map's evaluations, newest first."""

@@ -250,6 +250,12 @@ class Settings(BaseSettings):
         description="located photos from which a changed map is evaluated by itself; 0: never",
     )
 
+    word_weights: bool = Field(
+        True,
+        description="rank by word weights where a map has them, and learn them for maps with a "
+        "vocabulary of their own",
+    )
+
     # How search follows the catalog.
     search_follow_seconds: float = Field(
         1.0, gt=0, description="how often search looks for what is new"

@@ -33,6 +33,12 @@ def query(
     captured_before: Annotated[str | None, typer.Option(help="ISO 8601.")] = None,
     place: Annotated[str | None, typer.Option(help="Only photos with this label.")] = None,
     tags: Annotated[str | None, typer.Option(help="Separated by commas: all are wanted.")] = None,
+    word_weights: Annotated[
+        bool,
+        typer.Option(
+            "--word-weights/--no-word-weights", help="Rank by the map's word weights, if any."
+        ),
+    ] = True,
     map_name: MapOption = None,
     server: ServerOption = None,
     key: KeyOption = None,
@@ -51,13 +57,16 @@ def query(
                 captured_before=captured_before,
                 place=place,
                 tags=tags,
+                word_weights=None if word_weights else False,
             )
         if as_json:
             print_json(answer)
             return
+        weighted = answer["word_weights"] == "applied"
         table = Table(
             "rank",
             Column("score", no_wrap=True),
+            *([Column("weighted", no_wrap=True)] if weighted else []),
             Column("photo", overflow="fold"),
             Column("latitude", no_wrap=True),
             Column("longitude", no_wrap=True),
@@ -67,6 +76,7 @@ def query(
             table.add_row(
                 str(rank),
                 f"{found['similarity_score']:.4f}",
+                *([f"{found['weighted_score']:.4f}"] if weighted else []),
                 found["original_filename"],
                 _degrees(found["latitude"]),
                 _degrees(found["longitude"]),
@@ -76,7 +86,7 @@ def query(
         answers.print(_place(answer["estimate"]), soft_wrap=True)
         answers.print(
             f"{answer['rows_scanned']} photos compared ({answer['certificate']}), "
-            f"vocabulary: {answer['vocabulary']}",
+            f"vocabulary: {answer['vocabulary']}, word weights: {answer['word_weights']}",
             soft_wrap=True,
         )
 

@@ -52,6 +52,11 @@ class NetworkRungs:
         self._shipped = torch.from_numpy(shipped[0].array).to(device)
         self._fitted = self._fit(database)
 
+    @property
+    def words(self) -> dict[str, int]:
+        """Of the rungs that have a vocabulary."""
+        return {self.names[1]: len(self._shipped), self.names[2]: len(self._fitted)}
+
     def _fit(self, database: Sequence[Path]) -> torch.Tensor:
         """(clusters, width) centres, learnt as a map learns its own."""
         chosen = choose_photos(len(database), FIT_PHOTOS, self.extractor.backbone.width, SEED)

@@ -79,10 +79,18 @@ MapName = Annotated[
 FileId = Annotated[UUID, _known_shape("photo")]
 UploadId = Annotated[UUID, _known_shape("upload")]
 JobId = Annotated[UUID, _known_shape("job")]
+GenerationId = Annotated[UUID, _known_shape("generation")]
 TopK = Annotated[int, Query(ge=1, le=100, description="How many photos to answer.")]
 MinScore = Annotated[
     float | None,
     Query(ge=-1, le=1, description="Leave out photos less similar than this."),
+]
+WordWeightsWanted = Annotated[
+    bool,
+    Query(
+        alias="word_weights",
+        description="Rank by the map's word weights, where it has any.",
+    ),
 ]
 
 __all__ = [
@@ -92,10 +100,12 @@ __all__ = [
     "FileId",
     "Gateway",
     "GatewayDep",
+    "GenerationId",
     "JobId",
     "MapName",
     "MinScore",
     "TopK",
     "UploadId",
+    "WordWeightsWanted",
     "read_cursor",
 ]

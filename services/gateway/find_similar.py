@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 from uuid import UUID
 
 from pydantic import BaseModel, ConfigDict
 from sqlalchemy.orm import Session
 
+from services.gateway.choose_weights import choose_weights
 from services.gateway.context import Gateway
 from services.gateway.estimate import estimate, rank
 from services.gateway.schemas import (
@@ -57,6 +59,7 @@ class Wanted(BaseModel):
     top_k: int
     min_score: float | None = None
     photos: PhotoFilter = EVERYTHING
+    word_weights: bool = True
 
 
 def query_by_photo(gateway: Gateway, map_name: str, photo_id: UUID) -> Query:
@@ -108,18 +111,22 @@ def find_similar(gateway: Gateway, query: Query, wanted: Wanted) -> SimilarityAn
     """The most similar live photos that are wanted, without the query itself, and the place that
     they point to; noted in the history."""
     started = time.perf_counter()
+    weights = choose_weights(query.generation, wanted.word_weights, gateway.settings)
     # The estimate looks deeper than most answers, and also at what is below the least score.
-    hits, photos, response = _search_live(gateway, query, wanted, max(wanted.top_k, DEPTH))
+    search = partial(_search_live, gateway, query, weights=weights.values)
+    hits, photos, response = search(wanted.photos, max(wanted.top_k, DEPTH))
     ranking = everything = rank(hits, photos)
     if not wanted.photos.is_empty:
-        without_filter = wanted.model_copy(update={"photos": EVERYTHING})
-        everything = rank(*_search_live(gateway, query, without_filter, DEPTH)[:2])
-    found = estimate(query.generation, ranking, everything, gateway.settings.estimate_radius_m)
-    shown = [
-        hit
-        for hit in hits[: wanted.top_k]
-        if wanted.min_score is None or hit.score >= wanted.min_score
-    ]
+        everything = rank(*search(EVERYTHING, DEPTH)[:2])
+    found = estimate(
+        weights.calibration(hits), ranking, everything, gateway.settings.estimate_radius_m
+    )
+    shown = hits[: wanted.top_k]
+    if wanted.min_score is not None and weights.values:
+        # The least score is of the plain cosine: there may be more of them far down the ranking.
+        shown, photos, response = search(wanted.photos, wanted.top_k, min_score=wanted.min_score)
+    elif wanted.min_score is not None:
+        shown = [hit for hit in shown if hit.score >= wanted.min_score]
     took_ms = (time.perf_counter() - started) * 1000
     answer = SimilarityAnswer(
         query_file_id=query.photo_id,
@@ -129,12 +136,14 @@ def find_similar(gateway: Gateway, query: Query, wanted: Wanted) -> SimilarityAn
         similar_images=[
             SimilarPhoto(
                 similarity_score=hit.score,
+                weighted_score=hit.weighted_score,
                 **PhotoAnswer.fields_of(photos[hit.photo_id]),
             )
             for hit in shown
         ],
         estimate=found,
         vocabulary=query.vocabulary,
+        word_weights=weights.state(hits),
         generation_id=query.generation.id,
         certificate=response.certificate,
         rows_scanned=response.rows_scanned,
@@ -160,7 +169,13 @@ def find_similar(gateway: Gateway, query: Query, wanted: Wanted) -> SimilarityAn
 
 
 def _search_live(
-    gateway: Gateway, query: Query, wanted: Wanted, depth: int
+    gateway: Gateway,
+    query: Query,
+    wanted: PhotoFilter,
+    depth: int,
+    *,
+    weights: tuple[float, ...],
+    min_score: float | None = None,
 ) -> tuple[list[Hit], dict[UUID, Photo], SearchResponse]:
     """The first `depth` live photos, fewer when there are no more."""
     k = depth
@@ -173,8 +188,10 @@ def _search_live(
                 row=query.row,
                 min_version=query.min_version,
                 k=k,
-                photos=wanted.photos,
+                photos=wanted,
+                min_score=min_score,
                 exclude=(query.photo_id,) if query.photo_id else (),
+                word_weights=weights,
             )
         )
         with gateway.catalog.read() as session:

@@ -75,6 +75,11 @@ class OnePhotoAnswer(PhotoAnswer):
 
 class SimilarPhoto(PhotoAnswer):
     similarity_score: float = Field(description="cosine similarity in [-1, 1]")
+    weighted_score: float | None = Field(
+        None,
+        description="cosine similarity to the query with weighted words, by which the answer is "
+        "ranked; null where it is ranked by `similarity_score`",
+    )
 
 
 class EstimateAnswer(Answer):
@@ -106,6 +111,11 @@ class SimilarityAnswer(Answer):
     vocabulary: str = Field(
         description="`own`: learnt on this map's photos; `foreign`: on photos of elsewhere; "
         "`none`: the extractor uses none"
+    )
+    word_weights: str = Field(
+        description="`applied`: ranked by `weighted_score`; `none`: the generation has no weights, "
+        "or the query none of the words that have one; `off`: turned off by the call or by "
+        "WORD_WEIGHTS"
     )
     generation_id: UUID
     certificate: str = Field(description="`exhaustive`: every row was compared exactly")

@@ -19,6 +19,7 @@ from services.gateway.context import (
     MapName,
     MinScore,
     TopK,
+    WordWeightsWanted,
 )
 from services.gateway.filters import FilterDep
 from services.gateway.find_similar import Wanted, find_similar, query_by_job, query_by_photo
@@ -51,10 +52,11 @@ def similar_to_stored(
     photos: FilterDep,
     top_k: TopK = 10,
     min_score: MinScore = None,
+    word_weights: WordWeightsWanted = True,
     map_name: MapName = DEFAULT_MAP,
 ) -> SimilarityAnswer:
     """The photos most similar to a stored one, without itself."""
-    wanted = Wanted(top_k=top_k, min_score=min_score, photos=photos)
+    wanted = Wanted(top_k=top_k, min_score=min_score, photos=photos, word_weights=word_weights)
     return find_similar(gateway, query_by_photo(gateway, map_name, file_id), wanted)
 
 
@@ -75,6 +77,7 @@ async def similar_to_upload(
     photos: FilterDep,
     top_k: TopK = 10,
     min_score: MinScore = None,
+    word_weights: WordWeightsWanted = True,
     map_name: MapName = DEFAULT_MAP,
 ) -> Any:
     """The photos most similar to one that is not stored.
@@ -90,7 +93,7 @@ async def similar_to_upload(
             request, gateway.store, key, gateway.settings.max_file_size, check_photo_begin
         )
     await once.begin_form(gateway.store, received, life_seconds=gateway.settings.query_ttl_seconds)
-    wanted = Wanted(top_k=top_k, min_score=min_score, photos=photos)
+    wanted = Wanted(top_k=top_k, min_score=min_score, photos=photos, word_weights=word_weights)
     params = {"filename": received.filename, "wanted": wanted.model_dump(mode="json")}
     job: Job | None = await run_in_threadpool(
         _queue, gateway, map_name, job_id, received, params, once

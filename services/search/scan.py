@@ -19,6 +19,50 @@ FLOAT32_MARGIN = 1e-5
 # Picking rows copies them: worth it up to this share of a chunk, else all are multiplied.
 FEW = 0.25
 
+UnitQuery = NDArray[np.float64]
+
+
+class Scan:
+    """The selected rows of some chunks, numbered through, with their float32 scores."""
+
+    def __init__(
+        self,
+        chunks: Iterable[LoadedChunk],
+        query: UnitQuery,
+        wanted: PhotoFilter,
+        exclude: frozenset[UUID],
+    ) -> None:
+        rough_query = query.astype(np.float32)
+        rough: list[NDArray[np.float32]] = []
+        self._at: list[tuple[LoadedChunk, NDArray[np.intp]]] = []
+        for chunk in chunks:
+            rows = np.flatnonzero(select(chunk.photos, wanted, exclude))
+            if not len(rows):
+                continue
+            few = len(rows) <= FEW * len(chunk.rows)
+            rough.append(
+                chunk.rows[rows] @ rough_query if few else (chunk.rows @ rough_query)[rows]
+            )
+            self._at.append((chunk, rows))
+        self.scores = np.concatenate(rough) if rough else np.empty(0, np.float32)
+        """(n,) cosines, right to FLOAT32_MARGIN."""
+        self._firsts = np.cumsum([0, *(len(rows) for _, rows in self._at)])
+
+    def exact(self, number: int, query: UnitQuery) -> float:
+        """The cosine as a float64 sum, clipped: rounding may not turn it into 1.0000001."""
+        chunk, row = self._row(number)
+        return float(np.clip(chunk.rows[row].astype(np.float64) @ query, -1.0, 1.0))
+
+    def photo_id(self, number: int) -> UUID:
+        chunk, row = self._row(number)
+        photo_id: UUID = chunk.photos.photo_id[row]
+        return photo_id
+
+    def _row(self, number: int) -> tuple[LoadedChunk, int]:
+        which = int(np.searchsorted(self._firsts, number, side="right")) - 1
+        chunk, rows = self._at[which]
+        return chunk, int(rows[number - int(self._firsts[which])])
+
 
 def top_k(
     chunks: Iterable[LoadedChunk],
@@ -33,45 +77,33 @@ def top_k(
     rows scored again.
 
     `query` is (dimension,) float32 and need not be normalised: rows are unit vectors, and the
-    query is divided by its norm. Order: score, highest first; equal scores by photo id. Scores
-    are float64 sums, clipped to [-1, 1]: rounding may not turn a cosine into 1.0000001.
+    query is divided by its norm. Order: score, highest first; equal scores by photo id.
     """
-    norm = float(np.linalg.norm(query.astype(np.float64)))
-    if norm == 0.0:
+    exact_query = unit(query)
+    if exact_query is None:
         return [], 0, 0
-    exact_query = query.astype(np.float64) / norm
-    rough_query = exact_query.astype(np.float32)
-    scanned = 0
-    rough: list[NDArray[np.float32]] = []
-    at: list[tuple[LoadedChunk, NDArray[np.intp]]] = []
-    for chunk in chunks:
-        rows = np.flatnonzero(select(chunk.photos, wanted, exclude))
-        if not len(rows):
-            continue
-        scanned += len(rows)
-        few = len(rows) <= FEW * len(chunk.rows)
-        rough.append(chunk.rows[rows] @ rough_query if few else (chunk.rows @ rough_query)[rows])
-        at.append((chunk, rows))
-    if not scanned:
-        return [], 0, 0
-    candidates = _candidates(np.concatenate(rough), k)
-    firsts = np.cumsum([0, *(len(rows) for _, rows in at)])
-    ranked = []
-    for index in candidates.tolist():
-        which = int(np.searchsorted(firsts, index, side="right")) - 1
-        chunk, rows = at[which]
-        row = int(rows[index - int(firsts[which])])
-        score = float(np.clip(chunk.rows[row].astype(np.float64) @ exact_query, -1.0, 1.0))
-        ranked.append((score, chunk.photos.photo_id[row]))
+    scan = Scan(chunks, exact_query, wanted, exclude)
+    ranked = [
+        (scan.exact(number, exact_query), scan.photo_id(number))
+        for number in candidates(scan.scores, k).tolist()
+    ]
     ranked.sort(key=lambda hit: (-hit[0], hit[1]))
     hits = [
         (photo_id, score) for score, photo_id in ranked if min_score is None or score >= min_score
     ]
-    return hits[:k], scanned, len(ranked)
+    return hits[:k], len(scan.scores), len(ranked)
 
 
-def _candidates(scores: NDArray[np.float32], k: int) -> NDArray[np.int64]:
+def unit(query: NDArray[np.float32]) -> UnitQuery | None:
+    """The query divided by its norm; None for one of length 0, which is like nothing."""
+    norm = float(np.linalg.norm(query.astype(np.float64)))
+    return None if norm == 0.0 else query.astype(np.float64) / norm
+
+
+def candidates(scores: NDArray[np.float32], k: int) -> NDArray[np.int64]:
     """Indices of all rows that can be among the exact top k."""
     k = min(k, len(scores))
+    if not k:
+        return np.empty(0, np.int64)
     kth = np.partition(scores, len(scores) - k)[len(scores) - k]
     return np.flatnonzero(scores >= kth - FLOAT32_MARGIN)

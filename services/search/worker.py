@@ -13,16 +13,19 @@ from sqlalchemy.exc import SQLAlchemyError
 from services.search.follow import FOLLOWED, advance, wanted_versions
 from services.search.lag import Lags
 from services.search.query_row import QueryRows, expired
-from services.search.scan import top_k
+from services.search.scan import UnitQuery, top_k, unit
 from services.search.snapshot import Snapshot
+from services.search.weighted_scan import weighted_top_k
 from shared.catalog.away import Outage
 from shared.catalog.generations import GenerationState
 from shared.catalog.session import Catalog
-from shared.errors import Unavailable
+from shared.chunks import Row
+from shared.errors import InvalidRequest, Unavailable
 from shared.objects import ObjectStore
 from shared.search_protocol import EXHAUSTIVE, Hit, SearchRequest, SearchResponse, SearchStatus
 from shared.settings import Settings
 from shared.shards import WHOLE, Shard
+from shared.word_weights.learn import weigh
 
 log = logging.getLogger(__name__)
 
@@ -90,16 +93,9 @@ class SearchWorker:
 
     def search(self, request: SearchRequest) -> SearchResponse:
         snapshot = self._snapshot(request.generation_id, request.min_version)
-        hits, scanned, reranked = top_k(
-            snapshot.chunks,
-            self._rows.find(snapshot, request),
-            request.k,
-            min_score=request.min_score,
-            wanted=request.photos,
-            exclude=frozenset(request.exclude),
-        )
+        hits, scanned, reranked = _ranked(snapshot, self._rows.find(snapshot, request), request)
         return SearchResponse(
-            hits=tuple(Hit(photo_id=photo_id, score=score) for photo_id, score in hits),
+            hits=tuple(hits),
             certificate=EXHAUSTIVE,
             rows_scanned=scanned,
             rows_reranked=reranked,
@@ -152,3 +148,45 @@ class SearchWorker:
                 with self._swap:
                     self._snapshots = {**self._snapshots, generation_id: new}
             return new
+
+
+def _ranked(snapshot: Snapshot, row: Row, request: SearchRequest) -> tuple[list[Hit], int, int]:
+    """The hits, the rows scanned, the rows scored again."""
+    exclude = frozenset(request.exclude)
+    weighted = _weighted(row, request.word_weights)
+    if weighted is not None:
+        plain_query = unit(row)
+        assert plain_query is not None, "a query with a weighted word has a length"
+        found, scanned, reranked = weighted_top_k(
+            snapshot.chunks,
+            plain_query,
+            weighted,
+            request.k,
+            min_score=request.min_score,
+            wanted=request.photos,
+            exclude=exclude,
+        )
+        hits = [
+            Hit(photo_id=photo_id, score=score, weighted_score=weighted_score)
+            for photo_id, score, weighted_score in found
+        ]
+        return hits, scanned, reranked
+    plain, scanned, reranked = top_k(
+        snapshot.chunks,
+        row,
+        request.k,
+        min_score=request.min_score,
+        wanted=request.photos,
+        exclude=exclude,
+    )
+    return [Hit(photo_id=photo_id, score=score) for photo_id, score in plain], scanned, reranked
+
+
+def _weighted(row: Row, weights: tuple[float, ...]) -> UnitQuery | None:
+    """None without weights, and where no word of the query has any: the plain ranking is left."""
+    if not weights:
+        return None
+    try:
+        return weigh(row, weights)
+    except ValueError as error:
+        raise InvalidRequest("word_weights_unfit", f"{error}.") from None

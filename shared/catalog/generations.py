@@ -15,6 +15,7 @@ from sqlalchemy import BigInteger, ForeignKey, Index, Integer, String, Uuid, sel
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
 from shared.catalog.base import Base, JsonValue, UtcDateTime, db_now
+from shared.errors import NotFound
 from shared.ids import new_id
 
 
@@ -28,8 +29,9 @@ class GenerationState(StrEnum):
 class Generation(Base):
     """`spec` is everything that decides a descriptor's value; rows of two specs never mix.
 
-    `calibration` is what its evaluations have learnt of its scores (`shared.estimate`). New chunks
-    go into `open_slot`, which holds `open_slot_rows` rows so far.
+    `calibration` is what its evaluations have learnt of its scores (`shared.estimate`),
+    `word_weights` what the map's places have taught of its words (`shared.word_weights.record`).
+    New chunks go into `open_slot`, which holds `open_slot_rows` rows so far.
     """
 
     __tablename__ = "generations"
@@ -46,6 +48,7 @@ class Generation(Base):
         Uuid, ForeignKey("vocabularies.id"), index=True
     )
     calibration: Mapped[dict[str, Any] | None] = mapped_column(JsonValue)
+    word_weights: Mapped[dict[str, Any] | None] = mapped_column(JsonValue)
     open_slot: Mapped[int] = mapped_column(Integer, default=0)
     open_slot_rows: Mapped[int] = mapped_column(Integer, default=0)
     created_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())
@@ -91,6 +94,20 @@ def building_generation(session: Session, map_id: UUID) -> Generation | None:
             Generation.map_id == map_id, Generation.state == GenerationState.BUILDING
         )
     )
+
+
+def get_generation(session: Session, map_id: UUID, generation_id: UUID) -> Generation:
+    """A generation of the map; 404 when there is none."""
+    found = session.scalar(
+        select(Generation).where(Generation.id == generation_id, Generation.map_id == map_id)
+    )
+    if found is None:
+        raise NotFound(
+            "generation_not_found",
+            f"There is no generation {generation_id} in this map.",
+            generation_id=str(generation_id),
+        )
+    return found
 
 
 def lock_generation(session: Session, generation_id: UUID) -> Generation:

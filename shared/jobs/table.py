@@ -74,6 +74,7 @@ class JobKind(StrEnum):
     IMPORT = "import_vocabulary"  # check a vocabulary file and switch to it
     SWITCH = "switch"  # switch to a vocabulary that the map already has
     EVALUATE = "evaluate"  # ask the map about photos whose place is known, and count
+    WORD_WEIGHTS = "word_weights"  # learn which words of its vocabulary tell its places apart
     BATCH = "batch"  # bring in many photos; each has a job of its own (`shared.jobs.batches`)
 
 
@@ -81,7 +82,7 @@ MODEL_CHANGES = (JobKind.FIT, JobKind.IMPORT, JobKind.SWITCH)
 
 # Who takes what: extractors need photos and a backbone, the steward only the search tier.
 EXTRACTOR_JOBS = (JobKind.INDEX, JobKind.REINDEX, JobKind.DESCRIBE, *MODEL_CHANGES)
-STEWARD_JOBS = (JobKind.EVALUATE, JobKind.BATCH)
+STEWARD_JOBS = (JobKind.EVALUATE, JobKind.WORD_WEIGHTS, JobKind.BATCH)
 
 # Done in slices: between two of them they are running, and no one holds their lease.
 SLICED_JOBS = (*MODEL_CHANGES, JobKind.BATCH)

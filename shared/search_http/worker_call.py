@@ -34,7 +34,7 @@ def ask(
         "POST",
         f"{url}/search",
         timeout_seconds,
-        content=request.model_dump_json(),
+        content=request.as_json(),
         headers={"Content-Type": "application/json"},
     )
     return _read(SearchResponse, url, body)

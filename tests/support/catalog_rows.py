@@ -35,6 +35,7 @@ PRIORITIES = {
     JobKind.REINDEX: Priority.REINDEX,
     JobKind.DESCRIBE: Priority.QUERY,
     JobKind.EVALUATE: Priority.EVALUATION,
+    JobKind.WORD_WEIGHTS: Priority.EVALUATION,
     **dict.fromkeys(MODEL_CHANGES, Priority.MODEL_CHANGE),
 }
 
