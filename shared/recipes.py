@@ -26,6 +26,7 @@ FACETS = ("query", "key", "value", "token")
 AGGREGATORS = ("vlad", "soft-vlad", "gem", "avg")
 PREPROCESSINGS = ("square224", "demo1024", "paper480x640", "round14")
 MOST_CLUSTERS = 4096
+MOST_PCA = 1024  # dimensions after PCA: its time and memory grow with the square
 TORCHHUB = "torchhub"  # the backbone that is a torch.hub entry
 SLOW = "test-slow"  # the backbone whose width and time are options
 MOST_WIDTH = 131_072

@@ -288,7 +288,12 @@ class ExtractorWorker:
         rows = np.empty((0, target.generation.dimension), np.float32)
         if batch.ready:
             started = time.perf_counter()
-            rows = target.extractor.describe(batch.pixels(), target.centres)
+            if batch.stored is not None:
+                assert target.projection is not None
+                rows = target.projection.project(batch.stored)
+            else:
+                pixels = batch.pixels()
+                rows = target.extractor.describe(pixels, target.centres, target.projection)
             batch.seconds["describe"] = time.perf_counter() - started
         return publish(self._catalog, self._store, batch, rows, self._settings.slot_rows)
 
