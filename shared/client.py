@@ -253,9 +253,23 @@ class Client:
         """Start switching to the vocabulary in a `.npz` or `.npy` file."""
         return self._send_file("/vocabularies/import", file)
 
+    def vocabulary_file(self, vocabulary_id: UUID | str) -> bytes:
+        """A vocabulary as a file that `import_vocabulary` takes: `.npz` (it begins with `PK`), or
+        `.npy` where no one knows what it was learnt with."""
+        path = f"{API}/vocabularies/{vocabulary_id}/file"
+        return self._repeat(lambda: self._ask(self._http, "GET", path).content)
+
     def vocabularies(self) -> list[Json]:
         found: Any = self._call("GET", "/vocabularies")
         return list(found)
+
+    def start_generation(
+        self, *, vocabulary_id: UUID | str | None = None, pca: int | None = None
+    ) -> Json:
+        """Start switching to a vocabulary that the map has, or to descriptors of `pca` dimensions;
+        with neither, to whole ones of an extractor without vocabulary."""
+        wanted = _given(vocabulary_id=vocabulary_id and str(vocabulary_id), pca=pca)
+        return self._call("POST", "/generations", json=wanted)
 
     def generations(self) -> list[Json]:
         found: Any = self._call("GET", "/generations")

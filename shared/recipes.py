@@ -28,6 +28,7 @@ AGGREGATORS = ("vlad", "soft-vlad", "gem", "avg")
 PARITY_PREPROCESSINGS = ("demo1024", "paper480x640", "round14")
 PREPROCESSINGS = ("square224", *PARITY_PREPROCESSINGS)
 MOST_CLUSTERS = 4096
+MOST_PCA = 1024  # dimensions after PCA: its time and memory grow with the square
 TORCHHUB = "torchhub"  # the backbone that is a torch.hub entry
 SLOW = "test-slow"  # the backbone whose width and time are options
 MOST_WIDTH = 131_072

@@ -14,8 +14,9 @@ from rich.progress import Progress
 
 from services.cli.configuration import read_settings
 from services.cli.output import shown
-from services.cli.photo_files import decoded_batches, whole_or_nothing
+from services.cli.photo_files import decoded_batches
 from services.cli.photo_places import photo_paths
+from services.cli.whole_file import whole_or_nothing
 from shared.errors import InvalidRequest, PlacewiseError, Unprocessable
 from shared.recipes import Recipe, get_recipe
 from shared.settings import Settings

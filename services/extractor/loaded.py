@@ -1,9 +1,11 @@
-"""What the worker keeps in memory: a few loaded extractors and vocabularies."""
+"""What the worker keeps in memory: a few loaded extractors, vocabularies and whitenings."""
 
 from __future__ import annotations
 
 import threading
 from collections import OrderedDict, defaultdict
+from dataclasses import dataclass
+from typing import Any
 from uuid import UUID
 
 from sqlalchemy.orm import Session
@@ -11,17 +13,21 @@ from sqlalchemy.orm import Session
 from shared.catalog.generations import Generation
 from shared.catalog.models import Model, ensure_model
 from shared.catalog.vocabularies import Vocabulary
+from shared.catalog.whitenings import StoredWhitening
 from shared.errors import Unavailable
 from shared.objects import ObjectStore
 from shared.recipes import Recipe
 from shared.settings import Settings
 from shared.vision.extractors import Extractor, choose_device, spec_fingerprint
 from shared.vision.passes import PassLimit
+from shared.vision.pca import Projection
+from shared.vision.pca_file import decode_whitening
 from shared.vision.precision import PRECISIONS, Precision, choose_precision
 from shared.vision.vocabulary import Centres, decode_centres
 
 MOST_EXTRACTORS = 2  # a large backbone takes gigabytes of GPU memory
 MOST_VOCABULARIES = 16
+MOST_WHITENINGS = 2  # one from 98,304 to 512 dimensions takes 201 MB of the device's memory
 
 
 class LoadedModels:
@@ -36,6 +42,7 @@ class LoadedModels:
         # Of what was loaded once: to run out of memory again for each time would cost photos time.
         self._limits: defaultdict[tuple[object, ...], PassLimit] = defaultdict(PassLimit)
         self._centres: OrderedDict[UUID, Centres] = OrderedDict()
+        self._projections: OrderedDict[UUID, Projection] = OrderedDict()
 
     def extractor(self, name: str, precision: Precision | None = None) -> Extractor:
         """The extractor called `name`, its weights loaded.
@@ -112,6 +119,25 @@ class LoadedModels:
                 self._centres.popitem(last=False)
             return found
 
+    def projection(self, whitening: StoredWhitening) -> Projection:
+        """The whitening on the device, checked against the catalog's hash."""
+        with self._lock:
+            found = self._projections.get(whitening.id)
+            if found is None:
+                stored = decode_whitening(self._store.get(whitening.object_key))
+                found = Projection(stored.whitening, self._device)
+                if found.sha256 != whitening.sha256:
+                    raise Unavailable(
+                        "whitening_corrupt",
+                        f"The PCA whitening {whitening.id} is not what was stored (its hash "
+                        "differs). Restore it from a backup, or start a model change.",
+                    )
+                self._projections[whitening.id] = found
+            self._projections.move_to_end(whitening.id)
+            while len(self._projections) > MOST_WHITENINGS:
+                self._projections.popitem(last=False)
+            return found
+
 
 def register(session: Session, extractor: Extractor) -> Model:
     """The catalog's row of the extractor's weights."""
@@ -121,33 +147,41 @@ def register(session: Session, extractor: Extractor) -> Model:
     )
 
 
+@dataclass(frozen=True, slots=True)
+class Made:
+    """What makes the descriptors of a generation."""
+
+    extractor: Extractor
+    centres: Centres | None = None
+    projection: Projection | None = None
+
+    @property
+    def spec(self) -> dict[str, Any]:
+        return self.extractor.spec(self.centres, self.projection)
+
+
 def spec_columns(
     model: Model,
-    extractor: Extractor,
-    centres: Centres | None,
+    made: Made,
     vocabulary_id: UUID | None,
+    whitening_id: UUID | None = None,
 ) -> dict[str, object]:
     """The columns of a generation that say how its descriptors are made."""
-    spec = extractor.spec(centres)
+    spec = made.spec
     return {
-        "extractor": extractor.recipe.name,
+        "extractor": made.extractor.recipe.name,
         "spec": spec,
         "spec_fingerprint": spec_fingerprint(spec),
-        "dimension": extractor.dimension(centres),
+        "dimension": spec["dimension"],
         "model_id": model.id,
         "vocabulary_id": vocabulary_id,
+        "whitening_id": whitening_id,
     }
 
 
-def check_spec(
-    generation: Generation,
-    extractor: Extractor,
-    centres: Centres | None,
-    *,
-    decoder_matters: bool = True,
-) -> None:
+def check_spec(generation: Generation, made: Made, *, decoder_matters: bool = True) -> None:
     """Unavailable (`spec_differs`) when this worker does not reproduce the generation's spec."""
-    spec = extractor.spec(centres)
+    spec = made.spec
     differing = sorted(
         key
         for key in spec.keys() | generation.spec.keys()

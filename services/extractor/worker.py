@@ -406,7 +406,12 @@ def _rows(batch: Batch) -> Rows:
     while batch.ready:
         started = time.perf_counter()
         try:
-            rows = target.extractor.describe(batch.pixels(), target.centres)
+            if batch.stored is not None:
+                assert target.projection is not None
+                rows = target.projection.project(batch.stored)
+            else:
+                pixels = batch.pixels()
+                rows = target.extractor.describe(pixels, target.centres, target.projection)
         except PhotoDoesNotFit as error:
             batch.refuse(error.place, error)
             continue

@@ -251,7 +251,8 @@ class GenerationAnswer(Answer):
     generation_id: UUID
     state: GenerationState
     extractor: str
-    dimension: int
+    dimension: int = Field(description="of its descriptors, after PCA where there is one")
+    pca_from: int | None = Field(description="their dimension before PCA; null without")
     vocabulary_id: UUID | None
     photos: int = Field(description="live photos that have a descriptor in it")
     spec: dict[str, Any]
@@ -266,6 +267,7 @@ class GenerationAnswer(Answer):
             state=GenerationState(generation.state),
             extractor=generation.extractor,
             dimension=generation.dimension,
+            pca_from=generation.pca_from,
             vocabulary_id=generation.vocabulary_id,
             photos=photos,
             spec=generation.spec,

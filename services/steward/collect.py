@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable
 from datetime import timedelta
 from uuid import UUID
 
-from sqlalchemy import and_, delete, or_, select, update
+from sqlalchemy import and_, delete, exists, or_, select, update
 from sqlalchemy.orm import Session
 
 from shared.catalog.base import db_now, db_now_plus
@@ -23,6 +23,7 @@ from shared.catalog.maps import bump_version, lock_map
 from shared.catalog.photos import Photo
 from shared.catalog.session import Catalog
 from shared.catalog.vocabularies import Vocabulary
+from shared.catalog.whitenings import StoredWhitening
 from shared.chunks import delete_chunk
 from shared.jobs.batches import BatchItem
 from shared.jobs.table import MODEL_CHANGES, UNFINISHED, Job, JobKind, JobState
@@ -34,6 +35,7 @@ from shared.objects.keys import (
     QUERIES,
     THUMBNAILS,
     VOCABULARIES,
+    WHITENINGS,
     WORK,
     incoming_key,
     is_original_key,
@@ -97,6 +99,28 @@ def collect_ended_generations(catalog: Catalog, store: ObjectStore, grace_second
         with catalog.write() as session:
             session.execute(delete(Descriptor).where(Descriptor.chunk_id.in_(chunk_ids)))
             session.execute(delete(Chunk).where(Chunk.id.in_(chunk_ids)))
+
+
+def collect_whitenings(catalog: Catalog, store: ObjectStore, grace_seconds: float) -> None:
+    """Whitenings whose generations have all ended: no model change takes one up again."""
+    in_use = exists().where(
+        Generation.whitening_id == StoredWhitening.id,
+        or_(Generation.ended_at.is_(None), Generation.ended_at >= db_now_plus(-grace_seconds)),
+    )
+    with catalog.read() as session:
+        ended = session.scalars(select(StoredWhitening).where(~in_use).limit(AT_ONCE)).all()
+    for whitening in ended:
+        store.delete(whitening.object_key)
+    if ended:
+        ids = [whitening.id for whitening in ended]
+        with catalog.write() as session:
+            session.execute(
+                update(Generation)
+                .where(Generation.whitening_id.in_(ids))
+                .values(whitening_id=None)
+                .execution_options(synchronize_session=False)
+            )
+            session.execute(delete(StoredWhitening).where(StoredWhitening.id.in_(ids)))
 
 
 def collect_deleted_photos(catalog: Catalog, store: ObjectStore, grace_seconds: float) -> None:
@@ -229,6 +253,7 @@ def collect(catalog: Catalog, store: ObjectStore, settings: Settings) -> None:
     """Everything above but the orphans, which need a walk over the whole store."""
     collect_superseded_chunks(catalog, store, settings.superseded_grace_seconds)
     collect_ended_generations(catalog, store, settings.retired_grace_seconds)
+    collect_whitenings(catalog, store, settings.retired_grace_seconds)
     collect_deleted_photos(catalog, store, settings.retired_grace_seconds)
     collect_queries(catalog, store, settings.query_ttl_seconds)
     collect_work(catalog, store)
@@ -288,6 +313,12 @@ def _known_vocabularies(session: Session, keys: list[str]) -> Iterable[str]:
     return [*stored, *(params["object_key"] for params in waiting)]
 
 
+def _known_whitenings(session: Session, keys: list[str]) -> Iterable[str]:
+    return session.scalars(
+        select(StoredWhitening.object_key).where(StoredWhitening.object_key.in_(keys))
+    )
+
+
 def _known_queries(session: Session, keys: list[str]) -> Iterable[str]:
     job_ids = _ids(key.removeprefix(QUERIES).removesuffix(".npy") for key in keys)
     known = session.scalars(select(Job.id).where(Job.id.in_(job_ids)))
@@ -310,5 +341,6 @@ REFERENCED: dict[str, Callable[[Session, list[str]], Iterable[str]]] = {
     THUMBNAILS: _known_thumbnails,
     "chunks/": _known_chunks,
     VOCABULARIES: _known_vocabularies,
+    WHITENINGS: _known_whitenings,
     QUERIES: _known_queries,
 }

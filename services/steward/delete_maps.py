@@ -22,6 +22,7 @@ from shared.catalog.photos import Photo
 from shared.catalog.searches import Search
 from shared.catalog.session import Catalog
 from shared.catalog.vocabularies import Vocabulary
+from shared.catalog.whitenings import StoredWhitening
 from shared.chunks import delete_chunk
 from shared.jobs.batches import BatchItem
 from shared.jobs.finish import cancel_all
@@ -67,6 +68,7 @@ def _step(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
         session.execute(delete(Job).where(Job.map_id == map_id))
         session.execute(delete(Generation).where(Generation.map_id == map_id))
         session.execute(delete(Vocabulary).where(Vocabulary.map_id == map_id))
+        session.execute(delete(StoredWhitening).where(StoredWhitening.map_id == map_id))
         session.execute(delete(Map).where(Map.id == map_id))
     log.info("the deleted map %s is gone", map_id)
     return True
@@ -164,7 +166,9 @@ def _direct_uploads(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
 
 
 def _vocabularies(catalog: Catalog, store: ObjectStore, map_id: UUID) -> None:
-    """Only the objects, and those of imports that never came to a row: the rows are few."""
+    """Only the objects, also those of imports that never came to a row, and those of whitenings:
+    the rows are few.
+    """
     with catalog.read() as session:
         keys = list(
             session.scalars(select(Vocabulary.object_key).where(Vocabulary.map_id == map_id))
@@ -173,5 +177,8 @@ def _vocabularies(catalog: Catalog, store: ObjectStore, map_id: UUID) -> None:
             select(Job.params).where(Job.map_id == map_id, Job.kind == JobKind.IMPORT)
         )
         keys += [params["object_key"] for params in imports]
+        keys += session.scalars(
+            select(StoredWhitening.object_key).where(StoredWhitening.map_id == map_id)
+        )
     for key in keys:
         store.delete(key)

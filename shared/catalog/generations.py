@@ -47,6 +47,7 @@ class Generation(Base):
     vocabulary_id: Mapped[UUID | None] = mapped_column(
         Uuid, ForeignKey("vocabularies.id"), index=True
     )
+    whitening_id: Mapped[UUID | None] = mapped_column(Uuid, ForeignKey("whitenings.id"), index=True)
     calibration: Mapped[dict[str, Any] | None] = mapped_column(JsonValue)
     word_weights: Mapped[dict[str, Any] | None] = mapped_column(JsonValue)
     open_slot: Mapped[int] = mapped_column(Integer, default=0)
@@ -58,6 +59,14 @@ class Generation(Base):
     # workers have to have loaded that before it is switched in.
     complete_version: Mapped[int | None] = mapped_column(BigInteger)
     complete_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
+
+    @property
+    def pca_from(self) -> int | None:
+        """The dimension of its descriptors before PCA; None without. Known of a generation whose
+        whitening is gone, too.
+        """
+        whitening = self.spec.get("whitening")
+        return int(whitening["from_dimension"]) if whitening else None
 
     __table_args__ = (
         # One model change at a time: two would describe every photo three times over.

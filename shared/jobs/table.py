@@ -73,12 +73,13 @@ class JobKind(StrEnum):
     FIT = "fit"  # learn a vocabulary from the map's photos and switch to it
     IMPORT = "import_vocabulary"  # check a vocabulary file and switch to it
     SWITCH = "switch"  # switch to a vocabulary that the map already has
+    PCA = "pca"  # fit PCA whitening on the map's descriptors and switch to shorter ones
     EVALUATE = "evaluate"  # ask the map about photos whose place is known, and count
     WORD_WEIGHTS = "word_weights"  # learn which words of its vocabulary tell its places apart
     BATCH = "batch"  # bring in many photos; each has a job of its own (`shared.jobs.batches`)
 
 
-MODEL_CHANGES = (JobKind.FIT, JobKind.IMPORT, JobKind.SWITCH)
+MODEL_CHANGES = (JobKind.FIT, JobKind.IMPORT, JobKind.SWITCH, JobKind.PCA)
 
 # Who takes what: extractors need photos and a backbone, the steward only the search tier.
 EXTRACTOR_JOBS = (JobKind.INDEX, JobKind.REINDEX, JobKind.DESCRIBE, *MODEL_CHANGES)

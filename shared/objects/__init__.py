@@ -10,6 +10,7 @@
 | `thumbnails/<photo>` | its thumbnail, JPEG |
 | `chunks/<generation>/<chunk>.npy`, `.json` | descriptor rows, and what they are |
 | `vocabularies/<uuid>.npy` | VLAD centres |
+| `whitenings/<uuid>.safetensors` | PCA whitenings |
 | `queries/<job>`, `queries/<job>.npy` | a query photo that is not stored, and its descriptor |
 | `work/<job>/...` | what a sliced job keeps between its slices |
 | `imports/...` (IMPORT_PREFIX) | what others have put there; it is only read |

@@ -13,9 +13,10 @@ ORIGINALS = "originals/"
 QUERIES = "queries/"
 THUMBNAILS = "thumbnails/"
 VOCABULARIES = "vocabularies/"
+WHITENINGS = "whitenings/"
 WORK = "work/"
 
-OWN = (ARCHIVES, "chunks/", ORIGINALS, QUERIES, THUMBNAILS, VOCABULARIES, WORK)
+OWN = (ARCHIVES, "chunks/", ORIGINALS, QUERIES, THUMBNAILS, VOCABULARIES, WHITENINGS, WORK)
 
 
 def is_key(key: str) -> bool:
@@ -87,6 +88,10 @@ def query_vector_key(job_id: UUID) -> str:
 
 def new_vocabulary_key() -> str:
     return f"{VOCABULARIES}{new_id()}.npy"
+
+
+def new_whitening_key() -> str:
+    return f"{WHITENINGS}{new_id()}.safetensors"
 
 
 def work_key(job_id: UUID, name: str) -> str:

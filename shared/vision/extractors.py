@@ -22,6 +22,7 @@ from shared.vision.backbones.tiny import TinyBackbone
 from shared.vision.backbones.torchhub import HubModule
 from shared.vision.decode import DECODER
 from shared.vision.passes import PassLimit, PhotoDoesNotFit, in_passes
+from shared.vision.pca import Projection
 from shared.vision.pooling import average, gem
 from shared.vision.precision import Precision, computing_in
 from shared.vision.preprocessing import Preprocessing, get_preprocessing
@@ -126,7 +127,7 @@ class Extractor:
             )
         return centres, provenance
 
-    def spec(self, centres: Centres | None) -> dict[str, Any]:
+    def spec(self, centres: Centres | None, projection: Projection | None = None) -> dict[str, Any]:
         """Everything that decides a descriptor's value."""
         spec: dict[str, Any] = {
             "extractor": self.recipe.name,
@@ -140,16 +141,23 @@ class Extractor:
             "clusters": centres.clusters if centres else None,
             "precision": self.precision,
             "decoder": DECODER,
-            "dimension": self.dimension(centres),
+            "dimension": self.dimension(centres, projection),
         }
+        if projection is not None:
+            spec["whitening"] = {
+                "sha256": projection.sha256,
+                "from_dimension": projection.dimension,
+            }
         if self.recipe.aggregator == "soft-vlad":
             spec["temperature"] = self.recipe.temperature
         if isinstance(self.backbone, HubModule):
             spec["code_fingerprint"] = self.backbone.code_fingerprint
         return spec
 
-    def dimension(self, centres: Centres | None) -> int:
+    def dimension(self, centres: Centres | None, projection: Projection | None = None) -> int:
         """Length of a descriptor."""
+        if projection is not None:
+            return projection.kept
         return self.backbone.width * (centres.clusters if centres else 1)
 
     def warm_up(self, photos: int) -> None:
@@ -187,7 +195,12 @@ class Extractor:
                 found[place] = one
         return found
 
-    def describe(self, photos: Collection[Pixels], centres: Centres | None) -> NDArray[np.float32]:
+    def describe(
+        self,
+        photos: Collection[Pixels],
+        centres: Centres | None,
+        projection: Projection | None = None,
+    ) -> NDArray[np.float32]:
         """Photos (H, W, 3) as `preprocessing` brings them, of any sizes -> (n, dimension) float32.
 
         Rows in the photos' order, of length 1; or 0, see `shared.vision.vlad`; or NaN throughout
@@ -200,10 +213,13 @@ class Extractor:
         on_device = None
         if centres is not None:
             on_device = torch.from_numpy(centres.array).to(self.backbone.device)
-        rows = np.empty((len(photos), self.dimension(centres)), np.float32)
-        for places, found in self._in_passes(
-            photos, lambda features: self._aggregate(features, on_device).cpu()
-        ):
+
+        def row(features: torch.Tensor) -> torch.Tensor:
+            described = self._aggregate(features, on_device)
+            return (described if projection is None else projection(described)).cpu()
+
+        rows = np.empty((len(photos), self.dimension(centres, projection)), np.float32)
+        for places, found in self._in_passes(photos, row):
             rows[places] = found.numpy()
         return rows
 

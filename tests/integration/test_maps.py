@@ -88,7 +88,7 @@ def remove_all(catalog: Catalog, store: FolderStore) -> None:
 
 def live_in(service: Service, name: str) -> None:
     """Everything that can belong to a map: photos, found and failed and asking ones, a vocabulary
-    and an import under way, two generations, searches, queries, evaluations."""
+    and an import under way, generations, a whitening, searches, queries, evaluations."""
     settings = Settings().model_copy(update={"auto_fit_photos": 10_000})
     service.json("POST", "/maps", 201, json={"name": name, "extractor": "test-tiny-vlad"})
     params = {"map": name}
@@ -108,6 +108,8 @@ def live_in(service: Service, name: str) -> None:
     evaluator = Evaluator(service.catalog, service.store, service.search, settings, "evaluator")
     assert evaluator.evaluate_next(threading.Event())
     service.json("POST", "/vocabularies", 202, params=params, json={"clusters": 3, "seed": 5})
+    finish_changes(service)
+    service.json("POST", "/generations", 202, params=params, json={"pca": 1})
     finish_changes(service)
     with service.catalog.write() as session:
         keep_figures(session, id_of(service, name))
@@ -152,9 +154,8 @@ def test_a_deleted_map_leaves_no_row_and_no_byte_and_others_stay(
     during = rows(catalog)
     of_no_map = {"installation", "idempotency_keys"}
     assert all(during[table] > before[0][table] for table in during.keys() - of_no_map), during
-    assert {"originals", "thumbnails", "chunks", "queries", "vocabularies", "work"} >= {
-        key.split("/")[0] for key in objects(store) - before[1]
-    }
+    kinds = {"originals", "thumbnails", "chunks", "queries", "vocabularies", "whitenings", "work"}
+    assert kinds >= {key.split("/")[0] for key in objects(store) - before[1]}
     service.json("DELETE", "/maps/gone")
     problem(service("GET", "/maps/gone"), 404, "map_not_found")
     remove_all(catalog, store)
