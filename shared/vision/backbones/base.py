@@ -34,6 +34,10 @@ class Backbone(Protocol):
         A patch whose feature is zero stays zero.
         """
 
+    def grid(self, height: int, width: int) -> tuple[int, int]:
+        """Rows and columns of the patches of a photo of so many pixels; `features` has them row by
+        row. (1, 1) where there is one feature of the whole photo."""
+
 
 def normalise_pixels(
     pixels: torch.Tensor, mean: tuple[float, ...], std: tuple[float, ...]
