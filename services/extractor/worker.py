@@ -22,6 +22,7 @@ from uuid import UUID
 import numpy as np
 from sqlalchemy.exc import SQLAlchemyError
 
+from services.extractor.compare import Comparisons, Prepared
 from services.extractor.decoding import DecoderPool
 from services.extractor.loaded import LoadedModels
 from services.extractor.model_change import ModelChanges
@@ -90,7 +91,7 @@ class Work:
 
     jobs: list[Job]
     lease: contextlib.ExitStack
-    batch: Future[Batch | None] | None
+    batch: Future[Batch | Prepared | None] | None
     """None inside: the map has no vocabulary yet. None itself: a slice of a model change."""
 
     @property
@@ -122,6 +123,7 @@ class ExtractorWorker:
         self._models = LoadedModels(store, settings)
         self._decoders = DecoderPool(settings)
         self._changes = ModelChanges(catalog, store, self._models, self._decoders, settings)
+        self._comparisons = Comparisons(catalog, store, self._models, self._decoders, settings)
         # Two: a query's photo does not wait until those of the next batch are read.
         self._ahead = ThreadPoolExecutor(max_workers=2, thread_name_prefix="prepare")
         self._beside = ThreadPoolExecutor(max_workers=1, thread_name_prefix="queries")
@@ -240,7 +242,9 @@ class ExtractorWorker:
         result.maps.add(str(jobs[0].map_id))
         work = Work(jobs, contextlib.ExitStack(), None)
         work.lease.enter_context(hold_lease(self._catalog, work.token, settings.lease_seconds))
-        if jobs[0].kind not in MODEL_CHANGES:
+        if jobs[0].kind == JobKind.COMPARE:
+            work.batch = self._ahead.submit(self._comparisons.prepare, jobs[0])
+        elif jobs[0].kind not in MODEL_CHANGES:
             work.batch = self._ahead.submit(self._prepare, jobs)
         return work
 
@@ -263,6 +267,10 @@ class ExtractorWorker:
                     batch = work.batch.result()
                     if batch is None:
                         self._wait_for_vocabulary(work)
+                    elif isinstance(batch, Prepared):
+                        self._begin(work, company)
+                        result.seconds["compare"] += self._comparisons.finish(batch)
+                        result.succeeded += 1
                     else:
                         self._begin(work, company)
                         outcome = self._describe(batch)

@@ -15,7 +15,7 @@ from shared.catalog.maps import list_maps, lock_map
 from shared.catalog.session import Catalog
 from shared.ids import new_id
 from shared.jobs import Job, JobKind, JobState, Priority
-from shared.jobs.table import UNFINISHED
+from shared.jobs.table import QUERY_JOBS, UNFINISHED
 
 SAMPLE_PHOTOS = 300  # enough for a threshold that one in twenty exceeds
 CHANGED_SHARE = 0.2  # of the photos: more, and the last evaluation is out of date
@@ -69,7 +69,7 @@ def _due(session: Session, map_id: UUID, least_photos: int) -> dict[str, Any] | 
 def _is_busy(session: Session, map_id: UUID) -> bool:
     """Photos are being described, or an evaluation is under way: what is found still changes."""
     unfinished = exists().where(
-        Job.map_id == map_id, Job.state.in_(UNFINISHED), Job.kind != JobKind.DESCRIBE
+        Job.map_id == map_id, Job.state.in_(UNFINISHED), Job.kind.not_in(QUERY_JOBS)
     )
     return bool(session.scalar(select(unfinished)))
 

@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 from PIL import Image
 from torch.nn.functional import normalize
 
@@ -32,7 +33,7 @@ def features(seed: int, count: int = PATCHES) -> torch.Tensor:
 
 @pytest.fixture
 def centres() -> Centres:
-    return check_centres(0.5 * features(99, CLUSTERS).numpy())
+    return check_centres((0.5 * features(99, CLUSTERS)).numpy())
 
 
 def described(recipe: Recipe, photo: torch.Tensor, centres: Centres) -> torch.Tensor:
@@ -97,7 +98,7 @@ def test_descriptor_that_is_no_sum_is_refused() -> None:
         explain(replace(MEAN, aggregator="gem"), features(1), None, features(2, 1).numpy())
 
 
-def pixels_of(overlay: str) -> np.ndarray:  # type: ignore[type-arg]
+def pixels_of(overlay: str) -> NDArray[np.uint8]:
     head, _, data = overlay.partition(",")
     assert head == "data:image/png;base64"
     with Image.open(io.BytesIO(base64.b64decode(data))) as image:
