@@ -59,12 +59,12 @@ class Described:
     """By vocabulary, (photos, dimension)."""
 
 
-def measure(progress: Progress, *, places: int) -> Report:
-    """`places` of a generated city, four photos of each; half as many queries."""
+def measure(progress: Progress, *, places: int, seed: int) -> Report:
+    """`places` of the city `seed`, four photos of each; half as many queries."""
     extractor = Extractor(RECIPES[EXTRACTOR], choose_device("auto"))
-    report = Report(f"Reranking {places} generated places")
+    report = Report(f"Reranking {places} generated places, seed {seed}")
     with tempfile.TemporaryDirectory() as folder:
-        database, queries, positives = _city(Path(folder), places, progress)
+        database, queries, positives = _city(Path(folder), places, seed, progress)
         bar = progress.add_task("describing", total=len(database) + len(queries))
         described = _describe(extractor, database, queries, lambda n: progress.advance(bar, n))
         recompute = _time_features(extractor, database[: max(RERANKED)])
@@ -81,10 +81,10 @@ def measure(progress: Progress, *, places: int) -> Report:
 
 
 def _city(
-    folder: Path, places: int, progress: Progress
+    folder: Path, places: int, seed: int, progress: Progress
 ) -> tuple[list[Path], list[Path], list[Indices]]:
     """Paths of the database and of the queries in the map, and the positives of each query."""
-    plan = make_plan(CityOptions(places, 4, max(1, places // 2), 0, 0, 0.1, 320, 240, False))
+    plan = make_plan(CityOptions(places, 4, max(1, places // 2), seed, 0, 0.1, 320, 240, False))
     bar = progress.add_task("drawing", total=len(plan.shots))
     write_city(plan, folder, lambda count: progress.advance(bar, count))
     database = [shot for shot in plan.shots if shot.role == "database"]

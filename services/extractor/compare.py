@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from uuid import UUID
 
 import numpy as np
@@ -23,6 +23,7 @@ from sqlalchemy import select
 from services.extractor.candidates import CandidateFeatures
 from services.extractor.decoding import DecoderPool
 from services.extractor.loaded import LoadedModels
+from services.extractor.publish import Published
 from services.extractor.target import Target, find_target
 from shared.catalog.chunks import Chunk, Descriptor
 from shared.catalog.photos import Photo, get_photo, live_photos
@@ -61,6 +62,7 @@ class Prepared:
     asked: Comparison
     target: Target
     query: Decoded
+    seconds: dict[str, float] = field(default_factory=dict)
 
 
 class Comparisons:
@@ -95,16 +97,18 @@ class Comparisons:
             raise query
         return Prepared(job, asked, target, query)
 
-    def finish(self, prepared: Prepared) -> float:
-        """Compare, store the result and end the job; the seconds that it took."""
+    def finish(self, prepared: Prepared) -> Published:
+        """Compare, store the result and end the job."""
         started = time.perf_counter()
         job, result = prepared.job, self._compare(prepared)
+        prepared.seconds["compare"] = time.perf_counter() - started
         self._store.put(comparison_key(job.id), result.model_dump_json().encode())
         assert job.lease_token is not None, "a claimed job carries a token"
         with self._catalog.write() as session:
-            for mine in held(session, job.lease_token, [job]):
-                succeed(mine, {"candidates": len(result.candidates)})
-        return time.perf_counter() - started
+            mine = held(session, job.lease_token, [job])
+            for own in mine:
+                succeed(own, {"candidates": len(result.candidates)})
+        return Published(succeeded=len(mine))
 
     def _read_query(self, job: Job, asked: Comparison) -> bytes:
         if asked.query_photo_id is None:

@@ -267,13 +267,13 @@ class ExtractorWorker:
                     batch = work.batch.result()
                     if batch is None:
                         self._wait_for_vocabulary(work)
-                    elif isinstance(batch, Prepared):
-                        self._begin(work, company)
-                        result.seconds["compare"] += self._comparisons.finish(batch)
-                        result.succeeded += 1
                     else:
                         self._begin(work, company)
-                        outcome = self._describe(batch)
+                        outcome = (
+                            self._comparisons.finish(batch)
+                            if isinstance(batch, Prepared)
+                            else self._describe(batch)
+                        )
                         result.succeeded += outcome.succeeded
                         result.failed += outcome.failed
                         for stage, took in batch.seconds.items():

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable
 from uuid import UUID
 
 import pytest
 from sqlalchemy import select
 
+from services.extractor.compare import Comparisons, Prepared
 from services.extractor.worker import ExtractorWorker
 from services.steward.collect import (
     collect_ended_generations,
@@ -16,8 +18,9 @@ from services.steward.collect import (
 )
 from shared.catalog.maps import ensure_default_map
 from shared.catalog.session import Catalog
+from shared.comparison import Compared
 from shared.ids import new_id
-from shared.jobs import Job, JobKind
+from shared.jobs import Job, JobKind, free_expired_leases
 from shared.objects import FolderStore
 from shared.objects.keys import comparison_key, query_key
 from shared.settings import Settings
@@ -214,6 +217,40 @@ def test_comparisons_wait_in_the_queue_of_queries(
     refused = service("POST", f"/similarity/{query}", params=CLOSELY)
     problem(refused, 429, "queue_full")
     assert plain(service, query)["total_similar"] == 1, "what needs no extractor is answered"
+
+
+def test_cancelled_comparison_can_be_retried(service: Service) -> None:
+    query = service.indexed(0, 1, 2)[0]
+    started = begun(service, f"/similarity/{query}")
+    service.json("POST", f"/jobs/{started['job_id']}/cancel")
+    service.drain()
+    cancelled = service("GET", f"/jobs/{started['job_id']}/result")
+    problem(cancelled, 409, "job_cancelled")
+    service.json("POST", f"/jobs/{started['job_id']}/retry")
+    service.drain()
+    assert len(ids(result(service, started))) == 2
+
+
+def test_comparison_of_a_worker_that_was_given_up_is_ended_by_the_next_one(
+    service: Service, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = Comparisons._compare
+    given_up: list[int] = []
+
+    def compare(self: Comparisons, prepared: Prepared) -> Compared:
+        if not given_up:
+            with service.catalog.write() as session:
+                given_up.append(free_expired_leases(session, 3, everyone=True))
+        return real(self, prepared)
+
+    query = service.indexed(0, 1, 2)[0]
+    started = begun(service, f"/similarity/{query}")
+    monkeypatch.setattr(Comparisons, "_compare", compare)
+    assert service.worker.drain(threading.Event()).succeeded == 1
+    assert given_up == [1]
+    job = service.json("GET", f"/jobs/{started['job_id']}")
+    assert (job["state"], job["attempts"]) == ("succeeded", 1)
+    assert len(ids(result(service, started))) == 2
 
 
 # --- what goes meanwhile ---------------------------------------------------------------------
