@@ -188,33 +188,55 @@ class Client:
         top_k: int = 10,
         min_score: float | None = None,
         wait_seconds: int = 60,
+        rerank: int | None = None,
+        explain: bool = False,
         **filters: Any,
     ) -> Json:
-        """The photos most similar to one that is not stored; `filters` as in `similar_to`."""
-        params = _given(top_k=top_k, min_score=min_score, **filters)
+        """The photos most similar to one that is not stored; the rest as in `similar_to`."""
+        params = _given(
+            top_k=top_k,
+            min_score=min_score,
+            rerank=rerank,
+            explain=explain or None,
+            **filters,
+        )
         answer = self._send_file(
             "/similarity",
             photo,
             params=params,
             headers={"Prefer": f"wait={wait_seconds}"},
         )
-        if "result_url" not in answer:
-            return answer
-        self.wait_for(answer["job_id"])
-        return self._call("GET", answer["result_url"].removeprefix(API))
+        return self._result_of(answer)
 
     def similar_to(
         self,
         file_id: UUID | str,
         top_k: int = 10,
         min_score: float | None = None,
+        rerank: int | None = None,
+        explain: bool = False,
         **filters: Any,
     ) -> Json:
         """The photos most similar to a stored one, of those that pass the filters: `near`
         ("LAT,LON,RADIUS_M"), `box` ("S,W,N,E"), `captured_after`, `captured_before`, `place`,
-        `tags` and `ids` (separated by commas); `word_weights=False` ranks by the plain cosine."""
-        params = _given(top_k=top_k, min_score=min_score, **filters)
-        return self._call("POST", f"/similarity/{file_id}", params=params)
+        `tags` and `ids` (separated by commas); `word_weights=False` ranks by the plain cosine.
+        The first `rerank` of them are compared patch by patch; `explain` says of each what makes
+        it similar."""
+        params = _given(
+            top_k=top_k,
+            min_score=min_score,
+            rerank=rerank,
+            explain=explain or None,
+            **filters,
+        )
+        return self._result_of(self._call("POST", f"/similarity/{file_id}", params=params))
+
+    def _result_of(self, answer: Json) -> Json:
+        """The answer itself, waited for where it is a job's: one job may lead to another."""
+        while "result_url" in answer:
+            self.wait_for(answer["job_id"])
+            answer = self._call("GET", answer["result_url"].removeprefix(API))
+        return answer
 
     def job(self, job_id: UUID | str, wait_seconds: float = 0) -> Json:
         return self._call("GET", f"/jobs/{job_id}", params={"wait": wait_seconds})

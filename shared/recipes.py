@@ -79,6 +79,11 @@ class Recipe:
         return self.aggregator in ("vlad", "soft-vlad")
 
     @property
+    def has_patches(self) -> bool:
+        """Whether the backbone makes local features: several of a photo, each of a patch."""
+        return self.aggregator != "none"
+
+    @property
     def dimension(self) -> int | None:
         """Length of a descriptor once a fit has made `clusters` centres; None as for `width`.
 

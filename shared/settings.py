@@ -206,6 +206,18 @@ class Settings(BaseSettings):
         200, ge=1, description="photos at which a map without a vocabulary fits its own"
     )
 
+    # How the first photos of an answer are looked at closely (`rerank`, `explain`).
+    compare_wait_seconds: float = Field(
+        10.0,
+        ge=0,
+        description="longest wait for a comparison inside a call; then 202 and a job to poll",
+    )
+    local_features: Literal["recompute", "keep"] = Field(
+        "recompute",
+        description="those of compared photos: made again each time, or kept as float16 in the "
+        "object store once made (44 kB a photo with the default extractor)",
+    )
+
     # How jobs are kept alive.
     lease_seconds: float = Field(60.0, gt=0, description="silence after which a worker is given up")
     drain_seconds: float = Field(

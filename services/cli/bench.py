@@ -137,6 +137,19 @@ def query_latency(
     )
 
 
+@app.command("rerank")
+def rerank(
+    places: Annotated[int, typer.Option(min=20, help="Of a generated city.")] = 150,
+    seed: Annotated[int, typer.Option(min=0, help="Which city.")] = 0,
+    as_json: JsonOption = False,
+) -> None:
+    """How often does the right place come first with `rerank=10`, 25 and 50, and what does it take?
+
+    With PLACEWISE_TEST_DATA also the ranks of the true places of real photos.
+    """
+    _measure("rerank", as_json, places=places, seed=seed)
+
+
 @app.command("catalog")
 def catalog(
     photos: Annotated[int, typer.Option(min=100_000, help="Rows to make.")] = 1_000_000,

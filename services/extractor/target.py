@@ -14,8 +14,9 @@ from shared.catalog.session import Catalog
 from shared.catalog.vocabularies import Vocabulary, VocabularyOrigin, add_vocabulary
 from shared.catalog.whitenings import StoredWhitening
 from shared.ids import new_id
-from shared.jobs import Job, JobKind
+from shared.jobs import Job
 from shared.jobs.model_changes import release_vocabulary_waiters
+from shared.jobs.table import QUERY_JOBS
 from shared.objects import ObjectStore
 from shared.objects.keys import new_vocabulary_key
 from shared.vision.extractors import Extractor
@@ -34,11 +35,11 @@ def find_target(
 ) -> Target | None:
     """Where the batch of `job` goes; None while the map has no vocabulary.
 
-    A reindex job names its generation; the others go to the map's active one, which is made here
-    on first use when the extractor brings a vocabulary or needs none.
+    A job that names a generation goes there; the others go to the map's active one, which is made
+    here on first use when the extractor brings a vocabulary or needs none.
     """
     with catalog.read() as session:
-        if job.kind == JobKind.REINDEX:
+        if job.generation_id is not None:
             generation = session.get(Generation, job.generation_id)
         else:
             generation = active_generation(session, job.map_id)
@@ -59,8 +60,8 @@ def find_target(
         models.projection(whitening) if whitening else None,
         generation=generation,
     )
-    # A query's row is compared once and thrown away: another decoder release is close enough.
-    check_spec(generation, target, decoder_matters=job.kind != JobKind.DESCRIBE)
+    # A query is compared once and thrown away: another decoder release is close enough.
+    check_spec(generation, target, decoder_matters=job.kind not in QUERY_JOBS)
     return target
 
 

@@ -32,11 +32,12 @@ from uuid import UUID
 import numpy as np
 from sqlalchemy.exc import SQLAlchemyError
 
+from services.extractor.compare import Comparisons, Prepared
 from services.extractor.decoding import DecoderPool
 from services.extractor.loaded import LoadedModels
 from services.extractor.model_change import ModelChanges
 from services.extractor.prepare import Batch, prepare
-from services.extractor.publish import publish
+from services.extractor.publish import Published, publish
 from services.extractor.renew import renew_outdated_generations
 from services.extractor.target import find_target
 from shared.catalog.away import Outage
@@ -102,7 +103,7 @@ class Work:
 
     jobs: list[Job]
     lease: contextlib.ExitStack
-    batch: Future[Batch | None] | None
+    batch: Future[Batch | Prepared | None] | None
     """None inside: the map has no vocabulary yet. None itself: a slice of a model change."""
 
     @property
@@ -134,6 +135,7 @@ class ExtractorWorker:
         self._models = LoadedModels(store, settings)
         self._decoders = DecoderPool(settings)
         self._changes = ModelChanges(catalog, store, self._models, self._decoders, settings)
+        self._comparisons = Comparisons(catalog, store, self._models, self._decoders, settings)
         # Two: a query's photo does not wait until those of the next batch are read.
         self._ahead = ThreadPoolExecutor(max_workers=2, thread_name_prefix="prepare")
         self._beside = ThreadPoolExecutor(max_workers=1, thread_name_prefix="queries")
@@ -263,7 +265,9 @@ class ExtractorWorker:
         result.maps.add(str(jobs[0].map_id))
         work = Work(jobs, contextlib.ExitStack(), None)
         work.lease.enter_context(hold_lease(self._catalog, work.token, settings.lease_seconds))
-        if jobs[0].kind not in MODEL_CHANGES:
+        if jobs[0].kind == JobKind.COMPARE:
+            work.batch = self._ahead.submit(self._comparisons.prepare, jobs[0])
+        elif jobs[0].kind not in MODEL_CHANGES:
             work.batch = self._ahead.submit(self._prepare, jobs)
         return work
 
@@ -304,18 +308,25 @@ class ExtractorWorker:
                 self._wait_for_vocabulary(work)
                 return None
             self._begin(work, company)
+            if isinstance(batch, Prepared):
+                self._count(self._comparisons.finish(batch), batch.seconds, result)
+                return None
             return _rows(batch)
         return None  # what went wrong has been answered
 
     def _publish(self, work: Work, rows: Rows, result: DrainResult) -> None:
         with self._answered(work, result):
             batch = work.batch.result() if work.batch else None
-            assert batch is not None, "it was described"
+            assert isinstance(batch, Batch), "it was described"
             outcome = publish(self._catalog, self._store, batch, rows, self._settings.slot_rows)
-            result.succeeded += outcome.succeeded
-            result.failed += outcome.failed
-            for stage, took in batch.seconds.items():
-                result.seconds[stage] += took
+            self._count(outcome, batch.seconds, result)
+
+    @staticmethod
+    def _count(outcome: Published, seconds: dict[str, float], result: DrainResult) -> None:
+        result.succeeded += outcome.succeeded
+        result.failed += outcome.failed
+        for stage, took in seconds.items():
+            result.seconds[stage] += took
 
     def _publish_behind(self, work: Work, rows: Rows) -> DrainResult:
         result = DrainResult()

@@ -14,6 +14,7 @@ from services.gateway.job_watch import JobWatch
 from services.gateway.keys import Keys
 from shared.catalog.maps import DEFAULT_MAP
 from shared.catalog.session import Catalog
+from shared.comparison import MOST_RERANKED
 from shared.errors import NotFound, invalid_field
 from shared.jobs import Hints
 from shared.objects import ObjectStore
@@ -92,11 +93,23 @@ WordWeightsWanted = Annotated[
         description="Rank by the map's word weights, where it has any.",
     ),
 ]
+Rerank = Annotated[
+    int | None,
+    Query(
+        ge=1,
+        le=MOST_RERANKED,
+        description="Look at the first N photos patch by patch, and order them by what is seen.",
+    ),
+]
+Explain = Annotated[
+    bool, Query(description="Say of each photo which clusters and patches make it similar.")
+]
 
 __all__ = [
     "API",
     "DEFAULT_MAP",
     "NO_NUL",
+    "Explain",
     "FileId",
     "Gateway",
     "GatewayDep",
@@ -104,6 +117,7 @@ __all__ = [
     "JobId",
     "MapName",
     "MinScore",
+    "Rerank",
     "TopK",
     "UploadId",
     "WordWeightsWanted",

@@ -18,7 +18,7 @@ from shared.catalog.session import Catalog
 from shared.catalog.vocabularies import standing_of, why_no_word_weights
 from shared.ids import new_id
 from shared.jobs import Job, JobKind, JobState, Priority
-from shared.jobs.table import UNFINISHED
+from shared.jobs.table import QUERY_JOBS, UNFINISHED
 from shared.word_weights.record import stored_word_weights
 
 SAMPLE_PHOTOS = 300  # enough for a threshold that one in twenty exceeds
@@ -92,7 +92,7 @@ def _due(session: Session, map_id: UUID, least_photos: int, word_weights: bool) 
 def _is_busy(session: Session, map_id: UUID) -> bool:
     """Photos are being described, or an evaluation is under way: what is found still changes."""
     unfinished = exists().where(
-        Job.map_id == map_id, Job.state.in_(UNFINISHED), Job.kind != JobKind.DESCRIBE
+        Job.map_id == map_id, Job.state.in_(UNFINISHED), Job.kind.not_in(QUERY_JOBS)
     )
     return bool(session.scalar(select(unfinished)))
 

@@ -26,10 +26,11 @@ from shared.catalog.vocabularies import Vocabulary
 from shared.catalog.whitenings import StoredWhitening
 from shared.chunks import delete_chunk
 from shared.jobs.batches import BatchItem
-from shared.jobs.table import MODEL_CHANGES, UNFINISHED, Job, JobKind, JobState
+from shared.jobs.table import MODEL_CHANGES, QUERY_JOBS, UNFINISHED, Job, JobKind, JobState
 from shared.objects import ObjectStore
 from shared.objects.keys import (
     ARCHIVES,
+    FEATURES,
     INCOMING,
     ORIGINALS,
     QUERIES,
@@ -39,8 +40,9 @@ from shared.objects.keys import (
     WORK,
     incoming_key,
     is_original_key,
-    query_key,
-    query_vector_key,
+    keys_of_query,
+    local_features_key,
+    local_features_prefix,
     thumbnail_key,
 )
 from shared.settings import Settings
@@ -65,7 +67,8 @@ def collect_superseded_chunks(catalog: Catalog, store: ObjectStore, grace_second
 
 
 def collect_ended_generations(catalog: Catalog, store: ObjectStore, grace_seconds: float) -> None:
-    """Generations that no longer answer: their rows, chunks and unfinished photos' jobs.
+    """Generations that no longer answer: their rows, chunks, local features and unfinished photos'
+    jobs.
 
     The generation's own row stays as history until its map goes.
     """
@@ -92,6 +95,9 @@ def collect_ended_generations(catalog: Catalog, store: ObjectStore, grace_second
     if given_up:
         with catalog.write() as session:
             session.execute(delete(Job).where(Job.id.in_(given_up)))
+    for generation_id in {chunk.generation_id for chunk in ended}:
+        for info in list(store.list(local_features_prefix(generation_id))):
+            store.delete(info.key)
     for chunk in ended:
         delete_chunk(store, chunk.object_key)
     if ended:
@@ -124,22 +130,38 @@ def collect_whitenings(catalog: Catalog, store: ObjectStore, grace_seconds: floa
 
 
 def collect_deleted_photos(catalog: Catalog, store: ObjectStore, grace_seconds: float) -> None:
-    """The bytes of deleted photos at once; their rows after the grace, when every search worker
-    has seen the deletion and merging has dropped their descriptors."""
+    """The bytes and local features of deleted photos at once; their rows after the grace, when
+    every search worker has seen the deletion and merging has dropped their descriptors."""
     with catalog.read() as session:
         photos = session.scalars(
             select(Photo)
             .where(Photo.deleted_at.is_not(None), Photo.object_key != "")
             .limit(AT_ONCE)
         ).all()
+        described_in = _generations_with_rows(session, {photo.map_id for photo in photos})
     for photo in photos:
         store.delete(photo.object_key)
         store.delete(thumbnail_key(photo.id))
+        for generation_id in described_in[photo.map_id]:
+            store.delete(local_features_key(generation_id, photo.id))
     photo_ids = [photo.id for photo in photos]
     with catalog.write() as session:
         if photo_ids:
             session.execute(update(Photo).where(Photo.id.in_(photo_ids)).values(object_key=""))
         _forget_photos(session, grace_seconds)
+
+
+def _generations_with_rows(session: Session, map_ids: set[UUID]) -> dict[UUID, list[UUID]]:
+    """Of each map the generations that have chunks: of the others nothing is kept."""
+    found: dict[UUID, list[UUID]] = {map_id: [] for map_id in map_ids}
+    generations = session.execute(
+        select(Generation.map_id, Generation.id).where(
+            Generation.map_id.in_(map_ids), exists().where(Chunk.generation_id == Generation.id)
+        )
+    )
+    for map_id, generation_id in generations:
+        found[map_id].append(generation_id)
+    return found
 
 
 def _forget_photos(session: Session, grace_seconds: float) -> None:
@@ -160,16 +182,17 @@ def _forget_photos(session: Session, grace_seconds: float) -> None:
 
 
 def collect_queries(catalog: Catalog, store: ObjectStore, ttl_seconds: float) -> None:
-    """Query photos that are not stored, with their descriptors and jobs, after QUERY_TTL."""
+    """Query photos that are not stored, with their descriptors, comparisons and jobs, after
+    QUERY_TTL."""
     with catalog.read() as session:
         job_ids = session.scalars(
             select(Job.id)
-            .where(Job.kind == JobKind.DESCRIBE, Job.created_at < db_now_plus(-ttl_seconds))
+            .where(Job.kind.in_(QUERY_JOBS), Job.created_at < db_now_plus(-ttl_seconds))
             .limit(AT_ONCE)
         ).all()
     for job_id in job_ids:
-        store.delete(query_key(job_id))
-        store.delete(query_vector_key(job_id))
+        for key in keys_of_query(job_id):
+            store.delete(key)
     if job_ids:
         with catalog.write() as session:
             session.execute(delete(Job).where(Job.id.in_(job_ids)))
@@ -320,9 +343,26 @@ def _known_whitenings(session: Session, keys: list[str]) -> Iterable[str]:
 
 
 def _known_queries(session: Session, keys: list[str]) -> Iterable[str]:
-    job_ids = _ids(key.removeprefix(QUERIES).removesuffix(".npy") for key in keys)
+    job_ids = _ids(key.removeprefix(QUERIES).partition(".")[0] for key in keys)
     known = session.scalars(select(Job.id).where(Job.id.in_(job_ids)))
-    return [key for job_id in known for key in (query_key(job_id), query_vector_key(job_id))]
+    return [key for job_id in known for key in keys_of_query(job_id)]
+
+
+def _known_local_features(session: Session, keys: list[str]) -> Iterable[str]:
+    """Those of live photos in generations that still have their descriptors."""
+    named = {key: key.removeprefix(FEATURES).removesuffix(".npy").split("/") for key in keys}
+    generation_ids = _ids(names[0] for names in named.values())
+    photo_ids = _ids(names[-1] for names in named.values())
+    known = session.execute(
+        select(Descriptor.generation_id, Descriptor.photo_id)
+        .join(Photo, Photo.id == Descriptor.photo_id)
+        .where(
+            Descriptor.generation_id.in_(generation_ids),
+            Descriptor.photo_id.in_(photo_ids),
+            Photo.deleted_at.is_(None),
+        )
+    )
+    return [local_features_key(generation_id, photo_id) for generation_id, photo_id in known]
 
 
 def _ids(names: Iterable[str]) -> set[UUID]:
@@ -343,4 +383,5 @@ REFERENCED: dict[str, Callable[[Session, list[str]], Iterable[str]]] = {
     VOCABULARIES: _known_vocabularies,
     WHITENINGS: _known_whitenings,
     QUERIES: _known_queries,
+    FEATURES: _known_local_features,
 }

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import time
+from itertools import chain, islice
 from uuid import UUID
 
 from sqlalchemy import delete, select
@@ -26,13 +27,13 @@ from shared.catalog.whitenings import StoredWhitening
 from shared.chunks import delete_chunk
 from shared.jobs.batches import BatchItem
 from shared.jobs.finish import cancel_all
-from shared.jobs.table import Job, JobKind
+from shared.jobs.table import QUERY_JOBS, Job, JobKind
 from shared.objects import ObjectStore
 from shared.objects.keys import (
     ORIGINALS,
     incoming_key,
-    query_key,
-    query_vector_key,
+    keys_of_query,
+    local_features_prefix,
     thumbnail_key,
 )
 
@@ -57,7 +58,14 @@ def _step(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
     """Remove the next rows of the map with their objects; True when the map is gone."""
     with catalog.write() as session:
         cancel_all(session, Job.map_id == map_id)
-    for some_were_left in (_chunks, _queries, _batches, _photos, _direct_uploads):
+    for some_were_left in (
+        _chunks,
+        _queries,
+        _batches,
+        _photos,
+        _direct_uploads,
+        _local_features,  # last: it asks the store, whatever is there
+    ):
         if some_were_left(catalog, store, map_id):
             return False
     _vocabularies(catalog, store, map_id)
@@ -95,11 +103,11 @@ def _chunks(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
 def _queries(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
     with catalog.read() as session:
         ids = session.scalars(
-            select(Job.id).where(Job.map_id == map_id, Job.kind == JobKind.DESCRIBE).limit(AT_ONCE)
+            select(Job.id).where(Job.map_id == map_id, Job.kind.in_(QUERY_JOBS)).limit(AT_ONCE)
         ).all()
     for job_id in ids:
-        store.delete(query_key(job_id))
-        store.delete(query_vector_key(job_id))
+        for key in keys_of_query(job_id):
+            store.delete(key)
     if ids:
         with catalog.write() as session:
             session.execute(delete(Job).where(Job.id.in_(ids)))
@@ -163,6 +171,16 @@ def _direct_uploads(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
         with catalog.write() as session:
             session.execute(delete(DirectUpload).where(DirectUpload.id.in_(ids)))
     return bool(ids)
+
+
+def _local_features(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
+    with catalog.read() as session:
+        ids = session.scalars(select(Generation.id).where(Generation.map_id == map_id)).all()
+    kept = chain.from_iterable(store.list(local_features_prefix(id_)) for id_ in ids)
+    keys = [info.key for info in islice(kept, AT_ONCE)]
+    for key in keys:
+        store.delete(key)
+    return bool(keys)
 
 
 def _vocabularies(catalog: Catalog, store: ObjectStore, map_id: UUID) -> None:

@@ -34,6 +34,7 @@ PRIORITIES = {
     JobKind.INDEX: Priority.UPLOAD,
     JobKind.REINDEX: Priority.REINDEX,
     JobKind.DESCRIBE: Priority.QUERY,
+    JobKind.COMPARE: Priority.QUERY,
     JobKind.EVALUATE: Priority.EVALUATION,
     JobKind.WORD_WEIGHTS: Priority.EVALUATION,
     **dict.fromkeys(MODEL_CHANGES, Priority.MODEL_CHANGE),

@@ -37,6 +37,10 @@ class Backbone(Protocol):
         be, is NaN.
         """
 
+    def grid(self, height: int, width: int) -> tuple[int, int]:
+        """Rows and columns of the patches of a photo of so many pixels; `features` has them row by
+        row. (1, 1) where there is one feature of the whole photo."""
+
 
 def unit_features(features: torch.Tensor) -> torch.Tensor:
     """(..., width) of any floating type -> float32 of length 1, as `Backbone.features` promises.

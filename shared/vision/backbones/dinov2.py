@@ -112,6 +112,9 @@ class Dinov2:
         facet = last(tokens) if self.facet == "token" else last.attn.qkv(last.norm1(tokens))
         return unit_features(facet[:, 1 + self._shape.registers :])
 
+    def grid(self, height: int, width: int) -> tuple[int, int]:
+        return height // PATCH, width // PATCH
+
     def _with_positions(self, patches: torch.Tensor, rows: int, columns: int) -> torch.Tensor:
         """(B, patches, width) -> (B, 1 + registers + patches, width)."""
         vit, registers = self._vit, self._shape.registers

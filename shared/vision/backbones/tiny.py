@@ -41,3 +41,6 @@ class TinyBackbone:
         images = pixels.to(self.device).permute(0, 3, 1, 2).to(torch.float32) / 127.5 - 1.0
         patches = torch.nn.functional.unfold(images, PATCH, stride=PATCH).transpose(1, 2)
         return unit_features(patches @ self._projection)
+
+    def grid(self, height: int, width: int) -> tuple[int, int]:
+        return height // PATCH, width // PATCH

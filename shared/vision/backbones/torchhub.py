@@ -62,6 +62,9 @@ class HubModule:
     def features(self, pixels: torch.Tensor) -> torch.Tensor:
         return unit_features(self._forward(pixels)).unsqueeze(1)
 
+    def grid(self, height: int, width: int) -> tuple[int, int]:
+        return 1, 1
+
     def _forward(self, pixels: torch.Tensor) -> Any:
         batch = normalise_pixels(pixels.to(self.device), self._hub.mean, self._hub.std)
         out = self._module(batch)
