@@ -54,18 +54,20 @@ REQUEST_BYTES = 128 * 1024  # an environment has a few KiB
 
 def serve(control: socket.socket) -> dict[str, Any] | None:
     """Answer until the tests end. In a child: what it is to run."""
-    children: set[int] = set()
+    codes: dict[int, int | None] = {}  # of the children, by pid; None for those that run
     while True:
         message, given, _, _ = socket.recv_fds(control, REQUEST_BYTES, maxfds=3)
         if not message:  # the tests have ended, in good order or not
-            for pid in children:
-                os.kill(pid, signal.SIGKILL)
+            for pid, code in codes.items():
+                if code is None:
+                    os.kill(pid, signal.SIGKILL)
             return None
         request = json.loads(message)
         if "ended" in request:
-            answer = _exit_code(request["ended"])
-            if answer is not None:
-                children.remove(request["ended"])
+            pid = request["ended"]
+            if codes[pid] is None:
+                codes[pid] = _exit_code(pid)
+            answer = codes[pid]
         else:
             answer = os.fork()
             if answer == 0:
@@ -73,12 +75,12 @@ def serve(control: socket.socket) -> dict[str, Any] | None:
                 for standard, descriptor in enumerate(given):
                     os.dup2(descriptor, standard)
             else:
-                children.add(answer)
+                codes[answer] = None
             for descriptor in given:
                 os.close(descriptor)
             if answer == 0:
                 return dict(request)
-        control.send(json.dumps(answer).encode())
+        control.send(json.dumps([request["number"], answer]).encode())
 
 
 def run(request: dict[str, Any]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import atexit
+import contextlib
 import functools
 import json
 import os
@@ -96,13 +97,11 @@ class ForkedProcess:
         self._server = server
         self._command = command
         self._code: int | None = None
-        self._asking = threading.Lock()  # the code is given once
 
     def poll(self) -> int | None:
-        with self._asking:
-            if self._code is None:
-                self._code = self._server.ask({"ended": self.pid})
-            return self._code
+        if self._code is None:
+            self._code = self._server.ask({"ended": self.pid})
+        return self._code
 
     def wait(self, timeout: float | None = None) -> int:
         deadline = None if timeout is None else time.monotonic() + timeout
@@ -115,7 +114,8 @@ class ForkedProcess:
 
     def send_signal(self, sig: int) -> None:
         if self.poll() is None:
-            os.kill(self.pid, sig)
+            with contextlib.suppress(ProcessLookupError):  # another thread has asked meanwhile
+                os.kill(self.pid, sig)
 
     def terminate(self) -> None:
         self.send_signal(signal.SIGTERM)
@@ -130,6 +130,7 @@ class ForkServer:
     def __init__(self, environment: Mapping[str, str]) -> None:
         """`environment` is what its libraries see when they are imported."""
         self._asking = threading.Lock()
+        self._asked = 0
         self._log = tempfile.TemporaryFile()  # noqa: SIM115, it is open as long as the server runs
         self._control, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with theirs:
@@ -162,15 +163,18 @@ class ForkServer:
     def ask(self, request: dict[str, Any], descriptors: list[int] | None = None) -> Any:
         """One request and its answer; `descriptors` are the standard files of a new process."""
         with self._asking:
+            self._asked += 1
+            message = json.dumps({**request, "number": self._asked}).encode()
             try:
-                socket.send_fds(self._control, [json.dumps(request).encode()], descriptors or [])
-                answer = self._control.recv(ANSWER_BYTES)
+                socket.send_fds(self._control, [message], descriptors or [])
+                while said := self._control.recv(ANSWER_BYTES):
+                    number, answer = json.loads(said)
+                    if number == self._asked:  # others are of questions that were cut short
+                        return answer
             except OSError:
-                answer = b""
-        if not answer:
-            self._log.seek(0)
-            raise AssertionError(f"the fork server ended: {self._log.read()[-3000:].decode()}")
-        return json.loads(answer)
+                pass  # the log says more
+        self._log.seek(0)
+        raise AssertionError(f"the fork server ended: {self._log.read()[-3000:].decode()}")
 
     def close(self) -> None:
         """End it, and its processes that nobody has waited for."""
