@@ -186,8 +186,10 @@ def restart_under_load(
     servers: Servers,
     names: Sequence[str],
     on_restarted: Callable[[], object] = lambda: None,
+    *,
+    executed: bool = True,
 ) -> Report:
-    """The named services of two of each kind, one after the other."""
+    """The named services of two of each kind, one after the other. `executed`: see `Fleet`."""
     report = Report("Rolling restart under load")
     with Fleet(
         folder,
@@ -196,6 +198,7 @@ def restart_under_load(
         extractors=2,
         replicas=2,
         stewards=2,
+        executed=executed,
         extractor="test-slow-avg:milliseconds=20,width=1024",
         batch_photos=BATCH,
     ) as fleet:

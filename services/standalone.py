@@ -120,7 +120,7 @@ def standalone(settings: Settings, *, new_key: bool = False) -> Iterator[Standal
         presence = Presence(catalog, search, name)
         extractor = ExtractorWorker(catalog, store, settings, name=name, only_worker=True)
         steward = Steward(catalog, store, hints, settings)
-        evaluator = Evaluator(catalog, search, settings, name=name)
+        evaluator = Evaluator(catalog, store, search, settings, name=name)
         batches = BatchWorker(catalog, store, hints, settings, name=name)
         requests = catalog.limited(Limits.of_requests(settings))
         gateway = Gateway(requests, store, hints, search, settings, keys)

@@ -12,6 +12,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, BinaryIO
 from uuid import UUID
@@ -143,21 +144,30 @@ def corrupt(object_key: str) -> Unavailable:
 
 
 def read_row(store: ObjectStore, object_key: str, row: int) -> Row:
-    """One row of a chunk, (dimension,), fetching little more than that row.
+    """One row of a chunk, (dimension,); otherwise as `read_rows`."""
+    found: Row = read_rows(store, object_key, [row])[0]
+    return found
+
+
+def read_rows(store: ObjectStore, object_key: str, rows: Sequence[int]) -> Rows:
+    """These rows of a chunk, (n, dimension) in their order, fetching little more than them.
 
     No hash is checked: that of a chunk is of all its bytes. IndexError when there is no such row,
     ValueError for what is no chunk or ends too early, NotFound when the object is missing.
     """
     with store.open(object_key) as file:
-        (rows, dimension), offset = _read_header(_read(file, HEADER_BYTES))
-        if row >= rows:
-            raise IndexError(row)
+        (there, dimension), offset = _read_header(_read(file, HEADER_BYTES))
         size = dimension * np.dtype(np.float32).itemsize
-        file.seek(offset + row * size)
-        data = _read(file, size)
-    if len(data) < size:
-        raise ValueError(f"the object ends {size - len(data)} bytes too early")
-    return np.frombuffer(data, dtype=np.float32)
+        found = np.empty((len(rows), dimension), dtype=np.float32)
+        for place, row in enumerate(rows):
+            if row >= there:
+                raise IndexError(row)
+            file.seek(offset + row * size)
+            data = _read(file, size)
+            if len(data) < size:
+                raise ValueError(f"the object ends {size - len(data)} bytes too early")
+            found[place] = np.frombuffer(data, dtype=np.float32)
+    return found
 
 
 def _read(file: BinaryIO, size: int) -> bytes:

@@ -188,33 +188,55 @@ class Client:
         top_k: int = 10,
         min_score: float | None = None,
         wait_seconds: int = 60,
+        rerank: int | None = None,
+        explain: bool = False,
         **filters: Any,
     ) -> Json:
-        """The photos most similar to one that is not stored; `filters` as in `similar_to`."""
-        params = _given(top_k=top_k, min_score=min_score, **filters)
+        """The photos most similar to one that is not stored; the rest as in `similar_to`."""
+        params = _given(
+            top_k=top_k,
+            min_score=min_score,
+            rerank=rerank,
+            explain=explain or None,
+            **filters,
+        )
         answer = self._send_file(
             "/similarity",
             photo,
             params=params,
             headers={"Prefer": f"wait={wait_seconds}"},
         )
-        if "result_url" not in answer:
-            return answer
-        self.wait_for(answer["job_id"])
-        return self._call("GET", answer["result_url"].removeprefix(API))
+        return self._result_of(answer)
 
     def similar_to(
         self,
         file_id: UUID | str,
         top_k: int = 10,
         min_score: float | None = None,
+        rerank: int | None = None,
+        explain: bool = False,
         **filters: Any,
     ) -> Json:
         """The photos most similar to a stored one, of those that pass the filters: `near`
         ("LAT,LON,RADIUS_M"), `box` ("S,W,N,E"), `captured_after`, `captured_before`, `place`,
-        `tags` and `ids` (separated by commas)."""
-        params = _given(top_k=top_k, min_score=min_score, **filters)
-        return self._call("POST", f"/similarity/{file_id}", params=params)
+        `tags` and `ids` (separated by commas); `word_weights=False` ranks by the plain cosine.
+        The first `rerank` of them are compared patch by patch; `explain` says of each what makes
+        it similar."""
+        params = _given(
+            top_k=top_k,
+            min_score=min_score,
+            rerank=rerank,
+            explain=explain or None,
+            **filters,
+        )
+        return self._result_of(self._call("POST", f"/similarity/{file_id}", params=params))
+
+    def _result_of(self, answer: Json) -> Json:
+        """The answer itself, waited for where it is a job's: one job may lead to another."""
+        while "result_url" in answer:
+            self.wait_for(answer["job_id"])
+            answer = self._call("GET", answer["result_url"].removeprefix(API))
+        return answer
 
     def job(self, job_id: UUID | str, wait_seconds: float = 0) -> Json:
         return self._call("GET", f"/jobs/{job_id}", params={"wait": wait_seconds})
@@ -253,9 +275,23 @@ class Client:
         """Start switching to the vocabulary in a `.npz` or `.npy` file."""
         return self._send_file("/vocabularies/import", file)
 
+    def vocabulary_file(self, vocabulary_id: UUID | str) -> bytes:
+        """A vocabulary as a file that `import_vocabulary` takes: `.npz` (it begins with `PK`), or
+        `.npy` where no one knows what it was learnt with."""
+        path = f"{API}/vocabularies/{vocabulary_id}/file"
+        return self._repeat(lambda: self._ask(self._http, "GET", path).content)
+
     def vocabularies(self) -> list[Json]:
         found: Any = self._call("GET", "/vocabularies")
         return list(found)
+
+    def start_generation(
+        self, *, vocabulary_id: UUID | str | None = None, pca: int | None = None
+    ) -> Json:
+        """Start switching to a vocabulary that the map has, or to descriptors of `pca` dimensions;
+        with neither, to whole ones of an extractor without vocabulary."""
+        wanted = _given(vocabulary_id=vocabulary_id and str(vocabulary_id), pca=pca)
+        return self._call("POST", "/generations", json=wanted)
 
     def generations(self) -> list[Json]:
         found: Any = self._call("GET", "/generations")
@@ -264,6 +300,15 @@ class Client:
     def evaluate(self, **wanted: int) -> Json:
         """Start an evaluation of the map; `sample` and `seed` may be given."""
         return self._call("POST", "/evaluations", json=wanted)
+
+    def learn_word_weights(self, generation_id: UUID | str, **wanted: int) -> Json:
+        """Start learning the weights of the active generation's words; `sample` and `seed` may be
+        given."""
+        return self._call("POST", f"/generations/{generation_id}/word-weights", json=wanted)
+
+    def word_weights(self, generation_id: UUID | str) -> Json:
+        """What the map's places have taught of the generation's words."""
+        return self._call("GET", f"/generations/{generation_id}/word-weights")
 
     def evaluations(self, limit: int = 50) -> list[Json]:
         """The map's evaluations, newest first."""

@@ -24,8 +24,11 @@ from shared.torchhub_names import DEFAULT_SIDE, PREFIX, HubEntry, read_hub_name
 
 FACETS = ("query", "key", "value", "token")
 AGGREGATORS = ("vlad", "soft-vlad", "gem", "avg")
-PREPROCESSINGS = ("square224", "demo1024", "paper480x640", "round14")
+# Of the network's published figures: rankings with them are to be those of its authors.
+PARITY_PREPROCESSINGS = ("demo1024", "paper480x640", "round14")
+PREPROCESSINGS = ("square224", *PARITY_PREPROCESSINGS)
 MOST_CLUSTERS = 4096
+MOST_PCA = 1024  # dimensions after PCA: its time and memory grow with the square
 TORCHHUB = "torchhub"  # the backbone that is a torch.hub entry
 SLOW = "test-slow"  # the backbone whose width and time are options
 MOST_WIDTH = 131_072
@@ -74,6 +77,11 @@ class Recipe:
     @property
     def needs_vocabulary(self) -> bool:
         return self.aggregator in ("vlad", "soft-vlad")
+
+    @property
+    def has_patches(self) -> bool:
+        """Whether the backbone makes local features: several of a photo, each of a patch."""
+        return self.aggregator != "none"
 
     @property
     def dimension(self) -> int | None:

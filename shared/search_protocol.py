@@ -3,6 +3,9 @@
 A query is a reference to one descriptor row in the object store, never the vector itself: the
 gateway stays free of vectors. In one process the port is a call (`services.search.worker`);
 between machines it is HTTP, with a map's slots spread over shards (`shared.search_http`).
+
+Over HTTP a message leaves out what has its default (`as_json`): whoever is of the release before
+understands everything that it could have been told.
 """
 
 from __future__ import annotations
@@ -35,6 +38,10 @@ class _Message(BaseModel):
     # Of an answer, what a newer worker adds is passed over.
     model_config = ConfigDict(frozen=True)
 
+    def as_json(self) -> str:
+        """Without defaults: what is not asked for needs no one who understands it."""
+        return self.model_dump_json(exclude_defaults=True)
+
 
 class SearchRequest(_Message):
     """The `k` rows of `generation_id` that are most similar to row `row` of object `object_key`,
@@ -43,6 +50,10 @@ class SearchRequest(_Message):
     The worker first catches up with `min_version` of the map, so that whoever just saw a photo
     indexed or deleted sees it in the answer. `exclude` names photos that must not be answered
     (the query itself).
+
+    `word_weights`, one for each word of the generation's vocabulary, multiply the query's words,
+    and the rows are ranked by that; `min_score` still means the plain cosine. They come by value,
+    so that all shards of one answer rank by the same ones.
     """
 
     # What is asked has to be understood: a filter that is passed over would be a wrong answer.
@@ -62,16 +73,25 @@ class SearchRequest(_Message):
     """Give up once so many rows were compared exactly, and say so (`none`)."""
     most_seconds: float | None = Field(None, gt=0)
     """Give up after this time."""
+    word_weights: tuple[float, ...] = ()
 
 
 class Hit(_Message):
     photo_id: UUID
     score: float
     """Cosine similarity in [-1, 1]."""
+    weighted_score: float | None = None
+    """Cosine similarity to the weighted query; None where the ranking is the plain one: without
+    weights, or where no word of the query has any."""
+
+    @property
+    def ranked_by(self) -> float:
+        """The score that decides the order."""
+        return self.score if self.weighted_score is None else self.weighted_score
 
 
 class SearchResponse(_Message):
-    """`hits` are sorted by score, highest first, ties by photo id."""
+    """`hits` are sorted by what ranks them (`Hit.ranked_by`), highest first, ties by photo id."""
 
     hits: tuple[Hit, ...]
     certificate: str

@@ -185,6 +185,11 @@ class Settings(BaseSettings):
     device: Literal["auto", "cpu", "cuda"] = Field(
         "auto", description="where photos are described; auto takes CUDA where it is"
     )
+    precision: Literal["auto", "float32", "bfloat16"] = Field(
+        "auto",
+        description="what new generations are computed in; auto takes bfloat16 for DINOv2 on CUDA, "
+        "and float32 for all else",
+    )
     dino_weights: Path | None = Field(
         None,
         description="DINOv2's weights: a .pth, .pt or .safetensors file; unset: timm's on the hub",
@@ -200,6 +205,18 @@ class Settings(BaseSettings):
     )
     auto_fit_photos: int = Field(
         200, ge=1, description="photos at which a map without a vocabulary fits its own"
+    )
+
+    # How the first photos of an answer are looked at closely (`rerank`, `explain`).
+    compare_wait_seconds: float = Field(
+        10.0,
+        ge=0,
+        description="longest wait for a comparison inside a call; then 202 and a job to poll",
+    )
+    local_features: Literal["recompute", "keep"] = Field(
+        "recompute",
+        description="those of compared photos: made again each time, or kept as float16 in the "
+        "object store once made (44 kB a photo with the default extractor)",
     )
 
     # How jobs are kept alive.
@@ -244,6 +261,12 @@ class Settings(BaseSettings):
         20,
         ge=0,
         description="located photos from which a changed map is evaluated by itself; 0: never",
+    )
+
+    word_weights: bool = Field(
+        True,
+        description="rank by word weights where a map has them, and learn them for maps with a "
+        "vocabulary of their own",
     )
 
     # How search follows the catalog.

@@ -65,12 +65,13 @@ def run_chaos(
     fault_seconds: float,
     seed: int,
     faults: Sequence[Fault] | None = None,
+    executed: bool = True,
     on_outcome: Callable[[Outcome], object] = lambda outcome: None,
 ) -> Run:
     """Upload `photos` in equal parts, one for each fault, in an order that the seed decides.
 
     Faults that have a length last `fault_seconds`. Ends at the first fault after which something
-    is not as it has to be, with the services' logs in the run.
+    is not as it has to be, with the services' logs in the run. `executed`: see `Fleet`.
     """
     moments = random.Random(seed)
     chosen = list(faults or every_fault())
@@ -85,6 +86,7 @@ def run_chaos(
             extractors=3,
             shards=2,
             through_proxies=True,
+            executed=executed,
             extractor="test-slow-avg:milliseconds=20,width=256",  # so that a kill finds it at work
             lease_seconds=LEASE_SECONDS,
             batch_photos=8,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-import sys
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,10 +16,11 @@ from shared.catalog.schema import migrate
 from shared.catalog.session import Catalog
 from shared.objects import ObjectStore
 from shared.objects.s3 import S3Store
+from tests.support.processes import PLACEWISE
 from tests.support.server import environment
 from tests.support.servers.daemon import free_ports
 
-PLACEWISE = str(Path(sys.executable).with_name("placewise"))
+S3_TIMEOUT_SECONDS = 2.0  # so that a silent store is noticed within a fault
 LOOK_SECONDS = 0.2
 
 
@@ -41,9 +41,14 @@ class Fleet:
         replicas: int = 1,
         stewards: int = 1,
         through_proxies: bool = False,
+        executed: bool = True,
         **settings: Any,
     ) -> None:
-        """`through_proxies`: reach the servers so that they can be made to fail, and slower."""
+        """`through_proxies`: reach the servers so that they can be made to fail, and slower.
+
+        Without `executed` services start faster and are not what a user's are: for no figures.
+        """
+        self._executed = executed
         self.servers = servers
         bucket = servers.s3.new_bucket()
         database_url = servers.postgres.new_database()
@@ -66,6 +71,7 @@ class Fleet:
             "redis_url": redis_url,
             "search_urls": ",".join(self.search_urls),
             **s3.variables(bucket.name),
+            "s3_timeout_seconds": S3_TIMEOUT_SECONDS,
             **settings,
         }
         self.lease_seconds = float(settings.get("lease_seconds", 60.0))
@@ -96,6 +102,7 @@ class Fleet:
             self._folder / f"{name}.log",
             f"http://127.0.0.1:{port}/readyz" if port else None,
             f"Placewise {service} is at work",
+            executed=self._executed,
         )
 
     def __getitem__(self, name: str) -> Service:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import signal
-import subprocess
 import threading
 import time
 from collections.abc import Mapping
@@ -13,6 +12,7 @@ from pathlib import Path
 import httpx2
 import psutil
 
+from tests.support.processes import Process, start
 from tests.support.servers.daemon import cpu_seconds_of
 
 START_SECONDS = 120.0
@@ -23,6 +23,7 @@ class Service:
     """`ready_url` answers 200 when it is at work; what serves no HTTP writes `ready_line` then.
 
     While it is `wanted`, a supervisor starts it again (`start_if_ended`), as an orchestrator would.
+    `executed`: see tests/support/processes.py.
     """
 
     def __init__(
@@ -33,6 +34,8 @@ class Service:
         log: Path,
         ready_url: str | None,
         ready_line: str = "",
+        *,
+        executed: bool = True,
     ) -> None:
         self.name = name
         self.environment = dict(environment)
@@ -42,7 +45,8 @@ class Service:
         self.wanted = False
         self.starts = 0
         self._command = command
-        self._process: subprocess.Popen[bytes] | None = None
+        self._executed = executed
+        self._process: Process | None = None
         self._lock = threading.Lock()
         self._log_begin = 0  # where the log of this start begins
 
@@ -71,13 +75,13 @@ class Service:
     def _start(self) -> None:
         with self.log_path.open("ab") as log:
             self._log_begin = log.tell()
-            self._process = subprocess.Popen(  # noqa: S603
+            self._process = start(
                 self._command,
                 env=self.environment,
                 cwd=self.log_path.parent,  # where no developer's .env lies
-                stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=log,
+                executed=self._executed,
             )
         self.starts += 1
 

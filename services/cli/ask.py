@@ -19,6 +19,9 @@ from services.cli.output import (
     print_json,
 )
 from shared.client import Json
+from shared.comparison import MOST_RERANKED
+
+MOST_CLUSTERS = 3  # shown of an explanation
 
 
 def query(
@@ -33,6 +36,21 @@ def query(
     captured_before: Annotated[str | None, typer.Option(help="ISO 8601.")] = None,
     place: Annotated[str | None, typer.Option(help="Only photos with this label.")] = None,
     tags: Annotated[str | None, typer.Option(help="Separated by commas: all are wanted.")] = None,
+    word_weights: Annotated[
+        bool,
+        typer.Option(
+            "--word-weights/--no-word-weights", help="Rank by the map's word weights, if any."
+        ),
+    ] = True,
+    rerank: Annotated[
+        int | None,
+        typer.Option(
+            min=1, max=MOST_RERANKED, help="Compare the first N photos patch by patch.", metavar="N"
+        ),
+    ] = None,
+    explain: Annotated[
+        bool, typer.Option(help="Say of each photo what makes it similar; --json has the overlays.")
+    ] = False,
     map_name: MapOption = None,
     server: ServerOption = None,
     key: KeyOption = None,
@@ -45,40 +63,64 @@ def query(
                 photo,
                 top_k=top_k,
                 min_score=min_score,
+                rerank=rerank,
+                explain=explain,
                 near=near,
                 box=box,
                 captured_after=captured_after,
                 captured_before=captured_before,
                 place=place,
                 tags=tags,
+                word_weights=None if word_weights else False,
             )
         if as_json:
             print_json(answer)
             return
+        weighted = answer["word_weights"] == "applied"
         table = Table(
             "rank",
             Column("score", no_wrap=True),
+            *([Column("weighted", no_wrap=True)] if weighted else []),
+            *([Column("reranked", no_wrap=True)] if rerank else []),
             Column("photo", overflow="fold"),
             Column("latitude", no_wrap=True),
             Column("longitude", no_wrap=True),
             "place",
+            *([Column("made of", overflow="fold")] if explain else []),
         )
         for rank, found in enumerate(answer["similar_images"], start=1):
             table.add_row(
                 str(rank),
                 f"{found['similarity_score']:.4f}",
+                *([f"{found['weighted_score']:.4f}"] if weighted else []),
+                *([_score(found["rerank_score"])] if rerank else []),
                 found["original_filename"],
                 _degrees(found["latitude"]),
                 _degrees(found["longitude"]),
                 found["place"] or "",
+                *([_made_of(found["explanation"])] if explain else []),
             )
         answers.print(table)
         answers.print(_place(answer["estimate"]), soft_wrap=True)
         answers.print(
             f"{answer['rows_scanned']} photos compared ({answer['certificate']}), "
-            f"vocabulary: {answer['vocabulary']}",
+            f"vocabulary: {answer['vocabulary']}, word weights: {answer['word_weights']}",
             soft_wrap=True,
         )
+
+
+def _score(value: float | None) -> str:
+    return "" if value is None else f"{value:.4f}"
+
+
+def _made_of(explanation: Json | None) -> str:
+    """The clusters that add most to the score; without a vocabulary, its grid."""
+    if explanation is None:
+        return ""
+    if explanation["clusters"] is None:
+        return f"{explanation['rows']} x {explanation['columns']} patches"
+    most = explanation["clusters"][:MOST_CLUSTERS]
+    return ", ".join(f"cluster {one['cluster']}: {one['share']:+.4f}" for one in most)
 
 
 def _place(estimate: Json) -> str:

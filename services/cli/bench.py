@@ -18,6 +18,8 @@ from shared.errors import Misconfigured
 
 app = typer.Typer(help="Measure this machine.", no_args_is_help=True)
 
+DeviceOption = Annotated[str, typer.Option("--device", help="auto, cpu or cuda.")]
+
 OF_DEV = ("benchmarks", "tests", "psutil", "pytest", "testcontainers", "threadpoolctl")
 
 
@@ -60,6 +62,62 @@ def pipeline(
     )
 
 
+@app.command("extract")
+def extract(
+    extractor: Annotated[
+        str, typer.Option("--extractor", help="By name, with options as in EXTRACTOR.")
+    ] = "anyloc-vits14",
+    photos: Annotated[int, typer.Option(min=1)] = 32,
+    device: DeviceOption = "auto",
+    precision: Annotated[
+        str, typer.Option(help="auto, float32 or bfloat16, as PRECISION.")
+    ] = "auto",
+    batch: Annotated[int, typer.Option(min=1, help="Most photos in one batch.")] = 16,
+    rounds: Annotated[int, typer.Option(min=1, help="Of all photos, by either way.")] = 3,
+    as_json: JsonOption = False,
+) -> None:
+    """How fast do photos become descriptors, beside AnyLoc as published and this device's ceiling?
+
+    Without weights on this machine, random ones are measured, and the title says so.
+    """
+    _among(device, "--device", "auto", "cpu", "cuda")
+    _among(precision, "--precision", "auto", "float32", "bfloat16")
+    _measure(
+        "extract",
+        as_json,
+        extractor=extractor,
+        photos=photos,
+        device=device,
+        precision=precision,
+        batch=batch,
+        rounds=rounds,
+    )
+
+
+@app.command("precision")
+def precision(
+    extractor: Annotated[
+        str, typer.Option("--extractor", help="By name, with options as in EXTRACTOR.")
+    ] = "efficientnet-lite0-vlad",
+    places: Annotated[int, typer.Option(min=2, help="Of the generated city.")] = 60,
+    queries: Annotated[int, typer.Option(min=1)] = 60,
+    device: DeviceOption = "auto",
+    batch: Annotated[int, typer.Option(min=1, help="Most photos in one batch.")] = 16,
+    as_json: JsonOption = False,
+) -> None:
+    """What does bfloat16 change of patches, descriptors and recall, against float32?"""
+    _among(device, "--device", "auto", "cpu", "cuda")
+    _measure(
+        "precision",
+        as_json,
+        extractor=extractor,
+        places=places,
+        queries=queries,
+        device=device,
+        batch=batch,
+    )
+
+
 @app.command("query-latency")
 def query_latency(
     backlog: Annotated[int, typer.Option(min=1, help="Uploads that wait.")] = 5000,
@@ -77,6 +135,19 @@ def query_latency(
         milliseconds=milliseconds,
         batch=batch,
     )
+
+
+@app.command("rerank")
+def rerank(
+    places: Annotated[int, typer.Option(min=20, help="Of a generated city.")] = 150,
+    seed: Annotated[int, typer.Option(min=0, help="Which city.")] = 0,
+    as_json: JsonOption = False,
+) -> None:
+    """How often does the right place come first with `rerank=10`, 25 and 50, and what does it take?
+
+    With PLACEWISE_TEST_DATA also the ranks of the true places of real photos.
+    """
+    _measure("rerank", as_json, places=places, seed=seed)
 
 
 @app.command("catalog")
@@ -176,6 +247,11 @@ def _program(name: str) -> Any:
             f"`placewise bench {name}` needs a checkout of Placewise with the dev extra: {error}. "
             "In the checkout: make setup, then .venv/bin/placewise bench.",
         ) from error
+
+
+def _among(value: str, option: str, *allowed: str) -> None:
+    if value not in allowed:
+        raise typer.BadParameter(f"{option} is one of {', '.join(allowed)}, not {value!r}")
 
 
 def _numbers(text: str) -> list[int]:

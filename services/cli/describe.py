@@ -60,6 +60,15 @@ def describe(
             help="Of VLAD: .npz of `vocabulary fit`, .npy, or AnyLoc's c_centers.pt.",
         ),
     ] = None,
+    pca: Annotated[
+        Path | None,
+        typer.Option(
+            "--pca",
+            exists=True,
+            dir_okay=False,
+            help="Shorten the rows: .safetensors of `pca fit ROWS.npy` or `pca fit DIR`.",
+        ),
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Write the descriptors of photos into a .npy file: float32, a row for each, in their order.
@@ -94,7 +103,7 @@ def describe(
         with progress_bar() as progress:
             bar = progress.add_task("describing", total=len(photos))
             found = describe_files(
-                photos, out, recipe, vocabulary, settings, lambda n: progress.advance(bar, n)
+                photos, out, recipe, vocabulary, pca, settings, lambda n: progress.advance(bar, n)
             )
     if as_json:
         print_json(found.as_json())

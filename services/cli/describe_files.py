@@ -14,11 +14,16 @@ from typing import Any
 import numpy as np
 
 from services.cli.output import shown
-from services.cli.photo_files import decoded_batches, whole_or_nothing
+from services.cli.photo_files import decoded_batches
+from services.cli.whole_file import whole_or_nothing
 from shared.errors import Misconfigured, PlacewiseError, Unprocessable
 from shared.recipes import Recipe
 from shared.settings import Settings
 from shared.vision.extractors import Extractor, choose_device, not_finite
+from shared.vision.passes import PhotoDoesNotFit
+from shared.vision.pca import Projection
+from shared.vision.pca_file import decode_whitening
+from shared.vision.precision import choose_precision
 from shared.vision.provenance import check_fits
 from shared.vision.vocabulary import Centres
 from shared.vision.vocabulary_file import VocabularyFile, read_vocabulary
@@ -51,24 +56,34 @@ def describe_files(
     out: Path,
     recipe: Recipe,
     vocabulary: Path | None,
+    pca: Path | None,
     settings: Settings,
     advance: Callable[[int], None],
 ) -> DescribedFiles:
     """Write (photos, dimension) float32 to `out`, whole or not at all.
 
     `advance` is told how many more photos are done. Raises Unprocessable: `photos_refused`, which
-    names every photo that can't be described and why; `vocabulary_unfit`; Misconfigured:
-    `vocabulary_missing`, `out_unwritable`, and what loading the extractor raises.
+    names every photo that can't be described and why; `vocabulary_unfit`, `pca_unfit`;
+    Misconfigured: `vocabulary_missing`, `out_unwritable`, and what loading the extractor raises.
     """
     started = time.perf_counter()
-    own = _own_vocabulary(recipe, vocabulary)
+    own = own_vocabulary(recipe, vocabulary)
+    whitening = decode_whitening(pca.read_bytes()) if pca is not None else None
+    device = choose_device(settings.device)
     extractor = Extractor(
-        recipe, choose_device(settings.device), dino_weights=settings.dino_weights
+        recipe,
+        device,
+        precision=choose_precision(settings.precision, recipe, device),
+        dino_weights=settings.dino_weights,
     )
-    centres = _centres(extractor, own)
-    described = DescribedFiles(out, extractor.spec(centres), len(photos))
+    centres = centres_of(extractor, own)
+    projection = None
+    if whitening is not None:
+        whitening.check_fits(extractor.spec(centres))
+        projection = Projection(whitening.whitening, extractor.backbone.device)
+    described = DescribedFiles(out, extractor.spec(centres, projection), len(photos))
     described.seconds["load"] = time.perf_counter() - started
-    shape = (len(photos), extractor.dimension(centres))
+    shape = (len(photos), extractor.dimension(centres, projection))
     refused: list[tuple[Path, PlacewiseError]] = []
     with whole_or_nothing(out) as file:
         np.lib.format.write_array_header_1_0(
@@ -83,12 +98,16 @@ def describe_files(
                     pixels.append(outcome.pixels)
             if not refused:  # after a refusal, the rest is read for what else can't be described
                 begun = time.perf_counter()
-                rows = extractor.describe(pixels, centres)
+                try:
+                    rows = extractor.describe(pixels, centres, projection)
+                except PhotoDoesNotFit as error:
+                    refused.append((batch[error.place][0], error))
+                else:
+                    for (photo, _), row in zip(batch, rows, strict=True):
+                        if not np.isfinite(row).all():
+                            refused.append((photo, not_finite()))
+                    file.write(np.ascontiguousarray(rows, "<f4").tobytes())
                 described.seconds["describe"] += time.perf_counter() - begun
-                for (photo, _), row in zip(batch, rows, strict=True):
-                    if not np.isfinite(row).all():
-                        refused.append((photo, not_finite()))
-                file.write(np.ascontiguousarray(rows, "<f4").tobytes())
             advance(len(batch))
         if refused:
             raise _refusal(refused, len(photos))
@@ -96,8 +115,11 @@ def describe_files(
     return described
 
 
-def _own_vocabulary(recipe: Recipe, vocabulary: Path | None) -> VocabularyFile | None:
-    """The file's; None where the recipe does without, or brings its own."""
+def own_vocabulary(recipe: Recipe, vocabulary: Path | None) -> VocabularyFile | None:
+    """The file's; None where the recipe does without, or brings its own.
+
+    Raises Unprocessable (`vocabulary_unfit`) and Misconfigured (`vocabulary_missing`).
+    """
     if vocabulary is not None:
         if not recipe.needs_vocabulary:
             raise Unprocessable(
@@ -113,7 +135,8 @@ def _own_vocabulary(recipe: Recipe, vocabulary: Path | None) -> VocabularyFile |
     return None
 
 
-def _centres(extractor: Extractor, own: VocabularyFile | None) -> Centres | None:
+def centres_of(extractor: Extractor, own: VocabularyFile | None) -> Centres | None:
+    """Those of the file, else the shipped ones; Unprocessable (`vocabulary_unfit`)."""
     if own is not None:
         check_fits(own.provenance, own.centres, extractor)
         return own.centres

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Annotated
 
 import typer
+from rich.progress import Progress
 from rich.table import Column, Table
 
 from services.cli.connect import connect
@@ -20,6 +21,7 @@ from services.cli.output import (
 )
 from services.cli.wait import wait_with_bar
 from shared.client import Client, Json
+from shared.errors import Conflict
 from shared.estimate.calibration import LEAST_LABELLED, LEAST_OF_A_KIND
 
 SHOWN = 6  # evaluations that were asked for, this one and those before
@@ -31,6 +33,14 @@ def evaluate(
         int | None, typer.Option(min=1, help="Photos of the map to ask with; default 1000.")
     ] = None,
     seed: Annotated[int | None, typer.Option(min=0)] = None,
+    word_weights: Annotated[
+        bool,
+        typer.Option(
+            "--word-weights",
+            help="First learn which words of the vocabulary tell the map's places apart, and keep "
+            "their weights where recall rises.",
+        ),
+    ] = False,
     map_name: MapOption = None,
     server: ServerOption = None,
     key: KeyOption = None,
@@ -40,14 +50,36 @@ def evaluate(
     wanted = {"sample": sample, "seed": seed}
     given = {name: value for name, value in wanted.items() if value is not None}
     with explained(as_json):
+        learnt: Json | None = None
         with connect(server, map_name, key) as client, progress_bar() as progress:
+            if word_weights:
+                learnt = _learn(client, given, progress)
             job = wait_with_bar(client, client.evaluate(**given)["job_id"], progress, "asking")
             asked_for = [e for e in client.evaluations(LOOKED_AT) if not e["automatic"]][:SHOWN]
             vocabularies = _vocabularies(client)
         if as_json:
-            print_json(job["result"])
+            print_json({**job["result"], "word_weights": learnt} if learnt else job["result"])
             return
         _print(asked_for, vocabularies)
+        if learnt:
+            answers.print(
+                f"Word weights: {learnt['outcome']}. {learnt['reason']}",
+                soft_wrap=True,
+                markup=False,
+            )
+
+
+def _learn(client: Client, given: dict[str, int], progress: Progress) -> Json:
+    """Learn the active generation's word weights; what came of it."""
+    active = [g["generation_id"] for g in client.generations() if g["state"] == "active"]
+    if not active:
+        raise Conflict(
+            "nothing_to_evaluate",
+            "The map has no described photo yet. Upload some: placewise index.",
+        )
+    started = client.learn_word_weights(active[0], **given)
+    result: Json = wait_with_bar(client, started["job_id"], progress, "word weights")["result"]
+    return result
 
 
 def _vocabularies(client: Client) -> dict[str, str]:
@@ -68,9 +100,10 @@ def _print(evaluations: list[Json], vocabularies: dict[str, str]) -> None:
     )
     for found in evaluations:
         figures = found["figures"]
-        rows = [("own photos", figures["leave_one_out"])]
-        if figures["labelled_queries"]:
-            rows.append(("labelled queries", figures["labelled_queries"]))
+        rows = _recalls(figures)
+        # Evaluations of earlier releases don't speak of weights.
+        if weighted := figures.get("with_word_weights"):
+            rows += [(f"{what}, word weights", recall) for what, recall in _recalls(weighted)]
         for what, recall in rows:
             table.add_row(
                 found["evaluated_at"][5:19].replace("T", " "),
@@ -80,8 +113,16 @@ def _print(evaluations: list[Json], vocabularies: dict[str, str]) -> None:
                 *(_percent(recall[f"R@{k}"]) for k in (1, 5, 10)),
             )
     answers.print(table)
-    for line in _estimate_lines(evaluations[0]["figures"]):
+    figures = evaluations[0]["figures"]
+    for line in _estimate_lines(figures.get("with_word_weights") or figures):
         answers.print(line, soft_wrap=True)
+
+
+def _recalls(figures: Json) -> list[tuple[str, Json]]:
+    rows = [("own photos", figures["leave_one_out"])]
+    if figures["labelled_queries"]:
+        rows.append(("labelled queries", figures["labelled_queries"]))
+    return rows
 
 
 def _estimate_lines(figures: Json) -> list[str]:

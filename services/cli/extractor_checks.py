@@ -18,22 +18,25 @@ PROCESS_BYTES = 1_000_000_000  # PyTorch, or CUDA's context, before any weights
 
 
 def device_check(settings: Settings) -> str:
-    """Where photos are described."""
+    """Where photos are described, and in which precision."""
     import torch
 
     from shared.vision.extractors import choose_device
+    from shared.vision.precision import choose_precision
 
     device = choose_device(settings.device)
+    new = f"new generations in {choose_precision(settings.precision, _recipe(settings), device)}"
     if device.type == "cuda":
-        return f"CUDA: {torch.cuda.get_device_name(device)}, PyTorch {torch.__version__}"
-    return f"CPU, PyTorch {torch.__version__} (CUDA available: {torch.cuda.is_available()})"
+        return f"CUDA: {torch.cuda.get_device_name(device)}, PyTorch {torch.__version__}, {new}"
+    return f"CPU, PyTorch {torch.__version__} (CUDA available: {torch.cuda.is_available()}), {new}"
 
 
 def memory_check(settings: Settings) -> str:
     """Whether the extractor of new maps fits into the memory of its device: an estimate."""
     import torch
 
-    from shared.vision.extractors import USUAL_PIXELS, choose_device
+    from shared.vision.extractors import choose_device
+    from shared.vision.passes import USUAL_PIXELS
     from shared.vision.preprocessing import get_preprocessing
 
     recipe = _recipe(settings)

@@ -6,7 +6,7 @@ nothing. Figures of a generated city are never comparable with published ones.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from rich.progress import Progress
 
+from services.cli.weigh_rows import learn_weights, weigh_rows
 from shared.datasets.city.plan import Plan, Shot
 from shared.datasets.recall import rank, recall_at, true_positives
 from shared.datasets.weak_baselines import WEAK_BASELINES
@@ -37,10 +38,11 @@ def climb(plan: Plan, out: Path, progress: Progress) -> list[dict[str, Any]]:
     positives = true_positives(_positions(queries), _positions(database))
     other_way = np.array([shot.kind == "other_way" for shot in queries])
     rungs = []
-    for name, described in _described(
+    described = _described(
         [out / s.folder / s.name for s in database + queries], len(database), progress
-    ):
-        ranked = rank(described[len(database) :], described[: len(database)], max(KS))
+    )
+    for name, asked, rows in _with_word_weights(*described, [shot.name for shot in database]):
+        ranked = rank(asked, rows, max(KS))
         rungs.append(
             {
                 "rung": name,
@@ -52,8 +54,11 @@ def climb(plan: Plan, out: Path, progress: Progress) -> list[dict[str, Any]]:
     return rungs
 
 
-def _described(paths: Sequence[Path], database: int, progress: Progress) -> list[tuple[str, Rows]]:
-    """(photos, D) unit rows by each rung; the first `database` paths may be learnt from."""
+def _described(
+    paths: Sequence[Path], database: int, progress: Progress
+) -> tuple[list[tuple[str, Rows]], dict[str, int]]:
+    """(photos, D) unit rows by each rung, and the words of those that have a vocabulary; the first
+    `database` paths may be learnt from."""
     from services.cli.network_rungs import NetworkRungs  # torch takes seconds
 
     bar = progress.add_task("ladder: no network", total=len(paths))
@@ -67,7 +72,24 @@ def _described(paths: Sequence[Path], database: int, progress: Progress) -> list
     found = [(name, np.stack(rows)) for name, rows in weak.items()]
     bar = progress.add_task("ladder: networks", total=len(paths))
     advance: Callable[[int], None] = lambda count: progress.advance(bar, count)  # noqa: E731
-    found += NetworkRungs(paths[:database]).describe(paths, advance).items()
+    networks = NetworkRungs(paths[:database])
+    found += networks.describe(paths, advance).items()
+    return found, networks.words
+
+
+def _with_word_weights(
+    described: Sequence[tuple[str, Rows]], words: Mapping[str, int], names: Sequence[str]
+) -> list[tuple[str, Rows, Rows]]:
+    """(rung, queries, database rows); after each rung with so many words one more, whose queries
+    are weighted by what the database, of those file names, has taught. A city that is too small to
+    teach has none of these."""
+    found = []
+    for name, rows in described:
+        database, queries = rows[: len(names)], rows[len(names) :]
+        found.append((name, queries, database))
+        weights = learn_weights(database, names, words[name]) if name in words else None
+        if weights is not None:
+            found.append((f"{name}, word weights", weigh_rows(queries, weights), database))
     return found
 
 

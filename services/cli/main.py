@@ -26,6 +26,7 @@ COMMANDS = {
     "doctor": ("doctor", "doctor"),
     "maps": ("maps", "app"),
     "vocabulary": ("vocabulary", "app"),
+    "pca": ("pca", "app"),
     "models": ("models", "app"),
     "datasets": ("datasets", "app"),
     "storage": ("storage", "app"),

@@ -11,6 +11,7 @@ from rich.table import Table
 from services.cli.connect import connect
 from services.cli.extractor_options import PreprocessingOption, extractor_name
 from services.cli.output import JsonOption, KeyOption, ServerOption, answers, explained, print_json
+from shared.client import Json
 from shared.errors import Conflict
 
 app = typer.Typer(help="Named databases of photos, each with its own extractor and vocabulary.")
@@ -29,7 +30,8 @@ def list_maps(
         if as_json:
             print_json(found)
             return
-        table = Table("map", "photos", "searchable", "queries", "extractor", "vocabulary")
+        counts = ("photos", "searchable", "queries")
+        table = Table("map", *counts, "extractor", "vocabulary", "dimension")
         for map_ in found:
             table.add_row(
                 map_["name"],
@@ -38,8 +40,16 @@ def list_maps(
                 str(map_["labelled_queries"]),
                 map_["extractor"],
                 map_["vocabulary"] or "",
+                _dimension(map_),
             )
         answers.print(table)
+
+
+def _dimension(map_: Json) -> str:
+    if map_["dimension"] is None:
+        return ""
+    whole = "" if map_["pca_from"] is None else f" (PCA of {map_['pca_from']})"
+    return f"{map_['dimension']}{whole}"
 
 
 @app.command("create")

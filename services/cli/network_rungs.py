@@ -19,6 +19,9 @@ from shared.vision.backbones.efficientnet_lite0 import MEAN, STD
 from shared.vision.extractors import Extractor, choose_device
 from shared.vision.fit_photos import fit_photos
 from shared.vision.patches import choose_photos
+from shared.vision.pca import Projection
+from shared.vision.pca_fit import fit
+from shared.vision.pca_rows import choose_rows, sample_size
 from shared.vision.vlad import vlad
 
 EXTRACTOR = "efficientnet-lite0-vlad"
@@ -30,16 +33,23 @@ Rows = NDArray[np.float32]
 
 
 class NetworkRungs:
-    """Describes photos with an untrained network and with the default extractor twice."""
+    """Describes photos with an untrained network and with the default extractor twice, and shortens
+    the last rows by PCA whitening.
+    """
 
     names = (
         "untrained network",
         f"{EXTRACTOR}, shipped vocabulary",
         f"{EXTRACTOR}, fitted vocabulary",
     )
+    reduced = (512, 256, 128)
+    """Dimensions, as far as there are enough database photos."""
 
     def __init__(self, database: Sequence[Path]) -> None:
-        """`database` are the photos that the fitted vocabulary is learnt from."""
+        """`database` are the photos that the fitted vocabulary and the PCA are learnt from; they
+        are the first that `describe` is given.
+        """
+        self._database = len(database)
         self.extractor = Extractor(RECIPES[EXTRACTOR], choose_device("auto"))
         device = self.extractor.backbone.device
         torch.manual_seed(SEED)
@@ -51,6 +61,11 @@ class NetworkRungs:
         assert shipped is not None
         self._shipped = torch.from_numpy(shipped[0].array).to(device)
         self._fitted = self._fit(database)
+
+    @property
+    def words(self) -> dict[str, int]:
+        """Of the rungs that have a vocabulary."""
+        return {self.names[1]: len(self._shipped), self.names[2]: len(self._fitted)}
 
     def _fit(self, database: Sequence[Path]) -> torch.Tensor:
         """(clusters, width) centres, learnt as a map learns its own."""
@@ -79,7 +94,19 @@ class NetworkRungs:
             for name, batch in zip(self.names, described, strict=True):
                 rows[name].append(batch.cpu().numpy())
             advance(len(pixels))
-        return {name: np.concatenate(parts) for name, parts in rows.items()}
+        found = {name: np.concatenate(parts) for name, parts in rows.items()}
+        return found | self._reduced(found[self.names[-1]])
+
+    def _reduced(self, rows: Rows) -> dict[str, Rows]:
+        """The rows, whitened as a map whitens its own."""
+        shorter = {}
+        for kept in self.reduced:
+            if self._database > kept:
+                size = sample_size(rows.shape[1], kept)
+                found = fit(rows[choose_rows(self._database, size, SEED)], kept)
+                projection = Projection(found, self.extractor.backbone.device)
+                shorter[f"{self.names[-1]}, PCA to {kept}"] = projection.project(rows)
+        return shorter
 
     def _untrained_rows(self, pixels: NDArray[np.uint8]) -> torch.Tensor:
         on_device = torch.from_numpy(pixels).to(self.extractor.backbone.device)

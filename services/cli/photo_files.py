@@ -1,19 +1,16 @@
-"""Photos of this machine to pixels, and what is learnt of them to a file. Imports torch."""
+"""Photos of this machine to pixels, by the decoding children of the extractor."""
 
 from __future__ import annotations
 
 import contextlib
-import os
 import time
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import BinaryIO
 
-from services.cli.output import shown
 from services.extractor.decoding import DecoderPool
-from shared.errors import InvalidRequest, Misconfigured, PlacewiseError
+from shared.errors import InvalidRequest, PlacewiseError
 from shared.settings import Settings
 from shared.vision.decode import Decoded
 from shared.vision.preprocessing import Preprocessing
@@ -56,29 +53,6 @@ def decoded_batches(
             batch, ahead = ahead.result(), reader.submit(read, begin)
             yield batch
         yield ahead.result()
-
-
-@contextlib.contextmanager
-def whole_or_nothing(out: Path) -> Iterator[BinaryIO]:
-    """A file that takes its name when the block has ended well; else nothing is left of it.
-
-    Raises Misconfigured (`out_unwritable`).
-    """
-    partial = out.with_name(f".{out.name}.{os.getpid()}.partial")
-    try:
-        with partial.open("wb") as file:
-            yield file
-            file.flush()
-            os.fsync(file.fileno())
-        partial.replace(out)
-    except OSError as error:
-        raise Misconfigured(
-            "out_unwritable", f"{shown(out)} can't be written: {error.strerror}."
-        ) from error
-    finally:
-        # Where even the folder is missing, there is nothing to take away.
-        with contextlib.suppress(OSError):
-            partial.unlink(missing_ok=True)
 
 
 def _content(photo: Path) -> bytes | PlacewiseError:

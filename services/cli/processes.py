@@ -94,7 +94,7 @@ def steward() -> None:
         with _hints(settings) as hints, _search(settings) as search:
             store = open_own_store(catalog, settings, alone=False)
             name = f"steward-{socket.gethostname()}-{os.getpid()}"
-            evaluator = Evaluator(catalog, search, settings, name)
+            evaluator = Evaluator(catalog, store, search, settings, name)
             batches = BatchWorker(catalog, store, hints, settings, name)
             duties = Steward(catalog, store, hints, settings)
             parts = [

@@ -1,10 +1,11 @@
-"""`placewise vocabulary fit|import|list`."""
+"""`placewise vocabulary fit|import|export|list`."""
 
 from __future__ import annotations
 
 import tempfile
 from pathlib import Path
 from typing import Annotated
+from uuid import UUID
 
 import typer
 from rich.progress import Progress
@@ -21,8 +22,10 @@ from services.cli.output import (
     print_faults,
     print_json,
     progress_bar,
+    shown,
 )
 from services.cli.wait import wait_with_bar
+from services.cli.whole_file import whole_or_nothing
 from shared.client import Client, Json
 from shared.errors import InvalidRequest
 from shared.recipes import MOST_CLUSTERS
@@ -112,6 +115,35 @@ def import_(
         _print_change(job, as_json)
 
 
+@app.command("export")
+def export(
+    vocabulary_id: Annotated[str, typer.Argument(metavar="ID", help="As `vocabulary list` says.")],
+    out: Annotated[
+        Path, typer.Option("--out", metavar="FILE.npz", help="What to write: `import` takes it.")
+    ],
+    map_name: MapOption = None,
+    server: ServerOption = None,
+    key: KeyOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Write one of the map's vocabularies to a file: .npz, or .npy where its origin is unknown."""
+    with explained(as_json):
+        _check_id(vocabulary_id)
+        with connect(server, map_name, key) as client:
+            data = client.vocabulary_file(vocabulary_id)
+        suffix = ".npz" if data.startswith(b"PK") else ".npy"
+        if out.suffix != suffix:
+            raise InvalidRequest(
+                "bad_out", f"{shown(out)}: this vocabulary's file ends in {suffix}."
+            )
+        with whole_or_nothing(out) as file:
+            file.write(data)
+        if as_json:
+            print_json({"file": shown(out), "vocabulary_id": vocabulary_id, "bytes": len(data)})
+            return
+        answers.print(f"{shown(out)}: {len(data)} bytes.", soft_wrap=True, markup=False)
+
+
 @app.command("list")
 def list_(
     map_name: MapOption = None,
@@ -123,7 +155,10 @@ def list_(
     with explained(as_json):
         with connect(server, map_name, key) as client:
             found = client.vocabularies()
-            active = {g["vocabulary_id"] for g in client.generations() if g["state"] == "active"}
+            answering = {
+                g["vocabulary_id"]: g for g in client.generations() if g["state"] == "active"
+            }
+        active = answering.keys()
         if as_json:
             print_json([{**v, "active": v["vocabulary_id"] in active} for v in found])
             return
@@ -133,7 +168,8 @@ def list_(
         for v in found:
             table.add_row(
                 "*" if v["vocabulary_id"] in active else "",
-                f"{v['vocabulary_id']}\n{_learnt_with(v['provenance'])}\nsha256 {v['sha256'][:12]}",
+                f"{v['vocabulary_id']}\n{_learnt_with(v['provenance'])}\nsha256 {v['sha256'][:12]}"
+                + _shortened(answering.get(v["vocabulary_id"])),
                 v["origin"],
                 str(v["clusters"]),
                 str(v["dimension"]),
@@ -143,12 +179,28 @@ def list_(
         answers.print(table)
 
 
+def _check_id(vocabulary_id: str) -> None:
+    """InvalidRequest (`bad_id`): what is no id would be another path."""
+    try:
+        UUID(vocabulary_id)
+    except ValueError:
+        raise InvalidRequest(
+            "bad_id", f"{vocabulary_id!r} is no vocabulary's id; `vocabulary list` shows them."
+        ) from None
+
+
 def _learnt_with(provenance: Json) -> str:
     if "backbone" not in provenance:
         return "of unknown origin"
     pixels = provenance["preprocessing"]
     parts = (provenance["backbone"], provenance["layer"], provenance["facet"], pixels["name"])
     return " ".join(str(part) for part in parts if part is not None)
+
+
+def _shortened(generation: Json | None) -> str:
+    if generation is None or generation["pca_from"] is None:
+        return ""
+    return f"\nPCA: {generation['dimension']} of {generation['pca_from']} dimensions"
 
 
 def _only_for(what: str, options: dict[str, object]) -> None:

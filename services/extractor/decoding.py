@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import logging
 import multiprocessing
-import resource
 import threading
 from collections import deque
 from collections.abc import Sequence
@@ -17,8 +16,8 @@ from concurrent.futures import wait
 from concurrent.futures.process import BrokenProcessPool
 
 from pebble import ProcessExpired, ProcessFuture, ProcessPool
-from PIL import Image
 
+from services.extractor.decoder_process import limit_memory
 from shared.errors import PlacewiseError, Unavailable, Unprocessable
 from shared.settings import Settings
 from shared.vision.decode import Decoded, decode
@@ -31,9 +30,6 @@ LOOK_SECONDS = 1.0  # how often a waiting batch looks whether the pool still liv
 # Photos of a batch that a child has before it: one under way and the next. All of them at once
 # would keep a query's photo, which comes from another thread, waiting behind the whole batch.
 SCHEDULED_EACH = 2
-
-# Of Pillow's blocks, 16 MiB at most each, kept by a child between two photos.
-KEPT_BLOCKS = 8
 
 # A child may be killed for reasons of the machine (memory); a photo gets a second one.
 TRIES = 2
@@ -75,7 +71,7 @@ class DecoderPool:
             max_workers=self._settings.decode_processes,
             # Fork would copy a process that holds torch's threads and locks.
             context=multiprocessing.get_context("spawn"),
-            initializer=_prepare_child,
+            initializer=limit_memory,
             initargs=[self._settings.decode_memory_bytes],
         )
 
@@ -130,10 +126,3 @@ class DecoderPool:
 
 def _broke() -> Unavailable:
     return Unavailable("decoders_broke", "The decoder processes broke; trying again.")
-
-
-def _prepare_child(limit_bytes: int) -> None:
-    resource.setrlimit(resource.RLIMIT_AS, (limit_bytes, limit_bytes))
-    # Otherwise the memory of each picture comes page by page from the system, and goes back: that
-    # took almost half of the time of decoding one.
-    Image.core.set_blocks_max(KEPT_BLOCKS)  # type: ignore[attr-defined]

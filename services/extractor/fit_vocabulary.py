@@ -32,6 +32,7 @@ from shared.vision.patches import PatchStore, choose_photos
 from shared.vision.provenance import of_fit
 
 SLICE_SECONDS = 1.0  # about the time of a batch: what a query may have to wait
+CLUSTER_UNITS = 100  # of the job's progress: finding the centres, in per cent
 
 
 class FitVocabulary:
@@ -95,7 +96,7 @@ class FitVocabulary:
             job,
             stage="sample",
             params={**job.params, "clusters": clusters, "sampled": 0, "described": 0},
-            progress_total=len(plan) + len(photo_ids),
+            progress_total=len(plan) + CLUSTER_UNITS + len(photo_ids),
         )
 
     def _sample(self, job: Job, extractor: Extractor) -> None:
@@ -152,7 +153,14 @@ class FitVocabulary:
                 break
         if not fit.done:
             self._store.put(kept, fit.save())
-            go_on(self._catalog, job, stage="cluster", params={**params, "clustering": True})
+            done, most = fit.progress
+            go_on(
+                self._catalog,
+                job,
+                stage="cluster",
+                params={**params, "clustering": True},
+                progress_done=params["sampled"] + CLUSTER_UNITS * done // most,
+            )
             return
         centres = fit.centres()
         provenance = of_fit(
@@ -171,6 +179,7 @@ class FitVocabulary:
             centres,
             VocabularyOrigin.FITTED,
             provenance,
+            progress_done=params["sampled"] + CLUSTER_UNITS,
         )
 
     def _patches(self, job: Job, extractor: Extractor) -> PatchStore:

@@ -1,9 +1,11 @@
-"""What the worker keeps in memory: a few loaded extractors and vocabularies."""
+"""What the worker keeps in memory: a few loaded extractors, vocabularies and whitenings."""
 
 from __future__ import annotations
 
 import threading
-from collections import OrderedDict
+from collections import OrderedDict, defaultdict
+from dataclasses import dataclass
+from typing import Any
 from uuid import UUID
 
 from sqlalchemy.orm import Session
@@ -11,15 +13,21 @@ from sqlalchemy.orm import Session
 from shared.catalog.generations import Generation
 from shared.catalog.models import Model, ensure_model
 from shared.catalog.vocabularies import Vocabulary
+from shared.catalog.whitenings import StoredWhitening
 from shared.errors import Unavailable
 from shared.objects import ObjectStore
 from shared.recipes import Recipe
 from shared.settings import Settings
 from shared.vision.extractors import Extractor, choose_device, spec_fingerprint
+from shared.vision.passes import PassLimit
+from shared.vision.pca import Projection
+from shared.vision.pca_file import decode_whitening
+from shared.vision.precision import PRECISIONS, Precision, choose_precision
 from shared.vision.vocabulary import Centres, decode_centres
 
 MOST_EXTRACTORS = 2  # a large backbone takes gigabytes of GPU memory
 MOST_VOCABULARIES = 16
+MOST_WHITENINGS = 2  # one from 98,304 to 512 dimensions takes 201 MB of the device's memory
 
 
 class LoadedModels:
@@ -31,25 +39,67 @@ class LoadedModels:
         self._lock = threading.RLock()
         self._device = choose_device(settings.device)
         self._extractors: OrderedDict[str, Extractor] = OrderedDict()
+        # Of what was loaded once: to run out of memory again for each time would cost photos time.
+        self._limits: defaultdict[tuple[object, ...], PassLimit] = defaultdict(PassLimit)
         self._centres: OrderedDict[UUID, Centres] = OrderedDict()
+        self._projections: OrderedDict[UUID, Projection] = OrderedDict()
 
-    def extractor(self, name: str) -> Extractor:
-        """The extractor called `name`, its weights loaded."""
+    def extractor(self, name: str, precision: Precision | None = None) -> Extractor:
+        """The extractor called `name`, its weights loaded.
+
+        `precision` is that of a generation that is there (see `of_generation`); left out, that of
+        new ones: PRECISION.
+        """
         recipe = self._settings.recipe(name)
+        if precision is None:
+            precision = choose_precision(self._settings.precision, recipe, self._device)
         with self._lock:
             found = self._extractors.get(recipe.name)
             if found is None:
-                found = self._extractors[recipe.name] = self._load(recipe)
+                found = self._extractors[recipe.name] = self._load(recipe, precision)
             self._extractors.move_to_end(recipe.name)
             while len(self._extractors) > MOST_EXTRACTORS:
                 self._extractors.popitem(last=False)
-            return found
+            return found.at(precision)
 
-    def _load(self, recipe: Recipe) -> Extractor:
+    def of_generation(self, generation: Generation) -> Extractor:
+        """The extractor of a generation in the precision that it was begun in, whatever PRECISION
+        says and whatever device this is: rows of two precisions never mix.
+
+        Unavailable (`spec_differs`) for a precision that this release does not know.
+        """
+        precision = generation.spec["precision"]
+        if precision not in PRECISIONS:
+            raise Unavailable(
+                "spec_differs",
+                f"Generation {generation.id} was made in {precision}, which this worker can't do: "
+                f"it knows {' and '.join(PRECISIONS)}. Upgrade it, or start a model change "
+                "(POST /api/v1/generations).",
+                generation_id=str(generation.id),
+            )
+        return self.extractor(generation.extractor, precision)
+
+    def _load(self, recipe: Recipe, precision: Precision) -> Extractor:
+        limit = self._limits[recipe.local_features]
         for loaded in self._extractors.values():
             if loaded.recipe.local_features == recipe.local_features:
-                return Extractor(recipe, self._device, backbone=loaded.backbone)
-        return Extractor(recipe, self._device, dino_weights=self._settings.dino_weights)
+                return Extractor(
+                    recipe,
+                    self._device,
+                    precision=precision,
+                    backbone=loaded.backbone,
+                    limit=limit,
+                )
+        made = Extractor(
+            recipe,
+            self._device,
+            precision=precision,
+            dino_weights=self._settings.dino_weights,
+            limit=limit,
+        )
+        if self._device.type == "cuda":
+            made.warm_up(self._settings.batch_photos)
+        return made
 
     def centres(self, vocabulary: Vocabulary) -> Centres:
         """The vocabulary's centres, checked against the catalog's hash."""
@@ -69,6 +119,25 @@ class LoadedModels:
                 self._centres.popitem(last=False)
             return found
 
+    def projection(self, whitening: StoredWhitening) -> Projection:
+        """The whitening on the device, checked against the catalog's hash."""
+        with self._lock:
+            found = self._projections.get(whitening.id)
+            if found is None:
+                stored = decode_whitening(self._store.get(whitening.object_key))
+                found = Projection(stored.whitening, self._device)
+                if found.sha256 != whitening.sha256:
+                    raise Unavailable(
+                        "whitening_corrupt",
+                        f"The PCA whitening {whitening.id} is not what was stored (its hash "
+                        "differs). Restore it from a backup, or start a model change.",
+                    )
+                self._projections[whitening.id] = found
+            self._projections.move_to_end(whitening.id)
+            while len(self._projections) > MOST_WHITENINGS:
+                self._projections.popitem(last=False)
+            return found
+
 
 def register(session: Session, extractor: Extractor) -> Model:
     """The catalog's row of the extractor's weights."""
@@ -78,33 +147,41 @@ def register(session: Session, extractor: Extractor) -> Model:
     )
 
 
+@dataclass(frozen=True, slots=True)
+class Made:
+    """What makes the descriptors of a generation."""
+
+    extractor: Extractor
+    centres: Centres | None = None
+    projection: Projection | None = None
+
+    @property
+    def spec(self) -> dict[str, Any]:
+        return self.extractor.spec(self.centres, self.projection)
+
+
 def spec_columns(
     model: Model,
-    extractor: Extractor,
-    centres: Centres | None,
+    made: Made,
     vocabulary_id: UUID | None,
+    whitening_id: UUID | None = None,
 ) -> dict[str, object]:
     """The columns of a generation that say how its descriptors are made."""
-    spec = extractor.spec(centres)
+    spec = made.spec
     return {
-        "extractor": extractor.recipe.name,
+        "extractor": made.extractor.recipe.name,
         "spec": spec,
         "spec_fingerprint": spec_fingerprint(spec),
-        "dimension": extractor.dimension(centres),
+        "dimension": spec["dimension"],
         "model_id": model.id,
         "vocabulary_id": vocabulary_id,
+        "whitening_id": whitening_id,
     }
 
 
-def check_spec(
-    generation: Generation,
-    extractor: Extractor,
-    centres: Centres | None,
-    *,
-    decoder_matters: bool = True,
-) -> None:
+def check_spec(generation: Generation, made: Made, *, decoder_matters: bool = True) -> None:
     """Unavailable (`spec_differs`) when this worker does not reproduce the generation's spec."""
-    spec = extractor.spec(centres)
+    spec = made.spec
     differing = sorted(
         key
         for key in spec.keys() | generation.spec.keys()

@@ -2,6 +2,7 @@
 
     fit_vocabulary.py    plan, describe a sample, find the centres
     take_vocabulary.py   a file that was brought, or a vocabulary that the map has
+    fit_pca.py           gather stored rows, find their directions
     new_generation.py    what all of them come to
 
 Between two slices everything lies in the object store under `work/<job>/`, so that any worker can
@@ -11,6 +12,7 @@ take the next one.
 from __future__ import annotations
 
 from services.extractor.decoding import DecoderPool
+from services.extractor.fit_pca import FitPca
 from services.extractor.fit_vocabulary import FitVocabulary
 from services.extractor.loaded import LoadedModels
 from services.extractor.take_vocabulary import TakeVocabulary
@@ -33,6 +35,7 @@ class ModelChanges:
     ) -> None:
         self._fit = FitVocabulary(catalog, store, models, decoders, settings)
         self._take = TakeVocabulary(catalog, store, models)
+        self._pca = FitPca(catalog, store, models)
 
     def slice(self, job: Job) -> None:
         """The next piece of work of the claimed job; PlacewiseError when it can't go on."""
@@ -40,5 +43,7 @@ class ModelChanges:
             self._take.from_file(job)
         elif job.kind == JobKind.SWITCH:
             self._take.of_map(job)
+        elif job.kind == JobKind.PCA:
+            self._pca.slice(job)
         else:
             self._fit.slice(job)

@@ -5,19 +5,23 @@ from __future__ import annotations
 from typing import Any
 from uuid import UUID
 
-from services.extractor.loaded import LoadedModels, register, spec_columns
+from sqlalchemy.orm import Session
+
+from services.extractor.loaded import LoadedModels, Made, register, spec_columns
 from shared.catalog.generations import active_generation
 from shared.catalog.maps import Map
 from shared.catalog.photos import count_live
 from shared.catalog.session import Catalog
 from shared.catalog.vocabularies import VocabularyOrigin, add_vocabulary
+from shared.catalog.whitenings import add_whitening
 from shared.jobs import Job
 from shared.jobs.finish import release
 from shared.jobs.leases import held
 from shared.jobs.model_changes import begin_generation
 from shared.objects import ObjectStore
-from shared.objects.keys import new_vocabulary_key
+from shared.objects.keys import new_vocabulary_key, new_whitening_key
 from shared.vision.extractors import Extractor
+from shared.vision.pca_file import WhiteningFile
 from shared.vision.provenance import Provenance
 from shared.vision.vocabulary import Centres, encode_centres
 
@@ -38,8 +42,13 @@ def begin_with_new(
     centres: Centres,
     origin: VocabularyOrigin,
     provenance: Provenance,
+    *,
+    progress_done: int = 0,
 ) -> None:
-    """Store the vocabulary; one transaction makes it known and begins its generation."""
+    """Store the vocabulary; one transaction makes it known and begins its generation.
+
+    `progress_done`: of the job, before anything is described.
+    """
     key = new_vocabulary_key()
     store.put(key, encode_centres(centres))
     with catalog.write() as session:
@@ -56,29 +65,74 @@ def begin_with_new(
             begin_generation(
                 session,
                 mine,
-                **spec_columns(register(session, extractor), extractor, centres, vocabulary.id),
+                **spec_columns(
+                    register(session, extractor), Made(extractor, centres), vocabulary.id
+                ),
             )
-            mine.params = {**mine.params, "vocabulary_id": str(vocabulary.id)}
-            mine.attempts = 0
-            mine.progress_total = mine.progress_done + count_live(session, job.map_id)
+            _describe_all(session, mine, progress_done, vocabulary_id=str(vocabulary.id))
 
 
 def begin_with_known(
     catalog: Catalog,
     job: Job,
-    extractor: Extractor,
-    centres: Centres | None,
+    made: Made,
     vocabulary_id: UUID | None,
+    whitening_id: UUID | None = None,
 ) -> None:
-    """Begin the generation of a vocabulary that the map has, or of none."""
+    """Begin the generation of a vocabulary and a whitening that the map has, or of none."""
     with catalog.write() as session:
         for mine in held(session, _token(job), [job]):
             begin_generation(
                 session,
                 mine,
-                **spec_columns(register(session, extractor), extractor, centres, vocabulary_id),
+                **spec_columns(
+                    register(session, made.extractor), made, vocabulary_id, whitening_id
+                ),
             )
-            mine.progress_total = count_live(session, job.map_id)
+            _describe_all(session, mine, 0)
+
+
+def begin_whitened(
+    catalog: Catalog,
+    store: ObjectStore,
+    job: Job,
+    made: Made,
+    found: WhiteningFile,
+    vocabulary_id: UUID | None,
+    *,
+    progress_done: int,
+) -> None:
+    """Store the whitening, which `made` carries; one transaction makes it known and begins its
+    generation.
+    """
+    assert made.projection is not None
+    key = new_whitening_key()
+    store.put(key, found.encode())
+    with catalog.write() as session:
+        for mine in held(session, _token(job), [job]):
+            whitening = add_whitening(
+                session,
+                job.map_id,
+                dimension=found.whitening.dimension,
+                kept=found.whitening.kept,
+                rows=found.whitening.rows,
+                explained=found.whitening.explained,
+                object_key=key,
+                sha256=made.projection.sha256,
+            )
+            model = register(session, made.extractor)
+            begin_generation(
+                session, mine, **spec_columns(model, made, vocabulary_id, whitening.id)
+            )
+            _describe_all(session, mine, progress_done, whitening_id=str(whitening.id))
+
+
+def _describe_all(session: Session, job: Job, progress_done: int, **params: Any) -> None:
+    """What is left to do, beside what has been: every photo."""
+    job.params = {**job.params, **params, "done_before": progress_done}
+    job.attempts = 0
+    job.progress_done = progress_done
+    job.progress_total = progress_done + count_live(session, job.map_id)
 
 
 def go_on(catalog: Catalog, job: Job, **columns: Any) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 from sqlalchemy import select
 
 from services.extractor.decoding import DecoderPool
+from services.extractor.stored_rows import rows_to_project
 from services.extractor.target import Target
 from shared.catalog.photos import Photo
 from shared.catalog.session import Catalog
@@ -28,7 +29,8 @@ class Batch:
     """Claimed jobs of one kind, map and generation, on their way to a chunk.
 
     `ready` and `decoded` belong together; `failed` are jobs whose photo is at fault;
-    `gone` are jobs whose photo was deleted meanwhile.
+    `gone` are jobs whose photo was deleted meanwhile. With `stored`, nothing was decoded: these are
+    the whole rows of `ready`, to be projected.
     """
 
     jobs: list[Job]
@@ -37,6 +39,7 @@ class Batch:
     decoded: list[Decoded] = field(default_factory=list)
     failed: list[tuple[Job, PlacewiseError]] = field(default_factory=list)
     gone: list[Job] = field(default_factory=list)
+    stored: Rows | None = None
     seconds: dict[str, float] = field(default_factory=dict)
 
     @property
@@ -52,6 +55,11 @@ class Batch:
     def pixels(self) -> list[Pixels]:
         """Of each of `ready`, (height, width, 3)."""
         return [decoded.pixels for decoded in self.decoded]
+
+    def refuse(self, place: int, error: PlacewiseError) -> None:
+        """The job at that place of `ready` goes to `failed`."""
+        del self.decoded[place]
+        self.failed.append((self.ready.pop(place), error))
 
     def refuse_not_finite(self, rows: Rows) -> Rows:
         """The rows that are finite; the jobs of the others go from `ready` to `failed`."""
@@ -72,9 +80,17 @@ def prepare(
     jobs: list[Job],
     target: Target,
 ) -> Batch:
-    """Read and decode the photos of the claimed jobs, and store their thumbnails."""
+    """Read and decode the photos of the claimed jobs, and store their thumbnails; or read rows that
+    take their place.
+    """
     batch = Batch(jobs=jobs, target=target)
     started = time.perf_counter()
+    there = rows_to_project(catalog, store, jobs, target)
+    if there is not None:
+        batch.ready, batch.stored = there
+        batch.gone = [job for job in jobs if job not in batch.ready]
+        batch.seconds["read"] = time.perf_counter() - started
+        return batch
     keys = _object_keys(catalog, jobs)
     present: list[tuple[Job, bytes]] = []
     for job in jobs:

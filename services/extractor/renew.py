@@ -11,11 +11,12 @@ import logging
 
 from sqlalchemy import select
 
-from services.extractor.loaded import LoadedModels
+from services.extractor.loaded import LoadedModels, Made
 from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.maps import Map
 from shared.catalog.session import Catalog
 from shared.catalog.vocabularies import Vocabulary
+from shared.catalog.whitenings import StoredWhitening
 from shared.errors import Conflict, PlacewiseError
 from shared.jobs import JobKind
 from shared.jobs.model_changes import start_model_change
@@ -25,25 +26,32 @@ log = logging.getLogger(__name__)
 
 
 def renew_outdated_generations(catalog: Catalog, models: LoadedModels) -> int:
-    """Start a switch to the same vocabulary in every outdated map; returns how many."""
+    """Start a switch to the same vocabulary and whitening in every outdated map; how many."""
     with catalog.read() as session:
         found = session.execute(
-            select(Generation, Vocabulary)
+            select(Generation, Vocabulary, StoredWhitening)
             .outerjoin(Vocabulary, Vocabulary.id == Generation.vocabulary_id)
+            .outerjoin(StoredWhitening, StoredWhitening.id == Generation.whitening_id)
             .join(Map, Map.id == Generation.map_id)
             .where(Generation.state == GenerationState.ACTIVE, Map.deleted_at.is_(None))
         ).all()
     started = 0
-    for generation, vocabulary in found:
+    for generation, vocabulary, whitening in found:
         try:
-            extractor = models.extractor(generation.extractor)
-            spec = extractor.spec(models.centres(vocabulary) if vocabulary else None)
+            made = Made(
+                models.of_generation(generation),
+                models.centres(vocabulary) if vocabulary else None,
+                models.projection(whitening) if whitening else None,
+            )
         except PlacewiseError as error:
             log.error("generation %s can't be checked: %s", generation.id, error.detail)
             continue
-        if spec_fingerprint(spec) == generation.spec_fingerprint:
+        if spec_fingerprint(made.spec) == generation.spec_fingerprint:
             continue
-        params = {"vocabulary_id": str(vocabulary.id) if vocabulary else None}
+        params = {
+            "vocabulary_id": str(vocabulary.id) if vocabulary else None,
+            "whitening_id": str(whitening.id) if whitening else None,
+        }
         try:
             with catalog.write() as session:
                 start_model_change(session, generation.map_id, JobKind.SWITCH, params)

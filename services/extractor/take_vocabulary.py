@@ -4,14 +4,18 @@ from __future__ import annotations
 
 from uuid import UUID
 
-from services.extractor.loaded import LoadedModels
+from services.extractor.loaded import LoadedModels, Made
 from services.extractor.new_generation import begin_with_known, begin_with_new, extractor_of
 from shared.catalog.session import Catalog
 from shared.catalog.vocabularies import VocabularyOrigin, get_vocabulary
+from shared.catalog.whitenings import StoredWhitening
 from shared.errors import Unprocessable
 from shared.jobs import Job
 from shared.objects import ObjectStore
+from shared.vision.extractors import Extractor
+from shared.vision.pca_file import decode_whitening
 from shared.vision.provenance import check_fits
+from shared.vision.vocabulary import Centres
 from shared.vision.vocabulary_file import decode_vocabulary
 
 
@@ -49,10 +53,27 @@ class TakeVocabulary:
                     "vocabulary_unfit",
                     f"The extractor {extractor.recipe.name} needs a vocabulary.",
                 )
-            begin_with_known(self._catalog, job, extractor, None, None)
+            self._begin(job, extractor, None, None)
             return
         with self._catalog.read() as session:
             vocabulary = get_vocabulary(session, job.map_id, UUID(job.params["vocabulary_id"]))
         centres = self._models.centres(vocabulary)
         check_fits(vocabulary.provenance, centres, extractor)
-        begin_with_known(self._catalog, job, extractor, centres, vocabulary.id)
+        self._begin(job, extractor, centres, vocabulary.id)
+
+    def _begin(
+        self, job: Job, extractor: Extractor, centres: Centres | None, vocabulary_id: UUID | None
+    ) -> None:
+        """The generation, with the whitening that the job names, if any: a renewed generation keeps
+        its own. Unprocessable (`pca_unfit`) when the descriptors have become others.
+        """
+        whitening_id = job.params.get("whitening_id")
+        if whitening_id is None:
+            begin_with_known(self._catalog, job, Made(extractor, centres), vocabulary_id)
+            return
+        with self._catalog.read() as session:
+            stored = session.get_one(StoredWhitening, UUID(whitening_id))
+        kept = decode_whitening(self._store.get(stored.object_key))
+        kept.check_fits(extractor.spec(centres))
+        made = Made(extractor, centres, self._models.projection(stored))
+        begin_with_known(self._catalog, job, made, vocabulary_id, stored.id)

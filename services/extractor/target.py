@@ -6,28 +6,28 @@ import logging
 from dataclasses import dataclass
 from uuid import UUID
 
-from services.extractor.loaded import LoadedModels, check_spec, register, spec_columns
+from services.extractor.loaded import LoadedModels, Made, check_spec, register, spec_columns
 from shared.catalog.base import db_now
 from shared.catalog.generations import Generation, GenerationState, active_generation
 from shared.catalog.maps import Map, bump_version, lock_map
 from shared.catalog.session import Catalog
 from shared.catalog.vocabularies import Vocabulary, VocabularyOrigin, add_vocabulary
+from shared.catalog.whitenings import StoredWhitening
 from shared.ids import new_id
-from shared.jobs import Job, JobKind
+from shared.jobs import Job
 from shared.jobs.model_changes import release_vocabulary_waiters
+from shared.jobs.table import QUERY_JOBS
 from shared.objects import ObjectStore
 from shared.objects.keys import new_vocabulary_key
 from shared.vision.extractors import Extractor
-from shared.vision.vocabulary import Centres, encode_centres
+from shared.vision.vocabulary import encode_centres
 
 log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True, slots=True)
-class Target:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Target(Made):
     generation: Generation
-    extractor: Extractor
-    centres: Centres | None
 
 
 def find_target(
@@ -35,28 +35,34 @@ def find_target(
 ) -> Target | None:
     """Where the batch of `job` goes; None while the map has no vocabulary.
 
-    A reindex job names its generation; the others go to the map's active one, which is made here
-    on first use when the extractor brings a vocabulary or needs none.
+    A job that names a generation goes there; the others go to the map's active one, which is made
+    here on first use when the extractor brings a vocabulary or needs none.
     """
     with catalog.read() as session:
-        if job.kind == JobKind.REINDEX:
+        if job.generation_id is not None:
             generation = session.get(Generation, job.generation_id)
         else:
             generation = active_generation(session, job.map_id)
-        vocabulary = None
+        vocabulary, whitening = None, None
         if generation is not None and generation.vocabulary_id is not None:
             vocabulary = session.get(Vocabulary, generation.vocabulary_id)
+        if generation is not None and generation.whitening_id is not None:
+            whitening = session.get(StoredWhitening, generation.whitening_id)
         map_extractor = session.get_one(Map, job.map_id).extractor
     if generation is None:
         first = _make_first_generation(catalog, store, models.extractor(map_extractor), job.map_id)
         if first is None:
             return None
         generation, vocabulary = first
-    extractor = models.extractor(generation.extractor)
-    centres = models.centres(vocabulary) if vocabulary else None
-    # A query's row is compared once and thrown away: another decoder release is close enough.
-    check_spec(generation, extractor, centres, decoder_matters=job.kind != JobKind.DESCRIBE)
-    return Target(generation, extractor, centres)
+    target = Target(
+        models.of_generation(generation),
+        models.centres(vocabulary) if vocabulary else None,
+        models.projection(whitening) if whitening else None,
+        generation=generation,
+    )
+    # A query is compared once and thrown away: another decoder release is close enough.
+    check_spec(generation, target, decoder_matters=job.kind not in QUERY_JOBS)
+    return target
 
 
 def _make_first_generation(
@@ -96,8 +102,7 @@ def _make_first_generation(
             activated_at=db_now(),
             **spec_columns(
                 register(session, extractor),
-                extractor,
-                centres,
+                Made(extractor, centres),
                 vocabulary.id if vocabulary else None,
             ),
         )

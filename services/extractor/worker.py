@@ -1,8 +1,18 @@
 """The worker: drains the job table, one batch after the other, queries first.
 
-While a batch is on the GPU the next one is read and decoded. A query that arrives meanwhile is
-described beside it; where that can't be, it goes before the next bulk batch, so that it waits for
-one batch at most.
+    claim ──> read, decode ──> forward pass, aggregate ──> chunk, transaction
+              batch n + 1      batch n                      batch n - 1
+
+Bulk batches overlap: while one is on the model the next one is read and decoded and the one before
+is published. One is at each of the three places, no more: a batch that has been described waits
+until the one before is published. Its lease is kept through all of them, up to the transaction.
+
+A query that arrives while a batch is described is described beside it; where that can't be, it goes
+before the next bulk batch, so that it waits for one batch at most. Its row is published at once, in
+the thread that described it.
+
+Jobs that are tried alone, to find out who felled a worker, and slices of model changes overlap with
+nothing: what was described before is published first.
 """
 
 from __future__ import annotations
@@ -15,13 +25,14 @@ import time
 from collections import defaultdict
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 from uuid import UUID
 
 import numpy as np
 from sqlalchemy.exc import SQLAlchemyError
 
+from services.extractor.compare import Comparisons, Prepared
 from services.extractor.decoding import DecoderPool
 from services.extractor.loaded import LoadedModels
 from services.extractor.model_change import ModelChanges
@@ -33,6 +44,7 @@ from shared.catalog.away import Outage
 from shared.catalog.generations import active_generation
 from shared.catalog.maps import lock_map
 from shared.catalog.session import Catalog
+from shared.chunks import Rows
 from shared.errors import Conflict, PlacewiseError, Unavailable
 from shared.heartbeat import Heartbeat
 from shared.jobs import InProcessHints, Job, Priority, begin, claim, hold_lease
@@ -43,6 +55,7 @@ from shared.jobs.model_changes import abandon_generation
 from shared.jobs.table import EXTRACTOR_JOBS, MODEL_CHANGES, JobKind, WaitingFor
 from shared.objects import ObjectStore
 from shared.settings import Settings
+from shared.vision.passes import PhotoDoesNotFit
 
 log = logging.getLogger(__name__)
 
@@ -90,7 +103,7 @@ class Work:
 
     jobs: list[Job]
     lease: contextlib.ExitStack
-    batch: Future[Batch | None] | None
+    batch: Future[Batch | Prepared | None] | None
     """None inside: the map has no vocabulary yet. None itself: a slice of a model change."""
 
     @property
@@ -122,9 +135,12 @@ class ExtractorWorker:
         self._models = LoadedModels(store, settings)
         self._decoders = DecoderPool(settings)
         self._changes = ModelChanges(catalog, store, self._models, self._decoders, settings)
+        self._comparisons = Comparisons(catalog, store, self._models, self._decoders, settings)
         # Two: a query's photo does not wait until those of the next batch are read.
         self._ahead = ThreadPoolExecutor(max_workers=2, thread_name_prefix="prepare")
         self._beside = ThreadPoolExecutor(max_workers=1, thread_name_prefix="queries")
+        self._publisher = ThreadPoolExecutor(max_workers=1, thread_name_prefix="publish")
+        self._behind: Future[DrainResult] | None = None
 
     def warm_up(self) -> None:
         """Load the extractor of new maps, so that the first photo does not wait for it."""
@@ -156,6 +172,7 @@ class ExtractorWorker:
     def close(self) -> None:
         """End the decoders; what is claimed comes back when its lease expires."""
         self._beside.shutdown(wait=True)
+        self._publisher.shutdown(wait=True)
         self._ahead.shutdown(wait=True, cancel_futures=True)
         self._decoders.close()
 
@@ -175,22 +192,30 @@ class ExtractorWorker:
                 if work.jobs[0].priority < Priority.QUERY:
                     query = self._take(result, least_priority=Priority.QUERY)
                     if query is not None:
-                        self._do(query, result)
+                        self._go_on_with(query, result, stop)
                 # Taken before the forward pass: the next photos are decoded while it runs.
                 ahead = self._take(result)
-                if _may_have_company(work):
-                    with self._queries_beside(result, stop):
-                        self._do(work, result, company=1)
-                else:
-                    self._do(work, result)
+                self._go_on_with(work, result, stop)
                 if ahead is None:
+                    self._await_published(result)  # which may set jobs free again
                     ahead = self._take(result)
         finally:
             # The catalog may be away: what is held then comes back when its lease expires.
             for unfinished in (work, ahead):
                 if unfinished is not None:
                     unfinished.lease.close()
+            self._await_published(result)
         return result
+
+    def _go_on_with(self, work: Work, result: DrainResult, stop: threading.Event) -> None:
+        if _has_to_be_alone(work):
+            self._await_published(result)
+            self._do(work, result)
+        elif work.jobs[0].priority >= Priority.QUERY:
+            self._do(work, result, company=0 if self._behind is None else 1)
+        else:
+            with self._queries_beside(result, stop):
+                self._do(work, result, company=1, behind=True)
 
     @contextlib.contextmanager
     def _queries_beside(self, result: DrainResult, stop: threading.Event) -> Iterator[None]:
@@ -240,7 +265,9 @@ class ExtractorWorker:
         result.maps.add(str(jobs[0].map_id))
         work = Work(jobs, contextlib.ExitStack(), None)
         work.lease.enter_context(hold_lease(self._catalog, work.token, settings.lease_seconds))
-        if jobs[0].kind not in MODEL_CHANGES:
+        if jobs[0].kind == JobKind.COMPARE:
+            work.batch = self._ahead.submit(self._comparisons.prepare, jobs[0])
+        elif jobs[0].kind not in MODEL_CHANGES:
             work.batch = self._ahead.submit(self._prepare, jobs)
         return work
 
@@ -250,47 +277,86 @@ class ExtractorWorker:
             return None
         return prepare(self._catalog, self._store, self._decoders, jobs, target)
 
-    def _do(self, work: Work, result: DrainResult, company: int = 0) -> None:
-        """`company`: so many others may be described beside it, and share the blame for a fall."""
+    def _do(
+        self, work: Work, result: DrainResult, company: int = 0, *, behind: bool = False
+    ) -> None:
+        """`company`: so many others may be under way beside it, and share the blame for a fall.
+        `behind`: it may be published while the model has the next one.
+        """
         with work.lease:
-            try:
-                if work.batch is None:
-                    started = time.perf_counter()
-                    self._begin(work)
-                    self._changes.slice(work.jobs[0])
-                    result.seconds["model change"] += time.perf_counter() - started
-                else:
-                    batch = work.batch.result()
-                    if batch is None:
-                        self._wait_for_vocabulary(work)
-                    else:
-                        self._begin(work, company)
-                        outcome = self._describe(batch)
-                        result.succeeded += outcome.succeeded
-                        result.failed += outcome.failed
-                        for stage, took in batch.seconds.items():
-                            result.seconds[stage] += took
-            except (Unavailable, OSError, SQLAlchemyError) as error:
-                self._pause(work, error)
-            except PlacewiseError as error:
-                result.failed += self._refuse(work, error)
-            except Exception as error:
-                log.exception("a batch of %d jobs crashed", len(work.jobs))
-                self._crashed(work, error)
+            rows = self._describe(work, result, company)
+            if rows is None:
+                return
+            if not behind:
+                self._publish(work, rows, result)
+                return
+            self._await_published(result)
+            moved = replace(work, lease=work.lease.pop_all())
+            self._behind = self._publisher.submit(self._publish_behind, moved, rows)
+
+    def _describe(self, work: Work, result: DrainResult, company: int) -> Rows | None:
+        """A row for each of the batch's `ready`; None where there is nothing to publish."""
+        with self._answered(work, result):
+            if work.batch is None:
+                started = time.perf_counter()
+                self._begin(work)
+                self._changes.slice(work.jobs[0])
+                result.seconds["model change"] += time.perf_counter() - started
+                return None
+            batch = work.batch.result()
+            if batch is None:
+                self._wait_for_vocabulary(work)
+                return None
+            self._begin(work, company)
+            if isinstance(batch, Prepared):
+                self._count(self._comparisons.finish(batch), batch.seconds, result)
+                return None
+            return _rows(batch)
+        return None  # what went wrong has been answered
+
+    def _publish(self, work: Work, rows: Rows, result: DrainResult) -> None:
+        with self._answered(work, result):
+            batch = work.batch.result() if work.batch else None
+            assert isinstance(batch, Batch), "it was described"
+            outcome = publish(self._catalog, self._store, batch, rows, self._settings.slot_rows)
+            self._count(outcome, batch.seconds, result)
+
+    @staticmethod
+    def _count(outcome: Published, seconds: dict[str, float], result: DrainResult) -> None:
+        result.succeeded += outcome.succeeded
+        result.failed += outcome.failed
+        for stage, took in seconds.items():
+            result.seconds[stage] += took
+
+    def _publish_behind(self, work: Work, rows: Rows) -> DrainResult:
+        result = DrainResult()
+        with work.lease:
+            self._publish(work, rows, result)
+        return result
+
+    def _await_published(self, result: DrainResult) -> None:
+        """Until nothing is being published behind the model; what it came to is counted."""
+        behind, self._behind = self._behind, None
+        if behind is not None:
+            result.add(behind.result())
+
+    @contextlib.contextmanager
+    def _answered(self, work: Work, result: DrainResult) -> Iterator[None]:
+        """What goes wrong in the block is written to the jobs. Raises what can't be written."""
+        try:
+            yield
+        except (Unavailable, OSError, SQLAlchemyError) as error:
+            self._pause(work, error)
+        except PlacewiseError as error:
+            result.failed += self._refuse(work, error)
+        except Exception as error:
+            log.exception("a batch of %d jobs crashed", len(work.jobs))
+            self._crashed(work, error)
 
     def _begin(self, work: Work, company: int = 0) -> None:
         """Decoding, in other processes, is done: a fall from here on may be the photos' fault."""
         with self._catalog.write() as session:
             begin(session, work.token, len(work.jobs) + company)
-
-    def _describe(self, batch: Batch) -> Published:
-        target = batch.target
-        rows = np.empty((0, target.generation.dimension), np.float32)
-        if batch.ready:
-            started = time.perf_counter()
-            rows = target.extractor.describe(batch.pixels(), target.centres)
-            batch.seconds["describe"] = time.perf_counter() - started
-        return publish(self._catalog, self._store, batch, rows, self._settings.slot_rows)
 
     def _wait_for_vocabulary(self, work: Work) -> None:
         """Photos wait until the map has one; a query is told at once."""
@@ -345,10 +411,29 @@ class ExtractorWorker:
                 )
 
 
-def _may_have_company(work: Work) -> bool:
-    """A job that is tried alone has to be: else nobody knows who felled the worker."""
-    head = work.jobs[0]
-    return work.batch is not None and head.priority < Priority.QUERY and not head.alone
+def _rows(batch: Batch) -> Rows:
+    """A row for each of the batch's `ready`, which photos that the GPU can't hold have left."""
+    target = batch.target
+    while batch.ready:
+        started = time.perf_counter()
+        try:
+            if batch.stored is not None:
+                assert target.projection is not None
+                rows = target.projection.project(batch.stored)
+            else:
+                pixels = batch.pixels()
+                rows = target.extractor.describe(pixels, target.centres, target.projection)
+        except PhotoDoesNotFit as error:
+            batch.refuse(error.place, error)
+            continue
+        batch.seconds["describe"] = time.perf_counter() - started
+        return rows
+    return np.empty((0, target.generation.dimension), np.float32)
+
+
+def _has_to_be_alone(work: Work) -> bool:
+    """Else nobody knows who felled the worker. Model changes come as a batch of one, too."""
+    return work.batch is None or work.jobs[0].alone
 
 
 def no_vocabulary() -> Conflict:

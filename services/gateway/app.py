@@ -18,6 +18,7 @@ from services.gateway import (
     photos,
     similarity,
     upload,
+    word_weights,
 )
 from services.gateway.body_limit import BodyLimit
 from services.gateway.context import API, Gateway
@@ -62,6 +63,7 @@ def create_app(gateway: Gateway) -> FastAPI:
         photos,
         model_changes,
         evaluations,
+        word_weights,
         history,
         figures,
         health,

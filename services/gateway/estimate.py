@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from uuid import UUID
 
 from services.gateway.schemas import EstimateAnswer
-from shared.catalog.generations import Generation
 from shared.catalog.photos import Photo
 from shared.estimate.calibration import Calibration
 from shared.estimate.evidence import Ranked, locate, weigh
@@ -16,23 +15,21 @@ from shared.search_protocol import Hit
 
 def rank(hits: Sequence[Hit], photos: Mapping[UUID, Photo]) -> list[Ranked]:
     """Hits with the places of their photos."""
-    return [Ranked(hit.score, _spot(photos[hit.photo_id])) for hit in hits]
+    return [Ranked(hit.ranked_by, _spot(photos[hit.photo_id])) for hit in hits]
 
 
 def estimate(
-    generation: Generation,
+    calibration: Calibration | None,
     ranking: Sequence[Ranked],
     everything: Sequence[Ranked],
     radius_m: float,
 ) -> EstimateAnswer:
     """Where the ranking points to, and what the generation's evaluations say of that place.
 
-    `everything` is the ranking without a filter: the place has to stand up to all others, as it had
-    to when the evaluations learnt what is in the map.
+    `calibration` is what rankings of this kind, plain or by word weights, have taught. `everything`
+    is the ranking without a filter: the place has to stand up to all others, as it had to when the
+    evaluations learnt what is in the map.
     """
-    calibration = (
-        Calibration.model_validate(generation.calibration) if generation.calibration else None
-    )
     state = calibration.state if calibration else "uncalibrated"
     evidence = weigh(everything, radius_m, ranking[0].spot) if ranking else None
     if evidence is None:

@@ -44,7 +44,8 @@ class EvaluationAnswer(Answer):
     figures: dict[str, Any] = Field(
         description="`leave_one_out`: the map's own photos asked, themselves left out; "
         "`labelled_queries`: photos of role `query`; R@k is the share, of those that the map has "
-        "another photo of, with a right one among the first k"
+        "another photo of, with a right one among the first k; `with_word_weights`: the same, "
+        "ranked by the generation's word weights, null where it has none"
     )
     evaluated_at: datetime
 

@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 from uuid import UUID
 
 from pydantic import BaseModel, ConfigDict
 from sqlalchemy.orm import Session
 
+from services.gateway.choose_weights import choose_weights
 from services.gateway.context import Gateway
 from services.gateway.estimate import estimate, rank
 from services.gateway.schemas import (
@@ -57,6 +59,29 @@ class Wanted(BaseModel):
     top_k: int
     min_score: float | None = None
     photos: PhotoFilter = EVERYTHING
+    word_weights: bool = True
+    rerank: int | None = None
+    explain: bool = False
+
+    @property
+    def closely(self) -> bool:
+        """Whether an extractor has to look at what the search finds."""
+        return self.rerank is not None or self.explain
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """What the search tier has found: the answer but for its photos, and their scores."""
+
+    frame: SimilarityAnswer
+    """Without photos."""
+    hits: list[Hit]
+    """Live, wanted, most similar first: `top_k`, or as many more as are to be reranked."""
+    photos: dict[UUID, Photo]
+    word_weights: tuple[float, ...]
+    """By which the hits are ranked, one for each word; () for the plain ranking."""
+    history: Search
+    """The row to be added."""
 
 
 def query_by_photo(gateway: Gateway, map_name: str, photo_id: UUID) -> Query:
@@ -107,34 +132,49 @@ def query_by_job(gateway: Gateway, job: Job) -> Query:
 def find_similar(gateway: Gateway, query: Query, wanted: Wanted) -> SimilarityAnswer:
     """The most similar live photos that are wanted, without the query itself, and the place that
     they point to; noted in the history."""
+    found = search(gateway, query, wanted)
+    with gateway.catalog.write() as session:
+        session.add(found.history)
+    return found.frame.with_photos(
+        SimilarPhoto(
+            similarity_score=hit.score,
+            weighted_score=hit.weighted_score,
+            **PhotoAnswer.fields_of(found.photos[hit.photo_id]),
+        )
+        for hit in found.hits
+    )
+
+
+def search(gateway: Gateway, query: Query, wanted: Wanted) -> Found:
+    """Ask the search tier. Whoever answers with what it has found adds the history's row."""
     started = time.perf_counter()
+    weights = choose_weights(query.generation, wanted.word_weights, gateway.settings)
+    shown = max(wanted.top_k, wanted.rerank or 0)
     # The estimate looks deeper than most answers, and also at what is below the least score.
-    hits, photos, response = _search_live(gateway, query, wanted, max(wanted.top_k, DEPTH))
+    search = partial(_search_live, gateway, query, weights=weights.values)
+    hits, photos, response = search(wanted.photos, max(shown, DEPTH))
     ranking = everything = rank(hits, photos)
     if not wanted.photos.is_empty:
-        without_filter = wanted.model_copy(update={"photos": EVERYTHING})
-        everything = rank(*_search_live(gateway, query, without_filter, DEPTH)[:2])
-    found = estimate(query.generation, ranking, everything, gateway.settings.estimate_radius_m)
-    shown = [
-        hit
-        for hit in hits[: wanted.top_k]
-        if wanted.min_score is None or hit.score >= wanted.min_score
-    ]
+        everything = rank(*search(EVERYTHING, DEPTH)[:2])
+    found = estimate(
+        weights.calibration(hits), ranking, everything, gateway.settings.estimate_radius_m
+    )
+    similar = hits[:shown]
+    if wanted.min_score is not None and weights.values:
+        # The least score is of the plain cosine: there may be more of them far down the ranking.
+        similar, photos, response = search(wanted.photos, shown, min_score=wanted.min_score)
+    elif wanted.min_score is not None:
+        similar = [hit for hit in similar if hit.score >= wanted.min_score]
     took_ms = (time.perf_counter() - started) * 1000
-    answer = SimilarityAnswer(
+    frame = SimilarityAnswer(
         query_file_id=query.photo_id,
         query_filename=query.filename,
         processing_time_ms=took_ms,
-        total_similar=len(shown),
-        similar_images=[
-            SimilarPhoto(
-                similarity_score=hit.score,
-                **PhotoAnswer.fields_of(photos[hit.photo_id]),
-            )
-            for hit in shown
-        ],
+        total_similar=0,
+        similar_images=[],
         estimate=found,
         vocabulary=query.vocabulary,
+        word_weights=weights.state(hits),
         generation_id=query.generation.id,
         certificate=response.certificate,
         rows_scanned=response.rows_scanned,
@@ -142,25 +182,29 @@ def find_similar(gateway: Gateway, query: Query, wanted: Wanted) -> SimilarityAn
         snapshot_version=response.snapshot_version,
         missing=list(response.missing),
     )
-    with gateway.catalog.write() as session:
-        session.add(
-            Search(
-                map_id=query.map_id,
-                generation_id=query.generation.id,
-                query_photo_id=query.photo_id,
-                query_filename=query.filename,
-                top_k=wanted.top_k,
-                results=len(shown),
-                processing_ms=took_ms,
-                best_score=hits[0].score if hits else None,
-                in_map=found.in_map,
-            )
-        )
-    return answer
+    history = Search(
+        map_id=query.map_id,
+        generation_id=query.generation.id,
+        query_photo_id=query.photo_id,
+        query_filename=query.filename,
+        top_k=wanted.top_k,
+        results=min(len(similar), wanted.top_k),
+        processing_ms=took_ms,
+        best_score=hits[0].score if hits else None,
+        in_map=found.in_map,
+    )
+    weighted = any(hit.weighted_score is not None for hit in similar)
+    return Found(frame, similar, photos, weights.values if weighted else (), history)
 
 
 def _search_live(
-    gateway: Gateway, query: Query, wanted: Wanted, depth: int
+    gateway: Gateway,
+    query: Query,
+    wanted: PhotoFilter,
+    depth: int,
+    *,
+    weights: tuple[float, ...],
+    min_score: float | None = None,
 ) -> tuple[list[Hit], dict[UUID, Photo], SearchResponse]:
     """The first `depth` live photos, fewer when there are no more."""
     k = depth
@@ -173,8 +217,10 @@ def _search_live(
                 row=query.row,
                 min_version=query.min_version,
                 k=k,
-                photos=wanted.photos,
+                photos=wanted,
+                min_score=min_score,
                 exclude=(query.photo_id,) if query.photo_id else (),
+                word_weights=weights,
             )
         )
         with gateway.catalog.read() as session:

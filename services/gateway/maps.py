@@ -67,6 +67,8 @@ class MapAnswer(Answer):
     counted_at: datetime = Field(description="when the three counts above were made")
     generation_id: UUID | None
     vocabulary: str | None = Field(description="own, foreign, none; null before the first photo")
+    dimension: int | None = Field(description="of its descriptors; null before the first photo")
+    pca_from: int | None = Field(description="their dimension before PCA; null without")
     created_at: datetime
 
 
@@ -132,5 +134,7 @@ def _answer(session: Session, map_: Map) -> MapAnswer:
         counted_at=counted_at,
         generation_id=generation.id if generation else None,
         vocabulary=standing_of(session, generation) if generation else None,
+        dimension=generation.dimension if generation else None,
+        pca_from=generation.pca_from if generation else None,
         created_at=map_.created_at,
     )

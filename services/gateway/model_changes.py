@@ -7,6 +7,7 @@ from uuid import UUID
 
 from fastapi import APIRouter, Request, Response
 from pydantic import BaseModel, ConfigDict, Field
+from sqlalchemy.orm import Session
 from starlette.concurrency import run_in_threadpool
 
 from services.gateway.context import DEFAULT_MAP, Gateway, GatewayDep, MapName
@@ -24,11 +25,13 @@ from shared.catalog.generations import list_generations
 from shared.catalog.maps import get_map
 from shared.catalog.photos import PhotoRole, has_live
 from shared.catalog.vocabularies import get_vocabulary, list_vocabularies
-from shared.errors import Conflict, PlacewiseError
+from shared.catalog.whitenings import generation_to_whiten
+from shared.errors import Conflict, PlacewiseError, invalid_field
 from shared.jobs import Job, JobKind
 from shared.jobs.model_changes import start_model_change
 from shared.objects.keys import new_vocabulary_key
-from shared.recipes import MOST_CLUSTERS
+from shared.recipes import MOST_CLUSTERS, MOST_PCA
+from shared.vocabulary_npz import encode_vocabulary_file
 
 router = APIRouter(tags=["model changes"])
 
@@ -50,11 +53,20 @@ class FitRequest(BaseModel):
 
 
 class SwitchRequest(BaseModel):
-    """The vocabulary that the new generation is made with; null for extractors without one."""
+    """What the new generation is made with."""
 
     model_config = ConfigDict(extra="forbid")
 
-    vocabulary_id: UUID | None = None
+    vocabulary_id: UUID | None = Field(
+        None, description="null for extractors without one, and with `pca`"
+    )
+    pca: int | None = Field(
+        None,
+        ge=1,
+        le=MOST_PCA,
+        description="bring the map's descriptors to so many dimensions; their vocabulary stays. "
+        "null: whole descriptors",
+    )
 
 
 @router.post(
@@ -136,6 +148,39 @@ def vocabularies(gateway: GatewayDep, map_name: MapName = DEFAULT_MAP) -> list[V
 
 
 @router.get(
+    "/vocabularies/{vocabulary_id}/file",
+    operation_id="get_vocabulary_file",
+    response_class=Response,
+    responses={
+        200: {
+            "content": {
+                "application/zip": {"schema": {"type": "string", "format": "binary"}},
+                "application/octet-stream": {"schema": {"type": "string", "format": "binary"}},
+            }
+        }
+    },
+)
+def vocabulary_file(
+    gateway: GatewayDep,
+    vocabulary_id: UUID,
+    map_name: MapName = DEFAULT_MAP,
+) -> Response:
+    """The vocabulary as the file that `POST /vocabularies/import` takes elsewhere: `.npz` with its
+    provenance, or `.npy` (`application/octet-stream`) where that is unknown.
+    """
+    with gateway.catalog.read() as session:
+        found = get_vocabulary(session, get_map(session, map_name).id, vocabulary_id)
+    data, suffix = encode_vocabulary_file(
+        gateway.store.get(found.object_key), found.sha256, found.provenance
+    )
+    return Response(
+        data,
+        media_type="application/zip" if suffix == ".npz" else "application/octet-stream",
+        headers={"Content-Disposition": f'attachment; filename="{found.id}{suffix}"'},
+    )
+
+
+@router.get(
     "/generations",
     operation_id="list_generations",
     response_model=list[GenerationAnswer],
@@ -163,16 +208,37 @@ def start_generation(
     wanted: Annotated[SwitchRequest, Field()],
     map_name: MapName = DEFAULT_MAP,
 ) -> JobStarted:
-    """Describe all photos anew with a vocabulary that the map has, and switch to it."""
-    params: dict[str, Any] = {"vocabulary_id": None}
+    """Describe all photos anew with a vocabulary that the map has, and switch to it; or shorten
+    their descriptors by PCA whitening, fitted on those that the map has, and switch to these.
+    """
     with gateway.catalog.write() as session:
         map_id = get_map(session, map_name).id
-        if wanted.vocabulary_id is not None:
-            vocabulary = get_vocabulary(session, map_id, wanted.vocabulary_id)
-            params["vocabulary_id"] = str(vocabulary.id)
-        job = start_model_change(session, map_id, JobKind.SWITCH, params)
+        if wanted.pca is not None:
+            job = _queue_pca(session, map_id, wanted.pca, wanted.vocabulary_id)
+        else:
+            job = _queue_switch(session, map_id, wanted.vocabulary_id)
         once.keep_job(session, job)
     return _started(gateway, response, job)
+
+
+def _queue_switch(session: Session, map_id: UUID, vocabulary_id: UUID | None) -> Job:
+    if vocabulary_id is not None:
+        get_vocabulary(session, map_id, vocabulary_id)
+    params = {"vocabulary_id": str(vocabulary_id) if vocabulary_id else None}
+    return start_model_change(session, map_id, JobKind.SWITCH, params)
+
+
+def _queue_pca(session: Session, map_id: UUID, pca: int, vocabulary_id: UUID | None) -> Job:
+    source = generation_to_whiten(session, map_id)
+    if vocabulary_id is not None and vocabulary_id != source.vocabulary_id:
+        raise invalid_field(
+            "vocabulary_id",
+            "PCA is fitted on the descriptors that answer: leave it out, or switch"
+            " to that vocabulary first",
+        )
+    if pca > source.dimension:
+        raise invalid_field("pca", f"the map's descriptors have {source.dimension} dimensions")
+    return start_model_change(session, map_id, JobKind.PCA, {"pca": pca})
 
 
 def _queue_import(gateway: Gateway, map_name: str, params: dict[str, Any], once: Once) -> Job:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from datetime import datetime
 from typing import Any
 from uuid import UUID
@@ -13,6 +14,7 @@ from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.photos import Photo, PhotoRole
 from shared.catalog.vocabularies import Vocabulary, VocabularyOrigin
 from shared.jobs import Job, JobKind, JobState
+from shared.jobs.table import QUERY_JOBS
 
 
 class Answer(BaseModel):
@@ -73,8 +75,42 @@ class OnePhotoAnswer(PhotoAnswer):
     searchable: bool = Field(description="whether the active generation has its descriptor")
 
 
+class ClusterShareAnswer(Answer):
+    cluster: int = Field(description="of the generation's vocabulary, from 0")
+    share: float = Field(description="what it adds to the similarity")
+
+
+class ExplanationAnswer(Answer):
+    """Where a similarity comes from, as shares that add up to it."""
+
+    clusters: list[ClusterShareAnswer] | None = Field(
+        description="of those that both photos use, largest share first; null without a vocabulary"
+    )
+    rows: int = Field(description="of the grid of the query's patches")
+    columns: int
+    overlay: str = Field(
+        description="data URI of a PNG with one pixel for each patch of the query: orange speaks "
+        "for the match, violet against it, transparent for neither. Stretch it over the query "
+        "photo without smoothing"
+    )
+    full_share: float = Field(description="the share of a patch that is drawn opaque")
+
+
 class SimilarPhoto(PhotoAnswer):
     similarity_score: float = Field(description="cosine similarity in [-1, 1]")
+    weighted_score: float | None = Field(
+        None,
+        description="cosine similarity to the query with weighted words, by which the answer is "
+        "ranked; null where it is ranked by `similarity_score`",
+    )
+    rerank_score: float | None = Field(
+        None,
+        description="with `rerank`: the similarity, raised by half of the share of patches that "
+        "match the query's and have moved alike (0 to 1); null where a photo was not compared",
+    )
+    explanation: ExplanationAnswer | None = Field(
+        None, description="with `explain=true`, from the patches of the query"
+    )
 
 
 class EstimateAnswer(Answer):
@@ -107,12 +143,22 @@ class SimilarityAnswer(Answer):
         description="`own`: learnt on this map's photos; `foreign`: on photos of elsewhere; "
         "`none`: the extractor uses none"
     )
+    word_weights: str = Field(
+        description="`applied`: ranked by `weighted_score`; `none`: the generation has no weights, "
+        "or the query none of the words that have one; `off`: turned off by the call or by "
+        "WORD_WEIGHTS"
+    )
     generation_id: UUID
     certificate: str = Field(description="`exhaustive`: every row was compared exactly")
     rows_scanned: int
     rows_reranked: int
     snapshot_version: int
     missing: list[str] = Field(description="parts of the map that could not be searched")
+
+    def with_photos(self, photos: Iterable[SimilarPhoto]) -> SimilarityAnswer:
+        """The same answer with these photos."""
+        images = list(photos)
+        return self.model_copy(update={"similar_images": images, "total_similar": len(images)})
 
 
 class MetadataAnswer(Answer):
@@ -154,7 +200,7 @@ class JobAnswer(Answer):
 
     @classmethod
     def of(cls, job: Job) -> JobAnswer:
-        query = job.kind == JobKind.DESCRIBE
+        query = job.kind in QUERY_JOBS
         return cls(
             job_id=job.id,
             kind=JobKind(job.kind),
@@ -241,7 +287,8 @@ class GenerationAnswer(Answer):
     generation_id: UUID
     state: GenerationState
     extractor: str
-    dimension: int
+    dimension: int = Field(description="of its descriptors, after PCA where there is one")
+    pca_from: int | None = Field(description="their dimension before PCA; null without")
     vocabulary_id: UUID | None
     photos: int = Field(description="live photos that have a descriptor in it")
     spec: dict[str, Any]
@@ -256,6 +303,7 @@ class GenerationAnswer(Answer):
             state=GenerationState(generation.state),
             extractor=generation.extractor,
             dimension=generation.dimension,
+            pca_from=generation.pca_from,
             vocabulary_id=generation.vocabulary_id,
             photos=photos,
             spec=generation.spec,
@@ -274,5 +322,5 @@ def job_started(job: Job) -> JobStarted:
         job_id=job.id,
         status=JobState(job.state),
         status_url=job_url(job.id),
-        result_url=f"{job_url(job.id)}/result" if job.kind == JobKind.DESCRIBE else None,
+        result_url=f"{job_url(job.id)}/result" if job.kind in QUERY_JOBS else None,
     )

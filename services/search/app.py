@@ -53,7 +53,7 @@ def create_app(worker: SearchWorker) -> FastAPI:
             raise
         metrics.answered(answer, time.perf_counter() - started)
         # Written here: the framework would check again what was built a moment ago.
-        return Response(answer.model_dump_json(), media_type="application/json")
+        return Response(answer.as_json(), media_type="application/json")
 
     # On the event loop, as the probes are: it has to answer while every thread is searching.
     @app.get("/status", operation_id="status", response_model=SearchStatus)

@@ -98,7 +98,7 @@ class Blocks:
 class CodedQuery:
     """A query as the codes need it."""
 
-    row: NDArray[np.float32]
+    row: NDArray[np.float32] | NDArray[np.float64]
     """(dimension,) as it was asked, of any length but 0."""
     norm: float
     bits: Words
@@ -117,8 +117,8 @@ class CodedQuery:
     """How far off they are, squared, once they are divided so."""
 
     @classmethod
-    def of(cls, row: NDArray[np.float32], turn: Rotation) -> CodedQuery:
-        rotated = turn.rotate(row[np.newaxis])[0]
+    def of(cls, row: NDArray[np.float32] | NDArray[np.float64], turn: Rotation) -> CodedQuery:
+        rotated = turn.rotate(row[np.newaxis].astype(np.float32, copy=False))[0]
         bits = np.empty(turn.padded // WORD, np.uint64)
         planes = np.empty((PLANES, len(bits)), np.uint64)
         low, step, total, product, square = in_planes(rotated, bits, planes)
@@ -231,6 +231,8 @@ def warm_up() -> None:
         kept=(codes, row),
     )
     query = CodedQuery.of(row, rotation(len(row)))
+    CodedQuery.of(row.astype(np.float64), rotation(len(row)))
+    products_at(np.empty(0, np.uint64), row.astype(np.float64), np.empty(0))
     (first,) = glance(blocks, [query], [np.ones(1, bool)])
     distances_at(np.empty(0, np.uint64), query.bits, np.empty(0, np.int64))
     Refinement(blocks, query, 1, None, lambda _: None).search(first, Budget())
@@ -270,7 +272,8 @@ class Refinement:
 
     def search(self, first: Glance, budget: Budget) -> Found:
         """Go through the levels with what the first one has shown."""
-        self._raise_floor(first.nearest(max(FIRST_LOOK, self._k)))
+        if self._k < int(first.counts.sum()):  # else every row is wanted that is good enough
+            self._raise_floor(first.nearest(max(FIRST_LOOK, self._k)))
         rows = np.flatnonzero(first.distances <= self._limit(0))
         differ = first.distances[rows].astype(np.int64)
         last = len(self._words) - 1

@@ -21,6 +21,7 @@ PLANES = 4  # `weighted_at` is written for so many
 
 Words = NDArray[np.uint64]
 Addresses = NDArray[np.uint64]
+Row = NDArray[np.float32] | NDArray[np.float64]
 
 
 @intrinsic
@@ -123,7 +124,7 @@ def weighted_at(addresses: Addresses, planes: Words, out: NDArray[np.int64]) -> 
 
 
 @compiled(IN_LANES)
-def products_at(addresses: Addresses, query: NDArray[np.float32], out: NDArray[np.float64]) -> None:
+def products_at(addresses: Addresses, query: Row, out: NDArray[np.float64]) -> None:
     """The products of float32 rows with the query, in float64: each term is exact, and the sums
     of equal rows are equal."""
     for number in range(addresses.shape[0]):
@@ -135,7 +136,7 @@ def products_at(addresses: Addresses, query: NDArray[np.float32], out: NDArray[n
 
 
 @compiled(IN_LANES)
-def squares(row: NDArray[np.float32]) -> float:
+def squares(row: Row) -> float:
     """The sum of a row's squares, in float64."""
     total = 0.0
     for i in range(row.shape[0]):

@@ -16,47 +16,63 @@ FLOAT32_MARGIN = 1e-5
 # Picking rows copies them: worth it up to this share of a chunk, else all are multiplied.
 FEW = 0.25
 
+Query = NDArray[np.float32] | NDArray[np.float64]
+Rows = NDArray[np.int64]
+Scores = NDArray[np.float64]
+
 
 def scan(
-    chunks: Sequence[LoadedChunk],
-    query: NDArray[np.float32],
-    k: int,
-    asked: NDArray[np.bool_],
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    chunks: Sequence[LoadedChunk], query: Query, k: int, asked: NDArray[np.bool_]
+) -> tuple[Rows, Scores]:
     """The numbers and cosines of all rows that can be among the k most similar, unsorted.
 
-    `query` is (dimension,) float32, of any length but 0; rows are unit vectors or zero. `asked`,
-    (n,), says which of the chunks' rows, one chunk after the other, may be answered; one at least.
-    Cosines are float64 sums.
+    `query` is (dimension,), of any length but 0; rows are unit vectors or zero. `asked`, (n,), says
+    which of the chunks' rows, one chunk after the other, may be answered; one at least. Cosines are
+    float64 sums.
     """
-    exact_query = query.astype(np.float64)
-    exact_query /= np.linalg.norm(exact_query)
-    rough_query = exact_query.astype(np.float32)
-    rough: list[NDArray[np.float32]] = []
-    numbers: list[NDArray[np.int64]] = []
+    rows, rough = _rough(chunks, query, asked)
+    k = min(k, len(rough))
+    kth = np.partition(rough, len(rough) - k)[len(rough) - k]
+    found = rows[rough >= kth - FLOAT32_MARGIN]
+    return found, exact_scores(chunks, query, found)
+
+
+def scan_at_least(
+    chunks: Sequence[LoadedChunk], query: Query, least: float, asked: NDArray[np.bool_]
+) -> tuple[Rows, Scores]:
+    """The same of all rows whose cosine may be at least that."""
+    rows, rough = _rough(chunks, query, asked)
+    found = rows[rough >= least - FLOAT32_MARGIN]
+    return found, exact_scores(chunks, query, found)
+
+
+def exact_scores(chunks: Sequence[LoadedChunk], query: Query, rows: Rows) -> Scores:
+    """The cosines of these rows."""
+    unit = _unit(query)
+    firsts = np.cumsum([0, *(len(chunk.rows) for chunk in chunks)])
+    of_chunk = np.searchsorted(firsts, rows, side="right") - 1
+    places = zip(of_chunk.tolist(), (rows - firsts[of_chunk]).tolist(), strict=True)
+    return np.array([chunks[chunk].rows[row].astype(np.float64) @ unit for chunk, row in places])
+
+
+def _rough(
+    chunks: Sequence[LoadedChunk], query: Query, asked: NDArray[np.bool_]
+) -> tuple[Rows, NDArray[np.float32]]:
+    """The rows that are asked for, and their cosines in float32."""
+    unit = _unit(query).astype(np.float32)
+    scores: list[NDArray[np.float32]] = []
+    numbers: list[Rows] = []
     first = 0
     for chunk in chunks:
         rows = np.flatnonzero(asked[first : first + len(chunk.rows)])
         if len(rows):
             few = len(rows) <= FEW * len(chunk.rows)
-            rough.append(
-                chunk.rows[rows] @ rough_query if few else (chunk.rows @ rough_query)[rows]
-            )
+            scores.append(chunk.rows[rows] @ unit if few else (chunk.rows @ unit)[rows])
             numbers.append(rows + first)
         first += len(chunk.rows)
-    near = _near(np.concatenate(rough), k)
-    found = np.concatenate(numbers)[near]
-    firsts = np.cumsum([0, *(len(chunk.rows) for chunk in chunks)])
-    of_chunk = np.searchsorted(firsts, found, side="right") - 1
-    places = zip(of_chunk.tolist(), (found - firsts[of_chunk]).tolist(), strict=True)
-    scores = np.array(
-        [chunks[chunk].rows[row].astype(np.float64) @ exact_query for chunk, row in places]
-    )
-    return found, scores
+    return np.concatenate(numbers), np.concatenate(scores)
 
 
-def _near(scores: NDArray[np.float32], k: int) -> NDArray[np.int64]:
-    """Indices of all rows that can be among the exact top k."""
-    k = min(k, len(scores))
-    kth = np.partition(scores, len(scores) - k)[len(scores) - k]
-    return np.flatnonzero(scores >= kth - FLOAT32_MARGIN)
+def _unit(query: Query) -> Scores:
+    exact = query.astype(np.float64)
+    return exact / np.linalg.norm(exact)

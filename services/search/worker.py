@@ -8,9 +8,11 @@ import time
 from collections.abc import Collection
 from uuid import UUID
 
+import numpy as np
+from numpy.typing import NDArray
 from sqlalchemy.exc import SQLAlchemyError
 
-from services.search.answer import Question, answer
+from services.search.answer import Question, answer, weighted_answer
 from services.search.follow import FOLLOWED, advance, wanted_versions
 from services.search.lag import Lags
 from services.search.load import remove_others
@@ -22,11 +24,13 @@ from services.search.together import Glances
 from shared.catalog.away import Outage
 from shared.catalog.generations import GenerationState
 from shared.catalog.session import Catalog
-from shared.errors import Unavailable
+from shared.chunks import Row
+from shared.errors import InvalidRequest, Unavailable
 from shared.objects import ObjectStore
 from shared.search_protocol import SearchRequest, SearchResponse, SearchStatus
 from shared.settings import Settings
 from shared.shards import WHOLE, Shard
+from shared.word_weights.learn import weigh
 
 log = logging.getLogger(__name__)
 
@@ -109,7 +113,11 @@ class SearchWorker:
             most_rows=request.most_rows,
             most_seconds=request.most_seconds,
         )
-        found = answer(snapshot, query, asked, question, self._glances)
+        weighted = _weighted(query, request.word_weights)
+        if weighted is None:
+            found = answer(snapshot, query, asked, question, self._glances)
+        else:
+            found = weighted_answer(snapshot, query, weighted, asked, question, self._glances)
         return SearchResponse(
             hits=found.hits,
             certificate=found.certificate,
@@ -182,3 +190,13 @@ class SearchWorker:
                 with self._swap:
                     self._snapshots = {**self._snapshots, generation_id: new}
             return new
+
+
+def _weighted(row: Row, weights: tuple[float, ...]) -> NDArray[np.float64] | None:
+    """None without weights, and where no word of the query has any: the plain ranking is left."""
+    if not weights:
+        return None
+    try:
+        return weigh(row, weights)
+    except ValueError as error:
+        raise InvalidRequest("word_weights_unfit", f"{error}.") from None

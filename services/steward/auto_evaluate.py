@@ -1,7 +1,9 @@
-"""Evaluating maps that have changed, so that their answers can say "not in this map"."""
+"""Evaluating maps that have changed, so that their answers can say "not in this map"; and then
+learning the weights of their words, where the vocabulary is their own."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 from uuid import UUID
 
@@ -13,39 +15,54 @@ from shared.catalog.figures import figures_of
 from shared.catalog.generations import Generation, active_generation
 from shared.catalog.maps import list_maps, lock_map
 from shared.catalog.session import Catalog
+from shared.catalog.vocabularies import standing_of, why_no_word_weights
 from shared.ids import new_id
 from shared.jobs import Job, JobKind, JobState, Priority
-from shared.jobs.table import UNFINISHED
+from shared.jobs.table import QUERY_JOBS, UNFINISHED
+from shared.word_weights.record import stored_word_weights
 
 SAMPLE_PHOTOS = 300  # enough for a threshold that one in twenty exceeds
-CHANGED_SHARE = 0.2  # of the photos: more, and the last evaluation is out of date
+CHANGED_SHARE = 0.2  # of the photos: more, and what was measured is out of date
 
 
-def evaluate_changed_maps(catalog: Catalog, least_photos: int) -> None:
-    """Queue an evaluation for each map that is at rest and has changed since its last one."""
+@dataclass(frozen=True, slots=True)
+class Due:
+    """A job that a map should have now."""
+
+    kind: JobKind
+    params: dict[str, Any]
+
+
+def evaluate_changed_maps(catalog: Catalog, least_photos: int, word_weights: bool) -> None:
+    """Queue an evaluation for each map that is at rest and has changed since its last one; with
+    `word_weights` also, once that is done, the learning of its weights."""
     if not least_photos:
         return
     with catalog.read() as session:
-        due = [map_.id for map_ in list_maps(session) if _due(session, map_.id, least_photos)]
+        due = [
+            map_.id
+            for map_ in list_maps(session)
+            if _due(session, map_.id, least_photos, word_weights)
+        ]
     for map_id in due:
         with catalog.write() as session:
             lock_map(session, map_id)
-            params = _due(session, map_id, least_photos)
-            if params is None:
+            wanted = _due(session, map_id, least_photos, word_weights)
+            if wanted is None:
                 continue  # another steward was first
             session.add(
                 Job(
                     id=new_id(),
                     map_id=map_id,
-                    kind=JobKind.EVALUATE,
+                    kind=wanted.kind,
                     priority=Priority.EVALUATION,
-                    params=params,
+                    params=wanted.params,
                 )
             )
 
 
-def _due(session: Session, map_id: UUID, least_photos: int) -> dict[str, Any] | None:
-    """The evaluation that the map should have now, if any: the parameters of its job."""
+def _due(session: Session, map_id: UUID, least_photos: int, word_weights: bool) -> Due | None:
+    """The job that the map should have now, if any."""
     generation = active_generation(session, map_id)
     if generation is None or _is_busy(session, map_id):
         return None
@@ -53,10 +70,7 @@ def _due(session: Session, map_id: UUID, least_photos: int) -> dict[str, Any] | 
     if figures.located < least_photos:
         return None
     searchable, queries = figures.searchable, figures.located_queries
-    seen = _seen(session, generation)
-    if seen is not None and not (_differs(searchable, seen[0]) or _differs(queries, seen[1])):
-        return None
-    return {
+    params = {
         "sample": SAMPLE_PHOTOS,
         "seed": 0,
         "automatic": True,
@@ -64,22 +78,57 @@ def _due(session: Session, map_id: UUID, least_photos: int) -> dict[str, Any] | 
         "searchable": searchable,
         "labelled_queries": queries,
     }
+    seen = _evaluated(session, generation)
+    if seen is None or _differs(searchable, seen[0]) or _differs(queries, seen[1]):
+        return Due(JobKind.EVALUATE, params)
+    if not word_weights or not _has_words_of_its_own(session, generation):
+        return None
+    learnt = _learnt(session, generation)
+    if learnt is None or _differs(searchable, learnt):
+        return Due(JobKind.WORD_WEIGHTS, params)
+    return None
 
 
 def _is_busy(session: Session, map_id: UUID) -> bool:
     """Photos are being described, or an evaluation is under way: what is found still changes."""
     unfinished = exists().where(
-        Job.map_id == map_id, Job.state.in_(UNFINISHED), Job.kind != JobKind.DESCRIBE
+        Job.map_id == map_id, Job.state.in_(UNFINISHED), Job.kind.not_in(QUERY_JOBS)
     )
     return bool(session.scalar(select(unfinished)))
 
 
-def _seen(session: Session, generation: Generation) -> tuple[int, int] | None:
-    """How many photos and labelled queries the last evaluation saw, also one that was queued here
-    and came to nothing: its reason is in its job, and it is not tried for ever."""
+def _has_words_of_its_own(session: Session, generation: Generation) -> bool:
+    """Weights of a foreign vocabulary have never helped (benchmarks/RESULTS.md)."""
+    return (
+        standing_of(session, generation) == "own"
+        and why_no_word_weights(session, generation) is None
+    )
+
+
+def _evaluated(session: Session, generation: Generation) -> tuple[int, int] | None:
+    """How many photos and labelled queries the last evaluation saw."""
+    if failed := _came_to_nothing(session, generation, JobKind.EVALUATE):
+        return failed["searchable"], failed["labelled_queries"]
+    last = last_evaluation(session, generation.id)
+    return None if last is None else (last.searchable, last.labelled_queries)
+
+
+def _learnt(session: Session, generation: Generation) -> int | None:
+    """Of how many photos the generation's word weights were learnt."""
+    if failed := _came_to_nothing(session, generation, JobKind.WORD_WEIGHTS):
+        return int(failed["searchable"])
+    record = stored_word_weights(generation.word_weights)
+    return None if record is None else record.searchable
+
+
+def _came_to_nothing(
+    session: Session, generation: Generation, kind: JobKind
+) -> dict[str, Any] | None:
+    """The parameters of the map's last job of this kind, if it was queued here and came to nothing:
+    its reason is in the job, and it is not tried for ever."""
     job = session.scalar(
         select(Job)
-        .where(Job.map_id == generation.map_id, Job.kind == JobKind.EVALUATE)
+        .where(Job.map_id == generation.map_id, Job.kind == kind)
         .order_by(Job.id.desc())
         .limit(1)
     )
@@ -87,10 +136,10 @@ def _seen(session: Session, generation: Generation) -> tuple[int, int] | None:
         job is not None
         and job.state in (JobState.FAILED, JobState.CANCELLED)
         and job.params.get("generation_id") == str(generation.id)
+        and "searchable" in job.params
     ):
-        return job.params["searchable"], job.params["labelled_queries"]
-    last = last_evaluation(session, generation.id)
-    return None if last is None else (last.searchable, last.labelled_queries)
+        return job.params
+    return None
 
 
 def _differs(now: int, then: int) -> bool:

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable
 from datetime import timedelta
 from uuid import UUID
 
-from sqlalchemy import and_, delete, or_, select, update
+from sqlalchemy import and_, delete, exists, or_, select, update
 from sqlalchemy.orm import Session
 
 from shared.catalog.base import db_now, db_now_plus
@@ -23,22 +23,26 @@ from shared.catalog.maps import bump_version, lock_map
 from shared.catalog.photos import Photo
 from shared.catalog.session import Catalog
 from shared.catalog.vocabularies import Vocabulary
+from shared.catalog.whitenings import StoredWhitening
 from shared.chunks import codes_key, delete_chunk, manifest_key
 from shared.jobs.batches import BatchItem
-from shared.jobs.table import MODEL_CHANGES, UNFINISHED, Job, JobKind, JobState
+from shared.jobs.table import MODEL_CHANGES, QUERY_JOBS, UNFINISHED, Job, JobKind, JobState
 from shared.objects import ObjectStore
 from shared.objects.keys import (
     ARCHIVES,
+    FEATURES,
     INCOMING,
     ORIGINALS,
     QUERIES,
     THUMBNAILS,
     VOCABULARIES,
+    WHITENINGS,
     WORK,
     incoming_key,
     is_original_key,
-    query_key,
-    query_vector_key,
+    keys_of_query,
+    local_features_key,
+    local_features_prefix,
     thumbnail_key,
 )
 from shared.settings import Settings
@@ -63,7 +67,8 @@ def collect_superseded_chunks(catalog: Catalog, store: ObjectStore, grace_second
 
 
 def collect_ended_generations(catalog: Catalog, store: ObjectStore, grace_seconds: float) -> None:
-    """Generations that no longer answer: their rows, chunks and unfinished photos' jobs.
+    """Generations that no longer answer: their rows, chunks, local features and unfinished photos'
+    jobs.
 
     The generation's own row stays as history until its map goes.
     """
@@ -90,6 +95,9 @@ def collect_ended_generations(catalog: Catalog, store: ObjectStore, grace_second
     if given_up:
         with catalog.write() as session:
             session.execute(delete(Job).where(Job.id.in_(given_up)))
+    for generation_id in {chunk.generation_id for chunk in ended}:
+        for info in list(store.list(local_features_prefix(generation_id))):
+            store.delete(info.key)
     for chunk in ended:
         delete_chunk(store, chunk.object_key)
     if ended:
@@ -99,23 +107,61 @@ def collect_ended_generations(catalog: Catalog, store: ObjectStore, grace_second
             session.execute(delete(Chunk).where(Chunk.id.in_(chunk_ids)))
 
 
+def collect_whitenings(catalog: Catalog, store: ObjectStore, grace_seconds: float) -> None:
+    """Whitenings whose generations have all ended: no model change takes one up again."""
+    in_use = exists().where(
+        Generation.whitening_id == StoredWhitening.id,
+        or_(Generation.ended_at.is_(None), Generation.ended_at >= db_now_plus(-grace_seconds)),
+    )
+    with catalog.read() as session:
+        ended = session.scalars(select(StoredWhitening).where(~in_use).limit(AT_ONCE)).all()
+    for whitening in ended:
+        store.delete(whitening.object_key)
+    if ended:
+        ids = [whitening.id for whitening in ended]
+        with catalog.write() as session:
+            session.execute(
+                update(Generation)
+                .where(Generation.whitening_id.in_(ids))
+                .values(whitening_id=None)
+                .execution_options(synchronize_session=False)
+            )
+            session.execute(delete(StoredWhitening).where(StoredWhitening.id.in_(ids)))
+
+
 def collect_deleted_photos(catalog: Catalog, store: ObjectStore, grace_seconds: float) -> None:
-    """The bytes of deleted photos at once; their rows after the grace, when every search worker
-    has seen the deletion and merging has dropped their descriptors."""
+    """The bytes and local features of deleted photos at once; their rows after the grace, when
+    every search worker has seen the deletion and merging has dropped their descriptors."""
     with catalog.read() as session:
         photos = session.scalars(
             select(Photo)
             .where(Photo.deleted_at.is_not(None), Photo.object_key != "")
             .limit(AT_ONCE)
         ).all()
+        described_in = _generations_with_rows(session, {photo.map_id for photo in photos})
     for photo in photos:
         store.delete(photo.object_key)
         store.delete(thumbnail_key(photo.id))
+        for generation_id in described_in[photo.map_id]:
+            store.delete(local_features_key(generation_id, photo.id))
     photo_ids = [photo.id for photo in photos]
     with catalog.write() as session:
         if photo_ids:
             session.execute(update(Photo).where(Photo.id.in_(photo_ids)).values(object_key=""))
         _forget_photos(session, grace_seconds)
+
+
+def _generations_with_rows(session: Session, map_ids: set[UUID]) -> dict[UUID, list[UUID]]:
+    """Of each map the generations that have chunks: of the others nothing is kept."""
+    found: dict[UUID, list[UUID]] = {map_id: [] for map_id in map_ids}
+    generations = session.execute(
+        select(Generation.map_id, Generation.id).where(
+            Generation.map_id.in_(map_ids), exists().where(Chunk.generation_id == Generation.id)
+        )
+    )
+    for map_id, generation_id in generations:
+        found[map_id].append(generation_id)
+    return found
 
 
 def _forget_photos(session: Session, grace_seconds: float) -> None:
@@ -136,16 +182,17 @@ def _forget_photos(session: Session, grace_seconds: float) -> None:
 
 
 def collect_queries(catalog: Catalog, store: ObjectStore, ttl_seconds: float) -> None:
-    """Query photos that are not stored, with their descriptors and jobs, after QUERY_TTL."""
+    """Query photos that are not stored, with their descriptors, comparisons and jobs, after
+    QUERY_TTL."""
     with catalog.read() as session:
         job_ids = session.scalars(
             select(Job.id)
-            .where(Job.kind == JobKind.DESCRIBE, Job.created_at < db_now_plus(-ttl_seconds))
+            .where(Job.kind.in_(QUERY_JOBS), Job.created_at < db_now_plus(-ttl_seconds))
             .limit(AT_ONCE)
         ).all()
     for job_id in job_ids:
-        store.delete(query_key(job_id))
-        store.delete(query_vector_key(job_id))
+        for key in keys_of_query(job_id):
+            store.delete(key)
     if job_ids:
         with catalog.write() as session:
             session.execute(delete(Job).where(Job.id.in_(job_ids)))
@@ -229,6 +276,7 @@ def collect(catalog: Catalog, store: ObjectStore, settings: Settings) -> None:
     """Everything above but the orphans, which need a walk over the whole store."""
     collect_superseded_chunks(catalog, store, settings.superseded_grace_seconds)
     collect_ended_generations(catalog, store, settings.retired_grace_seconds)
+    collect_whitenings(catalog, store, settings.retired_grace_seconds)
     collect_deleted_photos(catalog, store, settings.retired_grace_seconds)
     collect_queries(catalog, store, settings.query_ttl_seconds)
     collect_work(catalog, store)
@@ -288,10 +336,33 @@ def _known_vocabularies(session: Session, keys: list[str]) -> Iterable[str]:
     return [*stored, *(params["object_key"] for params in waiting)]
 
 
+def _known_whitenings(session: Session, keys: list[str]) -> Iterable[str]:
+    return session.scalars(
+        select(StoredWhitening.object_key).where(StoredWhitening.object_key.in_(keys))
+    )
+
+
 def _known_queries(session: Session, keys: list[str]) -> Iterable[str]:
-    job_ids = _ids(key.removeprefix(QUERIES).removesuffix(".npy") for key in keys)
+    job_ids = _ids(key.removeprefix(QUERIES).partition(".")[0] for key in keys)
     known = session.scalars(select(Job.id).where(Job.id.in_(job_ids)))
-    return [key for job_id in known for key in (query_key(job_id), query_vector_key(job_id))]
+    return [key for job_id in known for key in keys_of_query(job_id)]
+
+
+def _known_local_features(session: Session, keys: list[str]) -> Iterable[str]:
+    """Those of live photos in generations that still have their descriptors."""
+    named = {key: key.removeprefix(FEATURES).removesuffix(".npy").split("/") for key in keys}
+    generation_ids = _ids(names[0] for names in named.values())
+    photo_ids = _ids(names[-1] for names in named.values())
+    known = session.execute(
+        select(Descriptor.generation_id, Descriptor.photo_id)
+        .join(Photo, Photo.id == Descriptor.photo_id)
+        .where(
+            Descriptor.generation_id.in_(generation_ids),
+            Descriptor.photo_id.in_(photo_ids),
+            Photo.deleted_at.is_(None),
+        )
+    )
+    return [local_features_key(generation_id, photo_id) for generation_id, photo_id in known]
 
 
 def _ids(names: Iterable[str]) -> set[UUID]:
@@ -310,5 +381,7 @@ REFERENCED: dict[str, Callable[[Session, list[str]], Iterable[str]]] = {
     THUMBNAILS: _known_thumbnails,
     "chunks/": _known_chunks,
     VOCABULARIES: _known_vocabularies,
+    WHITENINGS: _known_whitenings,
     QUERIES: _known_queries,
+    FEATURES: _known_local_features,
 }

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import time
+from itertools import chain, islice
 from uuid import UUID
 
 from sqlalchemy import delete, select
@@ -22,16 +23,17 @@ from shared.catalog.photos import Photo
 from shared.catalog.searches import Search
 from shared.catalog.session import Catalog
 from shared.catalog.vocabularies import Vocabulary
+from shared.catalog.whitenings import StoredWhitening
 from shared.chunks import delete_chunk
 from shared.jobs.batches import BatchItem
 from shared.jobs.finish import cancel_all
-from shared.jobs.table import Job, JobKind
+from shared.jobs.table import QUERY_JOBS, Job, JobKind
 from shared.objects import ObjectStore
 from shared.objects.keys import (
     ORIGINALS,
     incoming_key,
-    query_key,
-    query_vector_key,
+    keys_of_query,
+    local_features_prefix,
     thumbnail_key,
 )
 
@@ -56,7 +58,14 @@ def _step(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
     """Remove the next rows of the map with their objects; True when the map is gone."""
     with catalog.write() as session:
         cancel_all(session, Job.map_id == map_id)
-    for some_were_left in (_chunks, _queries, _batches, _photos, _direct_uploads):
+    for some_were_left in (
+        _chunks,
+        _queries,
+        _batches,
+        _photos,
+        _direct_uploads,
+        _local_features,  # last: it asks the store, whatever is there
+    ):
         if some_were_left(catalog, store, map_id):
             return False
     _vocabularies(catalog, store, map_id)
@@ -67,6 +76,7 @@ def _step(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
         session.execute(delete(Job).where(Job.map_id == map_id))
         session.execute(delete(Generation).where(Generation.map_id == map_id))
         session.execute(delete(Vocabulary).where(Vocabulary.map_id == map_id))
+        session.execute(delete(StoredWhitening).where(StoredWhitening.map_id == map_id))
         session.execute(delete(Map).where(Map.id == map_id))
     log.info("the deleted map %s is gone", map_id)
     return True
@@ -93,11 +103,11 @@ def _chunks(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
 def _queries(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
     with catalog.read() as session:
         ids = session.scalars(
-            select(Job.id).where(Job.map_id == map_id, Job.kind == JobKind.DESCRIBE).limit(AT_ONCE)
+            select(Job.id).where(Job.map_id == map_id, Job.kind.in_(QUERY_JOBS)).limit(AT_ONCE)
         ).all()
     for job_id in ids:
-        store.delete(query_key(job_id))
-        store.delete(query_vector_key(job_id))
+        for key in keys_of_query(job_id):
+            store.delete(key)
     if ids:
         with catalog.write() as session:
             session.execute(delete(Job).where(Job.id.in_(ids)))
@@ -163,8 +173,20 @@ def _direct_uploads(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
     return bool(ids)
 
 
+def _local_features(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
+    with catalog.read() as session:
+        ids = session.scalars(select(Generation.id).where(Generation.map_id == map_id)).all()
+    kept = chain.from_iterable(store.list(local_features_prefix(id_)) for id_ in ids)
+    keys = [info.key for info in islice(kept, AT_ONCE)]
+    for key in keys:
+        store.delete(key)
+    return bool(keys)
+
+
 def _vocabularies(catalog: Catalog, store: ObjectStore, map_id: UUID) -> None:
-    """Only the objects, and those of imports that never came to a row: the rows are few."""
+    """Only the objects, also those of imports that never came to a row, and those of whitenings:
+    the rows are few.
+    """
     with catalog.read() as session:
         keys = list(
             session.scalars(select(Vocabulary.object_key).where(Vocabulary.map_id == map_id))
@@ -173,5 +195,8 @@ def _vocabularies(catalog: Catalog, store: ObjectStore, map_id: UUID) -> None:
             select(Job.params).where(Job.map_id == map_id, Job.kind == JobKind.IMPORT)
         )
         keys += [params["object_key"] for params in imports]
+        keys += session.scalars(
+            select(StoredWhitening.object_key).where(StoredWhitening.map_id == map_id)
+        )
     for key in keys:
         store.delete(key)

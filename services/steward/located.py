@@ -9,6 +9,7 @@ from datetime import datetime
 from uuid import UUID
 
 import numpy as np
+from numpy.typing import NDArray
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
@@ -33,23 +34,33 @@ class LocatedPhotos:
     def __init__(self, photos: Sequence[Located]) -> None:
         self.photos = photos
         self._labels = Counter(p.spot.place for p in photos if p.spot.place is not None)
-        spots = np.array(
-            [(p.spot.latitude, p.spot.longitude) for p in photos if p.spot.latitude is not None],
-            dtype=np.float64,
+        on_earth = sorted(
+            (p for p in photos if p.spot.latitude is not None), key=lambda p: p.spot.latitude or 0.0
+        )
+        self._ids = [photo.photo_id for photo in on_earth]
+        self._spots = np.array(
+            [(p.spot.latitude, p.spot.longitude) for p in on_earth], dtype=np.float64
         ).reshape(-1, 2)
-        self._spots = spots[np.argsort(spots[:, 0], kind="stable")]
 
     def showing(self, spot: Spot, radius_m: float) -> int:
         """How many photos lie within `radius_m` of the spot, or bear its label: the larger count,
         so that one that does both counts once."""
         labelled = self._labels[spot.place] if spot.place is not None else 0
+        return max(labelled, len(self._within(spot, radius_m)))
+
+    def within(self, spot: Spot, radius_m: float) -> list[UUID]:
+        """The photos that lie within `radius_m` of the spot; none where it has no coordinates."""
+        return [self._ids[number] for number in self._within(spot, radius_m).tolist()]
+
+    def _within(self, spot: Spot, radius_m: float) -> NDArray[np.int64]:
         if spot.latitude is None or spot.longitude is None:
-            return labelled
+            return np.empty(0, np.int64)
         south, north = latitude_band(spot.latitude, radius_m)
         first, last = np.searchsorted(self._spots[:, 0], [south, north])
         near = self._spots[first : last + 1]
         away = distances_m(spot.latitude, spot.longitude, near[:, 0], near[:, 1])
-        return max(labelled, int((away <= radius_m).sum()))
+        found: NDArray[np.int64] = first + np.flatnonzero(away <= radius_m)
+        return found
 
 
 def read_located(

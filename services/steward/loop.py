@@ -79,7 +79,9 @@ class Steward:
             Duty(
                 "evaluate changed maps",
                 2.0,
-                lambda: evaluate_changed_maps(catalog, settings.auto_evaluate_photos),
+                lambda: evaluate_changed_maps(
+                    catalog, settings.auto_evaluate_photos, settings.word_weights
+                ),
             ),
             Duty(
                 "collect orphans",

@@ -26,6 +26,7 @@ from shared.catalog.generations import (
 from shared.catalog.maps import Map, bump_version, list_maps, lock_map
 from shared.catalog.photos import Photo, PhotoRole
 from shared.catalog.session import Catalog
+from shared.catalog.whitenings import StoredWhitening
 from shared.errors import Conflict
 from shared.ids import new_id
 from shared.jobs import Hints, Job, JobKind, JobState, Priority
@@ -106,11 +107,11 @@ def _advance(session: Session, job: Job, generation_id: UUID) -> int:
             & (Job.created_at <= generation.created_at)
         )
     if queued or session.scalar(select(exists().where(open_jobs, Job.state.in_(UNFINISHED)))):
-        sampled = int(job.params.get("sampled", 0))
+        before = int(job.params.get("done_before", 0))
         done = about_described(session, generation_id)
         # Also when it was complete before: photos have come since.
         job.waiting_for, job.stage, job.awaited = WaitingFor.DESCRIPTORS, "describe", None
-        job.progress_done = max(0, min(sampled + done, job.progress_total - 1))
+        job.progress_done = max(0, min(before + done, job.progress_total - 1))
         return queued
     failed = _count(session, open_jobs & (Job.state == JobState.FAILED))
     if generation.state == GenerationState.BUILDING:
@@ -120,12 +121,17 @@ def _advance(session: Session, job: Job, generation_id: UUID) -> int:
     job.progress_failed = failed
     job.progress_total = max(job.progress_total, failed)
     photos = about_described(session, generation_id)
+    whitening = None
+    if generation.whitening_id is not None:
+        whitening = session.get_one(StoredWhitening, generation.whitening_id).in_short()
     succeed(
         job,
         {
             "generation_id": str(generation_id),
             "vocabulary_id": str(generation.vocabulary_id) if generation.vocabulary_id else None,
             "clusters": generation.spec["clusters"],
+            "dimension": generation.dimension,
+            "pca": whitening,
             "photos": photos,
             "failed": failed,
         },

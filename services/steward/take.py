@@ -31,16 +31,16 @@ class Stopped(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Taker:
-    """Takes jobs of one kind; `do` does one, or a slice of it, and ends or releases it itself."""
+    """Takes jobs of some kinds; `do` does one, or a slice of it, and ends or releases it itself."""
 
     catalog: Catalog
     settings: Settings
     name: str
-    kind: JobKind
+    kinds: tuple[JobKind, ...]
 
     def run(self, stop: threading.Event, do: Callable[[Job], None]) -> None:
         """Take jobs until `stop` is set."""
-        outage = Outage(f"steward's {self.kind} worker")
+        outage = Outage(f"steward's {' and '.join(self.kinds)} worker")
         while not stop.is_set():
             try:
                 done = self.take_next(do)
@@ -56,7 +56,7 @@ class Taker:
         lease_seconds = self.settings.lease_seconds
         with self.catalog.write() as session:
             jobs = claim(
-                session, worker=self.name, limit=1, lease_seconds=lease_seconds, kinds=[self.kind]
+                session, worker=self.name, limit=1, lease_seconds=lease_seconds, kinds=self.kinds
             )
         if not jobs:
             return False

@@ -6,6 +6,7 @@ old; a row that no descriptor points at is dead and is dropped at the next mergi
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from datetime import datetime
 from uuid import UUID
 
@@ -31,6 +32,8 @@ from shared.ids import new_id
 
 # Rows that are counted whenever someone asks: some 10 ms.
 COUNTED_NOW = 10_000
+
+ASKED_AT_ONCE = 1000  # photos named in one statement
 
 
 class Chunk(Base):
@@ -94,6 +97,28 @@ def descriptor_of(
         .where(Descriptor.generation_id == generation_id, Descriptor.photo_id == photo_id)
     ).one_or_none()
     return None if found is None else (found[0], found[1])
+
+
+def rows_of(
+    session: Session, generation_id: UUID, photo_ids: Sequence[UUID]
+) -> dict[str, list[tuple[int, UUID]]]:
+    """Where the photos' descriptors in the generation lie: (row, photo) by row, of each chunk's
+    object; photos without one are left out."""
+    found: dict[str, list[tuple[int, UUID]]] = {}
+    for begin in range(0, len(photo_ids), ASKED_AT_ONCE):
+        located = session.execute(
+            select(Chunk.object_key, Descriptor.row, Descriptor.photo_id)
+            .join(Chunk, Chunk.id == Descriptor.chunk_id)
+            .where(
+                Descriptor.generation_id == generation_id,
+                Descriptor.photo_id.in_(photo_ids[begin : begin + ASKED_AT_ONCE]),
+            )
+        )
+        for object_key, row, photo_id in located:
+            found.setdefault(object_key, []).append((row, photo_id))
+    for rows in found.values():
+        rows.sort()
+    return found
 
 
 def live_chunks(session: Session, generation_id: UUID) -> list[Chunk]:

@@ -15,6 +15,7 @@ from sqlalchemy import BigInteger, ForeignKey, Index, Integer, String, Uuid, sel
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
 from shared.catalog.base import Base, JsonValue, UtcDateTime, db_now
+from shared.errors import NotFound
 from shared.ids import new_id
 
 
@@ -28,8 +29,9 @@ class GenerationState(StrEnum):
 class Generation(Base):
     """`spec` is everything that decides a descriptor's value; rows of two specs never mix.
 
-    `calibration` is what its evaluations have learnt of its scores (`shared.estimate`). New chunks
-    go into `open_slot`, which holds `open_slot_rows` rows so far.
+    `calibration` is what its evaluations have learnt of its scores (`shared.estimate`),
+    `word_weights` what the map's places have taught of its words (`shared.word_weights.record`).
+    New chunks go into `open_slot`, which holds `open_slot_rows` rows so far.
     """
 
     __tablename__ = "generations"
@@ -45,7 +47,9 @@ class Generation(Base):
     vocabulary_id: Mapped[UUID | None] = mapped_column(
         Uuid, ForeignKey("vocabularies.id"), index=True
     )
+    whitening_id: Mapped[UUID | None] = mapped_column(Uuid, ForeignKey("whitenings.id"), index=True)
     calibration: Mapped[dict[str, Any] | None] = mapped_column(JsonValue)
+    word_weights: Mapped[dict[str, Any] | None] = mapped_column(JsonValue)
     open_slot: Mapped[int] = mapped_column(Integer, default=0)
     open_slot_rows: Mapped[int] = mapped_column(Integer, default=0)
     created_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())
@@ -55,6 +59,14 @@ class Generation(Base):
     # workers have to have loaded that before it is switched in.
     complete_version: Mapped[int | None] = mapped_column(BigInteger)
     complete_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
+
+    @property
+    def pca_from(self) -> int | None:
+        """The dimension of its descriptors before PCA; None without. Known of a generation whose
+        whitening is gone, too.
+        """
+        whitening = self.spec.get("whitening")
+        return int(whitening["from_dimension"]) if whitening else None
 
     __table_args__ = (
         # One model change at a time: two would describe every photo three times over.
@@ -91,6 +103,20 @@ def building_generation(session: Session, map_id: UUID) -> Generation | None:
             Generation.map_id == map_id, Generation.state == GenerationState.BUILDING
         )
     )
+
+
+def get_generation(session: Session, map_id: UUID, generation_id: UUID) -> Generation:
+    """A generation of the map; 404 when there is none."""
+    found = session.scalar(
+        select(Generation).where(Generation.id == generation_id, Generation.map_id == map_id)
+    )
+    if found is None:
+        raise NotFound(
+            "generation_not_found",
+            f"There is no generation {generation_id} in this map.",
+            generation_id=str(generation_id),
+        )
+    return found
 
 
 def lock_generation(session: Session, generation_id: UUID) -> Generation:

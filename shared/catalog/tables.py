@@ -14,6 +14,7 @@ from shared.catalog.schema_compatibility import SchemaCompatibility
 from shared.catalog.search_workers import RegisteredWorker
 from shared.catalog.searches import Search
 from shared.catalog.vocabularies import Vocabulary
+from shared.catalog.whitenings import StoredWhitening
 from shared.jobs.batches import BatchItem
 from shared.jobs.table import Job
 
@@ -34,5 +35,6 @@ __all__ = [
     "RegisteredWorker",
     "SchemaCompatibility",
     "Search",
+    "StoredWhitening",
     "Vocabulary",
 ]

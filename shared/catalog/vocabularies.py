@@ -14,6 +14,7 @@ from shared.catalog.base import Base, JsonValue, UtcDateTime, db_now
 from shared.catalog.generations import Generation
 from shared.errors import NotFound
 from shared.ids import new_id
+from shared.recipes import PARITY_PREPROCESSINGS
 
 
 class VocabularyOrigin(StrEnum):
@@ -51,6 +52,25 @@ def standing_of(session: Session, generation: Generation) -> str:
     if generation.vocabulary_id is None:
         return "none"
     return session.get_one(Vocabulary, generation.vocabulary_id).standing
+
+
+def why_no_word_weights(session: Session, generation: Generation) -> str | None:
+    """Why its words can't be weighed, as a clause; None where they can.
+
+    A weight belongs to one block of the descriptor, as long as a local feature. PCA mixes the
+    blocks, which its shorter descriptors show.
+    """
+    if generation.vocabulary_id is None:
+        return "its extractor uses no vocabulary"
+    preprocessing = generation.spec["preprocessing"]["name"]
+    if preprocessing in PARITY_PREPROCESSINGS:
+        return f"with {preprocessing} it is to rank as its authors' code does"
+    vocabulary = session.get_one(Vocabulary, generation.vocabulary_id)
+    if "pca" in generation.spec or (
+        vocabulary.clusters * vocabulary.dimension != generation.dimension
+    ):
+        return "its descriptors are projected, and no longer made of words"
+    return None
 
 
 def add_vocabulary(

@@ -16,7 +16,7 @@ VOTERS = 10  # of them, those that may agree with the first
 
 @dataclass(frozen=True, slots=True)
 class Ranked:
-    """One photo of a ranking: its cosine and where it was taken."""
+    """One photo of a ranking: the score that ranks it (a cosine) and where it was taken."""
 
     score: float
     spot: Spot

@@ -12,7 +12,7 @@ from shared.catalog.base import Condition, db_now, db_now_plus
 from shared.ids import new_id
 from shared.jobs.table import (
     EXTRACTOR_JOBS,
-    MODEL_CHANGES,
+    LONE_JOBS,
     Job,
     JobKind,
     JobState,
@@ -35,10 +35,10 @@ def claim(
     """Up to `limit` claimable jobs of one kind, map and generation, leased under one fresh token.
 
     The first by (priority, age) decides which; jobs that other workers hold are passed over
-    (`FOR UPDATE SKIP LOCKED`; SQLite has one writer). A job marked `alone` and a model change come
-    as a batch of one. Jobs below `least_priority` are left, and without `alone` those that have to
-    be tried alone. A worker that will first do what can't harm it (read, decode) says so with
-    `begun=False`, and calls `begin` after that.
+    (`FOR UPDATE SKIP LOCKED`; SQLite has one writer). A job marked `alone` and one of LONE_JOBS
+    come as a batch of one. Jobs below `least_priority` are left, and without `alone` those that
+    have to be tried alone. A worker that will first do what can't harm it (read, decode) says so
+    with `begun=False`, and calls `begin` after that.
     """
     order = (Job.priority.desc(), Job.id)
     wanted = _wanted(kinds, least_priority, alone)
@@ -48,7 +48,7 @@ def claim(
     if head is None:
         return []
     batch = [head]
-    if not head.alone and head.kind not in MODEL_CHANGES and limit > 1:
+    if not head.alone and head.kind not in LONE_JOBS and limit > 1:
         batch += session.scalars(
             select(Job)
             .where(

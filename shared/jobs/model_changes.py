@@ -1,9 +1,10 @@
-"""Model changes: a new vocabulary for a map, and the generation made with it.
+"""Model changes: a new vocabulary or PCA for a map, and the generation made with it.
 
 ```
 POST /vocabularies ─> FIT     ─ sample ─ cluster ─┐
      .../import    ─> IMPORT  ─ check ────────────┼─> begin_generation ─> waits for descriptors
-POST /generations  ─> SWITCH  ────────────────────┘        │
+POST /generations  ─> SWITCH  ────────────────────┤        │
+                   ─> PCA     ─ gather ─ reduce ──┘        │
                                                            v
        every live photo is in it, or its failure is recorded: the steward switches and succeeds
 ```

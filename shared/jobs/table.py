@@ -70,21 +70,30 @@ class JobKind(StrEnum):
     INDEX = "index"  # describe a stored photo into the active generation
     REINDEX = "reindex"  # describe a stored photo into one generation that is being built
     DESCRIBE = "describe"  # describe a query photo that is not stored
+    COMPARE = "compare"  # look closely at what a search has found (`shared.comparison`)
     FIT = "fit"  # learn a vocabulary from the map's photos and switch to it
     IMPORT = "import_vocabulary"  # check a vocabulary file and switch to it
     SWITCH = "switch"  # switch to a vocabulary that the map already has
+    PCA = "pca"  # fit PCA whitening on the map's descriptors and switch to shorter ones
     EVALUATE = "evaluate"  # ask the map about photos whose place is known, and count
+    WORD_WEIGHTS = "word_weights"  # learn which words of its vocabulary tell its places apart
     BATCH = "batch"  # bring in many photos; each has a job of its own (`shared.jobs.batches`)
 
 
-MODEL_CHANGES = (JobKind.FIT, JobKind.IMPORT, JobKind.SWITCH)
+MODEL_CHANGES = (JobKind.FIT, JobKind.IMPORT, JobKind.SWITCH, JobKind.PCA)
+
+# Someone waits for their result, which is kept for QUERY_TTL_SECONDS.
+QUERY_JOBS = (JobKind.DESCRIBE, JobKind.COMPARE)
 
 # Who takes what: extractors need photos and a backbone, the steward only the search tier.
-EXTRACTOR_JOBS = (JobKind.INDEX, JobKind.REINDEX, JobKind.DESCRIBE, *MODEL_CHANGES)
-STEWARD_JOBS = (JobKind.EVALUATE, JobKind.BATCH)
+EXTRACTOR_JOBS = (JobKind.INDEX, JobKind.REINDEX, *QUERY_JOBS, *MODEL_CHANGES)
+STEWARD_JOBS = (JobKind.EVALUATE, JobKind.WORD_WEIGHTS, JobKind.BATCH)
 
 # Done in slices: between two of them they are running, and no one holds their lease.
 SLICED_JOBS = (*MODEL_CHANGES, JobKind.BATCH)
+
+# Claimed one at a time: each is as much work as a batch, or changes what the next one finds.
+LONE_JOBS = (*MODEL_CHANGES, JobKind.COMPARE)
 
 
 class Priority(IntEnum):
@@ -163,7 +172,7 @@ class Job(Base):
         # What is listed when no kind is asked for; a model change has very many others.
         partial_index("ix_jobs_map_listed", "map_id", "id", only=kind != JobKind.REINDEX),
         partial_index("ix_jobs_finished", "finished_at", only=finished_at.is_not(None)),
-        partial_index("ix_jobs_queries", "created_at", only=kind == JobKind.DESCRIBE),
+        partial_index("ix_jobs_asked", "created_at", only=kind.in_(QUERY_JOBS)),
         Index("ix_jobs_map_state", "map_id", "state", "id"),
         Index("ix_jobs_map_kind", "map_id", "kind", "id"),
         Index("ix_jobs_kind_waiting", "kind", "waiting_for"),

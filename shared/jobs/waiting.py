@@ -10,7 +10,7 @@ from sqlalchemy.orm import Session
 
 from shared.catalog.base import db_now_plus
 from shared.catalog.maps import Map
-from shared.jobs.table import UNFINISHED, Job, JobKind, Priority
+from shared.jobs.table import QUERY_JOBS, UNFINISHED, Job, JobKind, Priority
 
 RATE_SECONDS = 60.0
 MOST_FINISHED = 100_000  # counted in RATE_SECONDS at most: nobody is faster
@@ -26,7 +26,7 @@ class Waiting:
     of_maps: Mapping[str, int]
     """Name of a map -> its jobs, without queries."""
     queries: int
-    """Query photos, of all maps."""
+    """Query photos and comparisons, of all maps."""
     finished_per_second: float
     """Uploads and queries that ended of late, well or not."""
 
@@ -42,7 +42,7 @@ def look_at_queue(session: Session, most: int) -> Waiting:
     finished = (
         select(Job.id)
         .where(
-            Job.kind.in_((JobKind.INDEX, JobKind.DESCRIBE)),
+            Job.kind.in_((JobKind.INDEX, *QUERY_JOBS)),
             Job.finished_at > db_now_plus(-RATE_SECONDS),
         )
         .limit(MOST_FINISHED)

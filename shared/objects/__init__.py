@@ -10,7 +10,10 @@
 | `thumbnails/<photo>` | its thumbnail, JPEG |
 | `chunks/<generation>/<chunk>.npy`, `.json`, `.codes` | descriptor rows, what they are, codes |
 | `vocabularies/<uuid>.npy` | VLAD centres |
+| `whitenings/<uuid>.safetensors` | PCA whitenings |
 | `queries/<job>`, `queries/<job>.npy` | a query photo that is not stored, and its descriptor |
+| `queries/<job>.json` | what a comparison has come to |
+| `features/<generation>/<photo>.npy` | a photo's local features, with LOCAL_FEATURES=keep |
 | `work/<job>/...` | what a sliced job keeps between its slices |
 | `imports/...` (IMPORT_PREFIX) | what others have put there; it is only read |
 """

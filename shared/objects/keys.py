@@ -9,13 +9,25 @@ from shared.ids import new_id
 
 INCOMING = "incoming/"
 ARCHIVES = "archives/"
+FEATURES = "features/"
 ORIGINALS = "originals/"
 QUERIES = "queries/"
 THUMBNAILS = "thumbnails/"
 VOCABULARIES = "vocabularies/"
+WHITENINGS = "whitenings/"
 WORK = "work/"
 
-OWN = (ARCHIVES, "chunks/", ORIGINALS, QUERIES, THUMBNAILS, VOCABULARIES, WORK)
+OWN = (
+    ARCHIVES,
+    "chunks/",
+    FEATURES,
+    ORIGINALS,
+    QUERIES,
+    THUMBNAILS,
+    VOCABULARIES,
+    WHITENINGS,
+    WORK,
+)
 
 
 def is_key(key: str) -> bool:
@@ -85,8 +97,31 @@ def query_vector_key(job_id: UUID) -> str:
     return f"{QUERIES}{job_id}.npy"
 
 
+def comparison_key(job_id: UUID) -> str:
+    """What a comparison has come to: the JSON of a `shared.comparison.Compared`."""
+    return f"{QUERIES}{job_id}.json"
+
+
+def keys_of_query(job_id: UUID) -> tuple[str, ...]:
+    """All that lies there of a query, or of a comparison."""
+    return query_key(job_id), query_vector_key(job_id), comparison_key(job_id)
+
+
+def local_features_prefix(generation_id: UUID) -> str:
+    """Where the local features of a generation's photos lie."""
+    return f"{FEATURES}{generation_id}/"
+
+
+def local_features_key(generation_id: UUID, photo_id: UUID) -> str:
+    return f"{local_features_prefix(generation_id)}{photo_id}.npy"
+
+
 def new_vocabulary_key() -> str:
     return f"{VOCABULARIES}{new_id()}.npy"
+
+
+def new_whitening_key() -> str:
+    return f"{WHITENINGS}{new_id()}.safetensors"
 
 
 def work_key(job_id: UUID, name: str) -> str:

@@ -30,8 +30,8 @@ def merge(answers: Sequence[SearchResponse], k: int, away: Iterable[Shard] = ())
 
 
 def _first(k: int, answers: Sequence[SearchResponse]) -> list[Hit]:
-    """Each answer's hits are sorted already: by score, highest first, ties by photo id."""
-    merged = heapq.merge(*(a.hits for a in answers), key=lambda hit: (-hit.score, hit.photo_id))
+    """Each answer's hits are sorted already: by what ranks them, best first, ties by photo id."""
+    merged = heapq.merge(*(a.hits for a in answers), key=lambda hit: (-hit.ranked_by, hit.photo_id))
     found: dict[UUID, Hit] = {}
     for hit in merged:
         if len(found) == k:

@@ -34,8 +34,7 @@ def ask(
         "POST",
         f"{url}/search",
         timeout_seconds,
-        # Without what is not asked for: an older worker would not know its name.
-        content=request.model_dump_json(exclude_defaults=True),
+        content=request.as_json(),
         headers={"Content-Type": "application/json"},
     )
     return _read(SearchResponse, url, body)

@@ -21,14 +21,16 @@ from shared.vision.backbones.slow import SlowBackbone
 from shared.vision.backbones.tiny import TinyBackbone
 from shared.vision.backbones.torchhub import HubModule
 from shared.vision.decode import DECODER
+from shared.vision.passes import PassLimit, PhotoDoesNotFit, in_passes
+from shared.vision.pca import Projection
 from shared.vision.pooling import average, gem
+from shared.vision.precision import Precision, computing_in
 from shared.vision.preprocessing import Preprocessing, get_preprocessing
 from shared.vision.resample import Pixels
 from shared.vision.vlad import soft_vlad, vlad
 from shared.vision.vocabulary import Centres, decode_centres
 
 SHIPPED = Path(__file__).parent / "vocabularies"
-USUAL_PIXELS = 224 * 224  # of a photo, by which the size of a batch is chosen
 
 
 def _dinov2(recipe: Recipe, device: torch.device, weights: Path | None) -> Backbone:
@@ -78,19 +80,36 @@ class Extractor:
         recipe: Recipe,
         device: torch.device,
         *,
+        precision: Precision = "float32",
         dino_weights: Path | None = None,
         backbone: Backbone | None = None,
+        limit: PassLimit | None = None,
     ) -> None:
         """`dino_weights`: DINO_WEIGHTS, for the recipes on DINOv2; None takes timm's on the hub.
-        `backbone`: one that is loaded already, of the same `recipe.local_features`.
+        `backbone`: one that is loaded already, of the same `recipe.local_features`; `limit` is
+        what is known of it.
 
         Raises Misconfigured (`weights_missing`, `weights_unfit`, `torchhub_unfit`).
         """
         self.recipe = recipe
+        self.precision: Precision = precision
+        self.limit = limit or PassLimit()
         self.preprocessing: Preprocessing = get_preprocessing(recipe.preprocessing)
         self.backbone = backbone or BACKBONES[recipe.backbone](recipe, device, dino_weights)
         told = recipe.width
         assert told in (None, self.backbone.width), "the recipe tells others the width"
+
+    def at(self, precision: Precision) -> Extractor:
+        """The same weights computing in `precision`."""
+        if precision == self.precision:
+            return self
+        return Extractor(
+            self.recipe,
+            self.backbone.device,
+            precision=precision,
+            backbone=self.backbone,
+            limit=self.limit,
+        )
 
     def shipped_vocabulary(self) -> tuple[Centres, dict[str, Any]] | None:
         """The vocabulary that comes with the extractor, with its provenance; None without one."""
@@ -108,7 +127,7 @@ class Extractor:
             )
         return centres, provenance
 
-    def spec(self, centres: Centres | None) -> dict[str, Any]:
+    def spec(self, centres: Centres | None, projection: Projection | None = None) -> dict[str, Any]:
         """Everything that decides a descriptor's value."""
         spec: dict[str, Any] = {
             "extractor": self.recipe.name,
@@ -120,63 +139,97 @@ class Extractor:
             "aggregator": self.recipe.aggregator,
             "vocabulary_sha256": centres.sha256 if centres else None,
             "clusters": centres.clusters if centres else None,
-            "precision": "float32",
+            "precision": self.precision,
             "decoder": DECODER,
-            "dimension": self.dimension(centres),
+            "dimension": self.dimension(centres, projection),
         }
+        if projection is not None:
+            spec["whitening"] = {
+                "sha256": projection.sha256,
+                "from_dimension": projection.dimension,
+            }
         if self.recipe.aggregator == "soft-vlad":
             spec["temperature"] = self.recipe.temperature
         if isinstance(self.backbone, HubModule):
             spec["code_fingerprint"] = self.backbone.code_fingerprint
         return spec
 
-    def dimension(self, centres: Centres | None) -> int:
+    def dimension(self, centres: Centres | None, projection: Projection | None = None) -> int:
         """Length of a descriptor."""
+        if projection is not None:
+            return projection.kept
         return self.backbone.width * (centres.clusters if centres else 1)
+
+    def warm_up(self, photos: int) -> None:
+        """One pass as large as any of a batch of `photos`: kernels are chosen, memory is taken, and
+        what does not fit is found out before a photo waits for it.
+
+        Misconfigured (`gpu_out_of_memory`) where not even one photo of the usual size fits.
+        """
+        height, width = self.preprocessing.usual_size
+        at_once = self.limit.photos(photos, height * width)
+        blank = [np.zeros((height, width, 3), np.uint8)] * at_once
+        try:
+            for _ in self._in_passes(blank, lambda features: features):
+                pass
+        except PhotoDoesNotFit as error:
+            raise Misconfigured(
+                "gpu_out_of_memory",
+                f"The GPU holds the weights of {self.recipe.name}, but not one photo beside them. "
+                "See what else uses it (`nvidia-smi`), or set a smaller extractor or DEVICE=cpu.",
+            ) from error
 
     def features(self, pixels: Pixels) -> torch.Tensor:
         """(B, H, W, 3) of one size -> (B, patches, width) float32 local features on the device."""
-        return self.backbone.features(torch.from_numpy(np.ascontiguousarray(pixels)))
+        with computing_in(self.precision, self.backbone.device):
+            return self.backbone.features(torch.from_numpy(np.ascontiguousarray(pixels)))
 
     def local_features(self, photos: Collection[Pixels]) -> list[torch.Tensor]:
-        """Of each photo, in their order, (patches, width) float32 on the CPU; any sizes."""
+        """Of each photo, in their order, (patches, width) float32 on the CPU; any sizes.
+
+        Raises PhotoDoesNotFit.
+        """
         found: list[torch.Tensor] = [torch.empty(0)] * len(photos)
-        for places, features in self._passes(photos):
-            for place, one in zip(places, features.cpu(), strict=True):
+        for places, features in self._in_passes(photos, torch.Tensor.cpu):
+            for place, one in zip(places, features, strict=True):
                 found[place] = one
         return found
 
-    def describe(self, photos: Collection[Pixels], centres: Centres | None) -> NDArray[np.float32]:
+    def describe(
+        self,
+        photos: Collection[Pixels],
+        centres: Centres | None,
+        projection: Projection | None = None,
+    ) -> NDArray[np.float32]:
         """Photos (H, W, 3) as `preprocessing` brings them, of any sizes -> (n, dimension) float32.
 
         Rows in the photos' order, of length 1; or 0, see `shared.vision.vlad`; or NaN throughout
         where the network's features are not finite: these must not be stored (`not_finite`).
+
+        Raises PhotoDoesNotFit for a photo that is too much for the GPU even alone.
         """
         if self.recipe.needs_vocabulary and centres is None:
             raise ValueError(f"{self.recipe.name} needs a vocabulary")
         on_device = None
         if centres is not None:
             on_device = torch.from_numpy(centres.array).to(self.backbone.device)
-        rows = np.empty((len(photos), self.dimension(centres)), np.float32)
-        for places, features in self._passes(photos):
-            rows[places] = self._aggregate(features, on_device).cpu().numpy()
+
+        def row(features: torch.Tensor) -> torch.Tensor:
+            described = self._aggregate(features, on_device)
+            return (described if projection is None else projection(described)).cpu()
+
+        rows = np.empty((len(photos), self.dimension(centres, projection)), np.float32)
+        for places, found in self._in_passes(photos, row):
+            rows[places] = found.numpy()
         return rows
 
-    def _passes(self, photos: Collection[Pixels]) -> Iterator[tuple[list[int], torch.Tensor]]:
-        """Local features pass by pass: the places of its photos in `photos`, and theirs.
-
-        A pass has photos of one size, and no more pixels than all of them would have at 224 x 224
-        (or else one photo), so that a batch takes memory by its number of photos, not their sizes.
-        """
-        listed = list(photos)
-        of_shape: dict[tuple[int, ...], list[int]] = {}
-        for place, photo in enumerate(listed):
-            of_shape.setdefault(photo.shape, []).append(place)
-        for (height, width, _), places in of_shape.items():
-            at_once = max(1, len(listed) * USUAL_PIXELS // (height * width))
-            for begin in range(0, len(places), at_once):
-                chosen = places[begin : begin + at_once]
-                yield chosen, self.features(np.stack([listed[place] for place in chosen]))
+    def _in_passes(
+        self, photos: Collection[Pixels], then: Callable[[torch.Tensor], torch.Tensor]
+    ) -> Iterator[tuple[list[int], torch.Tensor]]:
+        """Places in `photos`, and what `then` makes of the local features of those."""
+        return in_passes(
+            photos, lambda pixels: then(self.features(pixels)), self.limit, self.backbone.device
+        )
 
     def _aggregate(self, features: torch.Tensor, centres: torch.Tensor | None) -> torch.Tensor:
         """(B, patches, width), (K, width) -> (B, dimension)."""

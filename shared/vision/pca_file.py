@@ -1,6 +1,14 @@
-"""Files of PCA whitenings: safetensors, checked before they spoil a descriptor."""
+"""Files of PCA whitenings: safetensors, checked before they spoil a descriptor.
+
+The header's `__metadata__` may hold `spec`, a string of JSON: how the rows were described that it
+was fitted on (`Extractor.spec`).
+"""
 
 from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,27 +18,55 @@ from shared.vision.pca import Whitening
 
 NAMES = ("mean", "directions", "variances", "explained", "rows")
 
-
-def encode_whitening(whitening: Whitening) -> bytes:
-    """The whitening as the bytes of a `.safetensors` file."""
-    from safetensors.numpy import save
-
-    return save(
-        {
-            "mean": np.ascontiguousarray(whitening.mean),
-            "directions": np.ascontiguousarray(whitening.directions),
-            "variances": np.ascontiguousarray(whitening.variances),
-            "explained": np.array([whitening.explained], dtype=np.float64),
-            "rows": np.array([whitening.rows], dtype=np.int64),
-        }
-    )
+# What changes a descriptor by its last bits alone: a whitening outlives it.
+MINOR = ("decoder", "precision")
 
 
-def decode_whitening(data: bytes, *, dimension: int | None = None) -> Whitening:
-    """The whitening in such bytes, for descriptors of `dimension` if that is known.
+@dataclass(frozen=True, slots=True, eq=False)
+class WhiteningFile:
+    whitening: Whitening
+    spec: dict[str, Any] | None
+    """Of the rows that it was fitted on; None where that is unknown."""
 
-    Unprocessable (`pca_unfit`) says what is wrong with it.
-    """
+    def encode(self) -> bytes:
+        """The bytes of a `.safetensors` file."""
+        from safetensors.numpy import save
+
+        found = self.whitening
+        return save(
+            {
+                "mean": np.ascontiguousarray(found.mean),
+                "directions": np.ascontiguousarray(found.directions),
+                "variances": np.ascontiguousarray(found.variances),
+                "explained": np.array([found.explained], dtype=np.float64),
+                "rows": np.array([found.rows], dtype=np.int64),
+            },
+            None if self.spec is None else {"spec": json.dumps(self.spec, sort_keys=True)},
+        )
+
+    def check_fits(self, spec: dict[str, Any]) -> None:
+        """Unprocessable (`pca_unfit`) naming what differs unless descriptors of `spec`, which are
+        not projected yet, are like the rows that it was fitted on. Of unknown rows only the
+        dimension can be compared.
+        """
+        if self.whitening.dimension != spec["dimension"]:
+            raise _unfit(
+                f"it is for descriptors of {self.whitening.dimension} dimensions, and these have "
+                f"{spec['dimension']}"
+            )
+        if self.spec is None:
+            return
+        differing = [
+            f"{key} is {spec.get(key)!r}, was {self.spec.get(key)!r}"
+            for key in sorted(spec.keys() | self.spec.keys())
+            if key not in MINOR and spec.get(key) != self.spec.get(key)
+        ]
+        if differing:
+            raise _unfit(f"it was fitted on other descriptors ({'; '.join(differing)})")
+
+
+def decode_whitening(data: bytes) -> WhiteningFile:
+    """The whitening in such bytes; Unprocessable (`pca_unfit`) says what is wrong with it."""
     from safetensors import SafetensorError
     from safetensors.numpy import load
 
@@ -38,6 +74,25 @@ def decode_whitening(data: bytes, *, dimension: int | None = None) -> Whitening:
         stored = load(data)
     except SafetensorError as error:
         raise _unfit(f"it is no safetensors file, or not a whole one ({error})") from error
+    return WhiteningFile(_whitening(stored), _spec(data))
+
+
+def _spec(data: bytes) -> dict[str, Any] | None:
+    """That of the header, which is known to be whole; None where there is none."""
+    header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])
+    text = header.get("__metadata__", {}).get("spec")
+    if text is None:
+        return None
+    try:
+        spec = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise _unfit(f"the spec in it can't be read ({error})") from error
+    if not isinstance(spec, dict):
+        raise _unfit("the spec in it is none")
+    return spec
+
+
+def _whitening(stored: dict[str, NDArray[np.generic]]) -> Whitening:
     missing = [name for name in NAMES if name not in stored]
     if missing:
         raise _unfit(f"it has no {', '.join(missing)}")
@@ -51,8 +106,6 @@ def decode_whitening(data: bytes, *, dimension: int | None = None) -> Whitening:
     kept, made_for = directions.shape
     if not 0 < kept <= made_for:
         raise _unfit(f"it makes {kept} dimensions of {made_for}")
-    if dimension is not None and made_for != dimension:
-        raise _unfit(f"it is for descriptors of {made_for} dimensions, and these have {dimension}")
     if not (variances > 0).all():
         raise _unfit("a variance is not positive")
     # A unit direction divided by its standard deviation, as far as float32 goes.

@@ -33,6 +33,8 @@ class Preprocessing:
     """Whether the photo is turned as its EXIF says. The published ways don't look at EXIF."""
     most_pixels: int
     """height x width of what comes out, at most"""
+    usual_size: tuple[int, int]
+    """Height and width of what comes out of most photos: those of 4 : 3 where they keep theirs."""
     bring: Callable[[Image.Image], Pixels]
     """A function of a module: it travels to the decoding children."""
 
@@ -113,11 +115,15 @@ def _middle(pixels: Pixels) -> Pixels:
 PREPROCESSINGS = {
     preprocessing.name: preprocessing
     for preprocessing in (
-        Preprocessing("square224", 1, True, 224 * 224, partial(_squeeze, height=224, width=224)),
-        Preprocessing("square32", 1, True, 32 * 32, partial(_squeeze, height=32, width=32)),
-        Preprocessing("demo1024", 1, False, 1022 * 1022, _demo1024),
-        Preprocessing("paper480x640", 1, False, 476 * 630, _paper480x640),
-        Preprocessing("round14", 1, False, ROUND14_MOST_PIXELS, _round14),
+        Preprocessing(
+            "square224", 1, True, 224 * 224, (224, 224), partial(_squeeze, height=224, width=224)
+        ),
+        Preprocessing(
+            "square32", 1, True, 32 * 32, (32, 32), partial(_squeeze, height=32, width=32)
+        ),
+        Preprocessing("demo1024", 1, False, 1022 * 1022, (756, 1022), _demo1024),
+        Preprocessing("paper480x640", 1, False, 476 * 630, (476, 630), _paper480x640),
+        Preprocessing("round14", 1, False, ROUND14_MOST_PIXELS, (770, 1022), _round14),
     )
 }
 
@@ -138,5 +144,10 @@ def get_preprocessing(name: str) -> Preprocessing:
         )
     height, width = int(size[1]), int(size[2])
     return Preprocessing(
-        name, 1, True, height * width, partial(_squeeze, height=height, width=width)
+        name,
+        1,
+        True,
+        height * width,
+        (height, width),
+        partial(_squeeze, height=height, width=width),
     )

@@ -13,6 +13,7 @@ from shared.errors import Unprocessable
 from shared.vision.extractors import Extractor
 from shared.vision.fit import Fit
 from shared.vision.vocabulary import Centres
+from shared.vocabulary_npz import is_known
 
 Provenance = dict[str, Any]
 """JSON: what `of_features` says, and of a fit `of_fit`. Without the former the vocabulary is of
@@ -75,11 +76,6 @@ def check_fits(provenance: Provenance, centres: Centres, extractor: Extractor) -
             f"The vocabulary has {centres.dimension} dimensions, the local features of "
             f"{extractor.recipe.name} {extractor.backbone.width}.",
         )
-
-
-def is_known(provenance: Provenance) -> bool:
-    """Does it say what the vocabulary was learnt from?"""
-    return "backbone_fingerprint" in provenance
 
 
 def _in_words(features: Provenance) -> str:

@@ -31,8 +31,7 @@ def assign(features: torch.Tensor, centres: torch.Tensor) -> torch.Tensor:
 @torch.inference_mode()
 def vlad(features: torch.Tensor, centres: torch.Tensor) -> torch.Tensor:
     """(B, patches, D) L2-normalised float32 features, (K, D) centres -> (B, K * D) unit rows."""
-    weights = one_hot(assign(features, centres), len(centres)).to(features.dtype)
-    return _sum_residuals(features, centres, weights)
+    return _sum_residuals(features, centres, hard_weights(features, centres))
 
 
 @torch.inference_mode()
@@ -40,8 +39,24 @@ def soft_vlad(features: torch.Tensor, centres: torch.Tensor, temperature: float)
     """As `vlad`, each patch in every cluster. The higher the temperature, the harder: a patch goes
     to its best centre alone as it grows, to all of them alike at 0.
     """
+    return _sum_residuals(features, centres, soft_weights(features, centres, temperature))
+
+
+def hard_weights(features: torch.Tensor, centres: torch.Tensor) -> torch.Tensor:
+    """(..., D) features, (K, D) centres -> (..., K): 1 for a patch's own cluster, else 0."""
+    weights = one_hot(assign(features, centres), len(centres)).to(features.dtype)
+    return weights * _has_direction(features)
+
+
+def soft_weights(features: torch.Tensor, centres: torch.Tensor, temperature: float) -> torch.Tensor:
+    """(..., D) features, (K, D) centres -> (..., K): a patch's weights in the clusters."""
     weights = (temperature * _cosines(features, centres)).softmax(dim=-1)
-    return _sum_residuals(features, centres, weights)
+    return weights * _has_direction(features)
+
+
+def _has_direction(features: torch.Tensor) -> torch.Tensor:
+    """(..., D) -> (..., 1): false for patches whose feature is zero."""
+    return (features != 0).any(dim=-1, keepdim=True)
 
 
 def _cosines(features: torch.Tensor, centres: torch.Tensor) -> torch.Tensor:
@@ -52,7 +67,6 @@ def _sum_residuals(
     features: torch.Tensor, centres: torch.Tensor, weights: torch.Tensor
 ) -> torch.Tensor:
     """(B, patches, D), (K, D), (B, patches, K) -> (B, K * D)."""
-    weights = weights * (features != 0).any(dim=-1, keepdim=True)
     sums = weights.transpose(1, 2) @ features  # (B, K, D)
     shares = weights.sum(dim=1).unsqueeze(-1)  # (B, K, 1)
     blocks = normalize(sums - shares * centres, dim=-1)

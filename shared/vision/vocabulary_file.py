@@ -16,24 +16,20 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from shared.errors import Unprocessable
-from shared.vision.provenance import UNKNOWN, Provenance, is_known
+from shared.vision.provenance import UNKNOWN, Provenance
 from shared.vision.vocabulary import (
     NO_ARRAY,
     Centres,
     check_centres,
     decode_array,
     decode_centres,
-    encode_array,
     encode_centres,
 )
+from shared.vocabulary_npz import CENTRES, PROVENANCE, encode_npz, is_known
 
-CENTRES, PROVENANCE = "centres", "provenance"
 MEMBERS = {f"{CENTRES}.npy", f"{PROVENANCE}.npy"}
 MOST_PROVENANCE_BYTES = 100_000
-LONG_AGO = (1980, 1, 1, 0, 0, 0)  # no clock in the file: equal vocabularies are equal bytes
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,14 +44,8 @@ class VocabularyFile:
 
     def encode(self) -> bytes:
         """The bytes of a file of that kind."""
-        if self.suffix == ".npy":
-            return encode_centres(self.centres)
-        text = json.dumps(self.provenance, sort_keys=True, ensure_ascii=False)
-        buffer = io.BytesIO()
-        with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
-            for name, array in ((CENTRES, self.centres.array), (PROVENANCE, np.array(text))):
-                archive.writestr(zipfile.ZipInfo(f"{name}.npy", LONG_AGO), encode_array(array))
-        return buffer.getvalue()
+        centres = encode_centres(self.centres)
+        return centres if self.suffix == ".npy" else encode_npz(centres, self.provenance)
 
 
 def decode_vocabulary(data: bytes) -> VocabularyFile:

@@ -50,7 +50,9 @@ class Poisoned(Preprocessing):
         return super().apply(image)
 
 
-POISONED = Poisoned("poisoned", 1, SQUARE.upright, SQUARE.most_pixels, SQUARE.bring)
+POISONED = Poisoned(
+    "poisoned", 1, SQUARE.upright, SQUARE.most_pixels, SQUARE.usual_size, SQUARE.bring
+)
 
 
 @contextlib.contextmanager
@@ -163,11 +165,11 @@ def test_pool_that_broke_is_made_anew(pool: DecoderPool) -> None:
     assert is_good(pool.decode([GOOD], SQUARE)[0])
 
 
-def test_children_import_no_torch_and_know_their_limit(pool: DecoderPool) -> None:
+def test_children_import_little_and_know_their_limit(pool: DecoderPool) -> None:
     pool.decode([GOOD], SQUARE)
     modules = in_child(pool, "sorted(__import__('sys').modules)")
     assert "shared.vision.decode" in modules, "the question went to another process"
-    assert {"torch", "torchvision", "timm"}.isdisjoint(modules)
+    assert {"torch", "torchvision", "timm", "pydantic", "sqlalchemy"}.isdisjoint(modules)
     resource = "__import__('resource')"
     limit = in_child(pool, f"{resource}.getrlimit({resource}.RLIMIT_AS)")
     assert limit == (2_000_000_000, 2_000_000_000)

@@ -166,6 +166,24 @@ def test_descriptor_that_is_not_finite_is_not_written(
     assert list(out.parent.iterdir()) == []
 
 
+def test_photo_that_the_gpu_can_not_hold_is_named(
+    photos: list[Path], out: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real, passes = Extractor.features, iter(range(10))
+
+    def features(made: Extractor, pixels: Any) -> torch.Tensor:
+        if next(passes) in (1, 3):  # the second batch, then its second photo alone
+            raise torch.cuda.OutOfMemoryError("CUDA out of memory.")
+        return real(made, pixels)
+
+    monkeypatch.setattr(Extractor, "features", features)
+    problem = run_json(*photos, "--out", out, code=1)
+    assert problem["code"] == "photos_refused"
+    (refused,) = problem["refused"]
+    assert (refused["photo"], refused["code"]) == (str(photos[3]), "gpu_out_of_memory")
+    assert list(out.parent.iterdir()) == []
+
+
 def test_interrupted_run_leaves_nothing_behind(
     photos: list[Path], out: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

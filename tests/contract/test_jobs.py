@@ -105,6 +105,7 @@ def test_higher_priority_goes_first_and_then_age(catalog: Catalog, map_id: UUID)
         (JobKind.FIT, 3),
         (JobKind.INDEX, 2),
         (JobKind.DESCRIBE, 1),
+        (JobKind.COMPARE, 1),
     ]
     made = [(place, queue(catalog, map_id, kind=kind)[0]) for kind, place in wanted]
     order = [job_id for _, job_id in sorted(made, key=lambda pair: pair[0])]
@@ -117,6 +118,12 @@ def test_a_batch_holds_the_oldest_up_to_its_limit(catalog: Catalog, map_id: UUID
     assert ids(take(catalog, limit=3)) == waiting[:3]
     assert ids(take(catalog, limit=3)) == waiting[3:]
     assert take(catalog, limit=3) == []
+
+
+def test_comparisons_are_claimed_one_at_a_time(catalog: Catalog, map_id: UUID) -> None:
+    first, second = queue(catalog, map_id, 2, kind=JobKind.COMPARE)
+    assert ids(take(catalog, limit=10)) == [first]
+    assert ids(take(catalog, limit=10)) == [second]
 
 
 def test_a_claim_says_who_has_the_jobs_and_until_when(catalog: Catalog, map_id: UUID) -> None:

@@ -21,7 +21,8 @@ from tests.support.server import environment
 from tests.support.servers.daemon import free_ports
 from tests.support.servers.programs import find_redis, find_weed
 
-START_SECONDS = 90.0
+START_SECONDS = 240.0  # seconds of work for each, of which a busy machine makes minutes
+LOOK_SECONDS = 1.0  # each look is a process
 WEED_PORTS = ("master.port", "volume.port", "filer.port")
 # What the images of others bring along.
 WGET = """#!{python}
@@ -97,7 +98,7 @@ class Machine:
             while not self.is_healthy(service):
                 assert self._running[service].poll() is None, f"{service}: {self.log(service)}"
                 assert time.monotonic() < deadline, f"{service}: {self.log(service)}"
-                time.sleep(0.2)
+                time.sleep(LOOK_SECONDS)
 
     def folder(self, service: str) -> Path:
         """Its /tmp and /data."""

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-import subprocess
 import time
 from pathlib import Path
 
 from shared.vision.backbones.dinov2 import SHAPES
 from tests.support.files_server import files_server
-from tests.support.server import PLACEWISE, environment, run_command
+from tests.support.processes import PLACEWISE, start
+from tests.support.server import environment, run_command
 from tests.support.vit import random_weights, save
 
 FETCH = ("models", "fetch", "anyloc-vits14:layer=0", "--json")
@@ -30,9 +30,8 @@ def test_a_killed_fetch_goes_on_where_it_was(tmp_path: Path) -> None:
             hf_home=tmp_path / "hf",
             xdg_cache_home=tmp_path / "cache",
         )
-        fetching = subprocess.Popen(
-            [PLACEWISE, *FETCH], env=env, cwd=tmp_path, stderr=subprocess.DEVNULL
-        )
+        with (tmp_path / "fetch.log").open("wb") as log:
+            fetching = start([PLACEWISE, *FETCH], env=env, cwd=tmp_path, stdout=log, stderr=log)
         deadline = time.monotonic() + SECONDS
         while sum(p.stat().st_size for p in tmp_path.glob("hf/hub/*/blobs/*.part")) < BEGUN_BYTES:
             assert fetching.poll() is None, "it ended before its time"

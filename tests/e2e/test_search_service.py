@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import re
 import signal
-import subprocess
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -23,7 +22,8 @@ from shared.catalog.session import Catalog
 from shared.search_http import HttpSearch
 from shared.search_protocol import SearchRequest, SearchResponse
 from tests.support.photos import photo_bytes
-from tests.support.server import PLACEWISE, START_SECONDS, ServerProcess, environment, run_command
+from tests.support.processes import PLACEWISE, Process, start
+from tests.support.server import START_SECONDS, ServerProcess, environment, run_command
 
 # One slot a photo, so that both shards have some.
 SETTINGS = {"slot_rows": 2, "batch_photos": 1}
@@ -31,17 +31,11 @@ PHOTOS = 4
 
 
 @contextlib.contextmanager
-def search_process(home: Path, log: Path, **settings: Any) -> Iterator[tuple[Any, str]]:
+def search_process(home: Path, log: Path, **settings: Any) -> Iterator[tuple[Process, str]]:
     """A running `placewise search` and its address."""
     with log.open("wb") as said:
-        process = subprocess.Popen(
-            [PLACEWISE, "search"],
-            env=environment(home, **settings),
-            cwd=home.parent,
-            stdin=subprocess.DEVNULL,
-            stdout=said,
-            stderr=said,
-        )
+        env = environment(home, **settings)
+        process = start([PLACEWISE, "search"], env=env, cwd=home.parent, stdout=said, stderr=said)
     try:
         deadline = time.monotonic() + START_SECONDS
         while not (match := re.search(r"on (http://\S+)", log.read_text())):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import re
 import signal
-import subprocess
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,7 +14,8 @@ import httpx2
 import pytest
 
 from tests.support.photos import photo_bytes
-from tests.support.server import PLACEWISE, environment, run_command
+from tests.support.processes import PLACEWISE, Process, start
+from tests.support.server import environment, run_command
 from tests.support.servers import PostgresServer, RedisServer, start_redis
 
 SECONDS = 90.0
@@ -33,24 +33,18 @@ class Deployment:
             "lease_seconds": 5,
             "search_urls": "",
         }
-        self._processes: list[subprocess.Popen[bytes]] = []
+        self._processes: list[Process] = []
 
     def migrate(self) -> None:
         env = environment(self.home, **self.settings)
         migrated = run_command("migrate", env=env, cwd=self.root)
         assert migrated.returncode == 0, migrated.stderr
 
-    def start(self, service: str, **settings: Any) -> subprocess.Popen[bytes]:
+    def start(self, service: str, **settings: Any) -> Process:
         log = self.root / f"{service}-{len(self._processes)}.log"
         with log.open("wb") as out:
-            process = subprocess.Popen(
-                [PLACEWISE, service],
-                env=environment(self.home, **{**self.settings, **settings}),
-                cwd=self.root,
-                stdin=subprocess.DEVNULL,
-                stdout=out,
-                stderr=out,
-            )
+            env = environment(self.home, **{**self.settings, **settings})
+            process = start([PLACEWISE, service], env=env, cwd=self.root, stdout=out, stderr=out)
         self._processes.append(process)
         return process
 

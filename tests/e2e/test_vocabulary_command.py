@@ -100,6 +100,46 @@ def test_a_map_takes_the_file_and_lists_where_it_comes_from(folder: Folder, fitt
         assert part in shown, shown
 
 
+def test_a_vocabulary_of_a_map_is_exported_as_a_file_that_a_map_takes(
+    folder: Folder, fitted: Any
+) -> None:
+    folder.json("import", "city.npz")
+    listed = folder.json("list")[0]
+    written = folder.json("export", listed["vocabulary_id"], "--out", "out.npz")
+    assert (written["file"], written["vocabulary_id"]) == ("out.npz", listed["vocabulary_id"])
+    found = read_vocabulary(folder.path / "out.npz")
+    assert found.provenance == {**fitted["provenance"], "imported_from": "city.npz"}
+    assert found.centres.sha256 == fitted["provenance"]["sha256"]
+    wrong = folder.json("export", listed["vocabulary_id"], "--out", "out.npy", code=1)
+    assert wrong["code"] == "bad_out"
+    assert folder.json("export", "../maps", "--out", "a.npz", code=1)["code"] == "bad_id"
+
+
+def test_a_map_is_reduced_by_one_command_and_whole_again_by_another(folder: Folder) -> None:
+    for number in range(101, 107):
+        assert folder.server.upload(photo_bytes(number)).status_code == 202
+    np.save(folder.path / "eight.npy", np.eye(8, WIDTH, dtype=np.float32))
+    folder.json("import", "eight.npy")
+
+    def run(*arguments: str) -> str:
+        env = environment(folder.server.home, **SETTINGS)
+        ended = run_command(*arguments, env=env, cwd=folder.path)
+        assert ended.returncode == 0, ended.stderr + ended.stdout
+        return " ".join(ended.stdout.split())
+
+    said = run("pca", "fit", "--dimension", "3")
+    assert "7 photos, 3 of 128 dimensions with" in said
+    assert "of the variance of 7 rows, 0 failed" in said
+    assert "3 (PCA" in run("maps", "list")
+    assert "PCA: 3 of" in run("vocabulary", "list")
+    assert "7 photos, 128 dimensions, 0 failed" in run("pca", "undo")
+    nothing = run_command(
+        "pca", "undo", env=environment(folder.server.home, **SETTINGS), cwd=folder.path
+    )
+    assert nothing.returncode == 1
+    assert "not_reduced" in nothing.stderr
+
+
 def test_a_file_of_another_extractor_is_refused_by_the_map(folder: Folder, fitted: Any) -> None:
     found = read_vocabulary(folder.path / "city.npz")
     other = VocabularyFile(found.centres, {**found.provenance, "layer": "another"})

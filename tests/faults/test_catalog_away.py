@@ -79,6 +79,7 @@ class House:
         self.client = TestClient(
             create_app(gateway), base_url="http://localhost", raise_server_exceptions=False
         )
+        evaluator = Evaluator(self.catalog, store, self.search, settings, "evaluator")
         self.died = threading.Event()
         self._stop = threading.Event()
         self._parts = [
@@ -88,7 +89,7 @@ class House:
                 ("presence", Presence(self.catalog, self.search, "search").run),
                 ("extractor", partial(self._extractor.run, hints=hints)),
                 ("steward", Steward(self.catalog, store, hints, settings).run),
-                ("evaluator", Evaluator(self.catalog, self.search, settings, "evaluator").run),
+                ("evaluator", evaluator.run),
             )
         ]
 

@@ -15,7 +15,7 @@ ONE_OF_EACH = ("gateway-0", "extractor-0", "search-0-0", "steward-0")
 @pytest.mark.timeout(600)
 def test_restarting_one_of_each_service_fails_no_request_and_loses_no_job(tmp_path: Path) -> None:
     with start_servers() as servers:
-        report = restart_under_load(tmp_path, servers, ONE_OF_EACH)
+        report = restart_under_load(tmp_path, servers, ONE_OF_EACH, executed=False)
     assert not report.missed, report.as_json()
     requests = {
         figure.what: figure.measured

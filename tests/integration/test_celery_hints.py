@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import json
-import subprocess
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -25,7 +24,8 @@ from shared.objects import FolderStore
 from shared.settings import Settings
 from tests.support.catalog_rows import add_map, ask, upload
 from tests.support.photos import photo_bytes
-from tests.support.server import PLACEWISE, environment
+from tests.support.processes import PLACEWISE, start
+from tests.support.server import environment
 from tests.support.servers import PostgresServer, RedisServer, start_redis
 
 SECONDS = 60.0
@@ -118,11 +118,10 @@ class Extractor:
 
     def start(self) -> None:
         with (self._home.parent / "extractor.log").open("ab") as log:
-            self.process = subprocess.Popen(
+            self.process = start(
                 [PLACEWISE, "extractor"],
                 env=self._environment,
                 cwd=self._home.parent,
-                stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=log,
             )

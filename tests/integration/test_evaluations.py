@@ -11,7 +11,7 @@ from uuid import UUID
 import pytest
 import sqlalchemy as sql
 
-from services.steward import evaluate as evaluate_module
+from services.steward import asked as asked_module
 from services.steward.auto_evaluate import evaluate_changed_maps
 from services.steward.collect import collect_superseded_chunks
 from services.steward.compact import merge_slot
@@ -240,7 +240,7 @@ def test_chunks_merged_and_removed_meanwhile_change_no_figure(town: Town) -> Non
 @pytest.fixture
 def look_always(monkeypatch: pytest.MonkeyPatch) -> None:
     """The evaluator looks at its job after every question."""
-    monkeypatch.setattr(evaluate_module, "REPORT_SECONDS", -1.0)
+    monkeypatch.setattr(asked_module, "REPORT_SECONDS", -1.0)
 
 
 @pytest.mark.usefixtures("look_always")
@@ -397,7 +397,7 @@ def automatic(town: Town, least_photos: int = LEAST) -> bool:
     """Whether the steward queues an evaluation now; it is done at once."""
     before = len(town.evaluation_jobs())
     for _ in range(2):  # the second time there is always one under way
-        evaluate_changed_maps(town.catalog, least_photos)
+        evaluate_changed_maps(town.catalog, least_photos, word_weights=True)
     jobs = town.evaluation_jobs()[before:]
     assert len(jobs) <= 1
     if jobs:
@@ -468,13 +468,13 @@ def test_an_evaluation_that_came_to_nothing_is_not_tried_again_before_the_next_c
         assert automatic(town)
         town.publish([(100 + n, at(40 + n)) for n in range(LEAST)])
     done = len(town.evaluation_jobs())
-    evaluate_changed_maps(town.catalog, LEAST)
+    evaluate_changed_maps(town.catalog, LEAST, word_weights=True)
     job = town.evaluation_jobs()[-1]
     with town.catalog.write() as session:
         mine = get_job(session, town.map_id, job.id, lock=True)
         cancel(mine) if end == "is cancelled" else fail(mine, {"code": "out_of_luck"})
     for _ in range(3):
-        evaluate_changed_maps(town.catalog, LEAST)
+        evaluate_changed_maps(town.catalog, LEAST, word_weights=True)
     assert len(town.evaluation_jobs()) == done + 1
     town.publish([(200 + n, at(-40 + n)) for n in range(2 * LEAST)])
     assert automatic(town)
@@ -502,7 +502,7 @@ def test_two_stewards_queue_one_evaluation(town: Town) -> None:
     def look() -> None:
         together.wait()
         for _ in range(3):
-            evaluate_changed_maps(town.catalog, LEAST)
+            evaluate_changed_maps(town.catalog, LEAST, word_weights=True)
 
     with ThreadPoolExecutor(4) as pool:
         for look_ in [pool.submit(look) for _ in range(4)]:

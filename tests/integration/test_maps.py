@@ -15,8 +15,8 @@ import pytest
 from sqlalchemy import func, select
 
 from services.extractor.loaded import LoadedModels
+from services.extractor.publish import publish
 from services.extractor.renew import renew_outdated_generations
-from services.extractor.worker import ExtractorWorker
 from services.gateway import upload as upload_module
 from services.steward import delete_maps as delete_maps_module
 from services.steward.collect import collect_orphans
@@ -88,7 +88,7 @@ def remove_all(catalog: Catalog, store: FolderStore) -> None:
 
 def live_in(service: Service, name: str) -> None:
     """Everything that can belong to a map: photos, found and failed and asking ones, a vocabulary
-    and an import under way, two generations, searches, queries, evaluations."""
+    and an import under way, generations, a whitening, searches, queries, evaluations."""
     settings = Settings().model_copy(update={"auto_fit_photos": 10_000})
     service.json("POST", "/maps", 201, json={"name": name, "extractor": "test-tiny-vlad"})
     params = {"map": name}
@@ -105,9 +105,11 @@ def live_in(service: Service, name: str) -> None:
     service.ask(near_copy(2), name)
     service.drain()
     service.json("POST", "/evaluations", 202, params=params)
-    evaluator = Evaluator(service.catalog, service.search, settings, "evaluator")
+    evaluator = Evaluator(service.catalog, service.store, service.search, settings, "evaluator")
     assert evaluator.evaluate_next(threading.Event())
     service.json("POST", "/vocabularies", 202, params=params, json={"clusters": 3, "seed": 5})
+    finish_changes(service)
+    service.json("POST", "/generations", 202, params=params, json={"pca": 1})
     finish_changes(service)
     with service.catalog.write() as session:
         keep_figures(session, id_of(service, name))
@@ -152,9 +154,8 @@ def test_a_deleted_map_leaves_no_row_and_no_byte_and_others_stay(
     during = rows(catalog)
     of_no_map = {"installation", "idempotency_keys"}
     assert all(during[table] > before[0][table] for table in during.keys() - of_no_map), during
-    assert {"originals", "thumbnails", "chunks", "queries", "vocabularies", "work"} >= {
-        key.split("/")[0] for key in objects(store) - before[1]
-    }
+    kinds = {"originals", "thumbnails", "chunks", "queries", "vocabularies", "whitenings", "work"}
+    assert kinds >= {key.split("/")[0] for key in objects(store) - before[1]}
     service.json("DELETE", "/maps/gone")
     problem(service("GET", "/maps/gone"), 404, "map_not_found")
     remove_all(catalog, store)
@@ -227,16 +228,15 @@ def before_publishing(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[],
     """Has something done when a batch is described and not published yet."""
 
     def meanwhile(do: Callable[[], object]) -> None:
-        real = ExtractorWorker._describe
         calls = iter([do])
 
-        def describe(self: ExtractorWorker, batch: Any) -> Any:
+        def act_and_publish(*arguments: Any) -> Any:
             for act in calls:
                 act()
                 break
-            return real(self, batch)
+            return publish(*arguments)
 
-        monkeypatch.setattr(ExtractorWorker, "_describe", describe)
+        monkeypatch.setattr("services.extractor.worker.publish", act_and_publish)
 
     return meanwhile
 

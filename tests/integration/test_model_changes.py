@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from sqlalchemy import select
 
 from services.extractor import fit_vocabulary
-from services.extractor.fit_vocabulary import FitVocabulary
+from services.extractor.fit_vocabulary import CLUSTER_UNITS, FitVocabulary
 from services.extractor.model_change import ModelChanges
 from services.extractor.worker import ExtractorWorker
 from services.steward.collect import collect_work
@@ -131,10 +131,12 @@ def test_a_fit_replaces_the_generation_while_the_old_one_answers(fitted: Workpla
         "generation_id": str(new.id),
         "vocabulary_id": str(new.vocabulary_id),
         "clusters": 7,  # 6 photos of 64 patches, 50 for each
+        "dimension": 7 * WIDTH,
+        "pca": None,
         "photos": PHOTOS,
         "failed": 0,
     }
-    assert job.progress_done == job.progress_total == 2 * PHOTOS
+    assert job.progress_done == job.progress_total == 2 * PHOTOS + CLUSTER_UNITS
     assert _version(fitted) > version
 
     vocabulary = fitted.vocabulary(new.vocabulary_id)
@@ -221,13 +223,18 @@ def test_a_fit_is_the_same_for_its_seed_and_whoever_does_its_slices(
     torn = workplace_of("test-tiny-vlad")
     torn.upload(*range(PHOTOS))
     job_id = torn.start(JobKind.FIT, **wanted)
-    slices = 0
+    progress = []
     while torn.job(job_id).waiting_for != WaitingFor.DESCRIPTORS:
         do_slices(monkeypatch, make_worker())  # each slice by a worker that knows nothing
-        slices += 1
-        assert slices < 120
-    assert slices > 20  # plan, two of the sample, 4 seeds, and the passes over one batch
+        progress.append((torn.job(job_id).progress_done, torn.job(job_id).progress_total))
+        assert len(progress) < 120
+    assert len(progress) > 20  # plan, two of the sample, 4 seeds, and the passes over one batch
+    done, totals = zip(*progress, strict=True)
+    assert set(totals) == {5 + CLUSTER_UNITS + PHOTOS}, "what there is to do does not change"
+    assert list(done) == sorted(set(done)), "each slice is seen"
+    assert (done[2], done[-1]) == (5, 5 + CLUSTER_UNITS)
     again = torn.finish(job_id)
+    assert again.progress_done == totals[0]
 
     other = workplace_of("test-tiny-vlad")
     other.upload(*range(PHOTOS))

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 from uuid import UUID
 
 import numpy as np
+import pytest
 
 from shared.catalog.vocabularies import Vocabulary
 from shared.jobs import JobKind, JobState
 from shared.objects.keys import new_vocabulary_key
 from shared.recipes import get_recipe
+from shared.vision import preprocessing
 from shared.vision.extractors import Extractor, choose_device
 from shared.vision.provenance import Provenance, of_features
 from shared.vision.vocabulary import check_centres, decode_centres, encode_centres
@@ -118,3 +121,43 @@ def test_a_switch_to_a_vocabulary_of_former_weights_is_refused(vlads: Workplace)
     assert job.error is not None
     assert job.error["code"] == "vocabulary_unfit"
     assert "efefefefefef" in job.error["detail"]
+
+
+def test_after_another_version_of_the_preprocessing_only_what_may_fit_is_switched_to(
+    vlads: Workplace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    vlads.upload(*range(6))
+    bare = encode_centres(check_centres(np.eye(3, WIDTH, dtype=np.float32)))
+    assert vlads.finish(import_file(vlads, bare, "bare.npy")).state == JobState.SUCCEEDED
+    unknown = vlads.active().vocabulary_id
+    assert vlads.fit().state == JobState.SUCCEEDED
+    former = vlads.active()
+    version_1 = former.spec["preprocessing"]
+    version_2 = {**version_1, "version": version_1["version"] + 1}
+    known = preprocessing.PREPROCESSINGS["square32"]
+    monkeypatch.setitem(
+        preprocessing.PREPROCESSINGS, "square32", replace(known, version=version_2["version"])
+    )
+    upgraded = replace(vlads, _worker=None)
+
+    refused = upgraded.finish(
+        upgraded.start(JobKind.SWITCH, vocabulary_id=str(former.vocabulary_id))
+    )
+    assert refused.state == JobState.FAILED
+    assert refused.error is not None
+    assert refused.error["code"] == "vocabulary_unfit"
+    assert "square32 version 1; the extractor" in refused.error["detail"].replace("name ", "")
+    assert refused.error["learnt_with"]["preprocessing"] == version_1
+    assert refused.error["extractor_makes"]["preprocessing"] == version_2
+    assert upgraded.active().id == former.id
+
+    # Of unknown origin: that it belongs to the extractor was someone's word, and still is.
+    taken = upgraded.finish(upgraded.start(JobKind.SWITCH, vocabulary_id=str(unknown)))
+    assert taken.state == JobState.SUCCEEDED
+    assert upgraded.active().spec["preprocessing"] == version_2
+    assert upgraded.vocabulary(unknown).provenance["learnt_with"] == "unknown"
+
+    assert upgraded.fit().state == JobState.SUCCEEDED
+    assert upgraded.active().spec["preprocessing"] == version_2
+    assert active_vocabulary(upgraded).provenance["preprocessing"] == version_2
+    assert upgraded.vocabulary(former.vocabulary_id).provenance["preprocessing"] == version_1

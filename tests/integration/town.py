@@ -95,7 +95,7 @@ class Town:
         return job.id
 
     def evaluator(self, search: SearchPort | None = None) -> Evaluator:
-        return Evaluator(self.catalog, search or self.search, Settings(), "evaluator")
+        return Evaluator(self.catalog, self.store, search or self.search, Settings(), "evaluator")
 
     def work(self, search: SearchPort | None = None, stop: threading.Event | None = None) -> bool:
         """Do the next evaluation; False when there was none."""

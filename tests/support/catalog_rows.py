@@ -34,7 +34,9 @@ PRIORITIES = {
     JobKind.INDEX: Priority.UPLOAD,
     JobKind.REINDEX: Priority.REINDEX,
     JobKind.DESCRIBE: Priority.QUERY,
+    JobKind.COMPARE: Priority.QUERY,
     JobKind.EVALUATE: Priority.EVALUATION,
+    JobKind.WORD_WEIGHTS: Priority.EVALUATION,
     **dict.fromkeys(MODEL_CHANGES, Priority.MODEL_CHANGE),
 }
 

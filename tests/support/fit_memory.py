@@ -47,6 +47,9 @@ class ManyPatches:
         turned = self._some.roll(self._turned, dims=1)
         return turned[: len(pixels) * PATCHES].reshape(len(pixels), PATCHES, WIDTH)
 
+    def grid(self, height: int, width: int) -> tuple[int, int]:
+        return 1, PATCHES
+
 
 def memory_bytes(name: str) -> int:
     """`VmRSS`, what the process holds now, or `VmHWM`, the most that it has held."""

@@ -2,15 +2,10 @@
 
 from __future__ import annotations
 
-import atexit
 import contextlib
-import functools
 import json
-import os
-import shutil
 import signal
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Iterator, Mapping
@@ -22,29 +17,16 @@ import httpx2
 import psutil
 
 from shared.home import address_file
-from shared.settings import Settings
+from tests.support.processes import INHERITED, PLACEWISE, Process, start
 
-START_SECONDS = 60.0
+START_SECONDS = 150.0  # seconds of work, of which a busy machine makes minutes
 COMMAND_SECONDS = 120.0
-PLACEWISE = str(Path(sys.executable).with_name("placewise"))
-
-
-@functools.cache
-def _bytecode() -> dict[str, str]:
-    """Where no bytecode is written beside the sources, each start would compile torch anew."""
-    if not os.environ.get("PYTHONDONTWRITEBYTECODE"):
-        return {}
-    folder = tempfile.mkdtemp(prefix="pw-bytecode-")
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    return {"PYTHONDONTWRITEBYTECODE": "", "PYTHONPYCACHEPREFIX": folder}
 
 
 def environment(home: Path, **settings: Any) -> dict[str, str]:
     """For a process on `home`: the tiny extractor, and none of the developer's own settings."""
-    own = {name.upper() for name in Settings.model_fields} | {"PLACEWISE_SERVER", "PLACEWISE_KEY"}
     return {
-        **{name: value for name, value in os.environ.items() if name not in own},
-        **_bytecode(),
+        **INHERITED,
         "PLACEWISE_HOME": str(home),
         "HOST": "127.0.0.1",
         "PORT": "0",
@@ -56,19 +38,21 @@ def environment(home: Path, **settings: Any) -> dict[str, str]:
 
 
 def run_command(
-    *arguments: str | Path, env: Mapping[str, str], cwd: Path
+    *arguments: str | Path, env: Mapping[str, str], cwd: Path, executed: bool = False
 ) -> subprocess.CompletedProcess[str]:
-    """`placewise ARGUMENTS` to its end. `cwd` should have no `.env`."""
-    return subprocess.run(
-        [PLACEWISE, *map(str, arguments)],
-        env=env,
-        cwd=cwd,
-        stdin=subprocess.DEVNULL,
-        capture_output=True,
-        text=True,
-        timeout=COMMAND_SECONDS,
-        check=False,
-    )
+    """`placewise ARGUMENTS` to its end. `cwd` should have no `.env`; `executed` as for `start`."""
+    with tempfile.TemporaryFile("w+") as out, tempfile.TemporaryFile("w+") as err:
+        process = start(
+            [PLACEWISE, *arguments], env=env, cwd=cwd, stdout=out, stderr=err, executed=executed
+        )
+        try:
+            code = process.wait(COMMAND_SECONDS)
+        finally:
+            process.kill()
+            process.wait()
+        out.seek(0)
+        err.seek(0)
+        return subprocess.CompletedProcess(arguments, code, out.read(), err.read())
 
 
 class ServerProcess:
@@ -81,7 +65,7 @@ class ServerProcess:
         self.home = home
         self._environment = environment(home, **settings)
         self.log_path = home.with_name(home.name + ".log")
-        self._process: subprocess.Popen[bytes] | None = None
+        self._process: Process | None = None
         self.client = httpx2.Client(timeout=60)
 
     def __enter__(self) -> Self:
@@ -98,7 +82,7 @@ class ServerProcess:
         self.kill()
 
     @property
-    def process(self) -> subprocess.Popen[bytes]:
+    def process(self) -> Process:
         assert self._process is not None, "the server was not started"
         return self._process
 
@@ -106,11 +90,10 @@ class ServerProcess:
         """Start and wait until it answers; `options` are those of `placewise serve`."""
         address_file(self.home).unlink(missing_ok=True)
         with self.log_path.open("ab") as log:
-            self._process = subprocess.Popen(
+            self._process = start(
                 [PLACEWISE, "serve", *options],
                 env=self._environment,
                 cwd=self.home.parent,  # the repository may hold a developer's .env
-                stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=log,
             )

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from services.gateway.estimate import estimate, rank
 from services.gateway.schemas import EstimateAnswer
-from shared.catalog.generations import Generation
 from shared.catalog.photos import Photo
 from shared.estimate.calibration import (
     FALSE_ACCEPTS,
@@ -208,9 +207,8 @@ def photo(number: int, spot: Spot) -> Photo:
 def answer(calibration: Calibration | None, *pairs: tuple[float, Spot]) -> EstimateAnswer:
     photos = {UUID(int=n): photo(n, spot) for n, (_, spot) in enumerate(pairs)}
     hits = [Hit(photo_id=UUID(int=n), score=score) for n, (score, _) in enumerate(pairs)]
-    stored = calibration.model_dump(mode="json") if calibration else None
     ranked = rank(hits, photos)
-    return estimate(Generation(calibration=stored), ranked, ranked, RADIUS_M)
+    return estimate(calibration, ranked, ranked, RADIUS_M)
 
 
 def calibration(threshold: float | None, confidence: Logistic | None = None) -> Calibration:
@@ -258,9 +256,9 @@ def test_nothing_found_and_nothing_known_are_told_apart() -> None:
 def test_a_filter_that_leaves_no_rival_makes_nobody_sure() -> None:
     everything = ranking((0.5, north(0)), (0.45, north(700)), (0.2, north(3000)))
     filtered = [everything[2]]
-    stored = calibration(0.01).model_dump(mode="json")
-    said = estimate(Generation(calibration=stored), filtered, everything, RADIUS_M)
+    known = calibration(0.01)
+    said = estimate(known, filtered, everything, RADIUS_M)
     assert said.in_map is False
-    alone = estimate(Generation(calibration=stored), everything[:1], everything, RADIUS_M)
-    whole = estimate(Generation(calibration=stored), everything, everything, RADIUS_M)
+    alone = estimate(known, everything[:1], everything, RADIUS_M)
+    whole = estimate(known, everything, everything, RADIUS_M)
     assert alone.in_map is whole.in_map is True

@@ -16,6 +16,7 @@ from shared.search_protocol import (
     STATISTICAL,
     Hit,
     Lag,
+    SearchRequest,
     SearchResponse,
     SearchStatus,
 )
@@ -55,6 +56,32 @@ def test_the_merged_order_is_that_of_one_list_also_for_equal_scores(
     merged = merge([answer(*hits) for hits in shards], k)
     whole = sorted(enumerate(scores), key=lambda hit: (-hit[1], hit[0]))
     assert ranked(merged) == whole[:k]
+
+
+def test_what_was_ranked_by_weighted_scores_is_merged_by_them_ties_by_photo() -> None:
+    def weighted(*hits: tuple[int, float, float]) -> SearchResponse:
+        return answer().model_copy(
+            update={
+                "hits": tuple(
+                    Hit(photo_id=UUID(int=number), score=score, weighted_score=by)
+                    for number, score, by in hits
+                )
+            }
+        )
+
+    shards = [weighted((4, 0.1, 0.9), (1, 0.8, 0.3)), weighted((3, 0.2, 0.9), (2, 0.9, 0.5))]
+    assert ranked(merge(shards, k=3)) == [(3, 0.2), (4, 0.1), (2, 0.9)]
+
+
+def test_a_message_without_weights_is_one_that_the_release_before_understands() -> None:
+    asked = SearchRequest(
+        map_id=new_id(), generation_id=new_id(), object_key="q", row=0, min_version=0, k=5
+    )
+    assert "word_weights" not in asked.as_json()
+    assert SearchRequest.model_validate_json(asked.as_json()) == asked
+    plain = answer((1, 0.5), missing=("chunks/a",))
+    assert "weighted_score" not in plain.as_json()
+    assert SearchResponse.model_validate_json(plain.as_json()) == plain
 
 
 def test_a_photo_that_two_shards_have_for_a_moment_is_answered_once() -> None:

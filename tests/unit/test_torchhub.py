@@ -16,6 +16,8 @@ from shared.recipes import get_recipe
 from shared.vision import torchhub_code
 from shared.vision.backbones.torchhub import HubModule
 from shared.vision.extractors import Extractor, spec_fingerprint
+from shared.vision.pca import Projection
+from shared.vision.pca_fit import fit
 from shared.vision.preprocessing import get_preprocessing
 from tests.support.hub import COMMIT, MIT, NETWORKS, write_hub
 from tests.support.photos import photo_image
@@ -79,6 +81,21 @@ def test_dimension_is_found_by_describing_and_stands_in_the_spec(folder: Path) -
     assert spec["preprocessing"] == {"name": "resize32x48", "version": 1}
     assert pixels_of(made, 1).shape == (1, 32, 48, 3)
     assert made.shipped_vocabulary() is None
+
+
+def test_descriptors_are_shortened_by_pca_as_those_of_other_extractors(folder: Path) -> None:
+    made = extractor(folder, "colours")
+    pixels = pixels_of(made, *range(8))
+    whole = made.describe(pixels, None)
+    projection = Projection(fit(whole, 3), CPU)
+    rows = made.describe(pixels, None, projection)
+    np.testing.assert_allclose(rows, projection.project(whole), atol=1e-5)
+    spec = made.spec(None, projection)
+    assert (rows.shape, spec["dimension"]) == ((8, 3), 3)
+    assert spec["whitening"] == {"sha256": projection.sha256, "from_dimension": 24}
+    assert {k: v for k, v in spec.items() if k not in ("dimension", "whitening")}.items() <= (
+        made.spec(None).items()
+    )
 
 
 def test_of_several_answers_the_first_is_the_descriptor(folder: Path) -> None:

@@ -53,7 +53,7 @@ class BatchWorker:
         self._catalog = catalog
         self._settings = settings
         self._bring_in = BringIn(catalog, store, hints, settings)
-        self._taker = Taker(catalog, settings, name, JobKind.BATCH)
+        self._taker = Taker(catalog, settings, name, (JobKind.BATCH,))
 
     def run(self, stop: threading.Event) -> None:
         """Take batches until `stop` is set."""

@@ -6,6 +6,8 @@ from typing import Any, Protocol
 
 import torch
 
+LEAST_LENGTH = 1e-12  # what is shorter is not scaled up to 1: it has no direction but noise
+
 
 class Backbone(Protocol):
     """Turns a batch of photos into dense local features."""
@@ -31,8 +33,25 @@ class Backbone(Protocol):
         `pixels` are uint8, or float32 where a preprocessing left them unrounded; they are
         normalised by channel here, and nowhere before.
 
-        A patch whose feature is zero stays zero.
+        A patch whose feature is zero stays zero. What is not finite, or too large for its length to
+        be, is NaN.
         """
+
+    def grid(self, height: int, width: int) -> tuple[int, int]:
+        """Rows and columns of the patches of a photo of so many pixels; `features` has them row by
+        row. (1, 1) where there is one feature of the whole photo."""
+
+
+def unit_features(features: torch.Tensor) -> torch.Tensor:
+    """(..., width) of any floating type -> float32 of length 1, as `Backbone.features` promises.
+
+    Dividing by a length that has overflowed would make zeros, which aggregators take for a patch
+    without any structure: such a patch is NaN, and its photo is refused.
+    """
+    features = features.float()
+    lengths = torch.linalg.vector_norm(features, dim=-1, keepdim=True)
+    lengths = torch.where(lengths.isfinite(), lengths, torch.nan)
+    return features / lengths.clamp(min=LEAST_LENGTH)
 
 
 def normalise_pixels(

@@ -22,10 +22,10 @@ from typing import Any
 
 import torch
 from torch.nn import Identity, Linear
-from torch.nn.functional import interpolate, normalize
+from torch.nn.functional import interpolate
 
 from shared.recipes import FACETS
-from shared.vision.backbones.base import normalise_pixels
+from shared.vision.backbones.base import normalise_pixels, unit_features
 from shared.vision.backbones.dinov2_weights import (
     WeightsFile,
     check_fit,
@@ -110,7 +110,10 @@ class Dinov2:
         for block in before:
             tokens = block(tokens)
         facet = last(tokens) if self.facet == "token" else last.attn.qkv(last.norm1(tokens))
-        return normalize(facet[:, 1 + self._shape.registers :], dim=-1)
+        return unit_features(facet[:, 1 + self._shape.registers :])
+
+    def grid(self, height: int, width: int) -> tuple[int, int]:
+        return height // PATCH, width // PATCH
 
     def _with_positions(self, patches: torch.Tensor, rows: int, columns: int) -> torch.Tensor:
         """(B, patches, width) -> (B, 1 + registers + patches, width)."""

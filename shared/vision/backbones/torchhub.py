@@ -14,7 +14,7 @@ from torch.nn.functional import normalize
 
 from shared.recipes import MOST_WIDTH
 from shared.torchhub_names import HubEntry
-from shared.vision.backbones.base import normalise_pixels
+from shared.vision.backbones.base import normalise_pixels, unit_features
 from shared.vision.download import OnProgress
 from shared.vision.torchhub_code import (
     bring_code,
@@ -60,7 +60,10 @@ class HubModule:
 
     @torch.inference_mode()
     def features(self, pixels: torch.Tensor) -> torch.Tensor:
-        return normalize(self._forward(pixels).float(), dim=-1).unsqueeze(1)
+        return unit_features(self._forward(pixels)).unsqueeze(1)
+
+    def grid(self, height: int, width: int) -> tuple[int, int]:
+        return 1, 1
 
     def _forward(self, pixels: torch.Tensor) -> Any:
         batch = normalise_pixels(pixels.to(self.device), self._hub.mean, self._hub.std)

@@ -1,0 +1,234 @@
+"""How fast photos become rows here, beside AnyLoc as published, and beside what the device can do.
+
+JPEG bytes go in, rows come out; both ways take the same photos in turn, so that whatever else the
+machine does meets both; on a CPU that has other work their CPU time tells more. The ceiling is the
+rate of large matrix products in the same precision.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import statistics
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+import psutil
+import torch
+from numpy.typing import NDArray
+from torch.nn.attention import SDPBackend, sdpa_kernel
+from torch.utils.flop_counter import FlopCounterMode
+
+from benchmarks.networks import Measured, centres_for
+from benchmarks.reference_anyloc import ReferenceAnyLoc
+from benchmarks.report import Report
+from benchmarks.traffic import photos_of
+from services.extractor.decoding import DecoderPool
+from shared.errors import PlacewiseError
+from shared.vision.extractors import Extractor
+from shared.vision.precision import Precision, choose_precision, computing_in
+from shared.vision.resample import Pixels
+from shared.vision.vocabulary import Centres
+from tests.support.fit_memory import memory_bytes
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
+
+WANTED_TIMES = 2.0
+SIZE, SIZE_BYTES = (1024, 768), 100_000
+TEXTURES = 32
+LEARNT_FROM = 16  # further ones, enough for 64 centres: to be one's own centre leaves only rounding
+MATRIX = {"cpu": 2048, "cuda": 8192}  # rows and columns
+MATRIX_ROUNDS = 5
+
+Rows = NDArray[np.float32]
+
+
+def measure(
+    progress: Progress,
+    *,
+    extractor: str,
+    photos: int,
+    device: str,
+    batch: int,
+    precision: Literal["auto", "float32", "bfloat16"],
+    rounds: int,
+) -> Report:
+    """`rounds` of `photos` by either way. Only `anyloc-` extractors with hard VLAD are published,
+    and compared; of others our own figures are told.
+    """
+    made = photos_of(LEARNT_FROM + min(TEXTURES, photos), SIZE, SIZE_BYTES)
+    textures = made[LEARNT_FROM:]
+    files = [textures[number % len(textures)] for number in range(photos)]
+    with tempfile.TemporaryDirectory() as folder:
+        measured = Measured.of(extractor, device, Path(folder))
+        chosen = choose_precision(precision, measured.recipe, measured.device)
+        report = Report(f"{measured.title}, {chosen}")
+        with _pipeline(measured, chosen, batch, made[:LEARNT_FROM]) as pipeline:
+            _measure(report, progress, measured, pipeline, files, rounds)
+    report.details = {
+        "random_weights": measured.random,
+        "precision": chosen,
+        "photos": photos,
+        "batch": batch,
+        "rounds": rounds,
+        "torch": torch.__version__,
+    }
+    return report
+
+
+def _measure(
+    report: Report,
+    progress: Progress,
+    measured: Measured,
+    pipeline: Pipeline,
+    files: Sequence[bytes],
+    rounds: int,
+) -> None:
+    published = measured.recipe.depth is not None and measured.recipe.aggregator == "vlad"
+    bar = progress.add_task("rounds", total=rounds)
+    pipeline.describe(files[: 2 * pipeline.batch])  # kernels are chosen, the decoders are there
+    ours, theirs = Times(), Times()
+    _forget_peak(measured.device)
+    rows = ours.take(lambda: pipeline.describe(files))
+    peak_bytes = _peak(measured.device)
+    reference, wanted = None, rows
+    if published:
+        assert pipeline.centres is not None
+        reference = ReferenceAnyLoc(measured, pipeline.centres.array)
+        reference.describe(files[:1])  # warm, as ours
+        wanted = theirs.take(lambda: reference.describe(files))
+    for _ in range(rounds - 1):
+        ours.take(lambda: pipeline.describe(files))
+        if reference is not None:
+            theirs.take(lambda: reference.describe(files))
+        progress.advance(bar)
+    progress.advance(bar)
+    rate = len(files) / statistics.median(ours.seconds)
+    report.add("this pipeline", rate, "photos/s")
+    if measured.device.type == "cpu":
+        report.add("CPU time of a photo", ours.cpu_milliseconds(len(files)), "ms")
+    if reference is not None:
+        report.add("as published", len(files) / statistics.median(theirs.seconds), "photos/s")
+        if measured.device.type == "cpu":
+            published_ms = theirs.cpu_milliseconds(len(files))
+            report.add("CPU time of a photo as published", published_ms, "ms")
+        ratios = [slow / quick for slow, quick in zip(theirs.seconds, ours.seconds, strict=True)]
+        report.add("times as fast", statistics.median(ratios), at_least=WANTED_TIMES)
+        report.add("largest difference of two numbers", float(np.abs(rows - wanted).max()))
+        report.add("least cosine of two descriptors", float((rows * wanted).sum(axis=1).min()))
+    flop = _flop(pipeline.made, pipeline.pixels(files[:1])[0])
+    ceiling = _matrix_flops(measured.device, pipeline.made.precision)
+    report.add("forward pass of a photo", flop / 1e9, "GFLOP")
+    report.add("matrix products on this device", ceiling / 1e9, "GFLOP/s")
+    report.add("of them, this pipeline", rate * flop / ceiling)
+    report.add("peak memory", peak_bytes / 1e6, "MB")
+
+
+class Pipeline:
+    """As the extractor does it: decoding children are a batch ahead of the network."""
+
+    def __init__(self, made: Extractor, decoders: DecoderPool, batch: int) -> None:
+        self.made = made
+        self.batch = batch
+        self.centres: Centres | None = None
+        self._decoders = decoders
+
+    def pixels(self, files: Sequence[bytes]) -> list[Pixels]:
+        found = []
+        for outcome in self._decoders.decode(files, self.made.preprocessing):
+            if isinstance(outcome, PlacewiseError):
+                raise outcome
+            found.append(outcome.pixels)
+        return found
+
+    def describe(self, files: Sequence[bytes]) -> Rows:
+        """JPEGs -> (n, dimension)."""
+        batches = [files[n : n + self.batch] for n in range(0, len(files), self.batch)]
+        rows = []
+        with ThreadPoolExecutor(1) as reader:
+            ahead = reader.submit(self.pixels, batches[0])
+            for following in [*batches[1:], None]:
+                photos = ahead.result()
+                if following is not None:
+                    ahead = reader.submit(self.pixels, following)
+                rows.append(self.made.describe(photos, self.centres))
+        return np.concatenate(rows)
+
+
+@contextlib.contextmanager
+def _pipeline(
+    measured: Measured, precision: Precision, batch: int, learnt_from: Sequence[bytes]
+) -> Iterator[Pipeline]:
+    with contextlib.closing(DecoderPool(measured.settings)) as decoders:
+        pipeline = Pipeline(measured.load(precision), decoders, batch)
+        pipeline.centres = centres_for(pipeline.made, pipeline.pixels(learnt_from))
+        yield pipeline
+
+
+@dataclass(slots=True)
+class Times:
+    """Of one way, a round after the other."""
+
+    seconds: list[float] = field(default_factory=list)
+    cpu_seconds: list[float] = field(default_factory=list)
+    """With those of the decoding children."""
+
+    def take(self, do: Callable[[], Rows]) -> Rows:
+        """What it makes. Rows lie on the CPU: a GPU has ended, too."""
+        begun, cpu_begun = time.perf_counter(), _cpu_seconds()
+        rows = do()
+        self.seconds.append(time.perf_counter() - begun)
+        self.cpu_seconds.append(_cpu_seconds() - cpu_begun)
+        return rows
+
+    def cpu_milliseconds(self, photos: int) -> float:
+        """Of one photo."""
+        return 1000 * statistics.median(self.cpu_seconds) / photos
+
+
+def _cpu_seconds() -> float:
+    processes = [psutil.Process(), *psutil.Process().children(recursive=True)]
+    return sum(sum(process.cpu_times()[:2]) for process in processes)
+
+
+def _flop(made: Extractor, photo: Pixels) -> float:
+    """Floating-point operations of the backbone for one photo; a product and its sum are two."""
+    # Fused attention is not counted on every device; written out, it always is.
+    with sdpa_kernel(SDPBackend.MATH), FlopCounterMode(display=False) as counter:
+        made.features(photo[None])
+    return float(counter.get_total_flops())
+
+
+def _matrix_flops(device: torch.device, precision: Precision) -> float:
+    """The best of some products of two square matrices, in operations per second."""
+    side = MATRIX[device.type]
+    kind = torch.float32 if precision == "float32" else torch.bfloat16
+    one = torch.rand(side, side, device=device, dtype=kind)
+    best = 0.0
+    with computing_in("float32", device):
+        for _ in range(MATRIX_ROUNDS):
+            begun = time.perf_counter()
+            (one @ one)[0, 0].item()  # waits for the device
+            best = max(best, 2 * side**3 / (time.perf_counter() - begun))
+    return best
+
+
+def _forget_peak(device: torch.device) -> None:
+    if device.type == "cuda":
+        torch.cuda.reset_peak_memory_stats(device)
+    else:
+        Path(f"/proc/{os.getpid()}/clear_refs").write_text("5")  # proc(5): VmHWM starts anew
+
+
+def _peak(device: torch.device) -> float:
+    """Bytes: of the GPU's memory, or of this process without its decoders."""
+    if device.type == "cuda":
+        return torch.cuda.max_memory_allocated(device)
+    return memory_bytes("VmHWM")

@@ -1,0 +1,136 @@
+"""What bfloat16 changes: patches, descriptors and recall, against float32 on the same photos.
+
+The photos are those of a generated city, which is drawn for it: recall is comparable between the
+two, and with nothing else.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from PIL import Image
+
+from benchmarks.networks import Measured, centres_for
+from benchmarks.report import Report
+from shared.datasets.city.plan import CityOptions, Shot, make_plan
+from shared.datasets.city.write import write_city
+from shared.datasets.recall import rank, recall_at, true_positives
+from shared.vision.extractors import Extractor
+from shared.vision.precision import PRECISIONS, Precision
+from shared.vision.resample import Pixels
+from shared.vision.vocabulary import Centres
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
+
+WANTED_PATCH_COSINE = 0.999
+WANTED_QUERIES = 1
+SIZE = 320, 240
+VIEWS = 2
+LEARNT_FROM = 32  # photos, where no vocabulary is shipped
+
+Rows = NDArray[np.float32]
+
+
+def measure(
+    progress: Progress, *, extractor: str, places: int, queries: int, device: str, batch: int
+) -> Report:
+    """A city of so many places, two views of each; the vocabulary is that of float32 for both."""
+    with tempfile.TemporaryDirectory() as folder:
+        measured = Measured.of(extractor, device, Path(folder))
+        single = measured.load("float32")
+        shots, files = _draw(progress, Path(folder, "city"), places, queries)
+        found = _Found(
+            single, centres_for(single, [_pixels(single, f) for f in files[:LEARNT_FROM]])
+        )
+        bar = progress.add_task("describing in both precisions", total=len(files))
+        for begin in range(0, len(files), batch):
+            chosen = [_pixels(single, file) for file in files[begin : begin + batch]]
+            found.add(chosen)
+            progress.advance(bar, len(chosen))
+    report = Report(f"{measured.title}: bfloat16 against float32")
+    found.tell(report, shots)
+    report.details = {
+        "random_weights": measured.random,
+        "photos": len(files),
+        "torch": torch.__version__,
+    }
+    return report
+
+
+@dataclass(slots=True)
+class _Found:
+    """What has been described so far, in both precisions."""
+
+    single: Extractor
+    centres: Centres | None
+    patch_cosines: list[Rows] = field(default_factory=list)
+    rows: dict[Precision, list[Rows]] = field(
+        default_factory=lambda: {precision: [] for precision in PRECISIONS}
+    )
+
+    def add(self, photos: list[Pixels]) -> None:
+        local: list[torch.Tensor] = []
+        for precision in PRECISIONS:
+            made = self.single.at(precision)
+            local.append(torch.stack(made.local_features(photos)))
+            self.rows[precision].append(made.describe(photos, self.centres))
+        self.patch_cosines.append((local[0] * local[1]).sum(dim=-1).flatten().numpy())
+
+    def tell(self, report: Report, shots: Sequence[Shot]) -> None:
+        patches = np.concatenate(self.patch_cosines)
+        report.add(
+            "patches, mean cosine",
+            float(patches.mean()),
+            at_least=WANTED_PATCH_COSINE,
+        )
+        report.add("patches, least cosine", float(patches.min()))
+        rows = {precision: np.concatenate(found) for precision, found in self.rows.items()}
+        cosines = (rows["float32"] * rows["bfloat16"]).sum(axis=1)
+        report.add("descriptors, mean cosine", float(cosines.mean()))
+        report.add("descriptors, least cosine", float(cosines.min()))
+        database = np.array([shot.role == "database" for shot in shots])
+        positions = np.array([(shot.camera.x, shot.camera.y) for shot in shots])
+        positives = true_positives(positions[~database], positions[database])
+        right = {}
+        for precision, found in rows.items():
+            ranked = rank(found[~database], found[database], 1)
+            right[precision] = round(recall_at(ranked, positives, (1,))[1] * len(positives))
+            report.add(f"queries found first in {precision}, of {len(positives)}", right[precision])
+        apart = abs(right["float32"] - right["bfloat16"])
+        report.add("queries apart", apart, at_most=WANTED_QUERIES)
+
+
+def _draw(
+    progress: Progress, out: Path, places: int, queries: int
+) -> tuple[list[Shot], list[Path]]:
+    """The shots of the database and the queries, and their files."""
+    width, height = SIZE
+    plan = make_plan(
+        CityOptions(
+            places=places,
+            views=VIEWS,
+            queries=queries,
+            seed=0,
+            catalogue_seed=0,
+            out_of_map=0,
+            width=width,
+            height=height,
+            train=False,
+        )
+    )
+    bar = progress.add_task("drawing the city", total=len(plan.shots))
+    write_city(plan, out, lambda count: progress.advance(bar, count))
+    return list(plan.shots), [out / shot.folder / shot.name for shot in plan.shots]
+
+
+def _pixels(extractor: Extractor, file: Path) -> Pixels:
+    with Image.open(file) as image:
+        return extractor.preprocessing.apply(image.convert("RGB"))

@@ -1,0 +1,87 @@
+"""Local features of compared photos: kept in the object store, or made from their pixels."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator, Sequence
+from uuid import UUID
+
+from services.extractor.decoding import DecoderPool
+from services.extractor.target import Target
+from shared.catalog.photos import Photo
+from shared.errors import NotFound, PlacewiseError, StorageFull
+from shared.objects import ObjectStore
+from shared.objects.keys import local_features_key
+from shared.settings import Settings
+from shared.vision.local_features import LocalFeatures
+
+log = logging.getLogger(__name__)
+
+
+class CandidateFeatures:
+    """Reads and, with LOCAL_FEATURES=keep, writes what lies under `features/`."""
+
+    def __init__(self, store: ObjectStore, decoders: DecoderPool, settings: Settings) -> None:
+        self._store = store
+        self._decoders = decoders
+        self._keep = settings.local_features == "keep"
+        self._at_once = settings.batch_photos
+
+    def of(self, target: Target, photos: Sequence[Photo]) -> Iterator[tuple[UUID, LocalFeatures]]:
+        """Each photo's features, in any order; left out are photos that can't be read or decoded
+        any more, or whose features are not finite. No more are held than a batch has."""
+        for begin in range(0, len(photos), self._at_once):
+            missing = []
+            for photo in photos[begin : begin + self._at_once]:
+                kept = self._kept(target, photo.id) if self._keep else None
+                if kept is None:
+                    missing.append(photo)
+                else:
+                    yield photo.id, kept
+            for photo_id, made in self._make(target, missing):
+                if self._keep:
+                    self._put(target, photo_id, made)
+                yield photo_id, made
+
+    def _kept(self, target: Target, photo_id: UUID) -> LocalFeatures | None:
+        key = local_features_key(target.generation.id, photo_id)
+        try:
+            data = self._store.get(key)
+        except NotFound:
+            return None
+        try:
+            return LocalFeatures.decode(data, target.extractor.backbone.width)
+        except ValueError as error:
+            log.error("the object %s is damaged (%s) and is made anew", key, error)
+            return None
+
+    def _make(
+        self, target: Target, photos: Sequence[Photo]
+    ) -> Iterator[tuple[UUID, LocalFeatures]]:
+        there, data = [], []
+        for photo in photos:
+            try:
+                data.append(self._store.get(photo.object_key))
+                there.append(photo.id)
+            except NotFound:
+                log.warning("the photo %s is not compared: it was deleted, or is lost", photo.id)
+        extractor = target.extractor
+        decoded = []
+        for photo_id, outcome in zip(
+            there, self._decoders.decode(data, extractor.preprocessing), strict=True
+        ):
+            if isinstance(outcome, PlacewiseError):
+                log.warning("the photo %s is not compared: %s", photo_id, outcome.detail)
+            else:
+                decoded.append((photo_id, outcome.pixels))
+        features = extractor.local_features([pixels for _, pixels in decoded])
+        for (photo_id, pixels), one in zip(decoded, features, strict=True):
+            made = LocalFeatures.of(one, extractor.backbone.grid(*pixels.shape[:2]))
+            if made.finite:
+                yield photo_id, made
+
+    def _put(self, target: Target, photo_id: UUID, made: LocalFeatures) -> None:
+        try:
+            self._store.put(local_features_key(target.generation.id, photo_id), made.encode())
+        except StorageFull as error:  # it is only made again the next time
+            log.warning("local features are not kept: %s", error.detail)

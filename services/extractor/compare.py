@@ -1,0 +1,216 @@
+"""COMPARE: look closely at the photos that a search has found. One job, one query, no slices.
+
+    prepare    which generation, and the query's pixels      beside the batch before
+    compare    local features of the query and, to rerank, of the candidates, a few at a time;
+               to explain, the candidates' descriptors       on the model
+    publish    the result as an object, then the job's end
+
+What was deleted meanwhile is left out of the result. One that another worker has taken over stores
+the same result, and can't end the job.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from uuid import UUID
+
+import numpy as np
+import torch
+from sqlalchemy import select
+
+from services.extractor.candidates import CandidateFeatures
+from services.extractor.decoding import DecoderPool
+from services.extractor.loaded import LoadedModels
+from services.extractor.publish import Published
+from services.extractor.target import Target, find_target
+from shared.catalog.chunks import Chunk, Descriptor
+from shared.catalog.photos import Photo, get_photo, live_photos
+from shared.catalog.session import Catalog
+from shared.chunks import read_row
+from shared.comparison import (
+    Candidate,
+    ClusterShare,
+    Compared,
+    ComparedCandidate,
+    Comparison,
+    Explanation,
+    check_can_explain,
+    check_can_rerank,
+)
+from shared.errors import Gone, NotFound, PlacewiseError
+from shared.jobs import Job
+from shared.jobs.finish import succeed
+from shared.jobs.leases import held
+from shared.objects import ObjectStore
+from shared.objects.keys import comparison_key, query_key
+from shared.settings import Settings
+from shared.vision.decode import Decoded
+from shared.vision.explain import Shared, explain
+from shared.vision.extractors import not_finite
+from shared.vision.local_features import LocalFeatures
+from shared.vision.matching import rerank_score
+from shared.vision.overlay import draw_overlay
+
+
+@dataclass(frozen=True, slots=True)
+class Prepared:
+    """A claimed compare job whose query is decoded."""
+
+    job: Job
+    asked: Comparison
+    target: Target
+    query: Decoded
+    seconds: dict[str, float] = field(default_factory=dict)
+
+
+class Comparisons:
+    """Does compare jobs."""
+
+    def __init__(
+        self,
+        catalog: Catalog,
+        store: ObjectStore,
+        models: LoadedModels,
+        decoders: DecoderPool,
+        settings: Settings,
+    ) -> None:
+        self._catalog = catalog
+        self._store = store
+        self._models = models
+        self._decoders = decoders
+        self._candidates = CandidateFeatures(store, decoders, settings)
+
+    def prepare(self, job: Job) -> Prepared:
+        """PlacewiseError when the job can't be done: what it needs is gone, or was never there."""
+        asked = Comparison.model_validate(job.params["request"])
+        target = find_target(self._catalog, self._store, self._models, job)
+        assert target is not None, "a compare job names a generation that has answered"
+        if asked.rerank:
+            check_can_rerank(target.extractor.recipe)
+        if asked.explain:
+            check_can_explain(target.extractor.recipe, target.generation.spec)
+        data = self._read_query(job, asked)
+        (query,) = self._decoders.decode([data], target.extractor.preprocessing)
+        if isinstance(query, PlacewiseError):
+            raise query
+        return Prepared(job, asked, target, query)
+
+    def finish(self, prepared: Prepared) -> Published:
+        """Compare, store the result and end the job."""
+        started = time.perf_counter()
+        job, result = prepared.job, self._compare(prepared)
+        prepared.seconds["compare"] = time.perf_counter() - started
+        self._store.put(comparison_key(job.id), result.model_dump_json().encode())
+        assert job.lease_token is not None, "a claimed job carries a token"
+        with self._catalog.write() as session:
+            mine = held(session, job.lease_token, [job])
+            for own in mine:
+                succeed(own, {"candidates": len(result.candidates)})
+        return Published(succeeded=len(mine))
+
+    def _read_query(self, job: Job, asked: Comparison) -> bytes:
+        if asked.query_photo_id is None:
+            assert asked.query_job_id is not None, "a query is one or the other"
+            try:
+                return self._store.get(query_key(asked.query_job_id))
+            except NotFound as error:
+                raise Gone(
+                    "query_expired",
+                    "The query is no longer kept (QUERY_TTL_SECONDS). Ask again.",
+                ) from error
+        with self._catalog.read() as session:
+            photo = get_photo(session, job.map_id, asked.query_photo_id)
+        return self._store.get(photo.object_key)
+
+    def _compare(self, prepared: Prepared) -> Compared:
+        asked, target = prepared.asked, prepared.target
+        (features,) = target.extractor.local_features([prepared.query.pixels])
+        if not bool(features.isfinite().all()):
+            raise not_finite()
+        grid = target.extractor.backbone.grid(*prepared.query.pixels.shape[:2])
+        with self._catalog.read() as session:
+            live = live_photos(session, [found.photo_id for found in asked.candidates])
+        there = [found for found in asked.candidates if found.photo_id in live]
+        first, rest = there[: asked.rerank], there[asked.rerank :]
+        query = LocalFeatures.of(features, grid)
+        scores = self._rerank(target, query, first, [live[one.photo_id] for one in first])
+        # The sort is stable: of equal scores, and without one, the more similar photo comes first.
+        first.sort(key=lambda one: -scores.get(one.photo_id, -np.inf))
+        ordered = [one.photo_id for one in first + rest]
+        shares = self._explain(target, features, ordered[: asked.explain], asked.word_weights)
+        return Compared(
+            candidates=tuple(
+                ComparedCandidate(
+                    photo_id=photo_id,
+                    rerank_score=scores.get(photo_id),
+                    explanation=_explanation(shares[photo_id], grid)
+                    if photo_id in shares
+                    else None,
+                )
+                for photo_id in ordered
+            )
+        )
+
+    def _rerank(
+        self,
+        target: Target,
+        query: LocalFeatures,
+        candidates: Sequence[Candidate],
+        photos: Sequence[Photo],
+    ) -> dict[UUID, float]:
+        """The rerank score of each candidate that can be read, by its photo."""
+        similarity = {one.photo_id: one.ranked_by for one in candidates}
+        device = target.extractor.backbone.device
+        return {
+            photo_id: rerank_score(similarity[photo_id], query, features, device)
+            for photo_id, features in self._candidates.of(target, photos)
+        }
+
+    def _explain(
+        self,
+        target: Target,
+        features: torch.Tensor,
+        photo_ids: Sequence[UUID],
+        word_weights: Sequence[float],
+    ) -> dict[UUID, Shared]:
+        """The shares of each of the photos; of none when none is asked for."""
+        if not photo_ids:
+            return {}
+        generation_id = target.generation.id
+        with self._catalog.read() as session:
+            found = session.execute(
+                select(Descriptor.photo_id, Descriptor.row, Chunk.object_key)
+                .join(Chunk, Chunk.id == Descriptor.chunk_id)
+                .where(
+                    Descriptor.generation_id == generation_id, Descriptor.photo_id.in_(photo_ids)
+                )
+            ).all()
+        if not found:
+            raise Gone(
+                "query_expired",
+                f"The generation {generation_id} that answered is gone. Ask again.",
+            )
+        rows = np.stack([read_row(self._store, key, row) for _, row, key in found])
+        shares = explain(target.extractor.recipe, features, target.centres, rows, word_weights)
+        return {photo_id: share for (photo_id, _, _), share in zip(found, shares, strict=True)}
+
+
+def _explanation(shared: Shared, grid: tuple[int, int]) -> Explanation:
+    overlay, full_share = draw_overlay(shared.patches.reshape(grid))
+    clusters = None
+    if shared.clusters is not None:
+        strongest = np.argsort(-shared.clusters, kind="stable")
+        clusters = tuple(
+            ClusterShare(cluster=int(cluster), share=float(shared.clusters[cluster]))
+            for cluster in strongest
+            if shared.clusters[cluster]
+        )
+    return Explanation(
+        clusters=clusters,
+        rows=grid[0],
+        columns=grid[1],
+        overlay=overlay,
+        full_share=full_share,
+    )

@@ -1,0 +1,207 @@
+"""PCA: fit a whitening on the map's stored rows, a slice at a time. No photo is described for it.
+
+    plan      which photos' rows, and how they are cut      -> plan.json
+    gather    the next few of these rows                    -> rows-*.f32
+    reduce    steps of `shared.vision.pca_fit`              -> fit.npz, part-*.npz
+
+The names are objects under `work/<job>/`. Nothing of a fit is kept in the worker's memory. The
+longest step finds the variances of the sample: some seconds where it has 2,000 rows.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import time
+from uuid import UUID
+
+import numpy as np
+from sqlalchemy import select
+
+from services.extractor.loaded import LoadedModels, Made
+from services.extractor.new_generation import begin_whitened, go_on
+from services.extractor.stored_rows import stored_rows
+from shared.catalog.chunks import Descriptor
+from shared.catalog.generations import Generation
+from shared.catalog.photos import Photo, PhotoRole
+from shared.catalog.session import Catalog
+from shared.catalog.vocabularies import Vocabulary
+from shared.catalog.whitenings import generation_to_whiten
+from shared.errors import Conflict
+from shared.jobs import Job
+from shared.objects import ObjectStore
+from shared.objects.keys import work_key
+from shared.vision.pca import Projection
+from shared.vision.pca_file import WhiteningFile
+from shared.vision.pca_fit import Part, PcaFit, check_can_fit
+from shared.vision.pca_rows import (
+    StoredColumns,
+    block_width,
+    blocks_of,
+    choose_rows,
+    sample_size,
+    usable,
+)
+
+SLICE_SECONDS = 1.0  # about the time of a batch: what a query may have to wait
+READ_BYTES = 16_000_000  # of rows that are read together
+SEED = 0
+REDUCE_UNITS = 100  # of the job's progress: finding the directions, in per cent
+
+
+class FitPca:
+    """Does one slice of a PCA at a time."""
+
+    def __init__(self, catalog: Catalog, store: ObjectStore, models: LoadedModels) -> None:
+        self._catalog = catalog
+        self._store = store
+        self._models = models
+
+    def slice(self, job: Job) -> None:
+        """The next slice, by the job's stage; PlacewiseError when it can't go on."""
+        if job.stage is None:
+            self._plan(job)
+        elif job.stage == "gather":
+            self._gather(job)
+        else:
+            self._reduce(job)
+
+    def _plan(self, job: Job) -> None:
+        """Choose the rows to learn from: those of database photos alone, never of queries."""
+        with self._catalog.read() as session:
+            source = generation_to_whiten(session, job.map_id)
+            photo_ids = session.scalars(
+                select(Descriptor.photo_id)
+                .join(Photo, Photo.id == Descriptor.photo_id)
+                .where(
+                    Descriptor.generation_id == source.id,
+                    Photo.deleted_at.is_(None),
+                    Photo.role == PhotoRole.DATABASE,
+                )
+                .order_by(Descriptor.photo_id)
+            ).all()
+        self._check_unchanged(source)
+        kept = job.params["pca"]
+        check_can_fit(len(photo_ids), source.dimension, kept)
+        chosen = choose_rows(len(photo_ids), sample_size(source.dimension, kept), SEED)
+        plan = [str(photo_ids[number]) for number in chosen]
+        self._store.put(work_key(job.id, "plan.json"), json.dumps(plan).encode())
+        go_on(
+            self._catalog,
+            job,
+            stage="gather",
+            params={
+                **job.params,
+                "source": str(source.id),
+                "dimension": source.dimension,
+                "width": block_width(len(plan), source.dimension),
+                "looked_at": 0,
+                "rows": 0,
+            },
+            progress_total=len(plan) + REDUCE_UNITS + len(photo_ids),
+        )
+
+    def _check_unchanged(self, source: Generation) -> None:
+        """Conflict (`spec_differs`) where this worker would not describe photos as the rows were:
+        they and the new ones would not belong together.
+        """
+        made = self._made(source)
+        if made.spec != source.spec:
+            raise Conflict(
+                "spec_differs",
+                "The map's photos were described by other releases than this worker's. Describe "
+                "them anew first (POST /api/v1/generations with the vocabulary alone).",
+                generation_id=str(source.id),
+            )
+
+    def _made(self, source: Generation) -> Made:
+        vocabulary = None
+        if source.vocabulary_id is not None:
+            with self._catalog.read() as session:
+                vocabulary = session.get_one(Vocabulary, source.vocabulary_id)
+        return Made(
+            self._models.extractor(source.extractor),
+            self._models.centres(vocabulary) if vocabulary else None,
+        )
+
+    def _gather(self, job: Job) -> None:
+        """The next rows of the plan, for about a second."""
+        params = job.params
+        plan = json.loads(self._store.get(work_key(job.id, "plan.json")))
+        at_once = max(1, READ_BYTES // (4 * params["dimension"]))
+        sample = self._sample(job)
+        looked_at = params["looked_at"]
+        until = time.monotonic() + SLICE_SECONDS
+        while looked_at < len(plan):  # at least once, however slow it is
+            wanted = [UUID(photo_id) for photo_id in plan[looked_at : looked_at + at_once]]
+            found = stored_rows(self._catalog, self._store, UUID(params["source"]), wanted)
+            if found:
+                rows = np.stack([found[photo_id] for photo_id in wanted if photo_id in found])
+                sample.add(rows[usable(rows)])
+            looked_at += len(wanted)
+            if time.monotonic() >= until:
+                break
+        go_on(
+            self._catalog,
+            job,
+            stage="gather" if looked_at < len(plan) else "reduce",
+            params={**params, "looked_at": looked_at, "rows": sample.count},
+            progress_done=looked_at,
+        )
+
+    def _reduce(self, job: Job) -> None:
+        """Steps for about a second; when they are done, the whitening and its generation."""
+        params = job.params
+        sample = self._sample(job)
+        fit = PcaFit(sample, params["pca"])
+        kept = work_key(job.id, "fit.npz")
+        if params.get("reducing"):
+            fit.resume(self._store.get(kept))
+        until = time.monotonic() + SLICE_SECONDS
+        while not fit.done:  # at least one step, however slow it is
+            part = fit.step()
+            if part is not None:
+                self._keep(job, fit.parts - 1, part)
+            if time.monotonic() >= until:
+                break
+        if not fit.done:
+            self._store.put(kept, fit.save())
+            done, most = fit.progress
+            go_on(
+                self._catalog,
+                job,
+                params={**params, "reducing": True},
+                progress_done=params["looked_at"] + REDUCE_UNITS * done // most,
+            )
+            return
+        with self._catalog.read() as session:
+            source = session.get_one(Generation, UUID(params["source"]))
+        found = fit.whitening([self._kept(job, number) for number in range(blocks_of(sample))])
+        made = self._made(source)
+        whole = Projection(found, made.extractor.backbone.device)
+        begin_whitened(
+            self._catalog,
+            self._store,
+            job,
+            Made(made.extractor, made.centres, whole),
+            WhiteningFile(found, source.spec),
+            source.vocabulary_id,
+            progress_done=params["looked_at"] + REDUCE_UNITS,
+        )
+
+    def _sample(self, job: Job) -> StoredColumns:
+        params = job.params
+        prefix = work_key(job.id, "rows-")
+        return StoredColumns(
+            self._store, prefix, params["dimension"], params["width"], params["rows"]
+        )
+
+    def _keep(self, job: Job, number: int, part: Part) -> None:
+        buffer = io.BytesIO()
+        np.savez(buffer, allow_pickle=False, mean=part.mean, directions=part.directions)
+        self._store.put(work_key(job.id, f"part-{number:05d}.npz"), buffer.getvalue())
+
+    def _kept(self, job: Job, number: int) -> Part:
+        data = self._store.get(work_key(job.id, f"part-{number:05d}.npz"))
+        with np.load(io.BytesIO(data), allow_pickle=False) as saved:
+            return Part(saved["mean"], saved["directions"])

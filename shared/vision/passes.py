@@ -1,0 +1,110 @@
+"""How much goes through a network at once, and what happens when that is more than the GPU holds.
+
+A pass for which memory does not suffice is repeated with half of its photos, and from then on none
+is larger. What one photo needs grows with its pixels, so it is pixels that are counted.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import math
+import threading
+from collections.abc import Callable, Collection, Iterator
+
+import numpy as np
+import torch
+
+from shared.errors import Unprocessable
+from shared.vision.resample import Pixels
+
+log = logging.getLogger(__name__)
+
+USUAL_PIXELS = 224 * 224  # of a photo, by which the size of a pass is chosen
+
+# All threads of a process queue their work on one GPU in one line: side by side they would gain
+# nothing, and need memory for both.
+_turn = threading.Lock()
+
+
+class PhotoDoesNotFit(Unprocessable):
+    """One photo alone is too much for the GPU: code `gpu_out_of_memory`."""
+
+    place = 0
+    """Which of the photos that were to be described, counted from 0."""
+
+    @classmethod
+    def at(cls, place: int, height: int, width: int) -> PhotoDoesNotFit:
+        error = cls(
+            "gpu_out_of_memory",
+            "The GPU's memory does not suffice for this photo alone, of which the preprocessing "
+            f"makes {width} x {height} pixels. See what else uses the GPU (`nvidia-smi`) and retry "
+            "the job; or take a preprocessing that makes photos smaller (square224), a smaller "
+            "extractor, or DEVICE=cpu.",
+        )
+        error.place = place
+        return error
+
+
+class PassLimit:
+    """What one loaded network can take at once. Kept as long as the process lives."""
+
+    def __init__(self) -> None:
+        self._most_pixels: float = math.inf
+
+    def photos(self, batch: int, photo_pixels: int) -> int:
+        """How many photos of that size make one pass of a batch of `batch` photos: together no more
+        pixels than the batch would have at 224 x 224, or else one photo.
+        """
+        return max(1, int(min(batch * USUAL_PIXELS, self._most_pixels)) // photo_pixels)
+
+    def ran_out(self, photos: int, photo_pixels: int) -> None:
+        """A pass of several such photos did not fit: the next ones have half of it at most."""
+        self._most_pixels = min(self._most_pixels, photos * photo_pixels // 2)
+        log.warning(
+            "%d photos of %d pixels at once are too much for the GPU: half of that from now on",
+            photos,
+            photo_pixels,
+        )
+
+
+def in_passes(
+    photos: Collection[Pixels],
+    run: Callable[[Pixels], torch.Tensor],
+    limit: PassLimit,
+    device: torch.device,
+) -> Iterator[tuple[list[int], torch.Tensor]]:
+    """Pass by pass: the places of its photos in `photos`, and what `run` makes of them.
+
+    `run` takes (B, H, W, 3): photos of one size, as many as `limit` says. On a GPU it has to leave
+    nothing of its own there but what it returns. Raises PhotoDoesNotFit.
+    """
+    listed = list(photos)
+    of_shape: dict[tuple[int, ...], list[int]] = {}
+    for place, photo in enumerate(listed):
+        of_shape.setdefault(photo.shape, []).append(place)
+    for (height, width, _), left in of_shape.items():
+        while left:
+            chosen = left[: limit.photos(len(listed), height * width)]
+            found = _if_it_fits(run, np.stack([listed[place] for place in chosen]), device)
+            if found is not None:
+                left = left[len(chosen) :]
+                yield chosen, found
+            elif len(chosen) > 1:
+                limit.ran_out(len(chosen), height * width)
+            else:
+                raise PhotoDoesNotFit.at(chosen[0], height, width)
+
+
+def _if_it_fits(
+    run: Callable[[Pixels], torch.Tensor], pixels: Pixels, device: torch.device
+) -> torch.Tensor | None:
+    """None where the GPU has no memory for it."""
+    with _turn if device.type == "cuda" else contextlib.nullcontext():
+        try:
+            return run(pixels)
+        except torch.cuda.OutOfMemoryError:
+            pass
+        # Outside of the handler, which would still hold what the pass had come to.
+        torch.cuda.empty_cache()
+        return None

@@ -1,0 +1,228 @@
+"""Fitting a PCA whitening (`shared.vision.pca`) on database rows: queries would tell the map what
+they are.
+
+At 98,304 dimensions the covariance (39 GB) can't be held. With fewer rows than dimensions the same
+directions come from the n x n Gram matrix (Turk and Pentland 1991): XX' = U diag(s^2) U' gives
+l = s^2 / (n - 1) and p = X'u / s. X is read in blocks of columns, each centred by its own mean,
+once for XX' and once for the directions, so that memory holds n x n numbers, one block, and what
+comes of it. Each block is a step, and a fit can be interrupted between any two.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared.errors import Unprocessable
+from shared.vision.pca import Rows, Whitening
+from shared.vision.pca_rows import BLOCK_BYTES, ArrayColumns, Columns, blocks_of
+
+# Of the largest one: below, float32's rounding of the rows is what would be made strong.
+LEAST_VARIANCE = 1e-9
+
+Matrix = NDArray[np.float64]
+
+
+class Stage(StrEnum):
+    PRODUCTS = "products"  # between all rows
+    VARIANCES = "variances"  # the largest of them
+    DIRECTIONS = "directions"
+    DONE = "done"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Part:
+    """A block of columns of the result."""
+
+    mean: Rows
+    """(width,)"""
+    directions: Rows
+    """(kept, width), each divided by its standard deviation."""
+
+
+class PcaFit:
+    """Finds a whitening; `step` until `done`. The same for the same rows, whether or not it was
+    saved and resumed between two steps.
+    """
+
+    def __init__(self, rows: Columns, kept: int) -> None:
+        """Raises Unprocessable as `check_can_fit` does."""
+        check_can_fit(rows.count, rows.dimension, kept)
+        self._rows = rows
+        self._kept = kept
+        self._blocks = blocks_of(rows)
+        self.stage = Stage.PRODUCTS
+        self._block = 0
+        """Blocks of columns that the stage has seen."""
+        # Of rows (XX') or of columns (X'X), whichever are fewer.
+        self._by_columns = rows.count > rows.dimension and self._blocks == 1
+        size = rows.dimension if self._by_columns else rows.count
+        self._products: Matrix = np.zeros((size, size))
+        self._basis: Matrix = np.empty((size, 0))
+        """What a centred block is multiplied with for its directions."""
+        self._variances: Matrix = np.empty(0)
+        self._total = 0.0
+
+    @property
+    def done(self) -> bool:
+        return self.stage == Stage.DONE
+
+    @property
+    def progress(self) -> tuple[int, int]:
+        """Steps done, and all of them."""
+        before = {Stage.PRODUCTS: 0, Stage.VARIANCES: 0, Stage.DIRECTIONS: self._blocks + 1}
+        most = 2 * self._blocks + 1
+        return (most if self.done else before[self.stage] + self._block), most
+
+    @property
+    def parts(self) -> int:
+        """Blocks of the result that there are."""
+        if self.done:
+            return self._blocks
+        return self._block if self.stage == Stage.DIRECTIONS else 0
+
+    def step(self) -> Part | None:
+        """A block of columns, or the variances; of the last stage, what came of the block.
+
+        Unprocessable (`pca_too_many_dimensions`) when the rows vary in too few directions.
+        """
+        if self.stage == Stage.VARIANCES:
+            self._find_variances()
+            return None
+        block, mean = _centred(self._rows.read(self._block))
+        part = None
+        if self.stage == Stage.PRODUCTS:
+            self._products += block.T @ block if self._by_columns else block @ block.T
+        else:
+            found = self._basis.T if self._by_columns else self._basis.T @ block
+            part = Part(mean.astype(np.float32), found.astype(np.float32))
+        self._block += 1
+        if self._block == self._blocks:
+            if self.stage == Stage.DIRECTIONS:
+                self.stage = Stage.DONE
+            else:
+                self.stage = Stage.VARIANCES
+        return part
+
+    def whitening(self, parts: Sequence[Part]) -> Whitening:
+        """What the parts of a fit that is done come to, in their order."""
+        assert self.done
+        directions = np.concatenate([part.directions for part in parts], axis=1)
+        return Whitening(
+            mean=np.concatenate([part.mean for part in parts]),
+            directions=_with_fixed_signs(directions),
+            variances=self._variances.astype(np.float32),
+            explained=float(self._variances.sum() / self._total),
+            rows=self._rows.count,
+        )
+
+    def _find_variances(self) -> None:
+        freedom = self._rows.count - 1
+        squares, vectors = _largest(self._products, self._kept)
+        self._variances = squares / freedom
+        self._total = float(np.trace(self._products)) / freedom
+        # p / sqrt(l) = X'u / s * sqrt(n - 1) / s; by columns the vectors are the directions p.
+        scale = 1 / np.sqrt(self._variances) if self._by_columns else np.sqrt(freedom) / squares
+        self._basis = vectors * scale
+        self._products = np.empty((0, 0))
+        self.stage, self._block = Stage.DIRECTIONS, 0
+
+    # --- between two steps ---------------------------------------------------------------------
+
+    def save(self) -> bytes:
+        """All that `resume` needs beside the same rows and the parts that there are."""
+        arrays: dict[str, Any] = {
+            "stage": np.array(str(self.stage)),
+            "block": np.array(self._block),
+            "products": self._products,
+            "basis": self._basis,
+            "variances": self._variances,
+            "total": np.array(self._total),
+        }
+        buffer = io.BytesIO()
+        np.savez(buffer, allow_pickle=False, **arrays)
+        return buffer.getvalue()
+
+    def resume(self, data: bytes) -> None:
+        """Go on where a fit of the same rows was saved."""
+        with np.load(io.BytesIO(data), allow_pickle=False) as saved:
+            self.stage = Stage(str(saved["stage"]))
+            self._block = int(saved["block"])
+            self._products, self._basis = saved["products"], saved["basis"]
+            self._variances, self._total = saved["variances"], float(saved["total"])
+
+
+def check_can_fit(rows: int, dimension: int, kept: int) -> None:
+    """Unprocessable: `pca_too_few_rows` unless there are more than `kept`;
+    `pca_too_many_dimensions` when they have fewer dimensions.
+    """
+    if kept > dimension:
+        raise Unprocessable(
+            "pca_too_many_dimensions",
+            f"Descriptors of {dimension} dimensions can't be brought to {kept}. Take fewer.",
+        )
+    if rows <= kept:
+        raise Unprocessable(
+            "pca_too_few_rows",
+            f"PCA to {kept} dimensions needs more than {kept} described photos, better several "
+            f"times as many, and there are {rows}. Index more photos, or take fewer dimensions.",
+        )
+
+
+def fit(rows: Rows, kept: int, *, block_bytes: int = BLOCK_BYTES) -> Whitening:
+    """The whitening of (n, D) rows, which may be mapped from a file, to `kept` dimensions.
+
+    Raises as `PcaFit` does.
+    """
+    return fit_columns(ArrayColumns(rows, block_bytes), kept)
+
+
+def fit_columns(rows: Columns, kept: int) -> Whitening:
+    """The whitening of rows to `kept` dimensions in one go."""
+    finding = PcaFit(rows, kept)
+    parts = []
+    while not finding.done:
+        part = finding.step()
+        if part is not None:
+            parts.append(part)
+    return finding.whitening(parts)
+
+
+def _largest(matrix: Matrix, kept: int) -> tuple[Matrix, Matrix]:
+    """The `kept` largest eigenvalues, largest first, and their (N, kept) unit eigenvectors."""
+    values, vectors = np.linalg.eigh(matrix)
+    values, vectors = values[::-1][:kept], vectors[:, ::-1][:, :kept]
+    usable = int((values > LEAST_VARIANCE * max(values[0], 0)).sum())
+    if usable < kept:
+        raise Unprocessable(
+            "pca_too_many_dimensions",
+            f"The described photos vary in {usable} directions only, and PCA to {kept} dimensions "
+            "needs as many. Index more different photos, or take fewer dimensions.",
+        )
+    return values, vectors
+
+
+def _centred(block: Rows) -> tuple[Matrix, Matrix]:
+    """The columns without their means, in float64, and the means."""
+    wide = block.astype(np.float64)
+    means: Matrix = wide.mean(axis=0)
+    wide -= means
+    return wide, means
+
+
+def _with_fixed_signs(directions: Rows) -> Rows:
+    """Of two opposite directions the one whose strongest number is positive: the same everywhere,
+    whichever way the eigenvectors came. (kept, D), C order.
+    """
+    fixed = np.ascontiguousarray(directions)
+    for direction in fixed:
+        if direction[np.abs(direction).argmax()] < 0:
+            # Not np.negative in place: NumPy 2.4 does it wrong where rows are strided by 16 bytes.
+            direction *= -1
+    return fixed

@@ -1,0 +1,104 @@
+"""From pairs of descriptors to one weight for each word, and from there to a weighted query.
+
+    w_k = max(0, (mean of <a_k, b_k> over near pairs - mean over far pairs) / deviation over far)
+
+The distance of two means in units of the noise between them, as signal detection's d' (Green and
+Swets 1966): a word that is alike wherever one looks (sky, asphalt) gets 0.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+# Deviations below are rounding: products of words that occur in no far pair are all 0.
+LEAST_DEVIATION = 1e-9
+
+Rows = NDArray[np.float32]
+Numbers = NDArray[np.float64]
+
+
+def word_products(rows: Rows, pairs: NDArray[np.int64], words: int) -> Numbers:
+    """(n, words) products <a_k, b_k> of the (n, 2) pairs of (m, words * width) rows.
+
+    Those of a pair add up to its cosine. Takes no more memory than two rows beside the result.
+    """
+    if not len(pairs):
+        return np.empty((0, words))
+    blocks = rows.reshape(len(rows), words, -1)
+    found = np.empty((len(pairs), words))
+    for number, (one, other) in enumerate(pairs.tolist()):
+        np.einsum("kw,kw->k", blocks[one], blocks[other], out=found[number], dtype=np.float64)
+    return found
+
+
+@dataclass(frozen=True, slots=True)
+class Moments:
+    """Sums over the products of so many pairs, word by word; those of two sets of pairs add up."""
+
+    pairs: int
+    total: Numbers
+    """(words,)"""
+    squares: Numbers
+    """(words,) sums of squares."""
+
+    @classmethod
+    def of(cls, products: Numbers) -> Moments:
+        """(n, words) products."""
+        return cls(len(products), products.sum(axis=0), (products**2).sum(axis=0))
+
+    def __add__(self, other: Moments) -> Moments:
+        return Moments(
+            self.pairs + other.pairs, self.total + other.total, self.squares + other.squares
+        )
+
+    @property
+    def mean(self) -> Numbers:
+        found: Numbers = self.total / self.pairs
+        return found
+
+    @property
+    def deviation(self) -> Numbers:
+        """Standard deviation over the pairs."""
+        found: Numbers = np.sqrt(np.maximum(0.0, self.squares / self.pairs - self.mean**2))
+        return found
+
+
+@dataclass(frozen=True, slots=True)
+class Taught:
+    """What pairs of one place (`near`) and of two places (`far`) come to."""
+
+    near: Moments
+    far: Moments
+
+    def __add__(self, other: Taught) -> Taught:
+        return Taught(self.near + other.near, self.far + other.far)
+
+    def weights(self) -> Numbers:
+        """(words,) weights from 0 up. ValueError without pairs of both kinds."""
+        if not (self.near.pairs and self.far.pairs):
+            raise ValueError(f"{self.near.pairs} near and {self.far.pairs} far pairs teach nothing")
+        noise = self.far.deviation
+        told = noise > LEAST_DEVIATION
+        gap = self.near.mean - self.far.mean
+        return np.where(told, np.maximum(0.0, gap / np.where(told, noise, 1.0)), 0.0)
+
+
+def nothing_taught(words: int) -> Taught:
+    """What no pairs come to: the sum's beginning."""
+    none = Moments(0, np.zeros(words), np.zeros(words))
+    return Taught(none, none)
+
+
+def weigh(query: NDArray[np.float32], weights: Sequence[float]) -> Numbers | None:
+    """(words * width,) query with its words multiplied, and normalised again; None where no word
+    of the query has any weight. ValueError when the query's length is no multiple of the words."""
+    if len(query) % len(weights):
+        raise ValueError(f"{len(weights)} weights don't fit {len(query)} dimensions")
+    blocks = query.astype(np.float64).reshape(len(weights), -1)
+    weighted = (blocks * np.asarray(weights, dtype=np.float64)[:, np.newaxis]).ravel()
+    norm = float(np.linalg.norm(weighted))
+    return None if norm == 0.0 else weighted / norm

@@ -1,0 +1,143 @@
+"""`placewise pca fit` on a file or a folder, and `describe --pca`: without a server."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from typer.testing import CliRunner
+
+from services.cli.main import tree
+from shared.vision.pca import Projection
+from shared.vision.pca_file import decode_whitening
+from shared.vision.pca_fit import fit
+from tests.support.photos import photo_bytes
+
+PHOTOS = 9
+KEPT = 4
+
+
+@pytest.fixture(autouse=True)
+def _small(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DECODE_PROCESSES", "1")
+    monkeypatch.setenv("DEVICE", "cpu")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("photos")
+    for number in range(PHOTOS):
+        (folder / f"{number}.jpg").write_bytes(photo_bytes(number))
+    return folder
+
+
+def run(*arguments: object, code: int = 0) -> dict[str, Any]:
+    command = [str(argument) for argument in arguments]
+    result = CliRunner().invoke(tree([command[0]]), [*command, "--json"])
+    assert result.exit_code == code, result.output
+    answer: dict[str, Any] = json.loads(result.stdout)
+    return answer
+
+
+def unit_rows(count: int = 40, dimension: int = 16) -> NDArray[np.float32]:
+    rows = np.random.default_rng(0).standard_normal((count, dimension)).astype(np.float32)
+    units: NDArray[np.float32] = rows / np.linalg.norm(rows, axis=1, keepdims=True)
+    return units
+
+
+def test_a_folders_whitening_shortens_the_rows_of_the_same_extractor(
+    folder: Path, tmp_path: Path
+) -> None:
+    file, photos = tmp_path / "city.safetensors", sorted(folder.glob("*.jpg"))
+    (tmp_path / "broken").mkdir()
+    fitted = run("pca", "fit", folder, "--dimension", KEPT, "--out", file)
+    assert (fitted["from_dimension"], fitted["dimension"]) == (16, KEPT)
+    assert (fitted["rows"], fitted["refused"]) == (PHOTOS, [])
+
+    whole = run("describe", *photos, "--out", tmp_path / "whole.npy")
+    rows = np.load(tmp_path / "whole.npy")
+    expected = fit(rows, KEPT)
+    assert fitted["sha256"] == decode_whitening(file.read_bytes()).whitening.sha256
+    shorter = run("describe", *photos, "--out", tmp_path / "short.npy", "--pca", file)
+    found = np.load(tmp_path / "short.npy")
+    by_hand = Projection(expected, torch.device("cpu")).project(rows)
+    np.testing.assert_allclose(found, by_hand, atol=1e-3)
+    assert shorter["spec"] == {
+        **whole["spec"],
+        "dimension": KEPT,
+        "whitening": {"sha256": fitted["sha256"], "from_dimension": 16},
+    }
+
+    # Of other features with as many numbers, it would spoil every row.
+    other = run("describe", photos[0], "--out", tmp_path / "no.npy", "--pca", file,
+                "--extractor", "test-tiny-vlad:aggregator=gem", code=1)  # fmt: skip
+    assert other["code"] == "pca_unfit"
+    assert "aggregator is 'gem', was 'avg'" in other["detail"]
+    assert not (tmp_path / "no.npy").exists()
+
+
+def test_a_file_of_rows_is_enough(tmp_path: Path) -> None:
+    rows = unit_rows()
+    rows[7] = 0  # a photo without anything to describe says nothing
+    np.save(tmp_path / "rows.npy", rows)
+    file = tmp_path / "rows.safetensors"
+    fitted = run("pca", "fit", tmp_path / "rows.npy", "--dimension", KEPT, "--out", file)
+    found = decode_whitening(file.read_bytes())
+    assert found.spec is None
+    assert (fitted["rows"], found.whitening.rows) == (39, 39)
+    expected = fit(np.delete(rows, 7, axis=0), KEPT)
+    np.testing.assert_allclose(found.whitening.directions, expected.directions, atol=1e-4)
+    assert fitted["explained"] == pytest.approx(expected.explained)
+
+
+@pytest.mark.parametrize(
+    ("rows", "arguments", "code", "said"),
+    [
+        (unit_rows(), ["--dimension", "17"], "pca_too_many_dimensions", "16"),
+        (unit_rows(4), ["--dimension", "4"], "pca_too_few_rows", "there are 4"),
+        (2 * unit_rows(), [], "bad_rows", "Row 0 has the length 2"),
+        (np.arange(12).reshape(3, 4), [], "bad_rows", "floating point"),
+        (unit_rows()[0], [], "bad_rows", "rows"),
+        (unit_rows(), ["--extractor", "test-tiny-avg"], "options_contradict", "--extractor"),
+        (unit_rows(), ["--map", "town"], "options_contradict", "--map"),
+        (unit_rows(), ["--out", "no-folder/a.safetensors"], "bad_out", "no folder"),
+        (unit_rows(), ["--out", "a.npz"], "bad_out", ".safetensors"),
+    ],
+)
+def test_what_can_not_be_fitted_is_refused_and_nothing_is_written(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    rows: NDArray[Any],
+    arguments: list[str],
+    code: str,
+    said: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    np.save("rows.npy", rows)
+    out = [] if "--out" in arguments else ["--out", "a.safetensors"]
+    dimension = [] if "--dimension" in arguments else ["--dimension", "4"]
+    problem = run("pca", "fit", "rows.npy", *arguments, *out, *dimension, code=1)
+    assert problem["code"] == code, problem
+    assert said in problem["detail"]
+    assert [path.name for path in tmp_path.iterdir()] == ["rows.npy"]
+
+
+def test_what_is_no_file_of_rows_or_of_a_whitening_is_refused(folder: Path, tmp_path: Path) -> None:
+    text = tmp_path / "rows.npy"
+    text.write_text("no rows")
+    assert run("pca", "fit", text, "--out", tmp_path / "a.safetensors", code=1)["code"] == (
+        "bad_rows"
+    )
+    photo = folder / "0.jpg"
+    refused = run("describe", photo, "--out", tmp_path / "no.npy", "--pca", text, code=1)
+    assert refused["code"] == "pca_unfit"
+    no_out = run("pca", "fit", text, code=1)
+    assert no_out["code"] == "bad_out"
+    for arguments in (["--out", "a.safetensors"], ["--vocabulary", text]):
+        problem = run("pca", "fit", *arguments, code=1)
+        assert problem["code"] == "options_contradict"

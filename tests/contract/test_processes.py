@@ -1,0 +1,112 @@
+"""A forked `placewise` is what an executed one is."""
+
+from __future__ import annotations
+
+import json
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import psutil
+import pytest
+
+from tests.support.processes import PLACEWISE, REPOSITORY, ForkedProcess, start
+from tests.support.server import environment, run_command
+from tests.support.servers.daemon import has_ended
+
+SECONDS = 60.0
+
+
+def wait_until(true: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + SECONDS
+    while not true():
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code"),
+    [
+        (["config", "--json"], 0),
+        (["indeks"], 2),
+        (["query", "here.jpg", "--server", "ftp://nowhere", "--json"], 1),
+    ],
+    ids=["done", "misspelt", "refused"],
+)
+def test_both_say_the_same(arguments: Sequence[str], code: int, tmp_path: Path) -> None:
+    (tmp_path / "here.jpg").write_text("no photo")
+    env = environment(tmp_path / "home", max_file_size=12345)
+    forked, executed = (
+        run_command(*arguments, env=env, cwd=tmp_path, executed=executed)
+        for executed in (False, True)
+    )
+    assert forked.returncode == executed.returncode == code, forked.stderr
+    assert (forked.stdout, forked.stderr) == (executed.stdout, executed.stderr)
+    assert forked.stdout + forked.stderr
+
+
+@pytest.mark.parametrize("executed", [False, True])
+def test_a_process_is_waited_for_and_killed(executed: bool, tmp_path: Path) -> None:
+    env = environment(tmp_path / "home")
+    with (tmp_path / "log").open("wb") as log:
+        process = start(
+            [PLACEWISE, "serve"], env=env, cwd=tmp_path, stdout=log, stderr=log, executed=executed
+        )
+    assert isinstance(process, ForkedProcess) is not executed
+    assert process.poll() is None
+    with pytest.raises(subprocess.TimeoutExpired):
+        process.wait(0.01)
+    wait_until(lambda: psutil.Process(process.pid).cwd() == str(tmp_path))
+    process.kill()
+    assert process.wait() == process.poll() == -signal.SIGKILL
+    process.kill()  # of one that has ended: nothing
+    assert not psutil.pid_exists(process.pid)
+
+
+def test_each_draws_numbers_of_its_own(tmp_path: Path) -> None:
+    """A fork begins with its parent's random state, too."""
+    drawn = []
+    for number in range(3):
+        ended = run_command("migrate", env=environment(tmp_path / str(number)), cwd=tmp_path)
+        assert ended.returncode == 0, ended.stderr
+        made = re.search(r"installation\s+([0-9a-f-]{36})", ended.stderr)
+        assert made, ended.stderr
+        drawn.append(made[1].rpartition("-")[2])  # what goes before it counts the time
+    assert len(set(drawn)) == 3, drawn
+
+
+def test_what_a_library_may_read_at_its_import_is_executed(tmp_path: Path) -> None:
+    env = {**environment(tmp_path / "home"), "OMP_NUM_THREADS": "3"}
+    with (tmp_path / "log").open("wb") as log:
+        process = start([PLACEWISE, "config"], env=env, cwd=tmp_path, stdout=log, stderr=log)
+    assert isinstance(process, subprocess.Popen)
+    assert process.wait() == 0
+
+
+def test_it_ends_with_tests_that_are_killed(tmp_path: Path) -> None:
+    script = (
+        "import json, sys, time\n"
+        "from pathlib import Path\n"
+        "from tests.support.processes import PLACEWISE, _fork_server, start\n"
+        "from tests.support.server import environment\n"
+        "cwd = Path(sys.argv[1])\n"
+        "log = (cwd / 'log').open('wb')\n"
+        "env = environment(cwd / 'home')\n"
+        "process = start([PLACEWISE, 'serve'], env=env, cwd=cwd, stdout=log, stderr=log)\n"
+        "print(json.dumps([process.pid, _fork_server().pid]), flush=True)\n"
+        "time.sleep(600)\n"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", script, str(tmp_path)],
+        cwd=REPOSITORY,
+        stdout=subprocess.PIPE,
+        text=True,
+    ) as tests:
+        assert tests.stdout is not None
+        processes = [psutil.Process(pid) for pid in json.loads(tests.stdout.readline())]
+        tests.send_signal(signal.SIGKILL)
+    wait_until(lambda: all(has_ended(process) for process in processes))

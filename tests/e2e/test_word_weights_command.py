@@ -1,0 +1,46 @@
+"""`placewise evaluate --word-weights` and `placewise query`: what they say of word weights."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import time
+from pathlib import Path
+
+from tests.support.photos import photo_bytes
+from tests.support.server import ServerProcess, environment, run_command
+
+SETTINGS = {"extractor": "test-tiny-vlad", "auto_fit_photos": 6, "auto_evaluate_photos": 0}
+
+
+def command(server: ServerProcess, *arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    run = run_command(*arguments, env=environment(server.home, **SETTINGS), cwd=server.home)
+    assert "Traceback" not in run.stderr
+    return run
+
+
+def test_a_small_map_is_told_in_numbers_why_it_gets_no_weights(
+    server: ServerProcess, tmp_path: Path
+) -> None:
+    early = command(server, "evaluate", "--word-weights")
+    assert early.returncode == 1
+    assert early.stderr.strip().startswith("nothing_to_evaluate: ")
+    for number in range(6):
+        assert server.upload(photo_bytes(number), latitude=number, longitude=7).status_code == 202
+    while server.client.get("/api/v1/maps/default").json()["searchable"] < 6:
+        time.sleep(0.05)
+
+    shown = command(server, "evaluate", "--word-weights")
+    assert shown.returncode == 0, shown.stderr
+    assert "Word weights: not enough pairs." in shown.stdout
+    assert "50 of either kind are needed" in " ".join(shown.stdout.split())
+    said = json.loads(command(server, "evaluate", "--word-weights", "--json").stdout)
+    assert said["word_weights"]["outcome"] == "not enough pairs"
+    assert said["word_weights"]["near_pairs"] == 0
+    assert said["with_word_weights"] is None
+
+    photo = tmp_path / "again.jpg"
+    photo.write_bytes(photo_bytes(2))
+    asked = command(server, "query", photo, "--no-word-weights")
+    assert asked.returncode == 0, asked.stderr
+    assert "word weights: none" in asked.stdout

@@ -1,0 +1,222 @@
+"""Batches that overlap: one is decoded, one on the model, one being published, and none is lost."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+
+from services.extractor.publish import publish
+from services.extractor.worker import ExtractorWorker
+from services.steward.queue import free_leases
+from shared.jobs import JobState
+from shared.objects import FolderStore
+from shared.vision.decode import decode
+from shared.vision.extractors import Extractor
+from shared.vision.preprocessing import get_preprocessing
+from tests.integration.workplace import Workplace, expected_row, same
+from tests.support.catalog_rows import set_columns
+from tests.support.photos import photo_bytes
+
+WAIT_SECONDS = 30.0
+BATCH = 4  # tests.integration.conftest
+
+
+class Gate:
+    """Publishing of bulk batches waits here, and what happens is written down in its order."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.open = threading.Event()
+        self.waiting = threading.Event()
+        self.seen: list[str] = []
+        describe = Extractor.describe
+
+        def described(made: Extractor, pixels: Any, centres: Any) -> Any:
+            self.seen.append(f"describe {len(pixels)}")
+            return describe(made, pixels, centres)
+
+        def published(catalog: Any, store: Any, batch: Any, *more: Any) -> Any:
+            if len(batch.jobs) == BATCH:
+                self.waiting.set()
+                assert self.open.wait(WAIT_SECONDS)
+            outcome = publish(catalog, store, batch, *more)
+            self.seen.append(f"published {len(batch.jobs)}")
+            return outcome
+
+        monkeypatch.setattr(Extractor, "describe", described)
+        monkeypatch.setattr("services.extractor.worker.publish", published)
+
+    def await_seen(self, *wanted: str) -> None:
+        deadline = time.monotonic() + WAIT_SECONDS
+        while self.seen != list(wanted):
+            assert time.monotonic() < deadline, self.seen
+            time.sleep(0.01)
+
+
+@pytest.fixture
+def gate(monkeypatch: pytest.MonkeyPatch) -> Gate:
+    return Gate(monkeypatch)
+
+
+def in_thread(do: Callable[[], Any]) -> tuple[threading.Thread, list[Any]]:
+    """Runs it beside the test; its result comes into the list."""
+    results: list[Any] = []
+    thread = threading.Thread(target=lambda: results.append(do()))
+    thread.start()
+    return thread, results
+
+
+def test_next_batch_is_described_while_one_is_published_and_the_one_after_waits(
+    averages: Workplace, gate: Gate
+) -> None:
+    photo_ids = averages.upload(*range(3 * BATCH))
+    draining, results = in_thread(averages.drain)
+    gate.await_seen("describe 4", "describe 4")
+    time.sleep(0.2)
+    assert gate.seen == ["describe 4"] * 2, "the third one has no place to go"
+    gate.open.set()
+    draining.join()
+    assert gate.seen.index("published 4") == 2
+    assert sorted(gate.seen) == ["describe 4"] * 3 + ["published 4"] * 3
+    (result,) = results
+    assert (result.claimed, result.succeeded, result.failed) == (12, 12, 0)
+    assert list(result.seconds) == ["read", "decode", "thumbnails", "describe", "publish"]
+    rows = averages.rows()
+    for number, photo_id in enumerate(photo_ids):
+        assert same(rows[photo_id], expected_row("test-tiny-avg", photo_bytes(number)))
+
+
+def test_batch_that_waits_to_be_published_keeps_its_lease(
+    averages: Workplace, gate: Gate, make_worker: Callable[[], ExtractorWorker]
+) -> None:
+    averages.upload(*range(2 * BATCH))
+    worker = make_worker()
+    lease_seconds = 1.5
+    worker._settings = worker._settings.model_copy(update={"lease_seconds": lease_seconds})
+    draining, results = in_thread(lambda: worker.drain(threading.Event()))
+    gate.await_seen("describe 4", "describe 4")
+    until = time.monotonic() + 2 * lease_seconds
+    while time.monotonic() < until:
+        assert free_leases(averages.catalog, 3) == 0
+        time.sleep(0.1)
+    gate.open.set()
+    draining.join()
+    assert results[0].succeeded == 2 * BATCH
+
+
+def test_query_is_published_at_once_while_bulk_batches_wait_to_be(
+    averages: Workplace, gate: Gate
+) -> None:
+    averages.upload(0)
+    averages.drain()
+    averages.upload(*range(1, 2 * BATCH + 1))
+    draining, _ = in_thread(averages.drain)
+    assert gate.waiting.wait(WAIT_SECONDS)
+    job_id = averages.ask(photo_bytes(99))
+    assert averages.await_end(job_id) == JobState.SUCCEEDED
+    assert "published 4" not in gate.seen
+    gate.open.set()
+    draining.join()
+    assert len(averages.rows()) == 2 * BATCH + 1
+
+
+def test_photo_that_is_tried_alone_begins_when_nothing_else_is_under_way(
+    averages: Workplace, gate: Gate
+) -> None:
+    averages.upload(*range(BATCH))
+    (suspect,) = averages.upload(50)
+    job_id = averages.job_of(suspect).id
+    set_columns(averages.catalog, job_id, alone=True)
+    draining, _ = in_thread(averages.drain)
+    assert gate.waiting.wait(WAIT_SECONDS)
+    time.sleep(0.3)
+    assert gate.seen == ["describe 4"]
+    assert averages.job(job_id).claimed_together == 0, "it could not be blamed for a fall yet"
+    gate.open.set()
+    draining.join()
+    assert gate.seen == ["describe 4", "published 4", "describe 1", "published 1"]
+
+
+def test_stopping_worker_publishes_what_it_has_described(averages: Workplace, gate: Gate) -> None:
+    photo_ids = averages.upload(*range(3 * BATCH))
+    stop = threading.Event()
+    draining, results = in_thread(lambda: averages.worker.drain(stop))
+    gate.await_seen("describe 4", "describe 4")
+    stop.set()
+    gate.open.set()
+    draining.join()
+    (result,) = results
+    assert (result.claimed, result.succeeded, result.more) == (12, 8, True)
+    assert set(averages.rows()) == set(photo_ids[:8])
+    left = [averages.job_of(photo_id) for photo_id in photo_ids[8:]]
+    assert all(job.state == JobState.QUEUED and job.lease_token is None for job in left)
+
+
+def test_batch_whose_publishing_crashes_is_tried_alone_and_the_next_one_is_not_to_blame(
+    averages: Workplace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls = iter(range(100))
+
+    def crash_once(*arguments: Any) -> Any:
+        if next(calls) == 0:
+            raise RuntimeError("a row of the wrong length")
+        return publish(*arguments)
+
+    monkeypatch.setattr("services.extractor.worker.publish", crash_once)
+    photo_ids = averages.upload(*range(2 * BATCH))
+    averages.drain()
+    jobs = [averages.job_of(photo_id) for photo_id in photo_ids]
+    assert {job.state for job in jobs} == {JobState.SUCCEEDED}
+    assert [job.alone for job in jobs] == [True] * BATCH + [False] * BATCH
+    assert {job.attempts for job in jobs} == {0}
+
+
+def test_object_store_that_goes_away_while_publishing_costs_no_attempt(
+    averages: Workplace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real, calls = FolderStore.writer, iter(range(100))
+    photo_ids = averages.upload(*range(2 * BATCH))
+
+    def away(store: FolderStore, key: str, *more: Any) -> Any:
+        if key.startswith("chunks/") and next(calls) == 0:
+            raise OSError("the disk is not there")
+        return real(store, key, *more)
+
+    monkeypatch.setattr(FolderStore, "writer", away)
+    result = averages.drain()
+    assert (result.claimed, result.succeeded, result.failed) == (8, 4, 0)
+    paused = [averages.job_of(photo_id) for photo_id in photo_ids[:BATCH]]
+    assert all((job.state, job.attempts) == (JobState.QUEUED, 0) for job in paused)
+    assert set(averages.rows()) == set(photo_ids[BATCH:])
+
+
+def test_photo_that_the_gpu_can_not_hold_fails_alone_and_is_not_tried_again(
+    averages: Workplace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = Extractor.features
+    heavy = expected_pixels(7)
+
+    def features(made: Extractor, pixels: Any) -> torch.Tensor:
+        if any((one == heavy).all() for one in pixels):
+            raise torch.cuda.OutOfMemoryError("CUDA out of memory.")
+        return real(made, pixels)
+
+    monkeypatch.setattr(Extractor, "features", features)
+    photo_ids = averages.upload(1, 7, 2)
+    result = averages.drain()
+    assert (result.claimed, result.succeeded, result.failed) == (3, 2, 1)
+    refused = averages.job_of(photo_ids[1])
+    assert (refused.state, refused.attempts) == (JobState.FAILED, 0)
+    assert refused.error is not None
+    assert refused.error["code"] == "gpu_out_of_memory"
+    rows = averages.rows()
+    for number, photo_id in ((1, photo_ids[0]), (2, photo_ids[2])):
+        assert same(rows[photo_id], expected_row("test-tiny-avg", photo_bytes(number)))
+
+
+def expected_pixels(number: int) -> Any:
+    return decode(photo_bytes(number), get_preprocessing("square32"), 10**9).pixels

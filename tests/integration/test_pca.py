@@ -1,0 +1,365 @@
+"""PCA whitening of a map: from the request to shorter descriptors, and back."""
+
+from __future__ import annotations
+
+import itertools
+import threading
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
+from uuid import UUID
+
+import numpy as np
+import pytest
+import torch
+
+from services.extractor import fit_pca, stored_rows
+from services.extractor.loaded import LoadedModels
+from services.extractor.model_change import ModelChanges
+from services.extractor.renew import renew_outdated_generations
+from services.extractor.worker import ExtractorWorker
+from services.steward.collect import collect_orphans, collect_whitenings
+from services.steward.delete_maps import delete_maps
+from shared.catalog.generations import Generation
+from shared.catalog.maps import Map, mark_map_deleted
+from shared.catalog.photos import Photo, PhotoRole
+from shared.catalog.whitenings import StoredWhitening
+from shared.chunks import Rows, decode_rows, read_row
+from shared.errors import NotFound
+from shared.jobs import Job, JobKind, JobState
+from shared.jobs.table import WaitingFor
+from shared.objects.keys import WHITENINGS, WORK, query_vector_key
+from shared.vision import extractors
+from shared.vision.pca import Projection, Whitening
+from shared.vision.pca_file import decode_whitening
+from shared.vision.pca_fit import fit
+from shared.vision.vocabulary import decode_centres
+from tests.integration.conftest import LentDecoders
+from tests.integration.workplace import Workplace, expected_row, same
+from tests.support.photos import photo_bytes
+
+PHOTOS = 14
+KEPT = 5
+CPU = torch.device("cpu")
+
+
+@pytest.fixture
+def described(averages: Workplace) -> Workplace:
+    """A map of PHOTOS photos with 16 dimensions."""
+    averages.upload(*range(PHOTOS))
+    averages.drain()
+    return averages
+
+
+@pytest.fixture
+def reduced(described: Workplace) -> Workplace:
+    """The same after PCA to KEPT dimensions."""
+    reduce(described)
+    return described
+
+
+def reduce(workplace: Workplace, pca: int = KEPT) -> Job:
+    job = workplace.finish(workplace.start(JobKind.PCA, pca=pca))
+    assert job.state == JobState.SUCCEEDED, job.error
+    return job
+
+
+def by_hand(rows: dict[UUID, Rows]) -> Whitening:
+    """What a fit on all of these rows comes to."""
+    return fit(np.stack([rows[photo_id] for photo_id in sorted(rows)]), KEPT)
+
+
+def projected(whitening: Whitening, row: Rows) -> Rows:
+    found: Rows = Projection(whitening, CPU).project(row[np.newaxis])[0]
+    return found
+
+
+def whitenings(workplace: Workplace) -> list[StoredWhitening]:
+    with workplace.catalog.read() as session:
+        return list(session.query(StoredWhitening))
+
+
+def refusal(job: Job) -> str:
+    assert job.state == JobState.FAILED
+    assert job.error is not None
+    return str(job.error["code"])
+
+
+def forbid_decoding(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: Any) -> None:
+        raise AssertionError("a photo was decoded")
+
+    monkeypatch.setattr(LentDecoders, "decode", refuse)
+
+
+# --- the change ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "extractor",
+    ["test-tiny-avg", "test-tiny-vlad", "test-tiny-vlad:aggregator=soft-vlad"],
+)
+def test_stored_rows_are_whitened_without_a_photo(
+    workplace_of: Callable[[str], Workplace], extractor: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    workplace = workplace_of(extractor)
+    workplace.upload(*range(PHOTOS))
+    workplace.drain()
+    if "vlad" in extractor:
+        workplace.fit(clusters=3)
+    old, before = workplace.active(), workplace.rows()
+    expected = by_hand(before)
+    answering: list[tuple[UUID, int]] = []
+    forbid_decoding(monkeypatch)
+
+    job = workplace.finish(
+        workplace.start(JobKind.PCA, pca=KEPT),
+        lambda: answering.append((workplace.active().id, workplace.searchable())),
+    )
+
+    new = workplace.active()
+    assert {count for _, count in answering} == {PHOTOS}  # at no moment fewer
+    assert [one for one, _ in itertools.groupby(a for a, _ in answering)] == [old.id, new.id]
+    assert new.spec == {
+        **old.spec,
+        "dimension": KEPT,
+        "whitening": {"sha256": expected.sha256, "from_dimension": old.dimension},
+    }
+    assert (new.dimension, new.pca_from, new.vocabulary_id) == (
+        KEPT,
+        old.dimension,
+        old.vocabulary_id,
+    )
+    rows = workplace.rows()
+    assert rows.keys() == before.keys()
+    for photo_id, row in rows.items():
+        assert same(row, projected(expected, before[photo_id]))
+        assert np.linalg.norm(row) == pytest.approx(1, abs=1e-5)
+    assert job.result is not None
+    assert job.result["pca"] == {
+        "from_dimension": old.dimension,
+        "dimension": KEPT,
+        "rows": PHOTOS,
+        "explained": pytest.approx(expected.explained),
+    }
+    assert job.progress_done == job.progress_total == 2 * PHOTOS + fit_pca.REDUCE_UNITS
+    (stored,) = whitenings(workplace)
+    file = decode_whitening(workplace.store.get(stored.object_key))
+    assert file.whitening.sha256 == stored.sha256 == expected.sha256
+    assert file.spec == old.spec
+
+
+def test_labelled_queries_are_projected_and_never_learnt_from(described: Workplace) -> None:
+    asked = sorted(described.rows())[:4]
+    with described.catalog.write() as session:
+        for photo_id in asked:
+            session.get_one(Photo, photo_id).role = PhotoRole.QUERY
+    before = described.rows()
+    expected = by_hand({one: row for one, row in before.items() if one not in asked})
+    assert expected.sha256 != by_hand(before).sha256
+
+    reduce(described)
+
+    assert whitenings(described)[0].sha256 == expected.sha256
+    assert whitenings(described)[0].rows == PHOTOS - 4
+    rows = described.rows()
+    for photo_id in asked:
+        assert same(rows[photo_id], projected(expected, before[photo_id]))
+
+
+def test_queries_and_new_photos_are_projected(reduced: Workplace) -> None:
+    stored = whitenings(reduced)[0]
+    whitening = decode_whitening(reduced.store.get(stored.object_key)).whitening
+    data = photo_bytes(50)
+    expected = projected(whitening, expected_row("test-tiny-avg", data))
+    asked, (photo_id, _) = reduced.ask(data), reduced.upload_bytes(data)
+    reduced.drain()
+    assert same(decode_rows(reduced.store.get(query_vector_key(asked)))[0], expected)
+    assert same(reduced.rows()[photo_id], expected)
+
+
+def test_a_fit_is_the_same_whoever_does_its_slices(
+    described: Workplace,
+    make_worker: Callable[[], ExtractorWorker],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    looks = itertools.count()
+    clock = SimpleNamespace(monotonic=lambda: next(looks) * fit_pca.SLICE_SECONDS)
+    monkeypatch.setattr(fit_pca, "time", clock)
+    monkeypatch.setattr(fit_pca, "READ_BYTES", 4 * 16 * 5)  # five rows at once
+    monkeypatch.setattr(
+        fit_pca, "block_width", lambda count, dimension: 6
+    )  # so: three blocks of columns
+    real = ModelChanges.slice
+    job_id = described.start(JobKind.PCA, pca=KEPT)
+    stages, progress = [], []
+    while described.job(job_id).waiting_for != WaitingFor.DESCRIPTORS:
+        stop = threading.Event()
+
+        def slice_and_stop(self: ModelChanges, job: Job, stop: threading.Event = stop) -> None:
+            real(self, job)
+            stop.set()
+
+        with monkeypatch.context() as patched:
+            patched.setattr(ModelChanges, "slice", slice_and_stop)
+            make_worker().drain(stop)  # one that knows nothing
+        job = described.job(job_id)
+        stages.append(job.stage)
+        progress.append(job.progress_done)
+        assert len(stages) < 20
+    assert stages == ["gather"] * 3 + ["reduce"] * 7 + ["describe"]
+    assert progress == sorted(set(progress))
+    assert all(0 < done < job.progress_total for done in progress[1:])
+    before = described.rows()
+    described.finish(job_id)
+    # In blocks, the same but for the order in which floats were summed.
+    expected = by_hand(before)
+    for photo_id, row in described.rows().items():
+        assert same(np.abs(row), np.abs(projected(expected, before[photo_id])))
+
+
+@pytest.mark.parametrize("missing", [False, True])
+def test_a_photo_whose_row_is_damaged_is_described_anew(
+    described: Workplace, monkeypatch: pytest.MonkeyPatch, missing: bool
+) -> None:
+    before = described.rows()
+    expected, damaged = by_hand(before), before[sorted(before)[3]]
+
+    def read(store: Any, key: str, row: int) -> Rows:
+        found = read_row(store, key, row)
+        if not np.array_equal(found, damaged):
+            return found
+        if missing:
+            raise NotFound("object_not_found", "It is gone.")
+        half: Rows = (found / 2).astype(np.float32)
+        return half
+
+    monkeypatch.setattr(fit_pca, "stored_rows", lambda *_: before)  # the fit is not meant
+    monkeypatch.setattr(stored_rows, "read_row", read)
+    reduce(described)
+    for photo_id, row in described.rows().items():
+        assert same(row, projected(expected, before[photo_id]))
+
+
+def test_photos_are_described_where_the_rows_that_answer_were_made_otherwise(
+    reduced: Workplace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An upgrade: the rows are projected ones, by a former decoder. The whitening stays."""
+    before, old = reduced.rows(), reduced.active()
+    monkeypatch.setattr(extractors, "DECODER", "another release")
+    models = LoadedModels(reduced.store, reduced.settings.model_copy(update={"device": "cpu"}))
+    assert renew_outdated_generations(reduced.catalog, models) == 1
+    with reduced.catalog.read() as session:
+        job_id = session.query(Job).filter_by(kind=JobKind.SWITCH).one().id
+    assert reduced.finish(job_id).state == JobState.SUCCEEDED
+    new = reduced.active()
+    assert (new.id != old.id, new.whitening_id) == (True, old.whitening_id)
+    assert new.spec == {**old.spec, "decoder": "another release"}
+    assert all(same(row, before[photo_id]) for photo_id, row in reduced.rows().items())
+
+
+# --- going on from there ---------------------------------------------------------------------
+
+
+def test_the_way_back_leads_to_whole_descriptors(described: Workplace) -> None:
+    before, old = described.rows(), described.active()
+    reduce(described)
+    job = described.finish(described.start(JobKind.SWITCH, vocabulary_id=None))
+    assert job.state == JobState.SUCCEEDED
+    assert job.result is not None
+    assert job.result["pca"] is None
+    assert described.active().spec == old.spec
+    assert described.active().whitening_id is None
+    assert all(same(row, before[photo_id]) for photo_id, row in described.rows().items())
+
+
+def test_a_new_vocabulary_comes_without_pca(vlads: Workplace) -> None:
+    vlads.upload(*range(PHOTOS))
+    vlads.fit(clusters=3)
+    reduce(vlads)
+    job = vlads.fit(clusters=4, seed=1)
+    assert job.state == JobState.SUCCEEDED
+    new = vlads.active()
+    assert (new.dimension, new.pca_from, new.whitening_id) == (4 * 16, None, None)
+    vocabulary = vlads.vocabulary(new.vocabulary_id)
+    centres = decode_centres(vlads.store.get(vocabulary.object_key))
+    rows = vlads.rows()
+    first = sorted(rows)[0]
+    assert same(rows[first], expected_row("test-tiny-vlad", photo_bytes(0), centres))
+
+
+def test_a_pca_of_a_pca_is_refused(reduced: Workplace) -> None:
+    before = reduced.active().id
+    assert refusal(reduced.finish(reduced.start(JobKind.PCA, pca=3))) == "already_reduced"
+    assert reduced.active().id == before
+
+
+def test_what_can_not_be_fitted_fails_with_the_reason(described: Workplace) -> None:
+    before = described.active().id
+    for pca, code in ((PHOTOS, "pca_too_few_rows"), (17, "pca_too_many_dimensions")):
+        assert refusal(described.finish(described.start(JobKind.PCA, pca=pca))) == code
+    assert described.active().id == before
+
+
+def test_photos_that_are_all_alike_are_refused_when_their_rows_are_known(
+    averages: Workplace,
+) -> None:
+    for number in range(PHOTOS):  # other bytes, the same pixels
+        averages.upload_bytes(photo_bytes(1) + bytes([number]))
+    averages.drain()
+    job = averages.finish(averages.start(JobKind.PCA, pca=2))
+    assert refusal(job) == "pca_too_many_dimensions"
+    assert job.stage == "reduce"
+
+
+def test_rows_of_another_release_are_not_learnt_from(
+    described: Workplace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(extractors, "DECODER", "another release")
+    assert refusal(described.finish(described.start(JobKind.PCA, pca=3))) == "spec_differs"
+
+
+def test_a_map_without_descriptors_is_refused(averages: Workplace) -> None:
+    assert refusal(averages.finish(averages.start(JobKind.PCA, pca=3))) == "nothing_described"
+
+
+def test_a_cancelled_pca_changes_nothing(described: Workplace) -> None:
+    before = described.active().id
+    job_id = described.start(JobKind.PCA, pca=KEPT)
+    described.drain()
+    building = described.building()
+    assert building is not None
+    assert building.whitening_id is not None
+    described.cancel(job_id)
+    described.advance()
+    assert (described.active().id, described.building()) == (before, None)
+
+
+# --- what is left of it ----------------------------------------------------------------------
+
+
+def test_a_whitening_goes_when_its_generations_have_ended(reduced: Workplace) -> None:
+    (stored,) = whitenings(reduced)
+    collect_whitenings(reduced.catalog, reduced.store, grace_seconds=0)
+    collect_orphans(reduced.catalog, reduced.store, age_seconds=-1)
+    assert reduced.keys(WHITENINGS) == {stored.object_key}
+    ended = reduced.active().id
+    reduced.finish(reduced.start(JobKind.SWITCH, vocabulary_id=None))
+    collect_whitenings(reduced.catalog, reduced.store, grace_seconds=60)
+    assert reduced.keys(WHITENINGS) == {stored.object_key}, "the grace has not passed"
+    collect_whitenings(reduced.catalog, reduced.store, grace_seconds=-1)
+    assert (reduced.keys(WHITENINGS), whitenings(reduced)) == (set(), [])
+    history = reduced.generation(ended)
+    assert (history.whitening_id, history.pca_from) == (None, 16)
+
+
+def test_a_deleted_map_leaves_no_whitening(reduced: Workplace) -> None:
+    with reduced.catalog.write() as session:
+        mark_map_deleted(session, session.get_one(Map, reduced.map_id))
+    delete_maps(reduced.catalog, reduced.store)
+    assert whitenings(reduced) == []
+    assert reduced.keys(WHITENINGS) | {k for k in reduced.keys(WORK) if "plan" not in k} <= (
+        reduced.keys(WORK)
+    )
+    with reduced.catalog.read() as session:
+        assert session.query(Generation).count() == 0

@@ -1,0 +1,123 @@
+"""One generation has rows of one precision, whatever PRECISION says and whatever the machine is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+from uuid import UUID
+
+import pytest
+import torch
+
+from services.extractor.loaded import LoadedModels
+from services.extractor.renew import renew_outdated_generations
+from services.extractor.worker import ExtractorWorker
+from shared.catalog.generations import Generation
+from shared.jobs import JobKind, JobState
+from shared.recipes import get_recipe
+from shared.vision.decode import decode
+from shared.vision.extractors import Extractor
+from shared.vision.precision import Precision
+from tests.integration.workplace import Workplace, same
+from tests.support.photos import photo_bytes
+
+
+@pytest.fixture
+def make_set(
+    make_worker: Callable[[], ExtractorWorker],
+) -> Callable[[str], ExtractorWorker]:
+    """Makes an extractor whose PRECISION is that one."""
+
+    def make(precision: str) -> ExtractorWorker:
+        worker = make_worker()
+        worker._models._settings = worker._models._settings.model_copy(
+            update={"precision": precision}
+        )
+        return worker
+
+    return make
+
+
+def row(precision: Precision, number: int) -> Any:
+    recipe = get_recipe("test-tiny-avg", allow_test_extractors=True)
+    made = Extractor(recipe, torch.device("cpu"), precision=precision)
+    pixels = decode(photo_bytes(number), made.preprocessing, 10**9).pixels
+    return made.describe([pixels], None)[0]
+
+
+def precision_of(generation: Generation) -> str:
+    found: str = generation.spec["precision"]
+    return found
+
+
+def test_photos_join_a_generation_in_the_precision_that_it_was_begun_in(
+    averages: Workplace, make_set: Callable[[str], ExtractorWorker]
+) -> None:
+    assert not same(row("float32", 2), row("bfloat16", 2)), "else this test could not fail"
+    first = averages.upload(1)
+    averages.drain()
+    averages._worker = make_set("bfloat16")
+    second = averages.upload(2)
+    query = averages.ask(photo_bytes(3))
+    averages.drain()
+    assert averages.job(query).state == JobState.SUCCEEDED
+    assert precision_of(averages.active()) == "float32"
+    rows = averages.rows()
+    assert same(rows[first[0]], row("float32", 1))
+    assert same(rows[second[0]], row("float32", 2))
+
+
+def test_setting_decides_for_a_map_that_begins(
+    averages: Workplace, make_set: Callable[[str], ExtractorWorker]
+) -> None:
+    averages._worker = make_set("bfloat16")
+    (photo_id,) = averages.upload(2)
+    averages.drain()
+    assert precision_of(averages.active()) == "bfloat16"
+    averages._worker = make_set("auto")  # another machine of the fleet, without a GPU
+    (other,) = averages.upload(3)
+    averages.drain()
+    assert same(averages.rows()[photo_id], row("bfloat16", 2))
+    assert same(averages.rows()[other], row("bfloat16", 3))
+
+
+def test_model_change_brings_the_other_precision_to_all_photos(
+    averages: Workplace, make_set: Callable[[str], ExtractorWorker]
+) -> None:
+    photo_ids = averages.upload(1, 2, 3)
+    averages.drain()
+    averages._worker = make_set("bfloat16")
+    job = averages.finish(averages.start(JobKind.SWITCH, vocabulary_id=None))
+    assert job.state == JobState.SUCCEEDED
+    assert precision_of(averages.active()) == "bfloat16"
+    rows = averages.rows()
+    for number, photo_id in enumerate(photo_ids, start=1):
+        assert same(rows[photo_id], row("bfloat16", number))
+
+
+def test_another_setting_alone_describes_nothing_anew(
+    averages: Workplace, make_set: Callable[[str], ExtractorWorker]
+) -> None:
+    averages.upload(1)
+    averages.drain()
+    models: LoadedModels = make_set("bfloat16")._models
+    assert renew_outdated_generations(averages.catalog, models) == 0
+
+
+def test_photos_wait_where_the_generations_precision_is_not_known(averages: Workplace) -> None:
+    averages.upload(1)
+    averages.drain()
+    _set_precision(averages, averages.active().id, "float8")
+    (photo_id,) = averages.upload(2)
+    averages.drain()
+    job = averages.job_of(photo_id)
+    assert (job.state, job.attempts) == (JobState.QUEUED, 0)
+    assert job.error is not None
+    assert job.error["code"] == "spec_differs"
+    assert "float8" in job.error["detail"]
+
+
+def _set_precision(place: Workplace, generation_id: UUID, precision: str) -> None:
+    with place.catalog.write() as session:
+        generation = session.get_one(Generation, generation_id)
+        generation.spec = {**generation.spec, "precision": precision}

@@ -1,0 +1,130 @@
+"""The fork server behind tests/support/processes.py: `python -m` it with the number of a socket.
+
+It imports what the `placewise` command imports, once, and then is forked for each start: a start
+costs a fork instead of seconds of imports. It serves one request at a time and has no threads, as a
+fork would copy the locks that they hold.
+"""
+
+from __future__ import annotations
+
+import gc
+import importlib
+import json
+import os
+import runpy
+import signal
+import socket
+import sys
+import threading
+from pathlib import Path
+from typing import Any
+
+from sqlalchemy.orm import configure_mappers
+
+import services.cli
+from shared.settings import Settings
+
+# Beside the command's own modules: what they import when they run. A module that is missing here is
+# imported by each process that needs it.
+MODULES = (
+    "services.cli.describe_files",
+    "services.cli.fit_folder",
+    "services.extractor.service",
+    "services.gateway.app",
+    "services.search.server",
+    "services.standalone",
+    "services.steward.batches.worker",
+    "services.steward.evaluate",
+    "services.steward.loop",
+    "shared.jobs.celery_hints",
+    "shared.objects.open_store",
+    "shared.vision.extractors",
+    "shared.vision.vocabulary_file",
+    # What libraries import at their first use.
+    "PIL.JpegImagePlugin",
+    "anyio._backends._asyncio",
+    "httpcore2",
+    "numpy.random",
+    "uvicorn.lifespan.on",
+    "uvicorn.loops.auto",
+    "uvicorn.protocols.http.h11_impl",
+)
+REQUEST_BYTES = 128 * 1024  # an environment has a few KiB
+
+
+def serve(control: socket.socket) -> dict[str, Any] | None:
+    """Answer until the tests end. In a child: what it is to run."""
+    codes: dict[int, int | None] = {}  # of the children, by pid; None for those that run
+    while True:
+        message, given, _, _ = socket.recv_fds(control, REQUEST_BYTES, maxfds=3)
+        if not message:  # the tests have ended, in good order or not
+            for pid, code in codes.items():
+                if code is None:
+                    os.kill(pid, signal.SIGKILL)
+            return None
+        request = json.loads(message)
+        if "ended" in request:
+            pid = request["ended"]
+            if codes[pid] is None:
+                codes[pid] = _exit_code(pid)
+            answer = codes[pid]
+        else:
+            answer = os.fork()
+            if answer == 0:
+                control.close()
+                for standard, descriptor in enumerate(given):
+                    os.dup2(descriptor, standard)
+            else:
+                codes[answer] = None
+            for descriptor in given:
+                os.close(descriptor)
+            if answer == 0:
+                return dict(request)
+        control.send(json.dumps([request["number"], answer]).encode())
+
+
+def run(request: dict[str, Any]) -> None:
+    """Be the process that was asked for. What the program raises is for the interpreter."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    os.chdir(request["cwd"])
+    os.environ.clear()
+    os.environ.update(request["env"])
+    program, *_ = sys.argv = request["command"]
+    sys.path[0] = str(Path(program).parent)
+    # As the interpreter does it: spawned children look for the program in sys.modules["__main__"].
+    runpy.run_path(program, run_name="__main__")
+
+
+def _exit_code(pid: int) -> int | None:
+    """As subprocess gives it; None while the process runs."""
+    ended, status = os.waitpid(pid, os.WNOHANG)
+    return os.waitstatus_to_exitcode(status) if ended else None
+
+
+def _import() -> None:
+    entry_point = services.cli.main
+    importlib.import_module("services.cli.main").tree()
+    for module in MODULES:
+        importlib.import_module(module)
+    services.cli.main = entry_point  # the submodule of the same name has taken its place
+    # What each process would work out for itself at its first use of them.
+    Settings()
+    configure_mappers()
+
+
+def main() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the tests, which then end this
+    control = socket.socket(fileno=int(sys.argv[1]))
+    _import()
+    assert threading.active_count() == 1, threading.enumerate()
+    tasks = list(Path("/proc/self/task").iterdir())
+    assert len(tasks) == 1, [task.joinpath("comm").read_text() for task in tasks]
+    gc.collect()
+    gc.freeze()  # children's collections leave these pages shared
+    request = serve(control)
+    if request is not None:
+        run(request)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,191 @@
+"""Starts processes: `placewise` ones as forks of a process that has imported everything."""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import functools
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import IO, Any, Protocol
+
+from shared.settings import Settings
+
+PLACEWISE = str(Path(sys.executable).with_name("placewise"))
+REPOSITORY = Path(__file__).parents[2]
+# What Placewise reads when it starts. All else may have been read by a library at its import.
+READ_AT_START = frozenset(
+    {name.upper() for name in Settings.model_fields}
+    | {"PLACEWISE_SERVER", "PLACEWISE_KEY", "PYTEST_CURRENT_TEST"}
+)
+ANSWER_BYTES = 1024
+LOOK_SECONDS = 0.01
+
+
+def _inherited() -> dict[str, str]:
+    kept = {name: value for name, value in os.environ.items() if name not in READ_AT_START}
+    # Where no bytecode is written beside the sources, each start would compile torch anew.
+    if kept.get("PYTHONDONTWRITEBYTECODE"):
+        folder = tempfile.TemporaryDirectory(prefix="pw-bytecode-", ignore_cleanup_errors=True)
+        atexit.register(folder.cleanup)
+        kept |= {"PYTHONDONTWRITEBYTECODE": "", "PYTHONPYCACHEPREFIX": folder.name}
+    return kept
+
+
+# The environment of the tests without the developer's settings, as it was before they changed it:
+# libraries write into it when a test imports them.
+INHERITED = _inherited()
+
+
+class Process(Protocol):
+    """What tests use of subprocess.Popen."""
+
+    @property
+    def pid(self) -> int: ...
+
+    def poll(self) -> int | None:
+        """The exit code, or minus the signal that ended it; None while it runs."""
+
+    def wait(self, timeout: float | None = None) -> int:
+        """As `poll` when it has ended; subprocess.TimeoutExpired after `timeout` seconds."""
+
+    def send_signal(self, sig: int) -> None: ...
+
+    def terminate(self) -> None: ...
+
+    def kill(self) -> None: ...
+
+
+def start(
+    command: Sequence[str | Path],
+    *,
+    env: Mapping[str, str],
+    cwd: Path,
+    stdout: IO[Any],
+    stderr: IO[Any],
+    executed: bool = False,
+) -> Process:
+    """A process of this command, with nothing to read.
+
+    PLACEWISE is a fork of the fork server, unless `executed` asks for a new interpreter, which
+    takes seconds, or `env` has what a library may read at its import.
+    """
+    words = list(map(str, command))
+    others = {name: value for name, value in env.items() if name not in READ_AT_START}
+    forked = words[0] == PLACEWISE and not executed and others == INHERITED
+    if forked and sys.platform == "linux":
+        return _fork_server().start(words, env, cwd, stdout, stderr)
+    return subprocess.Popen(
+        words, env=env, cwd=cwd, stdin=subprocess.DEVNULL, stdout=stdout, stderr=stderr
+    )
+
+
+class ForkedProcess:
+    """A child of the fork server, which keeps its pid until the exit code is asked for."""
+
+    def __init__(self, server: ForkServer, pid: int, command: list[str]) -> None:
+        self.pid = pid
+        self._server = server
+        self._command = command
+        self._code: int | None = None
+
+    def poll(self) -> int | None:
+        if self._code is None:
+            self._code = self._server.ask({"ended": self.pid})
+        return self._code
+
+    def wait(self, timeout: float | None = None) -> int:
+        deadline = None if timeout is None else time.monotonic() + timeout
+        while (code := self.poll()) is None:
+            if deadline is not None and time.monotonic() > deadline:
+                assert timeout is not None
+                raise subprocess.TimeoutExpired(self._command, timeout)
+            time.sleep(LOOK_SECONDS)
+        return code
+
+    def send_signal(self, sig: int) -> None:
+        if self.poll() is None:
+            with contextlib.suppress(ProcessLookupError):  # another thread has asked meanwhile
+                os.kill(self.pid, sig)
+
+    def terminate(self) -> None:
+        self.send_signal(signal.SIGTERM)
+
+    def kill(self) -> None:
+        self.send_signal(signal.SIGKILL)
+
+
+class ForkServer:
+    """tests/support/fork_server.py in a process that ends with the tests, however they end."""
+
+    def __init__(self, environment: Mapping[str, str]) -> None:
+        """`environment` is what its libraries see when they are imported."""
+        self._asking = threading.Lock()
+        self._asked = 0
+        self._log = tempfile.TemporaryFile()  # noqa: SIM115, it is open as long as the server runs
+        self._control, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        with theirs:
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", "tests.support.fork_server", str(theirs.fileno())],
+                # OpenBLAS starts its threads at import.
+                env={**environment, "OPENBLAS_NUM_THREADS": "1"},
+                cwd=REPOSITORY,
+                stdin=subprocess.DEVNULL,
+                stdout=self._log,
+                stderr=self._log,
+                pass_fds=[theirs.fileno()],
+            )
+        self.pid = self._process.pid
+
+    def start(
+        self,
+        command: list[str],
+        env: Mapping[str, str],
+        cwd: Path,
+        stdout: IO[Any],
+        stderr: IO[Any],
+    ) -> ForkedProcess:
+        request = {"command": command, "env": dict(env), "cwd": str(cwd)}
+        with open(os.devnull, "rb") as nothing:  # noqa: PTH123
+            standard = [nothing.fileno(), stdout.fileno(), stderr.fileno()]
+            pid: int = self.ask(request, standard)
+        return ForkedProcess(self, pid, command)
+
+    def ask(self, request: dict[str, Any], descriptors: list[int] | None = None) -> Any:
+        """One request and its answer; `descriptors` are the standard files of a new process."""
+        with self._asking:
+            self._asked += 1
+            message = json.dumps({**request, "number": self._asked}).encode()
+            try:
+                socket.send_fds(self._control, [message], descriptors or [])
+                while said := self._control.recv(ANSWER_BYTES):
+                    number, answer = json.loads(said)
+                    if number == self._asked:  # others are of questions that were cut short
+                        return answer
+            except OSError:
+                pass  # the log says more
+        self._log.seek(0)
+        raise AssertionError(f"the fork server ended: {self._log.read()[-3000:].decode()}")
+
+    def close(self) -> None:
+        """End it, and its processes that nobody has waited for."""
+        self._control.close()
+        self._process.wait()
+        self._log.close()
+
+
+@functools.cache
+def _fork_server() -> ForkServer:
+    """This test process's own, from the first start on."""
+    server = ForkServer(INHERITED)
+    atexit.register(server.close)
+    return server
