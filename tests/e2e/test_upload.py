@@ -26,9 +26,12 @@ from tests.support.problems import field_refused, problem
 from tests.support.server import ServerProcess
 
 MAX_FILE_SIZE = 100_000
-SETTINGS = {"max_file_size": MAX_FILE_SIZE}
 UPLOAD = "/api/v1/upload"
 AT_ONCE = 50
+SETTINGS = {
+    "max_file_size": MAX_FILE_SIZE,
+    "max_concurrent_uploads": AT_ONCE,  # none is to be turned away because others are on their way
+}
 ANSWER_FIELDS = {
     "file_id",
     "job_id",

@@ -41,12 +41,12 @@ from shared.vision.decode import decode
 from shared.vision.extractors import Extractor
 from shared.vision.preprocessing import get_preprocessing
 from shared.vision.resample import Pixels
-from shared.vision.vocabulary import Centres, decode_centres
+from shared.vision.vocabulary import decode_centres
 from tests.integration.workplace import Workplace, expected_row, same
 from tests.support.catalog_rows import end_pauses, expire_lease, set_columns, states
 from tests.support.photos import encoded, photo_bytes, photo_image
 
-Describe = Callable[[Extractor, list[Pixels], Centres | None], NDArray[np.float32]]
+Describe = Callable[..., NDArray[np.float32]]
 DAY_SECONDS = 86_400.0
 
 
@@ -56,11 +56,9 @@ def before_describing(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[...
     real: Describe = Extractor.describe
 
     def hook(do: Callable[..., None]) -> None:
-        def describe(
-            self: Extractor, pixels: list[Pixels], centres: Centres | None
-        ) -> NDArray[np.float32]:
+        def describe(self: Extractor, pixels: list[Pixels], *made_with: Any) -> NDArray[np.float32]:
             do(pixels)
-            return real(self, pixels, centres)
+            return real(self, pixels, *made_with)
 
         monkeypatch.setattr(Extractor, "describe", describe)
 
@@ -494,7 +492,7 @@ def test_photos_wait_for_a_worker_that_reproduces_the_generation(
     real = Extractor.spec
     with monkeypatch.context() as patched:
         patched.setattr(
-            Extractor, "spec", lambda self, centres: {**real(self, centres), "layer": "other"}
+            Extractor, "spec", lambda self, *made_with: {**real(self, *made_with), "layer": "other"}
         )
         (photo_id,) = averages.upload(2)
         averages.drain()
