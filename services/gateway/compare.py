@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict
 from sqlalchemy.orm import Session
 
 from services.gateway.context import Gateway
-from services.gateway.find_similar import Query, Wanted, search
+from services.gateway.find_similar import Query, search
 from services.gateway.once import Once
 from services.gateway.schemas import (
     ExplanationAnswer,
@@ -21,6 +21,7 @@ from services.gateway.schemas import (
     SimilarityAnswer,
     SimilarPhoto,
 )
+from services.gateway.wanted import Wanted
 from shared.catalog.generations import active_generation
 from shared.catalog.maps import get_map
 from shared.catalog.photos import live_photos

@@ -6,13 +6,13 @@ here, and the search is asked again for more until k live ones are found or ther
 
 from __future__ import annotations
 
+import itertools
 import time
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
 from uuid import UUID
 
-from pydantic import BaseModel, ConfigDict
 from sqlalchemy.orm import Session
 
 from services.gateway.choose_weights import choose_weights
@@ -24,6 +24,7 @@ from services.gateway.schemas import (
     SimilarPhoto,
     job_url,
 )
+from services.gateway.wanted import Wanted
 from shared.catalog.chunks import descriptor_of
 from shared.catalog.generations import Generation, active_generation
 from shared.catalog.maps import Map, get_map
@@ -49,24 +50,6 @@ class Query:
     row: int
     photo_id: UUID | None
     filename: str
-
-
-class Wanted(BaseModel):
-    """What of the ranking is asked for. Kept with the job of a photo that is described first."""
-
-    model_config = ConfigDict(frozen=True)
-
-    top_k: int
-    min_score: float | None = None
-    photos: PhotoFilter = EVERYTHING
-    word_weights: bool = True
-    rerank: int | None = None
-    explain: bool = False
-
-    @property
-    def closely(self) -> bool:
-        """Whether an extractor has to look at what the search finds."""
-        return self.rerank is not None or self.explain
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,7 +134,7 @@ def search(gateway: Gateway, query: Query, wanted: Wanted) -> Found:
     weights = choose_weights(query.generation, wanted.word_weights, gateway.settings)
     shown = max(wanted.top_k, wanted.rerank or 0)
     # The estimate looks deeper than most answers, and also at what is below the least score.
-    search = partial(_search_live, gateway, query, weights=weights.values)
+    search = partial(_search_live, gateway, query, wanted, weights=weights.values)
     hits, photos, response = search(wanted.photos, max(shown, DEPTH))
     ranking = everything = rank(hits, photos)
     if not wanted.photos.is_empty:
@@ -177,6 +160,8 @@ def search(gateway: Gateway, query: Query, wanted: Wanted) -> Found:
         word_weights=weights.state(hits),
         generation_id=query.generation.id,
         certificate=response.certificate,
+        certified_k=_certain(similar[: wanted.top_k], response),
+        max_z=response.max_z,
         rows_scanned=response.rows_scanned,
         rows_reranked=response.rows_reranked,
         snapshot_version=response.snapshot_version,
@@ -197,10 +182,17 @@ def search(gateway: Gateway, query: Query, wanted: Wanted) -> Found:
     return Found(frame, similar, photos, weights.values if weighted else (), history)
 
 
+def _certain(hits: list[Hit], response: SearchResponse) -> int:
+    """How many of the first of these hits the search is certain of."""
+    sure = {hit.photo_id for hit in response.hits[: response.certified_k]}
+    return sum(1 for _ in itertools.takewhile(lambda hit: hit.photo_id in sure, hits))
+
+
 def _search_live(
     gateway: Gateway,
     query: Query,
-    wanted: PhotoFilter,
+    wanted: Wanted,
+    photos: PhotoFilter,
     depth: int,
     *,
     weights: tuple[float, ...],
@@ -217,17 +209,20 @@ def _search_live(
                 row=query.row,
                 min_version=query.min_version,
                 k=k,
-                photos=wanted,
+                photos=photos,
                 min_score=min_score,
                 exclude=(query.photo_id,) if query.photo_id else (),
                 word_weights=weights,
+                mode=wanted.mode,
+                most_rows=wanted.most_rows,
+                most_seconds=wanted.most_seconds,
             )
         )
         with gateway.catalog.read() as session:
-            photos = live_photos(session, [hit.photo_id for hit in response.hits])
-        hits = [hit for hit in response.hits if hit.photo_id in photos]
+            live = live_photos(session, [hit.photo_id for hit in response.hits])
+        hits = [hit for hit in response.hits if hit.photo_id in live]
         if len(hits) >= depth or len(response.hits) < k:
-            return hits[:depth], photos, response
+            return hits[:depth], live, response
         k *= 2
 
 

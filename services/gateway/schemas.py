@@ -149,7 +149,18 @@ class SimilarityAnswer(Answer):
         "WORD_WEIGHTS"
     )
     generation_id: UUID
-    certificate: str = Field(description="`exhaustive`: every row was compared exactly")
+    certificate: str = Field(
+        description="`exhaustive`: every row was compared exactly; `bound`: none that was left out "
+        "can be in the answer; `statistical`: the same but for a chance of 1 in 10^8; `none`: the "
+        "search ended early"
+    )
+    certified_k: int = Field(
+        0, description="so many of the first photos are certain: all, unless it ended early"
+    )
+    max_z: float | None = Field(
+        None,
+        description="largest error of an estimate from codes, in standard deviations; null without",
+    )
     rows_scanned: int
     rows_reranked: int
     snapshot_version: int
