@@ -1,7 +1,8 @@
 """How fast search is, next to what one would write without it, and whether it is ever wrong.
 
-`places` makes descriptors and `world` a map of them; `oracle` knows the right answers, `methods`
-are compared by `compare`; `cold`, `growth` and `load` measure what is named so; `memory` reads.
+`places` makes descriptors and `world` a map of them; `oracle` knows the right answers; `methods`
+are asked in `turns`, and `comparison` says what came of it. `cold`, `growth` and `load` measure
+what their names say; `memory` tells how fast memory is read, and how much of it was.
 """
 
 from __future__ import annotations
@@ -13,10 +14,11 @@ from typing import TYPE_CHECKING
 
 from benchmarks.report import Report
 from benchmarks.search.cold import measure_cold
-from benchmarks.search.compare import CASES, compare, tell
+from benchmarks.search.comparison import tell
 from benchmarks.search.growth import measure_growth
 from benchmarks.search.load import measure_load
 from benchmarks.search.places import City
+from benchmarks.search.turns import compare
 from benchmarks.search.world import CHUNK_ROWS, enough_memory, new_world
 
 if TYPE_CHECKING:
@@ -46,21 +48,15 @@ def measure(
         for count in sorted(photos):
             with tempfile.TemporaryDirectory(dir=folder, prefix="placewise-bench-") as home:
                 making = progress.add_task(f"{count:,} x {dimension:,}", total=count)
-
-                def shown(rows, making=making):  # type: ignore[no-untyped-def]
-                    progress.advance(making, len(rows))
-                    return rows
-
                 with new_world(
                     Path(home, "home"),
                     dimension,
-                    map(shown, city.chunks(count, CHUNK_ROWS)),
                     search_memory_budget=enough_memory(count, dimension),
                 ) as world:
-                    asking = progress.add_task("asking", total=len(CASES) * queries)
-                    compared = compare(
-                        world, city, queries, lambda asking=asking: progress.advance(asking)
-                    )
+                    for rows in city.chunks(count, CHUNK_ROWS):
+                        world.add(rows)
+                        progress.advance(making, len(rows))
+                    compared = compare(world, city, queries, progress)
                     report.tables.append(compared.table())
                     report.details["comparisons"].append(compared.as_json())
                     tell(report, compared)

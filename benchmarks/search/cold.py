@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import gc
 import mmap
 import os
 import time
@@ -11,10 +12,11 @@ import numpy as np
 from rich.progress import Progress
 
 from benchmarks.report import Report, Spread
-from benchmarks.search.compare import MATCHED, load
+from benchmarks.search.comparison import MATCHED
 from benchmarks.search.methods import Asked, Ours
-from benchmarks.search.oracle import Oracle, same
+from benchmarks.search.oracle import Oracle, Ranking, same
 from benchmarks.search.places import City
+from benchmarks.search.turns import load
 from benchmarks.search.world import World
 from services.search.snapshot import Snapshot
 
@@ -29,6 +31,7 @@ def measure_cold(report: Report, world: World, city: City, queries: int, bar: Pr
     (MADV_DONTNEED), then the file's pages are (posix_fadvise DONTNEED); `mincore` says what is
     left.
     """
+    gc.collect()  # mappings of those who were asked before
     task = bar.add_task("cold", total=queries)
     asked = city.revisits(len(world.photo_ids), queries)
     pieces = (np.load(path, mmap_mode="r") for path in world.chunk_paths())
@@ -75,15 +78,16 @@ def cached_share(snapshot: Snapshot) -> float:
         memory = chunk.stored.file.memory
         address = np.frombuffer(memory, np.uint8).ctypes.data
         count = -(-len(memory) // mmap.PAGESIZE)
-        found = (ctypes.c_ubyte * count)()
-        if libc.mincore(ctypes.c_void_p(address), ctypes.c_size_t(len(memory)), found) != 0:
+        found = np.empty(count, np.uint8)
+        room = ctypes.c_void_p(found.ctypes.data)
+        if libc.mincore(ctypes.c_void_p(address), ctypes.c_size_t(len(memory)), room) != 0:
             raise OSError(ctypes.get_errno(), "mincore")
-        there += int(np.count_nonzero(np.frombuffer(found, np.uint8) & 1))
+        there += int(np.count_nonzero(found & 1))
         pages += count
     return there / pages
 
 
-def _timed(ours: Ours, question: Asked):  # type: ignore[no-untyped-def]
+def _timed(ours: Ours, question: Asked) -> tuple[float, Ranking]:
     begun = time.perf_counter()
     found = ours.search(question)
     return time.perf_counter() - begun, found

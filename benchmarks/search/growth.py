@@ -39,15 +39,15 @@ def measure_growth(report: Report, progress: Progress, sizes: Sequence[int] = ME
         codes = np.frombuffer(draw.bytes(8 * rows * words), np.uint64).reshape(rows, words)
         blocks = _blocks(codes)
         asked = np.ones(rows, bool)
-        speed = ReadSpeed(codes)
         took = []
         glance(blocks, query, asked)
-        for _ in range(ROUNDS):
-            begun = time.perf_counter()
-            glance(blocks, query, asked)
-            took.append(time.perf_counter() - begun)
-            speed.sample()
-            progress.advance(task)
+        with ReadSpeed(codes) as speed:
+            for _ in range(ROUNDS):
+                begun = time.perf_counter()
+                glance(blocks, query, asked)
+                took.append(time.perf_counter() - begun)
+                speed.sample()
+                progress.advance(task)
         seconds = median(took)
         ratio = seconds * speed.bytes_per_second / codes.nbytes
         per_row = seconds / rows

@@ -10,7 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
-from typing import Any
+from typing import Any, Self
 from unittest.mock import patch
 
 import numpy as np
@@ -25,38 +25,52 @@ Words = NDArray[np.uint64]
 
 
 @compiled(IN_LANES)
-def _read(words: Words) -> int:
-    """Something that depends on every word."""
+def _read(words: Words) -> np.uint64:
+    """Something that depends on every word; four streams at once, which is faster than one."""
+    quarter = words.shape[0] // 4
+    a, b, c = words[:quarter], words[quarter : 2 * quarter], words[2 * quarter : 3 * quarter]
+    d = words[3 * quarter :]
     found = np.uint64(0)
-    for i in range(words.shape[0]):
-        found ^= words[i]
+    for i in range(quarter):
+        found ^= a[i] ^ b[i] ^ c[i] ^ d[i]
     return found
 
 
 class ReadSpeed:
-    """How fast memory is read, sampled between other measurements so that what disturbs one
-    disturbs the other: by one thread and by one of each core, the faster of which is the floor."""
+    """How fast memory is read: by one thread, and by one on each core; the faster is the floor.
+
+    A context manager. Samples are taken between other measurements, so that what disturbs one
+    disturbs the other.
+    """
 
     def __init__(self, words: Words | None = None) -> None:
         """What is read: these words, or some that lie in no cache."""
         self._words = np.ones(STREAM_BYTES // 8, np.uint64) if words is None else words.ravel()
-        self._cores = len(os.sched_getaffinity(0))
-        self._took: dict[int, list[float]] = {1: [], self._cores: []}
+        cores = len(os.sched_getaffinity(0))
+        self._parts = np.array_split(self._words, cores)
+        self._pool = ThreadPoolExecutor(cores, thread_name_prefix="read")
+        self._took: tuple[list[float], list[float]] = ([], [])
         _read(self._words[:8])
 
     def sample(self) -> None:
         """Read everything once in each way."""
-        for threads, took in self._took.items():
-            parts = np.array_split(self._words, threads)
-            with ThreadPoolExecutor(threads) as pool:
-                begun = time.perf_counter()
-                list(pool.map(_read, parts))
-                took.append(time.perf_counter() - begun)
+        begun = time.perf_counter()
+        _read(self._words)
+        alone = time.perf_counter()
+        list(self._pool.map(_read, self._parts))
+        self._took[0].append(alone - begun)
+        self._took[1].append(time.perf_counter() - alone)
 
     @property
     def bytes_per_second(self) -> float:
-        """The median of the faster way. ValueError before the first sample."""
-        return self._words.nbytes / min(median(took) for took in self._took.values())
+        """The median of the faster way. StatisticsError before the first sample."""
+        return self._words.nbytes / min(map(median, self._took))
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._pool.shutdown()
 
 
 @dataclass(slots=True)

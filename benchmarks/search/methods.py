@@ -132,7 +132,7 @@ class Predecessor:
         return ranked(scores, self._ids, asked)
 
     def bytes_touched(self, asked: Asked) -> int:
-        return len(self._ids) * self._queries.shape[1] * 4
+        return int(self._queries[0].nbytes) * len(self._ids)
 
 
 class FlatIP:
@@ -144,7 +144,7 @@ class FlatIP:
         self._index = index
         self._ids = photo_ids
         self._queries = queries
-        self.memory_bytes = 4 * index.ntotal * index.d
+        self.memory_bytes = int(queries[0].nbytes) * len(photo_ids)
 
     def search(self, asked: Asked) -> Ranking:
         query = self._queries[asked.query]

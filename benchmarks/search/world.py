@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from uuid import UUID
@@ -146,11 +146,11 @@ class World:
 
 
 @contextlib.contextmanager
-def new_world(
-    home: Path, dimension: int, chunks: Iterable[Rows] = (), **settings: object
-) -> Iterator[World]:
-    """A map with these chunks of descriptors in the folder `home`, in a SQLite catalog."""
-    chosen = Settings(_env_file=None, placewise_home=home, **settings)  # type: ignore[call-arg, arg-type]
+def new_world(home: Path, dimension: int, *, search_memory_budget: int) -> Iterator[World]:
+    """An empty map in the folder `home`, in a SQLite catalog."""
+    chosen = Settings(
+        _env_file=None, placewise_home=home, search_memory_budget=search_memory_budget
+    )
     home.mkdir(parents=True, exist_ok=True)
     catalog = Catalog(chosen.catalog_url())
     try:
@@ -170,8 +170,6 @@ def new_world(
             session.add(generation)
         store = FolderStore(home / "objects")
         world = World(chosen, catalog, store, map_id, generation.id, dimension)
-        for rows in chunks:
-            world.add(rows)
         yield world
     finally:
         catalog.close()
