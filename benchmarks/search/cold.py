@@ -36,8 +36,9 @@ def measure_cold(report: Report, world: World, city: City, queries: int, bar: Pr
     asked = city.revisits(len(world.photo_ids), queries)
     pieces = (np.load(path, mmap_mode="r") for path in world.chunk_paths())
     oracle = Oracle.of(pieces, world.photo_ids, asked)
-    snapshot = load(world)
-    ours = Ours(snapshot, asked)
+    worker = load(world)
+    snapshot = worker.snapshot(world.generation_id, world.version)
+    ours = Ours(world, worker, asked)
     warm, cold, cached, differ = [], [], [], 0
     for number in range(queries):
         question = Asked(number, MATCHED.k)

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import os
+import sys
+import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +18,7 @@ from unittest.mock import patch
 import numpy as np
 from numpy.typing import NDArray
 
-from services.search import cascade
+from services.search import kernels
 from shared.codes.compiled import IN_LANES, compiled
 
 STREAM_BYTES = 256_000_000  # beyond every cache
@@ -85,22 +87,37 @@ def touched() -> Iterator[Touched]:
     """Counts what searches by codes read while the block runs: their loops are told which rows."""
     count = Touched()
 
-    def counted(name: str, bytes_of: Any) -> Any:
-        loop = getattr(cascade, name)
+    lock = threading.Lock()
+    loops: dict[str, Callable[..., int]] = {
+        "distances": _of_distances,
+        "distances_at": lambda at, query, _: 8 * len(query) * len(at),
+        "weighted_at": lambda at, planes, _: 8 * planes.shape[1] * len(at),
+        "products_at": lambda at, query, _: 4 * len(query) * len(at),
+    }
 
+    def counted(loop: Callable[..., Any], bytes_of: Callable[..., int]) -> Callable[..., Any]:
         def call(*arguments: Any) -> Any:
-            count.size_bytes += bytes_of(*arguments)
+            with lock:
+                count.size_bytes += bytes_of(*arguments)
             return loop(*arguments)
 
-        return patch.object(cascade, name, call)
+        return call
 
-    with (
-        counted("distances", lambda *a: 8 * len(a[3]) * int(np.count_nonzero(a[2][a[4] : a[5]]))),
-        counted("distances_at", lambda at, query, out: 8 * len(query) * len(at)),
-        counted("weighted_at", lambda at, planes, out: 8 * planes.shape[1] * len(at)),
-        counted("products_at", lambda at, query, out: 4 * len(query) * len(at)),
-    ):
+    callers = [module for name, module in sys.modules.items() if name.startswith("services.search")]
+    with contextlib.ExitStack() as patches:
+        for name, bytes_of in loops.items():
+            loop: Callable[..., Any] = getattr(kernels, name)
+            for module in callers:
+                if module is not kernels and getattr(module, name, None) is loop:
+                    patches.enter_context(patch.object(module, name, counted(loop, bytes_of)))
         yield count
+
+
+def _of_distances(
+    _blocks: Any, _first: Any, asked: NDArray[np.bool_], query: Words, begin: int, end: int, *_: Any
+) -> int:
+    rows = np.count_nonzero(asked[..., begin:end].reshape(-1, end - begin).any(axis=0))
+    return 8 * int(query.shape[-1]) * int(rows)
 
 
 def private_bytes() -> int:

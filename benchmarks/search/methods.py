@@ -16,7 +16,6 @@ from benchmarks.search.memory import touched
 from benchmarks.search.oracle import Ranking
 from benchmarks.search.world import World
 from services.search.answer import Question, answer
-from services.search.snapshot import Snapshot
 from services.search.worker import SearchWorker
 from shared.chunks import Rows
 from shared.codes.rotation import rotation
@@ -46,15 +45,15 @@ class Method(Protocol):
 
 
 class Ours:
-    """A snapshot as the search worker loads it, asked directly."""
+    """What a search worker has loaded, asked directly."""
 
     name = "Placewise, answer()"
 
-    def __init__(self, snapshot: Snapshot, queries: Rows) -> None:
-        self._snapshot = snapshot
+    def __init__(self, world: World, worker: SearchWorker, queries: Rows) -> None:
+        self._snapshot = worker.snapshot(world.generation_id, world.version)
         self._queries = queries
-        self._asked = snapshot.photos.findable
-        self.memory_bytes = snapshot.resident_bytes
+        self._asked = self._snapshot.photos.findable
+        self.memory_bytes = worker.status().resident_bytes
         self.certificates: set[str] = set()
 
     def search(self, asked: Asked) -> Ranking:
@@ -70,7 +69,8 @@ class Ours:
     def bytes_touched(self, asked: Asked) -> int:
         with touched() as count:
             self.search(asked)
-        return count.size_bytes or self._snapshot.row_bytes  # without codes all rows are read
+        # Without codes every row is read.
+        return count.size_bytes or int(self._queries[0].nbytes) * len(self._asked)
 
 
 class OurWorker:
@@ -78,14 +78,13 @@ class OurWorker:
 
     name = "Placewise, SearchWorker"
 
-    def __init__(self, world: World, queries: Rows, ours: Ours) -> None:
+    def __init__(self, world: World, worker: SearchWorker, queries: Rows, ours: Ours) -> None:
         self._world = world
-        self._worker = SearchWorker(world.catalog, world.store, world.settings)
-        self._worker.follow()
+        self._worker = worker
         self._version = world.version
         self._keys = [world.ask_with(row) for row in queries]
         self._ours = ours
-        self.memory_bytes = self._worker.status().resident_bytes
+        self.memory_bytes = ours.memory_bytes
 
     def search(self, asked: Asked) -> Ranking:
         request = self._world.request(

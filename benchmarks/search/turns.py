@@ -28,23 +28,20 @@ from benchmarks.search.methods import (
 from benchmarks.search.oracle import Oracle, same, same_photos
 from benchmarks.search.places import City
 from benchmarks.search.world import World
-from services.search.follow import advance
-from services.search.load import Loader
-from services.search.memory import Memory
 from services.search.snapshot import Snapshot
+from services.search.worker import SearchWorker
 from shared.chunks import Rows
 from shared.codes.signs import SignCodes, sign_codes
-from shared.shards import WHOLE
 
 
-def load(world: World) -> Snapshot:
-    """The map as a search worker loads it."""
-    loader = Loader(world.store, world.settings.search_cache(WHOLE))
-    memory = Memory(world.settings.search_memory_bytes)
-    snapshot = advance(world.catalog, loader, memory, world.generation_id, None)
-    assert snapshot is not None, "the generation is there"
-    assert not snapshot.missing, snapshot.missing
-    return snapshot
+def load(world: World) -> SearchWorker:
+    """A search worker that has loaded the map."""
+    worker = SearchWorker(world.catalog, world.store, world.settings)
+    worker.follow()
+    status = worker.status()
+    assert not status.missing, status.missing
+    assert status.rows == len(world.photo_ids), "every photo can be found"
+    return worker
 
 
 def compare(world: World, city: City, queries: int, progress: Progress) -> Compared:
@@ -54,11 +51,11 @@ def compare(world: World, city: City, queries: int, progress: Progress) -> Compa
     asked = np.concatenate([city.revisits(photos, queries), city.elsewhere(queries)])
     oracle = Oracle.of(_stored(world), world.photo_ids, asked)
     before = private_bytes()
-    snapshot = load(world)
+    worker = load(world)
     grown = private_bytes() - before
     took: dict[str, dict[str, list[float]]] = {}
     differ: Counter[tuple[str, str]] = Counter()
-    with ReadSpeed() as speed, _methods(world, snapshot, asked) as (methods, ours):
+    with ReadSpeed() as speed, _methods(world, worker, asked) as (methods, ours):
         for case in CASES:
             numbers = range(queries) if case.matched else range(queries, 2 * queries)
             took[case.name] = {method.name: [] for method in methods}
@@ -123,7 +120,7 @@ def _row(
 
 @contextlib.contextmanager
 def _methods(
-    world: World, snapshot: Snapshot, queries: Rows
+    world: World, worker: SearchWorker, queries: Rows
 ) -> Iterator[tuple[list[Method], Ours]]:
     index = faiss.IndexFlatIP(world.dimension)
     for rows in _stored(world):
@@ -132,11 +129,12 @@ def _methods(
     rows = faiss.rev_swig_ptr(index.get_xb(), photos * world.dimension)
     rows = rows.reshape(photos, world.dimension)
     ids = world.photo_ids
-    ours = Ours(snapshot, queries)
+    ours = Ours(world, worker, queries)
+    snapshot = worker.snapshot(world.generation_id, world.version)
     yield (
         [
             ours,
-            OurWorker(world, queries, ours),
+            OurWorker(world, worker, queries, ours),
             NumpyResident(rows, ids, queries),
             FlatIP(index, ids, queries),
             BinaryFlat(_codes(snapshot, rows), rows, ids, queries),

@@ -152,7 +152,7 @@ def test_a_search_by_codes_touches_all_first_bits_and_the_rows_that_it_compares(
     city = City(7168, 1)
     with world_of(tmp_path, city, 400, 200) as world:
         queries = city.revisits(400, 1)
-        ours = Ours(load(world), queries)
+        ours = Ours(world, load(world), queries)
         with touched() as count:
             ours.search(Asked(0, 3))
         assert ours.certificates == {"statistical"}
