@@ -205,9 +205,10 @@ def _change(world: World, pool: Rows, outcome: Outcome, stop: threading.Event) -
     """Add a photo, delete another one, merge what was added from time to time."""
     draw = random.Random(SEED)
     slot = len(world.photo_ids)  # far beyond those that are there
-    added = 0
+    added = turn = 0
     live = outcome.live[-1]
     while not stop.wait(CHANGE_SECONDS):
+        turn += 1
         if added < len(pool):
             version = world.add(pool[added : added + 1], slot)
             added += 1
@@ -218,7 +219,7 @@ def _change(world: World, pool: Rows, outcome: Outcome, stop: threading.Event) -
         live = live.copy()
         live[gone] = False
         _note(outcome, version, live)
-        if added % CHANGES_A_MERGE == 0 and world.merge(slot):
+        if turn % CHANGES_A_MERGE == 0 and world.merge(slot):
             outcome.merges += 1
 
 
