@@ -43,6 +43,8 @@ class Report:
     figures: list[Figure] = field(default_factory=list)
     details: Json = field(default_factory=dict)
     """What else a program may want to read; not shown in the table."""
+    tables: list[Table] = field(default_factory=list)
+    """Shown before that of the figures."""
 
     def add(
         self,

@@ -19,7 +19,6 @@ from uuid import UUID
 
 import numpy as np
 from numpy.typing import NDArray
-from typing_extensions import Buffer
 
 from shared.errors import Unavailable
 from shared.objects import ObjectStore
@@ -68,7 +67,7 @@ def encode_rows(rows: Rows) -> bytes:
     return buffer.getvalue()
 
 
-def decode_rows(data: Buffer) -> Rows:
+def decode_rows(data: bytes | mmap.mmap) -> Rows:
     """The rows of a `.npy` file, sharing memory with `data`."""
     shape, offset = _read_header(bytes(memoryview(data)[:HEADER_BYTES]))
     return np.frombuffer(data, dtype=np.float32, offset=offset).reshape(shape)

@@ -17,8 +17,9 @@ from sqlalchemy import insert
 from threadpoolctl import threadpool_limits
 
 from benchmarks.report import Report
-from services.search.scan import top_k
-from services.search.snapshot import LoadedChunk, PhotoColumns
+from services.search.photo_columns import PhotoColumns
+from services.search.scan import scan
+from services.search.snapshot import LoadedChunk
 from shared.catalog.chunks import Chunk, live_chunks
 from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.maps import create_map
@@ -56,7 +57,7 @@ def measure(progress: Progress) -> Report:
 
 
 def _scan_seconds(dimension: int, chunks: int) -> float:
-    """Of one row, in a search as services/search answers it, which excludes the query's photo."""
+    """Of one row, in a search that compares all of them but the query's."""
     draw = np.random.default_rng(SEED)
     loaded = []
     for _ in range(chunks):
@@ -64,9 +65,10 @@ def _scan_seconds(dimension: int, chunks: int) -> float:
         rows /= np.linalg.norm(rows, axis=1, keepdims=True)
         columns = PhotoColumns.of(CHUNK_ROWS, enumerate(_facts(CHUNK_ROWS)))
         loaded.append(LoadedChunk(new_id(), "chunks/x", rows, columns))
-    query, itself = loaded[0].rows[0], frozenset({loaded[0].photos.photo_id[0]})
+    query, asked = loaded[0].rows[0], np.ones(chunks * CHUNK_ROWS, bool)
+    asked[0] = False  # the query's own photo
     with threadpool_limits(1):
-        seconds = _median_seconds(lambda: top_k(loaded, query, 10, exclude=itself))
+        seconds = _median_seconds(lambda: scan(loaded, query, 10, asked))
     return seconds / (chunks * CHUNK_ROWS)
 
 

@@ -20,7 +20,7 @@ app = typer.Typer(help="Measure this machine.", no_args_is_help=True)
 
 DeviceOption = Annotated[str, typer.Option("--device", help="auto, cpu or cuda.")]
 
-OF_DEV = ("benchmarks", "tests", "psutil", "pytest", "testcontainers", "threadpoolctl")
+OF_DEV = ("benchmarks", "tests", "faiss", "psutil", "pytest", "testcontainers", "threadpoolctl")
 
 
 @app.command("spine")
@@ -150,6 +150,42 @@ def rerank(
     _measure("rerank", as_json, places=places, seed=seed)
 
 
+@app.command("search")
+def search(
+    photos: Annotated[str, typer.Option(help="Numbers of photos in the map.")] = "2000",
+    dimensions: Annotated[
+        str, typer.Option(help="Of the descriptors; multiples of 64.")
+    ] = "512,7168,98304",
+    queries: Annotated[int, typer.Option(min=2, help="Of each kind.")] = 20,
+    growth: Annotated[
+        bool, typer.Option("--growth", help="Scan the codes of up to a million photos.")
+    ] = False,
+    load: Annotated[
+        float, typer.Option("--load", min=0, help="Seconds that 32 clients ask at once.")
+    ] = 0,
+    everything: Annotated[
+        bool,
+        typer.Option("--long", help="1,000, 5,000 and 10,000 photos, --growth, --load 60."),
+    ] = False,
+    folder: Annotated[
+        Path | None,
+        typer.Option(exists=True, file_okay=False, help="Where the map is made: 4 GB of disk."),
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """How fast is search, next to NumPy, faiss and reading every chunk, and is it ever wrong?"""
+    _measure(
+        "search",
+        as_json,
+        photos=_numbers("1000,5000,10000" if everything else photos),
+        dimensions=_numbers(dimensions),
+        queries=queries,
+        growth=growth or everything,
+        load_seconds=load or (60.0 if everything else 0.0),
+        folder=folder,
+    )
+
+
 @app.command("catalog")
 def catalog(
     photos: Annotated[int, typer.Option(min=100_000, help="Rows to make.")] = 1_000_000,
@@ -230,7 +266,8 @@ def _measure(name: str, as_json: bool, **options: Any) -> None:
     if as_json:
         print_json(report.as_json())
     else:
-        answers.print(report.table())
+        for table in (*report.tables, report.table()):
+            answers.print(table)
     if report.missed:
         raise typer.Exit(1)
 

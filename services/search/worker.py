@@ -103,7 +103,7 @@ class SearchWorker:
             self._loading = {k: v for k, v in self._loading.items() if k in wanted or v.locked()}
 
     def search(self, request: SearchRequest) -> SearchResponse:
-        snapshot = self._snapshot(request.generation_id, request.min_version)
+        snapshot = self.snapshot(request.generation_id, request.min_version)
         query = self._rows.find(snapshot, request)
         asked = select(snapshot.photos, request.photos, request.exclude)
         question = Question(
@@ -150,8 +150,9 @@ class SearchWorker:
             lags=self.lags.now(versions),
         )
 
-    def _snapshot(self, generation_id: UUID, min_version: int) -> Snapshot:
-        """A snapshot at least as new as `min_version`; Unavailable when that takes too long."""
+    def snapshot(self, generation_id: UUID, min_version: int) -> Snapshot:
+        """What answers: a snapshot at least as new as `min_version`; Unavailable when that takes
+        too long."""
         deadline = time.monotonic() + self._settings.search_wait_seconds
         while True:
             snapshot = self._snapshots.get(generation_id)

@@ -1,0 +1,89 @@
+"""How the scan of the codes grows with the map; the codes are random words, made directly."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from statistics import median
+
+import numpy as np
+from rich.progress import Progress
+from rich.table import Table
+
+from benchmarks.report import Report
+from benchmarks.search.memory import ReadSpeed
+from services.search.cascade import Blocks, CodedQuery, glance
+from shared.codes.rotation import rotation
+from shared.codes.signs import level_words
+
+DIMENSION = 98_304
+MEASURED = (100_000, 1_000_000)
+RECKONED = (3_000_000, 10_000_000)
+BLOCK_ROWS = 1000  # of a chunk
+ROUNDS = 15
+WANTED = 1.3
+SEED = 20_261_121
+
+
+def measure_growth(report: Report, progress: Progress, sizes: Sequence[int] = MEASURED) -> None:
+    """Scans and reads of the same codes, in turn."""
+    turn = rotation(DIMENSION)
+    words = level_words(turn.padded)[0]
+    draw = np.random.default_rng(SEED)
+    query = CodedQuery.of(draw.standard_normal(DIMENSION).astype(np.float32), turn)
+    task = progress.add_task("growth", total=len(sizes) * ROUNDS)
+    table = Table("photos", "first bits", "scan", "of reading them", "", title="Growth")
+    per_row = 0.0
+    found = []
+    for rows in sizes:
+        codes = np.frombuffer(draw.bytes(8 * rows * words), np.uint64).reshape(rows, words)
+        blocks = _blocks(codes)
+        asked = np.ones(rows, bool)
+        took = []
+        glance(blocks, [query], [asked])
+        with ReadSpeed(codes) as speed:
+            for _ in range(ROUNDS):
+                begun = time.perf_counter()
+                glance(blocks, [query], [asked])
+                took.append(time.perf_counter() - begun)
+                speed.sample()
+                progress.advance(task)
+        seconds = median(took)
+        ratio = seconds * speed.bytes_per_second / codes.nbytes
+        per_row = seconds / rows
+        report.add(f"growth: scan of {rows:,} codes, median", 1000 * seconds, "ms")
+        report.add(f"growth: {rows:,} codes, of reading them", ratio, "x", at_most=WANTED)
+        table.add_row(
+            f"{rows:,}",
+            f"{codes.nbytes / 1e9:.2f} GB",
+            f"{1000 * seconds:.1f} ms",
+            f"{ratio:.2f}",
+            "measured",
+        )
+        found.append({"rows": rows, "seconds": took, "ratio": ratio, "measured": True})
+    for rows in RECKONED:
+        table.add_row(
+            f"{rows:,}",
+            f"{8 * rows * words / 1e9:.2f} GB",
+            f"{1000 * rows * per_row:.1f} ms",
+            "",
+            f"reckoned from {sizes[-1]:,}",
+        )
+        found.append({"rows": rows, "seconds": rows * per_row, "measured": False})
+    report.tables.append(table)
+    report.details["growth"] = found
+
+
+def _blocks(codes: np.ndarray[tuple[int, int], np.dtype[np.uint64]]) -> Blocks:
+    """Codes as a scan wants them: chunk by chunk, their first level only."""
+    begins = np.arange(0, len(codes), BLOCK_ROWS)
+    nothing = np.empty(0, np.uint64)
+    return Blocks(
+        dimension=DIMENSION,
+        first=np.array([*begins, len(codes)], np.int64),
+        levels=((codes.ctypes.data + begins * codes.strides[0]).astype(np.uint64),),
+        rows=nothing,
+        norms=np.ones(len(codes), np.float32),
+        zeros=np.empty(0, np.int64),
+        kept=codes,
+    )

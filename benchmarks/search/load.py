@@ -1,0 +1,260 @@
+"""Many clients at once, while photos are added, deleted and merged: is any answer wrong?
+
+The search service runs in a process of its own, as in production. Every answer names the version
+of the map that it is of, and is compared with brute force on the photos that the map had then.
+"""
+
+from __future__ import annotations
+
+import bisect
+import contextlib
+import random
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from http.client import HTTPException
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ValidationError
+from rich.progress import Progress
+
+from benchmarks.fleet.service import Service
+from benchmarks.report import Report, Spread
+from benchmarks.search.oracle import Oracle, Ranking, same
+from benchmarks.search.places import City
+from benchmarks.search.world import World
+from benchmarks.traffic import Caller
+from shared.chunks import Rows
+from shared.search_protocol import SearchResponse
+from tests.support.server import environment
+from tests.support.servers.daemon import free_ports
+
+CLIENTS = 32
+QUERIES = 48
+OUT_OF_MAP = 16  # of them
+KS = (1, 10, 100)
+POOL = 240  # photos that are added meanwhile
+CHANGE_SECONDS = 0.25
+CHANGES_A_MERGE = 20
+ALIKE = 0.8  # how much of another photo is in one that is added
+SEED = 20_261_121
+JSON = {"Content-Type": "application/json"}
+
+
+@dataclass(frozen=True, slots=True)
+class Answered:
+    query: int
+    k: int
+    least_version: int
+    """That the answer had to know."""
+    response: SearchResponse
+    seconds: float
+
+
+@dataclass(slots=True)
+class Outcome:
+    """What clients and the one who changes the map have seen."""
+
+    answered: list[Answered] = field(default_factory=list)
+    failed: list[str] = field(default_factory=list)
+    versions: list[int] = field(default_factory=list)
+    """Rising."""
+    live: list[NDArray[np.bool_]] = field(default_factory=list)
+    """Which photos the map has at each of the versions, and until the next one."""
+    merges: int = 0
+    seconds: float = 0.0
+
+    def live_at(self, version: int) -> int:
+        """The number of the entry of `live`. ValueError for a version before the first."""
+        found = bisect.bisect_right(self.versions, version) - 1
+        if found < 0:
+            raise ValueError(f"version {version} is older than all")
+        return found
+
+
+def measure_load(
+    report: Report, world: World, city: City, seconds: float, progress: Progress
+) -> None:
+    """CLIENTS ask for `seconds`."""
+    photos = len(world.photo_ids)
+    paths = world.chunk_paths()
+    queries = np.concatenate(
+        [city.revisits(photos, QUERIES - OUT_OF_MAP), city.elsewhere(OUT_OF_MAP)]
+    )
+    pool = _like(queries, city.elsewhere(OUT_OF_MAP + 1)[OUT_OF_MAP:])
+    with _service(world) as service:
+        outcome = _run(world, service, queries, pool, seconds, progress)
+    pieces: Iterator[Rows] = (np.load(path, mmap_mode="r") for path in paths)
+    added = len(world.photo_ids) - photos
+    oracle = Oracle.of((*pieces, pool[:added]), world.photo_ids, queries)
+    wrong = count_wrong(outcome, oracle)
+    spread = Spread.of([answered.seconds for answered in outcome.answered])
+    report.add("load: answers", len(outcome.answered), at_least=1)
+    report.add("load: versions of the map", len(outcome.versions) + outcome.merges, at_least=2)
+    report.add("load: wrong answers", wrong, at_most=0)
+    report.add("load: errors", len(outcome.failed), at_most=0)
+    report.add("load: throughput", len(outcome.answered) / outcome.seconds, "queries/s")
+    report.add("load: query, median", 1000 * spread.median, "ms")
+    report.add("load: query, p95", 1000 * spread.p95, "ms")
+    report.details["load"] = {
+        "clients": CLIENTS,
+        "photos": photos,
+        "dimension": world.dimension,
+        "added": added,
+        "deleted": len(world.photo_ids) - int(outcome.live[-1].sum()),
+        "merges": outcome.merges,
+        "errors": outcome.failed[:20],
+    }
+
+
+def count_wrong(outcome: Outcome, oracle: Oracle) -> int:
+    """Answers that are not those of brute force on the version that they name, or that name one
+    older than they had to know."""
+    expected: dict[tuple[int, int, int], Ranking] = {}
+    wrong = 0
+    for answered in outcome.answered:
+        response = answered.response
+        if response.snapshot_version < answered.least_version or response.missing:
+            wrong += 1
+            continue
+        at = outcome.live_at(response.snapshot_version), answered.query, answered.k
+        if at not in expected:
+            live = np.zeros(len(oracle.photo_ids), bool)
+            live[: len(outcome.live[at[0]])] = outcome.live[at[0]]
+            expected[at] = oracle.best(answered.query, answered.k, live=live)
+        found = [(hit.photo_id, hit.score) for hit in response.hits]
+        wrong += not same(found, expected[at])
+    return wrong
+
+
+def _run(
+    world: World,
+    service: Service,
+    queries: Rows,
+    pool: Rows,
+    seconds: float,
+    progress: Progress,
+) -> Outcome:
+    keys = [world.ask_with(row) for row in queries]
+    outcome = Outcome(versions=[world.version], live=[np.ones(len(world.photo_ids), bool)])
+    stop = threading.Event()
+    task = progress.add_task("load", total=seconds)
+    assert service.ready_url is not None
+    with Caller(service.ready_url.removesuffix("/readyz")) as caller:
+        for number in range(len(KS)):  # what is compiled is compiled now
+            _ask(world, caller, keys, number, KS[number], outcome)
+        outcome.answered.clear()
+        with ThreadPoolExecutor(CLIENTS + 1) as pool_of_threads:
+            begun = time.monotonic()
+            calls = [
+                pool_of_threads.submit(_client, world, caller, keys, number, outcome, stop)
+                for number in range(CLIENTS)
+            ]
+            calls.append(pool_of_threads.submit(_change, world, pool, outcome, stop))
+            try:
+                while (spent := time.monotonic() - begun) < seconds:
+                    progress.update(task, completed=spent)
+                    if any(call.done() for call in calls):
+                        break  # one of them has died: its error is raised below
+                    time.sleep(0.1)
+            finally:
+                stop.set()
+            for call in calls:
+                call.result()
+            outcome.seconds = time.monotonic() - begun
+    return outcome
+
+
+def _client(
+    world: World,
+    caller: Caller,
+    keys: list[str],
+    number: int,
+    outcome: Outcome,
+    stop: threading.Event,
+) -> None:
+    draw = random.Random(SEED + number)
+    while not stop.is_set():
+        _ask(world, caller, keys, draw.randrange(len(keys)), draw.choice(KS), outcome)
+
+
+def _ask(
+    world: World, caller: Caller, keys: list[str], query: int, k: int, outcome: Outcome
+) -> None:
+    least = outcome.versions[-1]
+    body = world.request(keys[query], k, least).model_dump_json().encode()
+    begun = time.perf_counter()
+    try:
+        answer = caller.call("POST", "/search", body, **JSON)
+        took = time.perf_counter() - begun
+        if answer.status == 200:
+            response = SearchResponse.model_validate_json(answer.body)
+            outcome.answered.append(Answered(query, k, least, response, took))
+        else:
+            outcome.failed.append(f"{answer.status}: {answer.body[:200]!r}")
+    except (OSError, HTTPException, ValidationError) as error:
+        outcome.failed.append(f"{type(error).__name__}: {error}")
+
+
+def _change(world: World, pool: Rows, outcome: Outcome, stop: threading.Event) -> None:
+    """Add a photo, delete another one, merge what was added from time to time."""
+    draw = random.Random(SEED)
+    slot = len(world.photo_ids)  # far beyond those that are there
+    added = turn = 0
+    live = outcome.live[-1]
+    while not stop.wait(CHANGE_SECONDS):
+        turn += 1
+        if added < len(pool):
+            version = world.add(pool[added : added + 1], slot)
+            added += 1
+            live = np.append(live, True)
+            _note(outcome, version, live)
+        gone = int(draw.choice(np.flatnonzero(live).tolist()))
+        version = world.delete(world.photo_ids[gone])
+        live = live.copy()
+        live[gone] = False
+        _note(outcome, version, live)
+        if turn % CHANGES_A_MERGE == 0 and world.merge(slot):
+            outcome.merges += 1
+
+
+def _note(outcome: Outcome, version: int, live: NDArray[np.bool_]) -> None:
+    outcome.live.append(live)
+    outcome.versions.append(version)  # last: clients ask for it from now on
+
+
+def _like(queries: Rows, others: Rows) -> Rows:
+    """(POOL, dimension): photos that answer the queries more or less."""
+    draw = np.random.default_rng(SEED)
+    rows = queries[draw.integers(len(queries), size=POOL)]
+    for row in rows:  # one after the other: the pool alone is large enough
+        row += draw.uniform(0.1, 2 * ALIKE) * others[draw.integers(len(others))]
+        noise = draw.standard_normal(len(row)).astype(np.float32)
+        row += np.float32(draw.uniform(0.2, 1.0)) * noise / np.linalg.norm(noise)
+        row /= np.linalg.norm(row)
+    return rows
+
+
+@contextlib.contextmanager
+def _service(world: World) -> Iterator[Service]:
+    """`placewise search` on the map."""
+    (port,) = free_ports(1)
+    home = world.settings.placewise_home
+    service = Service(
+        "search",
+        [str(Path(sys.executable).with_name("placewise")), "search"],
+        environment(home, port=port, search_memory_budget=world.settings.search_memory_bytes),
+        home / "search.log",
+        f"http://127.0.0.1:{port}/readyz",
+    )
+    service.start()
+    try:
+        service.wait_until_ready()
+        yield service
+    finally:
+        service.kill()

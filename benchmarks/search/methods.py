@@ -1,0 +1,206 @@
+"""The ways to search that are compared: ours, and what one would write without it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+from uuid import UUID
+
+import faiss
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.search.memory import touched
+from benchmarks.search.oracle import Ranking
+from benchmarks.search.world import World
+from services.search.answer import Question, answer
+from services.search.worker import SearchWorker
+from shared.chunks import Rows
+from shared.codes.rotation import rotation
+from shared.codes.signs import SignCodes, pack_signs
+
+LEAST_CANDIDATES = 32  # of the binary index, compared exactly
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """One question: the row of query number `query`, how many photos, from which score on."""
+
+    query: int
+    k: int
+    min_score: float | None = None
+
+
+class Method(Protocol):
+    name: str
+    memory_bytes: int
+    """That the index holds, without what the system caches of files."""
+
+    def search(self, asked: Asked) -> Ranking: ...
+
+    def bytes_touched(self, asked: Asked) -> int:
+        """Of codes and rows."""
+
+
+class Ours:
+    """What a search worker has loaded, asked directly."""
+
+    name = "Placewise, answer()"
+
+    def __init__(self, world: World, worker: SearchWorker, queries: Rows) -> None:
+        self._snapshot = worker.snapshot(world.generation_id, world.version)
+        self._glances = worker.together
+        self._queries = queries
+        self._asked = self._snapshot.photos.findable
+        self.memory_bytes = worker.status().resident_bytes
+        self.certificates: set[str] = set()
+
+    def search(self, asked: Asked) -> Ranking:
+        found = answer(
+            self._snapshot,
+            self._queries[asked.query],
+            self._asked,
+            Question(asked.k, asked.min_score),
+            self._glances,
+        )
+        self.certificates.add(found.certificate)
+        return [(hit.photo_id, hit.score) for hit in found.hits]
+
+    def bytes_touched(self, asked: Asked) -> int:
+        with touched() as count:
+            self.search(asked)
+        # Without codes every row is read.
+        return count.size_bytes or int(self._queries[0].nbytes) * len(self._asked)
+
+
+class OurWorker:
+    """The same through the worker: the query's descriptor is read from the store."""
+
+    name = "Placewise, SearchWorker"
+
+    def __init__(self, world: World, worker: SearchWorker, queries: Rows, ours: Ours) -> None:
+        self._world = world
+        self._worker = worker
+        self._version = world.version
+        self._keys = [world.ask_with(row) for row in queries]
+        self._ours = ours
+        self.memory_bytes = ours.memory_bytes
+
+    def search(self, asked: Asked) -> Ranking:
+        request = self._world.request(
+            self._keys[asked.query], asked.k, self._version, asked.min_score
+        )
+        return [(hit.photo_id, hit.score) for hit in self._worker.search(request).hits]
+
+    def bytes_touched(self, asked: Asked) -> int:
+        return self._ours.bytes_touched(asked)
+
+
+class NumpyResident:
+    """All rows in one float32 array."""
+
+    name = "NumPy, resident float32"
+
+    def __init__(self, rows: Rows, photo_ids: Sequence[UUID], queries: Rows) -> None:
+        self._rows = rows
+        self._ids = photo_ids
+        self._queries = queries
+        self.memory_bytes = rows.nbytes
+
+    def search(self, asked: Asked) -> Ranking:
+        return ranked(self._rows @ self._queries[asked.query], self._ids, asked)
+
+    def bytes_touched(self, asked: Asked) -> int:
+        return self._rows.nbytes
+
+
+class Predecessor:
+    """Every chunk is loaded for every query (AnyLoc's similarity service)."""
+
+    name = "predecessor: np.load of every chunk"
+    memory_bytes = 0
+
+    def __init__(self, paths: Sequence[Path], photo_ids: Sequence[UUID], queries: Rows) -> None:
+        self._paths = paths
+        self._ids = photo_ids
+        self._queries = queries
+
+    def search(self, asked: Asked) -> Ranking:
+        query = self._queries[asked.query]
+        scores = np.concatenate([np.dot(np.load(path), query) for path in self._paths])
+        return ranked(scores, self._ids, asked)
+
+    def bytes_touched(self, asked: Asked) -> int:
+        return int(self._queries[0].nbytes) * len(self._ids)
+
+
+class FlatIP:
+    """`faiss.IndexFlatIP`. Its rows are NumPy's, too: one copy is enough for both."""
+
+    name = "faiss.IndexFlatIP"
+
+    def __init__(self, index: faiss.IndexFlatIP, photo_ids: Sequence[UUID], queries: Rows) -> None:
+        self._index = index
+        self._ids = photo_ids
+        self._queries = queries
+        self.memory_bytes = int(queries[0].nbytes) * len(photo_ids)
+
+    def search(self, asked: Asked) -> Ranking:
+        query = self._queries[asked.query]
+        k = min(asked.k, len(self._ids))
+        scores, numbers = self._index.search(query[np.newaxis], k)
+        found = zip(numbers[0].tolist(), scores[0].tolist(), strict=True)
+        least = -np.inf if asked.min_score is None else asked.min_score
+        return [(self._ids[number], score) for number, score in found if score >= least]
+
+    def bytes_touched(self, asked: Asked) -> int:
+        return self.memory_bytes
+
+
+class BinaryFlat:
+    """`faiss.IndexBinaryFlat` on our codes, and the best of it compared exactly.
+
+    Nothing says how many candidates are enough.
+    """
+
+    name = "faiss.IndexBinaryFlat + rerank"
+
+    def __init__(
+        self, codes: SignCodes, rows: Rows, photo_ids: Sequence[UUID], queries: Rows
+    ) -> None:
+        words = np.concatenate(codes.levels, axis=1).view(np.uint8)
+        self._index = faiss.IndexBinaryFlat(8 * words.shape[1])
+        self._index.add(words)
+        self._rows = rows
+        self._ids = photo_ids
+        self._queries = queries
+        self._turn = rotation(rows.shape[1])
+        self.memory_bytes = words.nbytes
+
+    def search(self, asked: Asked) -> Ranking:
+        query = self._queries[asked.query]
+        code = pack_signs(self._turn.rotate(query[np.newaxis])).view(np.uint8)
+        _, numbers = self._index.search(code, self._candidates(asked))
+        rows = numbers[0]
+        scores = self._rows[rows].astype(np.float64) @ query.astype(np.float64)
+        return ranked(scores, [self._ids[row] for row in rows.tolist()], asked)
+
+    def bytes_touched(self, asked: Asked) -> int:
+        return self.memory_bytes + self._candidates(asked) * self._rows.strides[0]
+
+    def _candidates(self, asked: Asked) -> int:
+        return min(max(LEAST_CANDIDATES, 3 * asked.k), len(self._ids))
+
+
+def ranked(
+    scores: NDArray[np.floating[np.typing.NBitBase]], photo_ids: Sequence[UUID], asked: Asked
+) -> Ranking:
+    """The best of all rows' scores, which stand in the order of the photos."""
+    k = min(asked.k, len(scores))
+    best = np.argpartition(scores, len(scores) - k)[len(scores) - k :]
+    if asked.min_score is not None:
+        best = best[scores[best] >= asked.min_score]
+    best = best[np.argsort(-scores[best], kind="stable")]
+    return [(photo_ids[row], float(scores[row])) for row in best.tolist()]
