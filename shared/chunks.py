@@ -12,6 +12,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import mmap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, BinaryIO
