@@ -29,6 +29,7 @@ class Mode(StrEnum):
 
     AUTO = "auto"  # whichever reads less
     DENSE = "dense"  # compare every row exactly
+    DETERMINISTIC = "deterministic"  # leave nothing to chance: `exhaustive` or `bound`
 
 
 class _Message(BaseModel):

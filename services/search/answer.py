@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 from uuid import UUID
 
 import numpy as np
 from numpy.typing import NDArray
 
+from services.search import follow
 from services.search.scan import scan
 from services.search.snapshot import Snapshot
-from shared.search_protocol import EXHAUSTIVE, NONE, STATISTICAL, Hit, Mode
+from shared.search_protocol import BOUND, EXHAUSTIVE, NONE, STATISTICAL, Hit, Mode
+
+if TYPE_CHECKING:  # it leads to numba, which takes a while to load
+    from services.search.rerank import Budget
 
 # One row in ten million is further off: then the codes are not trusted.
 MOST_Z = 5.5
@@ -19,6 +25,7 @@ MOST_Z = 5.5
 # Equal rows are equal however they were added up, and then the photos' ids decide.
 DECIMALS = 12
 
+INT8_FIGURES_BYTES = 12  # scale, error and length, beside a code
 
 Rows = NDArray[np.int64]
 Scores = NDArray[np.float64]
@@ -60,11 +67,17 @@ def answer(
     selected = int(np.count_nonzero(asked))
     if not selected or not query.any():
         return Answer((), EXHAUSTIVE, 0, 0, 0)
-    by_codes = question.mode == Mode.AUTO and worth_codes(selected, question.k)
-    if by_codes and snapshot.coded:
-        found = _by_codes(snapshot, query, asked, question)
-        if found is not None:
-            return found
+    if question.mode == Mode.AUTO and snapshot.coded:
+        if worth_codes(selected, question.k):
+            found = _by_codes(snapshot, query, asked, question)
+            if found is not None:
+                return found
+    elif (
+        question.mode != Mode.DENSE
+        and snapshot.bounded
+        and worth_int8(selected, question.k, len(query))
+    ):
+        return _by_bound(snapshot, query, asked, question)
     rows, scores = scan(snapshot.chunks, query, question.k, asked)
     hits = _ranked(snapshot, rows, scores, question)
     return Answer(hits, EXHAUSTIVE, len(hits), selected, len(rows))
@@ -76,20 +89,65 @@ def worth_codes(selected: int, k: int) -> bool:
     return selected > 64 + 4 * k
 
 
+def worth_int8(selected: int, k: int, dimension: int) -> bool:
+    """Whether int8 codes, and about twice k rows to compare, are less to read than all rows."""
+    from shared.codes.rotation import rotation
+
+    row_bytes = 4 * dimension
+    code_bytes = rotation(dimension).padded + INT8_FIGURES_BYTES
+    return selected * code_bytes + (2 * k + 16) * row_bytes < selected * row_bytes
+
+
+def lacks_int8(snapshot: Snapshot, asked: NDArray[np.bool_], k: int) -> bool:
+    """Whether a search that leaves nothing to chance has to read every row, for want of codes."""
+    if snapshot.bounded or snapshot.row_bytes < follow.CODED_FROM_BYTES:
+        return False
+    return worth_int8(int(np.count_nonzero(asked)), k, snapshot.chunks[0].rows.shape[1])
+
+
+def _by_bound(
+    snapshot: Snapshot, query: NDArray[np.float32], asked: NDArray[np.bool_], question: Question
+) -> Answer:
+    from services.search.bounded import candidates
+    from services.search.rerank import Rerank
+    from shared.codes.int8 import Int8Query
+
+    budget = _budget(question)
+    least = -math.inf if question.min_score is None else question.min_score
+    scanned = int(np.count_nonzero(asked))
+    blocks = snapshot.int8_blocks
+    near = candidates(blocks, Int8Query.of(query), asked, question.k, least, budget)
+    if near is None:
+        return Answer((), NONE, 0, scanned, 0)
+    norm = float(np.linalg.norm(query.astype(np.float64)))
+    rerank = Rerank(blocks, query, norm, question.k, snapshot.read_ahead)
+    found = rerank.best(near.rows, near.reach, near.floor, budget)
+    hits = _ranked(snapshot, found.rows, found.scores, question)
+    certified = sum(hit.score > found.unseen for hit in hits)
+    return Answer(hits, BOUND if found.whole else NONE, certified, scanned, len(found.rows))
+
+
+def _budget(question: Question) -> Budget:
+    from services.search.rerank import Budget
+
+    until = question.most_seconds and time.monotonic() + question.most_seconds
+    return Budget(question.most_rows, until)
+
+
 def _by_codes(
     snapshot: Snapshot, query: NDArray[np.float32], asked: NDArray[np.bool_], question: Question
 ) -> Answer | None:
     """None when an estimate was further off than chance explains."""
-    from services.search.cascade import Budget, CodedQuery, Refinement, glance
+    from services.search.cascade import CodedQuery, Refinement, glance
     from shared.codes.rotation import rotation
 
-    until = question.most_seconds and time.monotonic() + question.most_seconds
+    budget = _budget(question)
     coded = CodedQuery.of(query, rotation(len(query)))
     first = glance(snapshot.blocks, coded, asked)
     refinement = Refinement(
         snapshot.blocks, coded, question.k, question.min_score, snapshot.read_ahead
     )
-    found = refinement.search(first, Budget(question.most_rows, until))
+    found = refinement.search(first, budget)
     if found.max_z > MOST_Z:
         return None
     hits = _ranked(snapshot, found.rows, found.scores, question)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 from uuid import UUID
 
 from sqlalchemy import select
@@ -20,6 +22,9 @@ from shared.catalog.session import Catalog
 from shared.chunks import CODED_DIMENSION
 from shared.errors import NotFound, Unavailable
 from shared.shards import WHOLE, Shard
+
+if TYPE_CHECKING:
+    from shared.codes.int8 import Int8Codes
 
 log = logging.getLogger(__name__)
 
@@ -88,22 +93,66 @@ def advance(
             continue
         photos = PhotoColumns.of(len(stored.rows), facts_of[chunk.id])
         loaded.append(LoadedChunk(chunk.id, chunk.object_key, stored.rows, photos, stored=stored))
-    if sum(chunk.rows.nbytes for chunk in loaded) >= CODED_FROM_BYTES:
+    large = sum(chunk.rows.nbytes for chunk in loaded) >= CODED_FROM_BYTES
+    if large:
         loaded = [_coded(loader, chunk) for chunk in loaded]
-    sizes = part_bytes(loaded)
-    parts = memory.parts_held(generation_id, sizes)
-    return Snapshot(
-        generation_id=generation_id,
-        map_id=generation.map_id,
-        version=version,
-        chunks=tuple(hold(chunk, parts) for chunk in loaded),
-        missing=tuple(missing),
+    middle = bool(loaded) and loaded[0].rows.shape[1] < CODED_DIMENSION
+    if (middle and large) or (old is not None and old.bounded):
+        loaded = _with_int8(loader, loaded)
+    return _held(
+        memory,
+        Snapshot(
+            generation_id=generation_id,
+            map_id=generation.map_id,
+            version=version,
+            chunks=tuple(loaded),
+            missing=tuple(missing),
+        ),
+    )
+
+
+def bounded(
+    loader: Loader, memory: Memory, old: Snapshot, made: Mapping[UUID, Int8Codes]
+) -> Snapshot:
+    """The same snapshot with int8 codes of every chunk: those that were made, by chunk id, and
+    others that are made now."""
+    return _held(memory, replace(old, chunks=tuple(_int8(loader, c, made) for c in old.chunks)))
+
+
+def _held(memory: Memory, snapshot: Snapshot) -> Snapshot:
+    """The snapshot with what the budget allows in memory."""
+    sizes = part_bytes(snapshot.chunks)
+    parts = memory.parts_held(snapshot.generation_id, sizes)
+    return replace(
+        snapshot,
+        chunks=tuple(hold(chunk, parts) for chunk in snapshot.chunks),
         resident_bytes=sum(sizes[:parts]),
     )
 
 
+def _with_int8(loader: Loader, chunks: list[LoadedChunk]) -> list[LoadedChunk]:
+    """The chunks with their int8 codes; all without where there is no room to keep them, for then
+    every row is compared, to the same answers."""
+    try:
+        return [_int8(loader, chunk, {}) for chunk in chunks]
+    except OSError as error:
+        log.error("int8 codes can't be kept, search does without: %s", error)
+        return [
+            replace(chunk, int8=None, stored=chunk.stored and replace(chunk.stored, int8=None))
+            for chunk in chunks
+        ]
+
+
+def _int8(loader: Loader, chunk: LoadedChunk, made: Mapping[UUID, Int8Codes]) -> LoadedChunk:
+    stored = chunk.stored
+    if stored is None or stored.int8 is not None:
+        return chunk
+    codes = made.get(chunk.chunk_id) or loader.int8_codes(chunk.object_key, stored)
+    return replace(chunk, int8=codes, stored=replace(stored, int8=codes))
+
+
 def _coded(loader: Loader, chunk: LoadedChunk) -> LoadedChunk:
-    """The chunk with its codes, where rows of this length have any."""
+    """The chunk with its sign codes, where rows of this length have any."""
     stored = chunk.stored
     if stored is None or stored.codes is not None or stored.rows.shape[1] < CODED_DIMENSION:
         return chunk

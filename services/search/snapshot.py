@@ -16,7 +16,9 @@ from services.search.photo_columns import JoinedColumns, PhotoColumns
 from shared.chunks import Rows
 
 if TYPE_CHECKING:  # numba takes a while to load, and small maps need no codes
+    from services.search.bounded import Int8Blocks
     from services.search.cascade import Blocks
+    from shared.codes.int8 import Int8Codes
     from shared.codes.signs import SignCodes
 
 
@@ -32,6 +34,8 @@ class LoadedChunk:
     """None while search does without."""
     stored: StoredChunk | None = None
     """Where rows and codes lie on the disk; None for rows that were never there."""
+    int8: Int8Codes | None = None
+    """None while search does without."""
 
     def read_ahead(self, row: int) -> None:
         """Say that a row is read next, where it is mapped from a file."""
@@ -49,6 +53,7 @@ class StoredChunk:
     rows: Rows
     sha256: str
     codes: SignCodes | None = None
+    int8: Int8Codes | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,8 +88,13 @@ class Snapshot:
 
     @cached_property
     def coded(self) -> bool:
-        """Whether every chunk has its codes."""
+        """Whether every chunk has its sign codes."""
         return bool(self.chunks) and all(chunk.codes is not None for chunk in self.chunks)
+
+    @cached_property
+    def bounded(self) -> bool:
+        """Whether every chunk has its int8 codes."""
+        return bool(self.chunks) and all(chunk.int8 is not None for chunk in self.chunks)
 
     def read_ahead(self, rows: NDArray[np.int64]) -> None:
         """Say that these rows are read next, where they are mapped from a file."""
@@ -96,7 +106,14 @@ class Snapshot:
 
     @cached_property
     def blocks(self) -> Blocks:
-        """Where the codes and rows of a coded snapshot lie."""
+        """Where the sign codes and rows of a coded snapshot lie."""
         from services.search.cascade import Blocks
 
         return Blocks.of(self.chunks)
+
+    @cached_property
+    def int8_blocks(self) -> Int8Blocks:
+        """Where the int8 codes and rows of a bounded snapshot lie."""
+        from services.search.bounded import Int8Blocks
+
+        return Int8Blocks.of(self.chunks)

@@ -6,14 +6,16 @@ import logging
 import threading
 import time
 from collections.abc import Collection
+from typing import TYPE_CHECKING
 from uuid import UUID
 
 from sqlalchemy.exc import SQLAlchemyError
 
-from services.search.answer import Question, answer
-from services.search.follow import FOLLOWED, advance, wanted_versions
+from services.search.answer import Question, answer, lacks_int8
+from services.search.follow import FOLLOWED, advance, bounded, wanted_versions
 from services.search.lag import Lags
 from services.search.load import Loader
+from services.search.make_int8 import Int8Maker
 from services.search.memory import Memory
 from services.search.query_row import QueryRows, expired
 from services.search.select import select
@@ -23,9 +25,12 @@ from shared.catalog.generations import GenerationState
 from shared.catalog.session import Catalog
 from shared.errors import Unavailable
 from shared.objects import ObjectStore
-from shared.search_protocol import SearchRequest, SearchResponse, SearchStatus
+from shared.search_protocol import Mode, SearchRequest, SearchResponse, SearchStatus
 from shared.settings import Settings
 from shared.shards import WHOLE, Shard
+
+if TYPE_CHECKING:
+    from shared.codes.int8 import Int8Codes
 
 log = logging.getLogger(__name__)
 
@@ -53,6 +58,7 @@ class SearchWorker:
         self._snapshots: dict[UUID, Snapshot] = {}
         self._swap = threading.Lock()  # held for a moment, never while something is read
         self._loading: dict[UUID, threading.Lock] = {}
+        self._int8 = Int8Maker(self._loader, self._attach_int8)
 
     def run(self, stop: threading.Event) -> None:
         """Follow what answers until `stop` is set."""
@@ -98,6 +104,10 @@ class SearchWorker:
         snapshot = self._snapshot(request.generation_id, request.min_version)
         query = self._rows.find(snapshot, request)
         asked = select(snapshot.photos, request.photos, request.exclude)
+        if request.mode == Mode.DETERMINISTIC and lacks_int8(snapshot, asked, request.k):
+            self._int8.wait(snapshot, self._settings.search_wait_seconds)
+            snapshot = self._snapshot(request.generation_id, snapshot.version)
+            asked = select(snapshot.photos, request.photos, request.exclude)
         question = Question(
             k=request.k,
             min_score=request.min_score,
@@ -162,3 +172,15 @@ class SearchWorker:
                 with self._swap:
                     self._snapshots = {**self._snapshots, generation_id: new}
             return new
+
+    def _attach_int8(self, generation_id: UUID, made: dict[UUID, Int8Codes]) -> None:
+        """Swap in the snapshot that is there now with its int8 codes."""
+        with self._swap:
+            loading = self._loading.setdefault(generation_id, threading.Lock())
+        with loading:
+            old = self._snapshots.get(generation_id)
+            if old is None:
+                return  # it was forgotten meanwhile
+            new = bounded(self._loader, self._memory, old, made)
+            with self._swap:
+                self._snapshots = {**self._snapshots, generation_id: new}
