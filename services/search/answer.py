@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import time
 from dataclasses import dataclass
@@ -17,7 +18,10 @@ from services.search.snapshot import Snapshot
 from shared.search_protocol import BOUND, EXHAUSTIVE, NONE, STATISTICAL, Hit, Mode
 
 if TYPE_CHECKING:  # it leads to numba, which takes a while to load
+    from services.search.bounded import Candidates
     from services.search.rerank import Budget
+
+log = logging.getLogger(__name__)
 
 # One row in ten million is further off: then the codes are not trusted.
 MOST_Z = 5.5
@@ -67,6 +71,10 @@ def answer(
     selected = int(np.count_nonzero(asked))
     if not selected or not query.any():
         return Answer((), EXHAUSTIVE, 0, 0, 0)
+    if question.mode != Mode.DENSE and worth_codes(selected, question.k):
+        found = _on_device(snapshot, query, asked, question)
+        if found is not None:
+            return found
     if question.mode == Mode.AUTO and snapshot.coded:
         if worth_codes(selected, question.k):
             found = _by_codes(snapshot, query, asked, question)
@@ -100,31 +108,65 @@ def worth_int8(selected: int, k: int, dimension: int) -> bool:
 
 def lacks_int8(snapshot: Snapshot, asked: NDArray[np.bool_], k: int) -> bool:
     """Whether a search that leaves nothing to chance has to read every row, for want of codes."""
-    if snapshot.bounded or snapshot.row_bytes < follow.CODED_FROM_BYTES:
+    if snapshot.bounded or snapshot.resident or snapshot.row_bytes < follow.CODED_FROM_BYTES:
         return False
     return worth_int8(int(np.count_nonzero(asked)), k, snapshot.chunks[0].rows.shape[1])
+
+
+def _on_device(
+    snapshot: Snapshot, query: NDArray[np.float32], asked: NDArray[np.bool_], question: Question
+) -> Answer | None:
+    """None where the snapshot lies on no GPU, or that fails."""
+    resident = snapshot.resident
+    if resident is None or resident.failure is not None:
+        return None
+    from services.search.gpu import Asked, DeviceFailed
+
+    budget = _budget(question)
+    try:
+        (near,) = resident.candidates([Asked(query, asked, question.k, _least(question))])
+    except DeviceFailed as error:
+        log.error("generation %s is searched by the CPU: %s", snapshot.generation_id, error)
+        return None
+    return _settled(snapshot, query, near, asked, question, budget)
 
 
 def _by_bound(
     snapshot: Snapshot, query: NDArray[np.float32], asked: NDArray[np.bool_], question: Question
 ) -> Answer:
     from services.search.bounded import candidates
-    from services.search.rerank import Rerank
     from shared.codes.int8 import Int8Query
 
     budget = _budget(question)
-    least = -math.inf if question.min_score is None else question.min_score
-    scanned = int(np.count_nonzero(asked))
-    blocks = snapshot.int8_blocks
-    near = candidates(blocks, Int8Query.of(query), asked, question.k, least, budget)
+    coded = Int8Query.of(query)
+    near = candidates(snapshot.int8_blocks, coded, asked, question.k, _least(question), budget)
     if near is None:
-        return Answer((), NONE, 0, scanned, 0)
+        return Answer((), NONE, 0, int(np.count_nonzero(asked)), 0)
+    return _settled(snapshot, query, near, asked, question, budget)
+
+
+def _settled(
+    snapshot: Snapshot,
+    query: NDArray[np.float32],
+    near: Candidates,
+    asked: NDArray[np.bool_],
+    question: Question,
+    budget: Budget,
+) -> Answer:
+    """Compare what may be among the best exactly."""
+    from services.search.rerank import Rerank
+
     norm = float(np.linalg.norm(query.astype(np.float64)))
-    rerank = Rerank(blocks, query, norm, question.k, snapshot.read_ahead)
+    rerank = Rerank(snapshot.row_blocks, query, norm, question.k, snapshot.read_ahead)
     found = rerank.best(near.rows, near.reach, near.floor, budget)
     hits = _ranked(snapshot, found.rows, found.scores, question)
     certified = sum(hit.score > found.unseen for hit in hits)
+    scanned = int(np.count_nonzero(asked))
     return Answer(hits, BOUND if found.whole else NONE, certified, scanned, len(found.rows))
+
+
+def _least(question: Question) -> float:
+    return -math.inf if question.min_score is None else question.min_score
 
 
 def _budget(question: Question) -> Budget:

@@ -16,8 +16,10 @@ from services.search.photo_columns import JoinedColumns, PhotoColumns
 from shared.chunks import Rows
 
 if TYPE_CHECKING:  # numba takes a while to load, and small maps need no codes
+    from services.search.blocks import RowBlocks
     from services.search.bounded import Int8Blocks
     from services.search.cascade import Blocks
+    from services.search.gpu import Resident
     from shared.codes.int8 import Int8Codes
     from shared.codes.signs import SignCodes
 
@@ -67,6 +69,8 @@ class Snapshot:
     missing: tuple[str, ...] = ()
     resident_bytes: int = 0
     """Of rows and codes that are held in memory; the rest is mapped from files."""
+    resident: Resident | None = None
+    """Its rows in a GPU's memory."""
 
     @cached_property
     def by_key(self) -> Mapping[str, LoadedChunk]:
@@ -117,3 +121,10 @@ class Snapshot:
         from services.search.bounded import Int8Blocks
 
         return Int8Blocks.of(self.chunks)
+
+    @cached_property
+    def row_blocks(self) -> RowBlocks:
+        """Where the rows lie."""
+        from services.search.blocks import RowBlocks
+
+        return RowBlocks.of(self.chunks)

@@ -12,6 +12,7 @@ from uuid import UUID
 from sqlalchemy.exc import SQLAlchemyError
 
 from services.search.answer import Question, answer, lacks_int8
+from services.search.device import Residency, open_device
 from services.search.follow import FOLLOWED, advance, bounded, wanted_versions
 from services.search.lag import Lags
 from services.search.load import Loader
@@ -30,6 +31,7 @@ from shared.settings import Settings
 from shared.shards import WHOLE, Shard
 
 if TYPE_CHECKING:
+    from services.search.gpu import Device
     from shared.codes.int8 import Int8Codes
 
 log = logging.getLogger(__name__)
@@ -46,8 +48,14 @@ class SearchWorker:
     """
 
     def __init__(
-        self, catalog: Catalog, store: ObjectStore, settings: Settings, shard: Shard = WHOLE
+        self,
+        catalog: Catalog,
+        store: ObjectStore,
+        settings: Settings,
+        shard: Shard = WHOLE,
+        device: Device | None = None,
     ) -> None:
+        """`device`: where rows are compared, instead of what the settings say."""
         self.shard = shard
         self.lags = Lags()
         self._catalog = catalog
@@ -58,6 +66,7 @@ class SearchWorker:
         self._snapshots: dict[UUID, Snapshot] = {}
         self._swap = threading.Lock()  # held for a moment, never while something is read
         self._loading: dict[UUID, threading.Lock] = {}
+        self._residency = Residency(device or open_device(settings.search_device))
         self._int8 = Int8Maker(self._loader, self._attach_int8)
 
     def run(self, stop: threading.Event) -> None:
@@ -93,6 +102,7 @@ class SearchWorker:
             snapshot = self._snapshots.get(generation_id)
             if snapshot is None or snapshot.version < now.version or snapshot.missing:
                 self._advance(generation_id, now.version)
+            self._fill_device(generation_id)
             self.lags.level(generation_id, looked_at)
         for generation_id in self._snapshots.keys() - wanted.keys():
             self._memory.forget(generation_id)
@@ -138,6 +148,7 @@ class SearchWorker:
             incomplete=tuple(key for key, snapshot in snapshots.items() if snapshot.missing),
             missing=tuple(key for snapshot in snapshots.values() for key in snapshot.missing),
             lags=self.lags.now(versions),
+            devices=self._residency.status(snapshots.values()),
         )
 
     def _snapshot(self, generation_id: UUID, min_version: int) -> Snapshot:
@@ -169,9 +180,30 @@ class SearchWorker:
                 return old  # another thread loaded it while this one waited
             new = advance(self._catalog, self._loader, self._memory, generation_id, old, self.shard)
             if new is not None:
+                new = self._residency.carry(new, old)
                 with self._swap:
                     self._snapshots = {**self._snapshots, generation_id: new}
             return new
+
+    def _fill_device(self, generation_id: UUID) -> None:
+        """Put the generation on the device, if there is one, or take it from there after a failure.
+        Queries go on meanwhile."""
+        snapshot = self._snapshots.get(generation_id)
+        if snapshot is None or not self._residency.wants(snapshot):
+            return
+        filled = self._residency.fill(snapshot)
+        if filled.resident is None and snapshot.resident is None:
+            if self._residency.lacks_int8(snapshot):
+                self._int8.start(snapshot)
+            return
+        with self._swap:
+            loading = self._loading.setdefault(generation_id, threading.Lock())
+        with loading:
+            now = self._snapshots.get(generation_id)
+            if now is not None:
+                new = self._residency.carry(now, filled)
+                with self._swap:
+                    self._snapshots = {**self._snapshots, generation_id: new}
 
     def _attach_int8(self, generation_id: UUID, made: dict[UUID, Int8Codes]) -> None:
         """Swap in the snapshot that is there now with its int8 codes."""
