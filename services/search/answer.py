@@ -110,6 +110,8 @@ def lacks_int8(snapshot: Snapshot, asked: NDArray[np.bool_], k: int) -> bool:
     """Whether a search that leaves nothing to chance has to read every row, for want of codes."""
     if snapshot.bounded or snapshot.resident or snapshot.row_bytes < follow.CODED_FROM_BYTES:
         return False
+    if not snapshot.chunks:
+        return False
     return worth_int8(int(np.count_nonzero(asked)), k, snapshot.chunks[0].rows.shape[1])
 
 

@@ -96,7 +96,7 @@ class Device:
     """One device and its memory."""
 
     def __init__(
-        self, where: torch.device, free_bytes: Callable[[], int], headroom_bytes: int
+        self, where: torch.device, free_bytes: Callable[[], float], headroom_bytes: int
     ) -> None:
         """`free_bytes` tells how much of its memory can be had now."""
         self.where = where

@@ -73,10 +73,11 @@ class Int8Maker:
                 retry_after_seconds=making.seconds_left(),
             )
         if making.error is not None:
+            reason = making.error.strerror or str(making.error)
             raise Unavailable(
                 "codes_not_made",
                 "The codes for mode=deterministic can't be kept in the search worker's folder "
-                f"({making.error.strerror}). Make room there, or ask with mode=dense.",
+                f"({reason}). Make room there, or ask with mode=dense.",
             )
 
     def start(self, snapshot: Snapshot) -> _Making:

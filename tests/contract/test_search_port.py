@@ -15,6 +15,7 @@ from uuid import UUID
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import HealthCheck, assume
 from hypothesis import settings as how
 from hypothesis import strategies as st
@@ -27,6 +28,7 @@ from hypothesis.stateful import (
 )
 from numpy.typing import NDArray
 
+from services.search import answer, gpu
 from services.search.load import Loader
 from services.search.snapshot import StoredChunk
 from services.search.worker import SearchWorker
@@ -794,6 +796,48 @@ class TestSearchWorkerDeterministic(TestSearchWorker):
         assert_answers(search.search(request), places.brute_force(vector))
 
 
+class TestSearchWorkerOnADevice(TestSearchWorker):
+    """The same promises where the rows lie on a device: PyTorch's CPU stands for a GPU."""
+
+    certificate = "bound"
+
+    @pytest.fixture(params=["float16", "int8"])
+    def port(
+        self,
+        request: pytest.FixtureRequest,
+        catalog: Catalog,
+        store: FolderStore,
+        settings: Settings,
+        monkeypatch: pytest.MonkeyPatch,
+    ) -> OpenPort:
+        always_by_int8(monkeypatch)
+        monkeypatch.setattr(answer, "worth_codes", lambda selected, k: selected > 0)
+        monkeypatch.setattr(gpu, "KINDS", (request.param,))
+
+        def open_port(**changes: object) -> SearchPort:
+            device = gpu.Device(torch.device("cpu"), lambda: 1e9, 0)
+            worker = SearchWorker(
+                catalog, store, settings.model_copy(update=changes), device=device
+            )
+            worker.follow()
+            return worker
+
+        return open_port
+
+    def test_status_tells_what_lies_on_the_device(self, places: SmallMap, port: OpenPort) -> None:
+        places.add(unit_rows(1, 40))
+        search = port()
+        (device,) = search.status().devices
+        assert device.name == "cpu"
+        assert list(device.generations) == [places.generation_id]
+        before = device.resident_bytes
+        places.add(unit_rows(2, 40))
+        response = search.search(places.request(places.query(unit_rows(3, 1)[0])))
+        assert response.certificate == "bound", "a new chunk is on the device at once"
+        assert search.status().devices[0].resident_bytes == 2 * before
+        assert search.status().devices[0].failure is None
+
+
 def _once_made(search: SearchPort, request: SearchRequest) -> SearchResponse:
     for _ in range(1000):
         try:
@@ -827,6 +871,35 @@ class TestSearchOverHttp(SearchPortContract):
                 return running.enter_context(tier).port
 
             yield open_port
+
+    def test_codes_that_are_being_made_are_no_reason_to_leave_shards_out(
+        self, places: SmallMap, port: OpenPort, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        int8_on_demand(monkeypatch)
+        go_on = threading.Event()
+        make = Loader.int8_codes
+
+        def slowly(self: Loader, object_key: str, stored: StoredChunk) -> Int8Codes:
+            assert go_on.wait(60)
+            return make(self, object_key, stored)
+
+        monkeypatch.setattr(Loader, "int8_codes", slowly)
+        for slot in range(3):
+            places.add(unit_rows(slot, 10), slot=slot)
+        vector = unit_rows(9, 1)[0]
+        request = places.request(places.query(vector))
+        request = request.model_copy(update={"mode": Mode.DETERMINISTIC})
+        search = port(search_wait_seconds=0.2)
+        try:
+            with pytest.raises(Unavailable) as caught:
+                search.search(request)
+        finally:
+            go_on.set()
+        assert caught.value.code == "codes_being_made"
+        assert caught.value.extra["retry_after_seconds"] >= 1
+        response = _once_made(search, request)
+        assert_answers(response, places.brute_force(vector))
+        assert response.certificate == "bound"
 
 
 class AddDeleteMerge(RuleBasedStateMachine):
