@@ -92,7 +92,7 @@ def distances(
 
 
 @compiled(IN_LANES)
-def product(row: NDArray[np.int8], query: NDArray[np.int16]) -> int:
+def product(row: NDArray[np.int8], query: NDArray[np.int16]) -> np.int64:
     """The product of whole numbers of at most 127 and 127 * 128 + 63: exact."""
     total = np.int64(0)
     for begin in range(0, query.shape[0], EXACT_TERMS):

@@ -81,8 +81,8 @@ class Int8Query:
     @classmethod
     def of(cls, row: Floats) -> Int8Query:
         """Of a (dimension,) float32 row of any length but 0."""
-        unit = row.astype(np.float64)
-        unit = (unit / np.linalg.norm(unit)).astype(np.float32)
+        exact = row.astype(np.float64)
+        unit: Floats = (exact / np.linalg.norm(exact)).astype(np.float32)
         turn = rotation(len(row))
         numbers = np.empty((1, turn.padded), np.int16)
         figures = np.empty((1, 4))
@@ -121,7 +121,7 @@ def _above(bounds: NDArray[np.float64]) -> Floats:
 
 @compiled(IN_LANES)
 def _round(
-    rotated: Floats, most: int, numbers: NDArray[np.int16], figures: NDArray[np.float64]
+    rotated: Floats, most: int, numbers: Bytes | Shorts, figures: NDArray[np.float64]
 ) -> None:
     """Round each of (n, m) float32 rows to whole numbers of -most to most, and measure the result.
 

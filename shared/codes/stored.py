@@ -57,7 +57,7 @@ def decode_codes(data: Any, *, rows: int, dimension: int, chunk_sha256: str) -> 
 def encode_int8(rows: Floats, chunk_sha256: str) -> bytes:
     """The file of the int8 codes of (n, dimension) rows, whose chunk has this hash."""
     codes = int8_codes(rows)
-    arrays = [codes.scales, codes.errors, codes.lengths, codes.numbers]
+    arrays: list[NDArray[Any]] = [codes.scales, codes.errors, codes.lengths, codes.numbers]
     return _encode(_int8_made(rows.shape[1]), arrays, chunk_sha256)
 
 
