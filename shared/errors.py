@@ -10,10 +10,10 @@ PlacewiseError
 ├── UnsupportedMedia 415        unsupported_photo, unsupported_body, unsupported_archive
 ├── Unprocessable 422           invalid_field, undecodable_photo, too_many_pixels, ...
 ├── TooManyRequests 429         queue_full, too_many_uploads (come again after `Retry-After`)
-├── Unavailable 503             search_behind, chunk_unreadable, ... (may be tried again)
+├── Unavailable 503             search_behind, codes_being_made, ... (may be tried again)
 │   │                       object_store_unavailable, bucket_not_found, ...
 │   └── StorageFull 507         disk_full, object_store_full
-└── Misconfigured 500           weights_missing, torchhub_unfit, ... (an operator must act)
+└── Misconfigured 500           weights_missing, no_gpu, ... (an operator must act)
 
 `shared.errors` knows nothing of HTTP libraries: the gateway turns these into RFC 9457 problems,
 the extractor stores them in `jobs.error`, the command line prints `detail`.

@@ -32,6 +32,7 @@ class Mode(StrEnum):
 
     AUTO = "auto"  # whichever reads less
     DENSE = "dense"  # compare every row exactly
+    DETERMINISTIC = "deterministic"  # leave nothing to chance: `exhaustive` or `bound`
 
 
 class _Message(BaseModel):
@@ -136,6 +137,18 @@ class Held(_Message):
     parts: tuple[Part, ...]
 
 
+class DeviceStatus(_Message):
+    """A GPU that a worker searches on."""
+
+    name: str
+    resident_bytes: int
+    """Of descriptors in its memory."""
+    generations: dict[UUID, str]
+    """Those that are searched there, as `float16` rows or `int8` codes; others by the CPU."""
+    failure: str | None = None
+    """What went wrong last: since then the CPU searches, until the next try."""
+
+
 class SearchStatus(_Message):
     """How far a worker has followed: rows and bytes in memory, version by generation.
 
@@ -156,6 +169,8 @@ class SearchStatus(_Message):
     """The chunks that can't be read."""
     lags: dict[UUID, Lag] = {}
     """Empty where no one follows the catalog."""
+    devices: tuple[DeviceStatus, ...] = ()
+    """Empty where the CPU does all."""
     away: tuple[str, ...] = ()
     """Shards of which no worker answers, as `missing` of an answer names them."""
 

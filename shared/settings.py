@@ -281,6 +281,9 @@ class Settings(BaseSettings):
         description="bytes of codes and rows that search holds in memory; unset: half of the "
         "machine's, or of what its container may use",
     )
+    search_device: Literal["auto", "cpu", "cuda"] = Field(
+        "auto", description="where search compares rows; auto: on a CUDA GPU if there is one"
+    )
 
     # How search is spread over machines (`placewise search`, which listens on HOST and PORT, too).
     search_shard: str = Field(

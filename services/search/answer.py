@@ -2,18 +2,27 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import time
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 from uuid import UUID
 
 import numpy as np
 from numpy.typing import NDArray
 
+from services.search import follow
 from services.search.scan import Query, exact_scores, scan, scan_at_least
 from services.search.snapshot import Snapshot
 from services.search.together import Glances
-from shared.search_protocol import EXHAUSTIVE, NONE, STATISTICAL, Hit, Mode
+from shared.search_protocol import BOUND, EXHAUSTIVE, NONE, STATISTICAL, Hit, Mode
+
+if TYPE_CHECKING:  # it leads to numba, which takes a while to load
+    from services.search.bounded import Candidates
+    from services.search.rerank import Budget
+
+log = logging.getLogger(__name__)
 
 # One row in ten million is further off: then the codes are not trusted.
 MOST_Z = 5.5
@@ -21,9 +30,13 @@ MOST_Z = 5.5
 # Equal rows are equal however they were added up, and then the photos' ids decide.
 DECIMALS = 12
 
+INT8_FIGURES_BYTES = 12  # scale, error and length, beside a code
 
 Rows = NDArray[np.int64]
 Scores = NDArray[np.float64]
+
+NO_ROWS = np.empty(0, np.int64)
+NO_SCORES = np.empty(0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,13 +132,23 @@ def _compare(
     glances: Glances,
 ) -> _Compared:
     selected = int(np.count_nonzero(asked))
-    by_codes = question.mode == Mode.AUTO and worth_codes(selected, question.k)
-    if by_codes and snapshot.coded:
-        found = _by_codes(snapshot, query, asked, question, glances)
-        if found is not None:
-            return found
-    rows, scores = scan(snapshot.chunks, query, question.k, asked)
-    return _Compared(rows, scores, EXHAUSTIVE, selected)
+    found = None
+    if question.mode != Mode.DENSE and worth_codes(selected, question.k):
+        found = _on_device(snapshot, query, asked, question)
+        if found is None and question.mode == Mode.AUTO and snapshot.coded:
+            found = _by_codes(snapshot, query, asked, question, glances)
+    if found is None and _bounded(snapshot, question.mode, selected, question.k):
+        found = _by_bound(snapshot, query, asked, question)
+    if found is None:
+        rows, scores = scan(snapshot.chunks, query, question.k, asked)
+        found = _Compared(rows, scores, EXHAUSTIVE, selected)
+    return found
+
+
+def _bounded(snapshot: Snapshot, mode: Mode, selected: int, k: int) -> bool:
+    """Whether int8 codes are there, wanted, and spare anything."""
+    wanted = mode == Mode.DETERMINISTIC or (mode == Mode.AUTO and not snapshot.coded)
+    return wanted and snapshot.bounded and worth_int8(selected, k, snapshot.dimension)
 
 
 def _at_least(
@@ -150,6 +173,86 @@ def _at_least(
     return passing
 
 
+def worth_int8(selected: int, k: int, dimension: int) -> bool:
+    """Whether int8 codes, and about twice k rows to compare, are less to read than all rows."""
+    from shared.codes.rotation import rotation
+
+    row_bytes = 4 * dimension
+    code_bytes = rotation(dimension).padded + INT8_FIGURES_BYTES
+    return selected * code_bytes + (2 * k + 16) * row_bytes < selected * row_bytes
+
+
+def lacks_int8(snapshot: Snapshot, asked: NDArray[np.bool_], k: int) -> bool:
+    """Whether a search that leaves nothing to chance has to read every row, for want of codes."""
+    if snapshot.bounded or snapshot.resident or snapshot.row_bytes < follow.CODED_FROM_BYTES:
+        return False
+    if not snapshot.chunks:
+        return False
+    return worth_int8(int(np.count_nonzero(asked)), k, snapshot.dimension)
+
+
+def _on_device(
+    snapshot: Snapshot, query: Query, asked: NDArray[np.bool_], question: Question
+) -> _Compared | None:
+    """None where the snapshot lies on no GPU, or that fails."""
+    resident = snapshot.resident
+    if resident is None or resident.failure is not None:
+        return None
+    from services.search.gpu import Asked, DeviceFailed
+
+    budget = _budget(question)
+    try:
+        (near,) = resident.candidates([Asked(query, asked, question.k, _least(question))])
+    except DeviceFailed as error:
+        log.error("generation %s is searched by the CPU: %s", snapshot.generation_id, error)
+        return None
+    return _settled(snapshot, query, near, asked, question, budget)
+
+
+def _by_bound(
+    snapshot: Snapshot, query: Query, asked: NDArray[np.bool_], question: Question
+) -> _Compared:
+    from services.search.bounded import candidates
+    from shared.codes.int8 import Int8Query
+
+    budget = _budget(question)
+    coded = Int8Query.of(query)
+    near = candidates(snapshot.int8_blocks, coded, asked, question.k, _least(question), budget)
+    if near is None:
+        return _Compared(NO_ROWS, NO_SCORES, NONE, int(np.count_nonzero(asked)), unseen=math.inf)
+    return _settled(snapshot, query, near, asked, question, budget)
+
+
+def _settled(
+    snapshot: Snapshot,
+    query: Query,
+    near: Candidates,
+    asked: NDArray[np.bool_],
+    question: Question,
+    budget: Budget,
+) -> _Compared:
+    """Compare what may be among the best exactly."""
+    from services.search.rerank import Rerank
+
+    norm = float(np.linalg.norm(query.astype(np.float64)))
+    rerank = Rerank(snapshot.row_blocks, query, norm, question.k, snapshot.read_ahead)
+    found = rerank.best(near.rows, near.reach, near.floor, budget)
+    certificate = BOUND if found.whole else NONE
+    scanned = int(np.count_nonzero(asked))
+    return _Compared(found.rows, found.scores, certificate, scanned, unseen=found.unseen)
+
+
+def _least(question: Question) -> float:
+    return -math.inf if question.min_score is None else question.min_score
+
+
+def _budget(question: Question) -> Budget:
+    from services.search.rerank import Budget
+
+    until = question.most_seconds and time.monotonic() + question.most_seconds
+    return Budget(question.most_rows, until)
+
+
 def _by_codes(
     snapshot: Snapshot,
     query: Query,
@@ -158,16 +261,16 @@ def _by_codes(
     glances: Glances,
 ) -> _Compared | None:
     """None when an estimate was further off than chance explains."""
-    from services.search.cascade import Budget, CodedQuery, Refinement
+    from services.search.cascade import CodedQuery, Refinement
     from shared.codes.rotation import rotation
 
-    until = question.most_seconds and time.monotonic() + question.most_seconds
+    budget = _budget(question)
     coded = CodedQuery.of(query, rotation(len(query)))
     first = glances.glance(snapshot.blocks, coded, asked)
     refinement = Refinement(
         snapshot.blocks, coded, question.k, question.min_score, snapshot.read_ahead
     )
-    found = refinement.search(first, Budget(question.most_rows, until))
+    found = refinement.search(first, budget)
     if found.max_z > MOST_Z:
         return None
     certificate = STATISTICAL if found.whole else NONE

@@ -15,26 +15,25 @@ how far off its estimates were: `max_z`, in standard deviations.
 from __future__ import annotations
 
 import math
-import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from services.search.blocks import Addresses, Indices, RowBlocks, addresses
 from services.search.kernels import (
     NOT_ASKED,
     PLANES,
     distances,
     distances_at,
     in_planes,
-    products_at,
     squares,
     weighted_at,
 )
 from services.search.parts import in_parts
+from services.search.rerank import Budget, Rerank, Scores
 from services.search.snapshot import LoadedChunk
 from shared.codes.rotation import Rotation, rotation
 from shared.codes.signs import WORD, Words, level_words, sign_codes
@@ -42,30 +41,18 @@ from shared.codes.signs import WORD, Words, level_words, sign_codes
 BOUND = 6.0
 FIRST_LOOK = 64  # rows whose whole codes are looked at early, for a floor
 FEW = 4 * FIRST_LOOK
-STEP = 8  # rows compared exactly between two looks at the floor
-
-Addresses = NDArray[np.uint64]
-Indices = NDArray[np.int64]
-Scores = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Blocks:
-    """Where the codes and the rows of n photos lie, in c blocks; who makes it keeps them alive."""
+class Blocks(RowBlocks):
+    """Where the sign codes and the rows of n photos lie, in c blocks."""
 
-    dimension: int
-    first: NDArray[np.int64]
-    """(c + 1,): the number of each block's first row; the last is n."""
     levels: tuple[Addresses, ...]
     """(c,) for each level of the codes: where the block's begin."""
-    rows: Addresses
-    """(c,): where the block's float32 rows begin."""
     norms: NDArray[np.float32]
     """(n,): |x|_1 of each rotated row; 0 for a row of zeros."""
     zeros: Indices
     """The rows of zeros."""
-    kept: object = None
-    """What has to live as long."""
 
     @classmethod
     def of(cls, chunks: Sequence[LoadedChunk]) -> Blocks:
@@ -73,32 +60,24 @@ class Blocks:
         codes = [chunk.codes for chunk in chunks if chunk.codes is not None]
         if len(codes) < len(chunks):
             raise ValueError("a chunk has no codes")
+        rows = RowBlocks.of(chunks)
         norms = np.concatenate([code.norms for code in codes])
         return cls(
-            dimension=chunks[0].rows.shape[1],
-            first=np.cumsum([0, *(len(chunk.rows) for chunk in chunks)]),
-            levels=tuple(map(_addresses, zip(*(code.levels for code in codes), strict=True))),
-            rows=_addresses([chunk.rows for chunk in chunks]),
+            dimension=rows.dimension,
+            first=rows.first,
+            rows=rows.rows,
+            kept=rows.kept,
+            levels=tuple(map(addresses, zip(*(code.levels for code in codes), strict=True))),
             norms=norms,
             zeros=np.flatnonzero(norms == 0),
-            kept=chunks,
         )
-
-    def __len__(self) -> int:
-        return int(self.first[-1])
-
-    def at(self, begins: Addresses, indices: Indices, bytes_each: int) -> Addresses:
-        """The addresses of these rows in blocks that begin at `begins`."""
-        block = np.searchsorted(self.first, indices, side="right") - 1
-        inside = (indices - self.first[block]).astype(np.uint64)
-        return begins[block] + inside * np.uint64(bytes_each)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CodedQuery:
     """A query as the codes need it."""
 
-    row: NDArray[np.float32] | NDArray[np.float64]
+    row: NDArray[np.float32]
     """(dimension,) as it was asked, of any length but 0."""
     norm: float
     bits: Words
@@ -117,8 +96,8 @@ class CodedQuery:
     """How far off they are, squared, once they are divided so."""
 
     @classmethod
-    def of(cls, row: NDArray[np.float32] | NDArray[np.float64], turn: Rotation) -> CodedQuery:
-        rotated = turn.rotate(row[np.newaxis].astype(np.float32, copy=False))[0]
+    def of(cls, row: NDArray[np.float32], turn: Rotation) -> CodedQuery:
+        rotated = turn.rotate(row[np.newaxis])[0]
         bits = np.empty(turn.padded // WORD, np.uint64)
         planes = np.empty((PLANES, len(bits)), np.uint64)
         low, step, total, product, square = in_planes(rotated, bits, planes)
@@ -134,25 +113,6 @@ class CodedQuery:
             share=product / norm,
             blur=max(0.0, square * norm**2 / product**2 - 1.0),
         )
-
-
-def _addresses(arrays: Iterable[NDArray[Any]]) -> Addresses:
-    return np.array([array.ctypes.data for array in arrays], np.uint64)
-
-
-@dataclass(slots=True)
-class Budget:
-    """When to give up: an answer that was cut short says so."""
-
-    rows: int | None = None
-    """So many are compared exactly, and no more."""
-    until: float | None = None
-    """Of time.monotonic()."""
-
-    def spent(self, rows: int) -> bool:
-        if self.rows is not None and rows >= self.rows:
-            return True
-        return self.until is not None and time.monotonic() >= self.until
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -224,15 +184,13 @@ def warm_up() -> None:
     blocks = Blocks(
         dimension=len(row),
         first=np.array([0, 1]),
-        levels=tuple(_addresses([level]) for level in codes.levels),
-        rows=_addresses([row]),
+        rows=addresses([row]),
+        kept=(codes, row),
+        levels=tuple(addresses([level]) for level in codes.levels),
         norms=codes.norms,
         zeros=np.empty(0, np.int64),
-        kept=(codes, row),
     )
     query = CodedQuery.of(row, rotation(len(row)))
-    CodedQuery.of(row.astype(np.float64), rotation(len(row)))
-    products_at(np.empty(0, np.uint64), row.astype(np.float64), np.empty(0))
     (first,) = glance(blocks, [query], [np.ones(1, bool)])
     distances_at(np.empty(0, np.uint64), query.bits, np.empty(0, np.int64))
     Refinement(blocks, query, 1, None, lambda _: None).search(first, Budget())
@@ -355,33 +313,18 @@ class Refinement:
     def _compare(self, left: _Estimates, first: Glance, budget: Budget) -> Found:
         """Compare what may matter exactly, best first."""
         reach = left.scores + BOUND * left.deviations
-        order = np.argsort(-reach, kind="stable")
-        order = order[: np.count_nonzero(reach >= self._floor)]
-        rows, reach = left.rows[order], reach[order]
-        scores = np.empty(len(rows))
-        done, unseen = 0, -math.inf
-        while done < len(rows) and reach[done] >= self._floor:
-            if budget.spent(done):
-                unseen = float(reach[done])
-                break
-            # The first k are needed in any case.
-            upto = min(len(rows), max(self._k, done + STEP), budget.rows or len(rows))
-            self._read_ahead(rows[done:upto])
-            at = self._blocks.at(self._blocks.rows, rows[done:upto], 4 * self._blocks.dimension)
-            products_at(at, self._query.row, scores[done:upto])
-            scores[done:upto] /= self._query.norm
-            done = upto
-            if done >= self._k:
-                kth = float(np.partition(scores[:done], done - self._k)[done - self._k])
-                self._floor = max(self._floor, kth)
-        errors = np.abs(scores[:done] - left.scores[order[:done]])
-        sure = left.deviations[order[:done]]
+        query = self._query
+        rerank = Rerank(self._blocks, query.row, query.norm, self._k, self._read_ahead)
+        compared = rerank.best(left.rows, reach, self._floor, budget)
+        estimated = left.of(compared.rows)
+        errors = np.abs(compared.scores - estimated.scores)
+        sure = estimated.deviations
         return Found(
-            rows=rows[:done],
-            scores=scores[:done],
+            rows=compared.rows,
+            scores=compared.scores,
             scanned=int(first.counts.sum()),
             max_z=float(np.max(errors / np.where(sure > 0, sure, np.inf), initial=0.0)),
-            unseen=unseen,
+            unseen=compared.unseen,
         )
 
 

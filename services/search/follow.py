@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 from uuid import UUID
 
 from sqlalchemy import select
 
-from services.search.load import Loader, hold, parts_of
+from services.search.load import Loader, hold, loader_of, parts_of
 from services.search.memory import Memory
 from services.search.photo_columns import PhotoColumns
 from services.search.snapshot import LoadedChunk, Snapshot
@@ -24,6 +25,9 @@ from shared.errors import NotFound, Unavailable
 from shared.objects import ObjectStore
 from shared.search_protocol import Part
 from shared.shards import WHOLE, Shard
+
+if TYPE_CHECKING:
+    from shared.codes.int8 import Int8Codes
 
 log = logging.getLogger(__name__)
 
@@ -66,7 +70,7 @@ def advance(
     Reads the catalog in one consistent transaction. A chunk that can't be read, or whose hash
     differs, is named in `missing`, and the rest is served. Files are kept below `folder`.
     """
-    loader = Loader(store, folder / str(generation_id))
+    loader = loader_of(store, folder, generation_id)
     with catalog.read() as session:
         generation = session.get(Generation, generation_id)
         if generation is None:
@@ -94,18 +98,46 @@ def advance(
             continue
         photos = PhotoColumns.of(len(stored.rows), facts_of[chunk.id])
         loaded.append(LoadedChunk(chunk.id, chunk.object_key, stored.rows, photos, stored=stored))
-    if sum(chunk.rows.nbytes for chunk in loaded) >= CODED_FROM_BYTES:
+    large = sum(chunk.rows.nbytes for chunk in loaded) >= CODED_FROM_BYTES
+    if large:
         loaded = [_coded(loader, chunk) for chunk in loaded]
         _warm_up(loaded)
     loader.keep_only(loaded)
-    parts = parts_of(loaded)
-    held = memory.parts_held(generation_id, [size_bytes for _, size_bytes in parts])
-    return Snapshot(
-        generation_id=generation_id,
-        map_id=generation.map_id,
-        version=version,
-        chunks=tuple(hold(chunk, held) for chunk in loaded),
-        missing=tuple(missing),
+    middle = bool(loaded) and loaded[0].rows.shape[1] < CODED_DIMENSION
+    if (middle and large) or (old is not None and old.bounded):
+        loaded = _with_int8(loader, loaded)
+    return _held(
+        memory,
+        Snapshot(
+            generation_id=generation_id,
+            map_id=generation.map_id,
+            version=version,
+            chunks=tuple(loaded),
+            missing=tuple(missing),
+        ),
+    )
+
+
+def bounded(
+    store: ObjectStore,
+    folder: Path,
+    memory: Memory,
+    old: Snapshot,
+    made: Mapping[UUID, Int8Codes],
+) -> Snapshot:
+    """The same snapshot with int8 codes of every chunk: those that were made, by chunk id, and
+    others that are made now."""
+    loader = loader_of(store, folder, old.generation_id)
+    return _held(memory, replace(old, chunks=tuple(_int8(loader, c, made) for c in old.chunks)))
+
+
+def _held(memory: Memory, snapshot: Snapshot) -> Snapshot:
+    """The snapshot with what the budget allows in memory."""
+    parts = parts_of(snapshot.chunks)
+    held = memory.parts_held(snapshot.generation_id, [size_bytes for _, size_bytes in parts])
+    return replace(
+        snapshot,
+        chunks=tuple(hold(chunk, held) for chunk in snapshot.chunks),
         parts=tuple(
             Part(name=name, size_bytes=size_bytes, resident=number < held)
             for number, (name, size_bytes) in enumerate(parts)
@@ -113,8 +145,29 @@ def advance(
     )
 
 
+def _with_int8(loader: Loader, chunks: list[LoadedChunk]) -> list[LoadedChunk]:
+    """The chunks with their int8 codes; all without where there is no room to keep them, for then
+    every row is compared, to the same answers."""
+    try:
+        return [_int8(loader, chunk, {}) for chunk in chunks]
+    except OSError as error:
+        log.error("int8 codes can't be kept, search does without: %s", error)
+        return [
+            replace(chunk, int8=None, stored=chunk.stored and replace(chunk.stored, int8=None))
+            for chunk in chunks
+        ]
+
+
+def _int8(loader: Loader, chunk: LoadedChunk, made: Mapping[UUID, Int8Codes]) -> LoadedChunk:
+    stored = chunk.stored
+    if stored is None or stored.int8 is not None:
+        return chunk
+    codes = made.get(chunk.chunk_id) or loader.int8_codes(chunk.object_key, stored)
+    return replace(chunk, int8=codes, stored=replace(stored, int8=codes))
+
+
 def _coded(loader: Loader, chunk: LoadedChunk) -> LoadedChunk:
-    """The chunk with its codes, where rows of this length have any."""
+    """The chunk with its sign codes, where rows of this length have any."""
     stored = chunk.stored
     if stored is None or stored.codes is not None or stored.rows.shape[1] < CODED_DIMENSION:
         return chunk

@@ -17,11 +17,12 @@ from numpy.typing import NDArray
 from shared.codes.compiled import IN_LANES, compiled
 
 NOT_ASKED = 65_535  # more than any distance
+EXACT_TERMS = 1024  # so many products of a byte and 15 bits add up to less than 2^31
+ROUNDING = 1e-9  # more than what float64 loses of a score anywhere: 2^-53 for each of 100,000 terms
 PLANES = 4  # `weighted_at` is written for so many
 
 Words = NDArray[np.uint64]
 Addresses = NDArray[np.uint64]
-Row = NDArray[np.float32] | NDArray[np.float64]
 
 
 @intrinsic
@@ -93,6 +94,81 @@ def distances(
 
 
 @compiled(IN_LANES)
+def product(row: NDArray[np.int8], query: NDArray[np.int16]) -> np.int64:
+    """The product of whole numbers of at most 127 and 127 * 128 + 63: exact."""
+    total = np.int64(0)
+    for begin in range(0, query.shape[0], EXACT_TERMS):
+        some, asked = row[begin : begin + EXACT_TERMS], query[begin : begin + EXACT_TERMS]
+        part = np.int32(0)
+        for j in range(asked.shape[0]):
+            part = np.int32(part + np.int32(some[j]) * np.int32(asked[j]))
+        total += np.int64(part)
+    return total
+
+
+@compiled(IN_LANES)
+def above_floor(
+    blocks: Addresses,
+    first: NDArray[np.int64],
+    asked: NDArray[np.bool_],
+    figures: NDArray[np.float32],
+    query: NDArray[np.int16],
+    query_figures: tuple[float, float, float],
+    begin: int,
+    end: int,
+    least: NDArray[np.float64],
+    rows: NDArray[np.int64],
+    reach: NDArray[np.float64],
+    count: int,
+) -> int:
+    """Of the rows `begin` to `end` of all blocks together, those that may reach the floor.
+
+    blocks (c,): where each block's int8 numbers begin, rows of the query's length one after the
+    other. first (c + 1,): the number of each block's first row. asked (rows,): the others are
+    passed over. figures (3, rows): scale, error and length of each row; query_figures: scale and
+    error of the query, and the lowest floor there is. least (k,): a heap, the least first, of the
+    highest scores that rows have for certain; the floor is its least. Who passes is written to
+    `rows`, and to `reach` what it scores at most, from place `count` on; returns the next place.
+    """
+    words = query.shape[0]
+    scale, error, lowest = query_figures
+    floor = max(lowest, least[0])
+    block = np.searchsorted(first, begin, side="right") - 1
+    while begin < end:
+        upto = min(end, first[block + 1])
+        numbers = nb.carray(_bytes_at(blocks[block]), (first[block + 1] - first[block], words))
+        for row in range(begin, upto):
+            if not asked[row]:
+                continue
+            whole = product(numbers[row - first[block]], query)
+            score = np.float64(figures[0, row]) * scale * np.float64(whole)
+            bound = figures[1, row] + figures[2, row] * error + ROUNDING
+            if score + bound >= floor:
+                rows[count], reach[count] = row, score + bound
+                count += 1
+                if score - bound > least[0]:
+                    _replace_least(least, score - bound)
+                    floor = max(lowest, least[0])
+        begin = upto
+        block += 1
+    return count
+
+
+@compiled(IN_LANES)
+def _replace_least(heap: NDArray[np.float64], value: float) -> None:
+    place, end = 0, heap.shape[0]
+    while True:
+        child = 2 * place + 1
+        if child + 1 < end and heap[child + 1] < heap[child]:
+            child += 1
+        if child >= end or heap[child] >= value:
+            break
+        heap[place] = heap[child]
+        place = child
+    heap[place] = value
+
+
+@compiled(IN_LANES)
 def distances_at(addresses: Addresses, query: Words, out: NDArray[np.int64]) -> None:
     """Add to `out` how many bits differ of the code at each address."""
     words = query.shape[0]
@@ -124,7 +200,7 @@ def weighted_at(addresses: Addresses, planes: Words, out: NDArray[np.int64]) -> 
 
 
 @compiled(IN_LANES)
-def products_at(addresses: Addresses, query: Row, out: NDArray[np.float64]) -> None:
+def products_at(addresses: Addresses, query: NDArray[np.float32], out: NDArray[np.float64]) -> None:
     """The products of float32 rows with the query, in float64: each term is exact, and the sums
     of equal rows are equal."""
     for number in range(addresses.shape[0]):
@@ -136,7 +212,7 @@ def products_at(addresses: Addresses, query: Row, out: NDArray[np.float64]) -> N
 
 
 @compiled(IN_LANES)
-def squares(row: Row) -> float:
+def squares(row: NDArray[np.float32]) -> float:
     """The sum of a row's squares, in float64."""
     total = 0.0
     for i in range(row.shape[0]):

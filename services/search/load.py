@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import shutil
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
@@ -22,11 +22,15 @@ from shared.errors import NotFound
 from shared.objects import ObjectStore
 
 if TYPE_CHECKING:
+    from shared.codes.int8 import Int8Codes
     from shared.codes.signs import SignCodes
 
 log = logging.getLogger(__name__)
 
+ENDINGS = (".npy", ".codes", ".int8")  # of a chunk's files in the folder
+
 Number = TypeVar("Number", bound=np.generic)
+Codes = TypeVar("Codes")
 
 
 class Loader:
@@ -47,7 +51,7 @@ class Loader:
         return StoredChunk(file, decode_rows(file.memory), chunk.sha256)
 
     def codes(self, object_key: str, stored: StoredChunk) -> SignCodes:
-        """The chunk's codes: those beside it, or made from its rows where there are none."""
+        """The chunk's sign codes: those beside it, or made from its rows where there are none."""
         from shared.codes.stored import decode_codes, encode_codes
 
         def kept(target: Path) -> None:
@@ -56,12 +60,33 @@ class Loader:
         def made(target: Path) -> None:
             _write(target, encode_codes(stored.rows, stored.sha256))
 
-        name = f"{stored.sha256}.codes"
-        for make in (kept, made):
+        return self._codes(object_key, stored, "codes", (kept, made), decode_codes)
+
+    def int8_codes(self, object_key: str, stored: StoredChunk) -> Int8Codes:
+        """The chunk's int8 codes: those of the folder, or made from its rows."""
+        from shared.codes.stored import decode_int8, encode_int8
+
+        def made(target: Path) -> None:
+            _write(target, encode_int8(stored.rows, stored.sha256))
+
+        # Twice: what is there may be damaged.
+        return self._codes(object_key, stored, "int8", (made, made), decode_int8)
+
+    def _codes(
+        self,
+        object_key: str,
+        stored: StoredChunk,
+        ending: str,
+        ways: Sequence[Callable[[Path], None]],
+        decode: Callable[..., Codes],
+    ) -> Codes:
+        """Codes of the folder, which the ways to make them are tried for, one after the other."""
+        name = f"{stored.sha256}.{ending}"
+        rows, dimension = stored.rows.shape
+        for make in ways:
             try:
                 file = self._files.made(name, make)
-                rows, dimension = stored.rows.shape
-                return decode_codes(
+                return decode(
                     file.memory, rows=rows, dimension=dimension, chunk_sha256=stored.sha256
                 )
             except NotFound:
@@ -74,7 +99,12 @@ class Loader:
     def keep_only(self, chunks: Collection[LoadedChunk]) -> None:
         """Remove the files of all other chunks."""
         hashes = [chunk.stored.sha256 for chunk in chunks if chunk.stored is not None]
-        self._files.keep_only({f"{one}{end}" for one in hashes for end in (".npy", ".codes")})
+        self._files.keep_only({f"{one}{end}" for one in hashes for end in ENDINGS})
+
+
+def loader_of(store: ObjectStore, folder: Path, generation_id: UUID) -> Loader:
+    """The loader of a generation, whose files lie below `folder`."""
+    return Loader(store, folder / str(generation_id))
 
 
 def remove_others(folder: Path, generation_ids: Collection[UUID]) -> None:
@@ -91,20 +121,26 @@ def hold(chunk: LoadedChunk, parts: int) -> LoadedChunk:
     stored = chunk.stored
     if stored is None:
         return chunk
-    levels = stored.codes.levels if stored.codes else ()
-    rows = _held(stored.rows, chunk.rows, parts > len(levels))
+    held = 0
     codes = None
     if stored.codes is not None:
-        now = chunk.codes.levels if chunk.codes else levels
+        held = len(stored.codes.levels)
+        now = (chunk.codes or stored.codes).levels
         codes = replace(
             stored.codes,
             levels=tuple(
                 _held(level, there, parts > number)
-                for number, (level, there) in enumerate(zip(levels, now, strict=True))
+                for number, (level, there) in enumerate(zip(stored.codes.levels, now, strict=True))
             ),
             norms=np.array(stored.codes.norms),  # 4 bytes a row: always
         )
-    return replace(chunk, rows=rows, codes=codes)
+    int8 = None
+    if stored.int8 is not None:
+        there = (chunk.int8 or stored.int8).numbers
+        int8 = replace(stored.int8, numbers=_held(stored.int8.numbers, there, parts > held))
+        held += 1
+    rows = _held(stored.rows, chunk.rows, parts > held)
+    return replace(chunk, rows=rows, codes=codes, int8=int8)
 
 
 def parts_of(chunks: Sequence[LoadedChunk]) -> list[tuple[str, int]]:
@@ -115,6 +151,8 @@ def parts_of(chunks: Sequence[LoadedChunk]) -> list[tuple[str, int]]:
         for number, level in enumerate(levels):
             name = f"codes {number}"
             sizes[name] = sizes.get(name, 0) + level.nbytes
+        if chunk.int8 is not None:
+            sizes["int8 codes"] = sizes.get("int8 codes", 0) + chunk.int8.numbers.nbytes
     return [*sizes.items(), ("rows", sum(chunk.rows.nbytes for chunk in chunks))]
 
 

@@ -1,7 +1,7 @@
 """Which parts of the generations are held in memory: what is read most, as far as the budget goes.
 
-A generation's parts, in the order in which they are wanted: the levels of its codes, then its rows;
-rows alone where search does without codes. A part is held whole or not at all; what is not held
+A generation's parts, in the order in which they are wanted: the levels of its sign codes, its int8
+codes, its rows; whichever it has. A part is held whole or not at all; what is not held
 stays a mapped file, of which the operating system keeps what it has room for.
 """
 

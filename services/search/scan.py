@@ -16,7 +16,7 @@ FLOAT32_MARGIN = 1e-5
 # Picking rows copies them: worth it up to this share of a chunk, else all are multiplied.
 FEW = 0.25
 
-Query = NDArray[np.float32] | NDArray[np.float64]
+Query = NDArray[np.float32]
 Rows = NDArray[np.int64]
 Scores = NDArray[np.float64]
 

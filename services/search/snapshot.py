@@ -17,7 +17,11 @@ from shared.chunks import Rows
 from shared.search_protocol import Held, Part
 
 if TYPE_CHECKING:  # numba takes a while to load, and small maps need no codes
+    from services.search.blocks import RowBlocks
+    from services.search.bounded import Int8Blocks
     from services.search.cascade import Blocks
+    from services.search.gpu import Resident
+    from shared.codes.int8 import Int8Codes
     from shared.codes.signs import SignCodes
 
 
@@ -33,6 +37,8 @@ class LoadedChunk:
     """None while search does without."""
     stored: StoredChunk | None = None
     """Where rows and codes lie on the disk; None for rows that were never there."""
+    int8: Int8Codes | None = None
+    """None while search does without."""
 
     def read_ahead(self, row: int) -> None:
         """Say that a row is read next, where it is mapped from a file."""
@@ -50,6 +56,7 @@ class StoredChunk:
     rows: Rows
     sha256: str
     codes: SignCodes | None = None
+    int8: Int8Codes | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +70,8 @@ class Snapshot:
     missing: tuple[str, ...] = ()
     parts: tuple[Part, ...] = ()
     """What lies in memory, and what is mapped from files."""
+    resident: Resident | None = None
+    """Its rows in a GPU's memory."""
 
     @cached_property
     def by_key(self) -> Mapping[str, LoadedChunk]:
@@ -78,15 +87,28 @@ class Snapshot:
     def live_rows(self) -> int:
         return int(self.photos.findable.sum())
 
+    @property
+    def dimension(self) -> int:
+        """0 without any rows."""
+        return self.chunks[0].rows.shape[1] if self.chunks else 0
+
+    @property
+    def row_bytes(self) -> int:
+        return sum(chunk.rows.nbytes for chunk in self.chunks)
+
     @cached_property
     def held(self) -> Held:
-        dimension = self.chunks[0].rows.shape[1] if self.chunks else 0
-        return Held(rows=len(self.photos), dimension=dimension, parts=self.parts)
+        return Held(rows=len(self.photos), dimension=self.dimension, parts=self.parts)
 
     @cached_property
     def coded(self) -> bool:
-        """Whether every chunk has its codes."""
+        """Whether every chunk has its sign codes."""
         return bool(self.chunks) and all(chunk.codes is not None for chunk in self.chunks)
+
+    @cached_property
+    def bounded(self) -> bool:
+        """Whether every chunk has its int8 codes."""
+        return bool(self.chunks) and all(chunk.int8 is not None for chunk in self.chunks)
 
     def read_ahead(self, rows: NDArray[np.int64]) -> None:
         """Say that these rows are read next, where they are mapped from a file."""
@@ -98,7 +120,21 @@ class Snapshot:
 
     @cached_property
     def blocks(self) -> Blocks:
-        """Where the codes and rows of a coded snapshot lie."""
+        """Where the sign codes and rows of a coded snapshot lie."""
         from services.search.cascade import Blocks
 
         return Blocks.of(self.chunks)
+
+    @cached_property
+    def int8_blocks(self) -> Int8Blocks:
+        """Where the int8 codes and rows of a bounded snapshot lie."""
+        from services.search.bounded import Int8Blocks
+
+        return Int8Blocks.of(self.chunks)
+
+    @cached_property
+    def row_blocks(self) -> RowBlocks:
+        """Where the rows lie."""
+        from services.search.blocks import RowBlocks
+
+        return RowBlocks.of(self.chunks)

@@ -6,16 +6,18 @@ import logging
 import threading
 import time
 from collections.abc import Collection
+from typing import TYPE_CHECKING
 from uuid import UUID
 
 import numpy as np
-from numpy.typing import NDArray
 from sqlalchemy.exc import SQLAlchemyError
 
-from services.search.answer import Question, answer, weighted_answer
-from services.search.follow import FOLLOWED, advance, wanted_versions
+from services.search.answer import Question, answer, lacks_int8, weighted_answer
+from services.search.device import Residency, open_device
+from services.search.follow import FOLLOWED, advance, bounded, wanted_versions
 from services.search.lag import Lags
 from services.search.load import remove_others
+from services.search.make_int8 import Int8Maker
 from services.search.memory import Memory
 from services.search.query_row import QueryRows, expired
 from services.search.select import select
@@ -27,10 +29,14 @@ from shared.catalog.session import Catalog
 from shared.chunks import Row
 from shared.errors import InvalidRequest, Unavailable
 from shared.objects import ObjectStore
-from shared.search_protocol import SearchRequest, SearchResponse, SearchStatus
+from shared.search_protocol import Mode, SearchRequest, SearchResponse, SearchStatus
 from shared.settings import Settings
 from shared.shards import WHOLE, Shard
 from shared.word_weights.learn import weigh
+
+if TYPE_CHECKING:
+    from services.search.gpu import Device
+    from shared.codes.int8 import Int8Codes
 
 log = logging.getLogger(__name__)
 
@@ -46,8 +52,14 @@ class SearchWorker:
     """
 
     def __init__(
-        self, catalog: Catalog, store: ObjectStore, settings: Settings, shard: Shard = WHOLE
+        self,
+        catalog: Catalog,
+        store: ObjectStore,
+        settings: Settings,
+        shard: Shard = WHOLE,
+        device: Device | None = None,
     ) -> None:
+        """`device`: where rows are compared, instead of what the settings say."""
         self.shard = shard
         self.lags = Lags()
         self._catalog = catalog
@@ -60,6 +72,8 @@ class SearchWorker:
         self._snapshots: dict[UUID, Snapshot] = {}
         self._swap = threading.Lock()  # held for a moment, never while something is read
         self._loading: dict[UUID, threading.Lock] = {}
+        self._residency = Residency(device or open_device(settings.search_device))
+        self._int8 = Int8Maker(store, self._folder, self._attach_int8)
 
     def run(self, stop: threading.Event) -> None:
         """Follow what answers until `stop` is set."""
@@ -94,6 +108,7 @@ class SearchWorker:
             snapshot = self._snapshots.get(generation_id)
             if snapshot is None or snapshot.version < now.version or snapshot.missing:
                 self._advance(generation_id, now.version)
+            self._fill_device(generation_id)
             self.lags.level(generation_id, looked_at)
         for generation_id in self._snapshots.keys() - wanted.keys():
             self._memory.forget(generation_id)
@@ -106,6 +121,10 @@ class SearchWorker:
         snapshot = self.snapshot(request.generation_id, request.min_version)
         query = self._rows.find(snapshot, request)
         asked = select(snapshot.photos, request.photos, request.exclude)
+        if request.mode == Mode.DETERMINISTIC and lacks_int8(snapshot, asked, request.k):
+            self._int8.wait(snapshot, self._settings.search_wait_seconds)
+            snapshot = self.snapshot(request.generation_id, snapshot.version)
+            asked = select(snapshot.photos, request.photos, request.exclude)
         question = Question(
             k=request.k,
             min_score=request.min_score,
@@ -148,6 +167,7 @@ class SearchWorker:
             incomplete=tuple(key for key, snapshot in snapshots.items() if snapshot.missing),
             missing=tuple(key for snapshot in snapshots.values() for key in snapshot.missing),
             lags=self.lags.now(versions),
+            devices=self._residency.status(snapshots.values()),
         )
 
     def snapshot(self, generation_id: UUID, min_version: int) -> Snapshot:
@@ -188,16 +208,51 @@ class SearchWorker:
                 self.shard,
             )
             if new is not None:
+                new = self._residency.carry(new, old)
                 with self._swap:
                     self._snapshots = {**self._snapshots, generation_id: new}
             return new
 
+    def _fill_device(self, generation_id: UUID) -> None:
+        """Put the generation on the device, if there is one, or take it from there after a failure.
+        Queries go on meanwhile."""
+        snapshot = self._snapshots.get(generation_id)
+        if snapshot is None or not self._residency.wants(snapshot):
+            return
+        filled = self._residency.fill(snapshot)
+        if filled.resident is None and snapshot.resident is None:
+            if self._residency.lacks_int8(snapshot):
+                self._int8.start(snapshot)
+            return
+        with self._swap:
+            loading = self._loading.setdefault(generation_id, threading.Lock())
+        with loading:
+            now = self._snapshots.get(generation_id)
+            if now is not None:
+                new = self._residency.carry(now, filled)
+                with self._swap:
+                    self._snapshots = {**self._snapshots, generation_id: new}
 
-def _weighted(row: Row, weights: tuple[float, ...]) -> NDArray[np.float64] | None:
+    def _attach_int8(self, generation_id: UUID, made: dict[UUID, Int8Codes]) -> None:
+        """Swap in the snapshot that is there now with its int8 codes."""
+        with self._swap:
+            loading = self._loading.setdefault(generation_id, threading.Lock())
+        with loading:
+            old = self._snapshots.get(generation_id)
+            if old is None:
+                return  # it was forgotten meanwhile
+            new = bounded(self._store, self._folder, self._memory, old, made)
+            with self._swap:
+                self._snapshots = {**self._snapshots, generation_id: new}
+
+
+def _weighted(row: Row, weights: tuple[float, ...]) -> Row | None:
     """None without weights, and where no word of the query has any: the plain ranking is left."""
     if not weights:
         return None
     try:
-        return weigh(row, weights)
+        weighted = weigh(row, weights)
     except ValueError as error:
         raise InvalidRequest("word_weights_unfit", f"{error}.") from None
+    # As every row and every query is: the same question, whichever way it is searched.
+    return None if weighted is None else weighted.astype(np.float32)

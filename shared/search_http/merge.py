@@ -77,5 +77,6 @@ def merge_status(shards: Mapping[Shard, SearchStatus], away: Iterable[Shard] = (
             )
             for key in lagging
         },
+        devices=tuple(device for status in found for device in status.devices),
         away=tuple(shard.name for shard in sorted(away)),
     )

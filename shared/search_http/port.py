@@ -26,6 +26,8 @@ LATE_SECONDS = 0.2  # for a call that ends at the deadline to say why
 PAUSE_SECONDS = 0.05  # before workers that are behind are asked again
 
 BEHIND, UNREADABLE = "search_behind", "chunk_unreadable"
+NOT_YET = (BEHIND, "codes_being_made")  # who refuses so may answer in a moment
+FINAL = (UNREADABLE, "codes_not_made")
 
 
 class HttpSearch:
@@ -33,9 +35,9 @@ class HttpSearch:
 
     Of each shard one worker is asked, and the next one when that fails. A shard of which no worker
     answers in time is named in the answer's `missing`, and the rest is answered. Raises what the
-    workers refuse with: Gone, NotFound, Unavailable (`chunk_unreadable`); Unavailable
-    (`search_behind`) when no shard reaches `min_version` in time, and (`search_unavailable`) when
-    no shard answers at all.
+    workers refuse with: Gone, NotFound, Unavailable (`chunk_unreadable`, `codes_being_made`,
+    `codes_not_made`); Unavailable (`search_behind`) when no shard reaches `min_version` in time,
+    and (`search_unavailable`) when no shard answers at all.
     """
 
     def __init__(self, urls: Sequence[str], timeout_seconds: float) -> None:
@@ -119,12 +121,12 @@ class HttpSearch:
                     self._workers.failed(url)
                 except Unavailable as error:
                     log.debug("%s: %s: %s", shard.name, url, error.detail)
-                    if error.code == BEHIND:
+                    if error.code in NOT_YET:
                         behind, again = error, True
-                    elif error.code == UNREADABLE:
+                    elif error.code in FINAL:
                         unreadable = error
             if unreadable is not None:
-                raise unreadable  # no other worker could read it, and this one has the last word
+                raise unreadable  # no other worker could, and this one has the last word
             if not again or time.monotonic() + PAUSE_SECONDS > deadline:
                 # Who was behind and ran out of time at the next try is still behind.
                 raise behind or WorkerAway(shard.name, "no worker answers")

@@ -6,6 +6,7 @@ import contextlib
 import shutil
 import tempfile
 import threading
+import time
 from collections.abc import Callable, Collection, Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -14,6 +15,7 @@ from uuid import UUID
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import HealthCheck, assume
 from hypothesis import settings as how
 from hypothesis import strategies as st
@@ -26,6 +28,9 @@ from hypothesis.stateful import (
 )
 from numpy.typing import NDArray
 
+from services.search import answer, gpu
+from services.search.load import Loader
+from services.search.snapshot import StoredChunk
 from services.search.worker import SearchWorker
 from services.steward.compact import merge_slot
 from shared.catalog.chunks import Chunk, Descriptor, live_chunks
@@ -36,13 +41,15 @@ from shared.catalog.photos import Photo, PhotoRole, mark_deleted
 from shared.catalog.schema import migrate
 from shared.catalog.session import Catalog
 from shared.chunks import decode_rows, encode_rows, manifest_key, write_chunk
+from shared.codes.int8 import Int8Codes
 from shared.errors import Gone, InvalidRequest, Unavailable
 from shared.ids import new_id
 from shared.objects import FolderStore, ObjectStore
 from shared.photo_filter import Box, Circle, PhotoFilter
-from shared.search_protocol import SearchPort, SearchRequest, SearchResponse
+from shared.search_protocol import Mode, SearchPort, SearchRequest, SearchResponse
 from shared.settings import Settings
-from tests.support.codes import always_by_codes
+from shared.shards import WHOLE
+from tests.support.codes import always_by_codes, always_by_int8, int8_on_demand
 from tests.support.search_tier import SearchTier
 
 DIMENSION = 12
@@ -64,6 +71,9 @@ class SmallMap:
 
     `rows` is the model to compare with: every live photo with its descriptor.
     """
+
+    mode = Mode.AUTO
+    """How it is searched."""
 
     def __init__(self, catalog: Catalog, store: ObjectStore) -> None:
         self.catalog = catalog
@@ -208,6 +218,7 @@ class SmallMap:
             photos=PhotoFilter(**photos),
             min_score=min_score,
             exclude=exclude,
+            mode=self.mode,
         )
 
     def brute_force(
@@ -730,6 +741,168 @@ class TestSearchWorkerByCodes(TestSearchWorker):
         always_by_codes(monkeypatch)
 
 
+class TestSearchWorkerByInt8(TestSearchWorker):
+    """The same promises where rows of middle length are told apart by their int8 codes."""
+
+    certificate = "bound"
+
+    @pytest.fixture(autouse=True)
+    def by_int8(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        always_by_int8(monkeypatch)
+
+    @pytest.mark.parametrize("damage", ["flipped", "truncated", "gone"])
+    def test_codes_that_are_damaged_or_gone_are_made_again(
+        self, places: SmallMap, port: OpenPort, settings: Settings, damage: str
+    ) -> None:
+        places.add(unit_rows(1, 30))
+        vector = unit_rows(2, 1)[0]
+        first = port().search(places.request(places.query(vector)))
+        (path,) = settings.search_cache(WHOLE).glob("*.int8")
+        whole = path.read_bytes()
+        path.unlink()
+        if damage != "gone":
+            path.write_bytes(_damaged(whole, damage))
+        again = port().search(places.request(places.query(vector)))
+        assert again == first
+        assert path.read_bytes() == whole
+
+    def test_without_room_for_codes_every_row_is_compared(
+        self, places: SmallMap, port: OpenPort, settings: Settings
+    ) -> None:
+        places.add(unit_rows(1, 30))
+        settings.search_cache(WHOLE).parent.mkdir(parents=True, exist_ok=True)
+        settings.search_cache(WHOLE).write_text("no folder can be here")
+        vector = unit_rows(2, 1)[0]
+        response = port().search(places.request(places.query(vector)))
+        assert_answers(response, places.brute_force(vector))
+        assert response.certificate == "exhaustive"
+
+
+class TestSearchWorkerDeterministic(TestSearchWorker):
+    """The same promises of `mode=deterministic`, whose codes are made when they are asked for."""
+
+    certificate = "bound"
+
+    @pytest.fixture(autouse=True)
+    def deterministic(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        int8_on_demand(monkeypatch)
+        monkeypatch.setattr(SmallMap, "mode", Mode.DETERMINISTIC)
+
+    def test_codes_are_made_once_asked_for_and_counted(
+        self, places: SmallMap, port: OpenPort, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        places.add(unit_rows(1, 30))
+        search = port()
+        reference = places.query(unit_rows(2, 1)[0])
+        with monkeypatch.context() as patch:
+            patch.setattr(SmallMap, "mode", Mode.DENSE)
+            dense = search.search(places.request(reference))
+        assert dense.certificate == "exhaustive"
+        before = search.status().resident_bytes
+        found = search.search(places.request(reference))
+        assert found.certificate == "bound"
+        assert found.hits == dense.hits
+        assert search.status().resident_bytes == before + 30 * 64  # 12 numbers are padded to 64
+
+    def test_codes_that_take_long_refuse_with_progress_and_come(
+        self, places: SmallMap, port: OpenPort, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        go_on = threading.Event()
+        make = Loader.int8_codes
+
+        def slowly(self: Loader, object_key: str, stored: StoredChunk) -> Int8Codes:
+            assert go_on.wait(60)
+            return make(self, object_key, stored)
+
+        monkeypatch.setattr(Loader, "int8_codes", slowly)
+        places.add(unit_rows(1, 30))
+        vector = unit_rows(2, 1)[0]
+        request = places.request(places.query(vector))
+        search = port(search_wait_seconds=0.01)
+        for _ in range(2):
+            with pytest.raises(Unavailable) as caught:
+                search.search(request)
+            assert caught.value.code == "codes_being_made"
+            assert caught.value.extra["retry_after_seconds"] >= 1
+            assert (caught.value.extra["done"], caught.value.extra["rows"]) == (0, 30)
+        auto = search.search(request.model_copy(update={"mode": Mode.AUTO}))
+        assert_answers(auto, places.brute_force(vector))
+        go_on.set()
+        response = _once_made(search, request)
+        assert_answers(response, places.brute_force(vector))
+        assert response.certificate == "bound"
+
+    def test_codes_that_can_not_be_kept_are_refused_and_tried_again(
+        self, places: SmallMap, port: OpenPort, settings: Settings
+    ) -> None:
+        places.add(unit_rows(1, 30))
+        vector = unit_rows(2, 1)[0]
+        request = places.request(places.query(vector))
+        search = port()
+        search.search(request.model_copy(update={"mode": Mode.AUTO}))
+        folder = settings.search_cache(WHOLE)
+        shutil.rmtree(folder)
+        folder.write_text("no folder can be here")
+        with pytest.raises(Unavailable) as caught:
+            search.search(request)
+        assert caught.value.code == "codes_not_made"
+        folder.unlink()
+        assert_answers(search.search(request), places.brute_force(vector))
+
+
+class TestSearchWorkerOnADevice(TestSearchWorker):
+    """The same promises where the rows lie on a device: PyTorch's CPU stands for a GPU."""
+
+    certificate = "bound"
+
+    @pytest.fixture(params=["float16", "int8"])
+    def port(
+        self,
+        request: pytest.FixtureRequest,
+        catalog: Catalog,
+        store: FolderStore,
+        settings: Settings,
+        monkeypatch: pytest.MonkeyPatch,
+    ) -> OpenPort:
+        always_by_int8(monkeypatch)
+        monkeypatch.setattr(answer, "worth_codes", lambda selected, k: selected > 0)
+        monkeypatch.setattr(gpu, "KINDS", (request.param,))
+
+        def open_port(**changes: object) -> SearchPort:
+            device = gpu.Device(torch.device("cpu"), lambda: 1e9, 0)
+            worker = SearchWorker(
+                catalog, store, settings.model_copy(update=changes), device=device
+            )
+            worker.follow()
+            return worker
+
+        return open_port
+
+    def test_status_tells_what_lies_on_the_device(self, places: SmallMap, port: OpenPort) -> None:
+        places.add(unit_rows(1, 40))
+        search = port()
+        (device,) = search.status().devices
+        assert device.name == "cpu"
+        assert list(device.generations) == [places.generation_id]
+        before = device.resident_bytes
+        places.add(unit_rows(2, 40))
+        response = search.search(places.request(places.query(unit_rows(3, 1)[0])))
+        assert response.certificate == "bound", "a new chunk is on the device at once"
+        assert search.status().devices[0].resident_bytes == 2 * before
+        assert search.status().devices[0].failure is None
+
+
+def _once_made(search: SearchPort, request: SearchRequest) -> SearchResponse:
+    for _ in range(1000):
+        try:
+            return search.search(request)
+        except Unavailable as error:
+            if error.code != "codes_being_made":
+                raise
+            time.sleep(0.01)
+    raise AssertionError("the codes never came")
+
+
 class TestSearchOverHttp(SearchPortContract):
     """The same promises, with HTTP between and the map's slots spread over workers."""
 
@@ -752,6 +925,35 @@ class TestSearchOverHttp(SearchPortContract):
                 return running.enter_context(tier).port
 
             yield open_port
+
+    def test_codes_that_are_being_made_are_no_reason_to_leave_shards_out(
+        self, places: SmallMap, port: OpenPort, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        int8_on_demand(monkeypatch)
+        go_on = threading.Event()
+        make = Loader.int8_codes
+
+        def slowly(self: Loader, object_key: str, stored: StoredChunk) -> Int8Codes:
+            assert go_on.wait(60)
+            return make(self, object_key, stored)
+
+        monkeypatch.setattr(Loader, "int8_codes", slowly)
+        for slot in range(3):
+            places.add(unit_rows(slot, 10), slot=slot)
+        vector = unit_rows(9, 1)[0]
+        request = places.request(places.query(vector))
+        request = request.model_copy(update={"mode": Mode.DETERMINISTIC})
+        search = port(search_wait_seconds=0.2)
+        try:
+            with pytest.raises(Unavailable) as caught:
+                search.search(request)
+        finally:
+            go_on.set()
+        assert caught.value.code == "codes_being_made"
+        assert caught.value.extra["retry_after_seconds"] >= 1
+        response = _once_made(search, request)
+        assert_answers(response, places.brute_force(vector))
+        assert response.certificate == "bound"
 
 
 class AddDeleteMerge(RuleBasedStateMachine):
@@ -846,12 +1048,14 @@ def migrated(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("migrated")
-@pytest.mark.parametrize("by_codes", [False, True], ids=["dense", "by codes"])
+@pytest.mark.parametrize("by", ["dense", "sign codes", "int8 codes"])
 def test_no_order_of_adding_deleting_and_merging_attaches_a_score_to_another_photo(
-    by_codes: bool, monkeypatch: pytest.MonkeyPatch
+    by: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    if by_codes:
+    if by == "sign codes":
         always_by_codes(monkeypatch)
+    elif by == "int8 codes":
+        always_by_int8(monkeypatch)
     run_state_machine_as_test(
         AddDeleteMerge,
         settings=how(

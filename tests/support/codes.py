@@ -12,3 +12,15 @@ def always_by_codes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(follow, "CODED_FROM_BYTES", 0)
     monkeypatch.setattr(follow, "CODED_DIMENSION", 1)
     monkeypatch.setattr(answer, "worth_codes", lambda selected, k: selected > 0)
+
+
+def always_by_int8(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every search of more than nothing goes through int8 codes, as that of middle dimensions."""
+    monkeypatch.setattr(follow, "CODED_FROM_BYTES", 0)
+    monkeypatch.setattr(answer, "worth_int8", lambda selected, k, dimension: selected > 0)
+
+
+def int8_on_demand(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same of long rows: the codes are made once `Mode.DETERMINISTIC` is asked for."""
+    always_by_int8(monkeypatch)
+    monkeypatch.setattr(follow, "CODED_DIMENSION", 1)

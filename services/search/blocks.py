@@ -1,0 +1,55 @@
+"""Where the rows of a snapshot lie in memory, for the compiled loops."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.search.snapshot import LoadedChunk
+
+Addresses = NDArray[np.uint64]
+Indices = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RowBlocks:
+    """n rows in c blocks; who makes it keeps them alive."""
+
+    dimension: int
+    first: Indices
+    """(c + 1,): the number of each block's first row; the last is n."""
+    rows: Addresses
+    """(c,): where the block's float32 rows begin."""
+    kept: object
+    """What has to live as long."""
+
+    @classmethod
+    def of(cls, chunks: Sequence[LoadedChunk]) -> RowBlocks:
+        return cls(
+            dimension=chunks[0].rows.shape[1],
+            first=np.cumsum([0, *(len(chunk.rows) for chunk in chunks)]),
+            rows=addresses(chunk.rows for chunk in chunks),
+            kept=chunks,
+        )
+
+    def __len__(self) -> int:
+        return int(self.first[-1])
+
+    def at(self, begins: Addresses, indices: Indices, bytes_each: int) -> Addresses:
+        """The addresses of these rows in blocks that begin at `begins`."""
+        block = np.searchsorted(self.first, indices, side="right") - 1
+        inside = (indices - self.first[block]).astype(np.uint64)
+        return begins[block] + inside * np.uint64(bytes_each)
+
+    def rows_at(self, indices: Indices) -> Addresses:
+        """The addresses of these float32 rows."""
+        return self.at(self.rows, indices, 4 * self.dimension)
+
+
+def addresses(arrays: Iterable[NDArray[Any]]) -> Addresses:
+    """Where each array begins."""
+    return np.array([array.ctypes.data for array in arrays], np.uint64)

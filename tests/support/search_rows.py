@@ -1,0 +1,77 @@
+"""Rows to search in, and what brute force in float64 finds."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from uuid import UUID
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.search import answer as answer_module
+from services.search.answer import DECIMALS, Answer, Question
+from services.search.photo_columns import PhotoColumns
+from services.search.snapshot import LoadedChunk, Snapshot
+from services.search.together import Glances
+from shared.codes.int8 import int8_codes
+from shared.codes.signs import sign_codes
+from shared.ids import new_id
+from tests.support.photo_facts import facts_of
+
+DIMENSION = 7168
+
+Rows = NDArray[np.float32]
+
+
+def photo(number: int) -> UUID:
+    return UUID(int=number + 1)
+
+
+def snapshot_of(rows: Rows, pieces: int = 3, by: str = "signs") -> Snapshot:
+    """The rows in so many chunks, with one kind of codes or none."""
+    bounds = np.linspace(0, len(rows), pieces + 1).astype(int)
+    chunks = [
+        LoadedChunk(
+            new_id(),
+            f"chunks/{a}.npy",
+            rows[a:b],
+            PhotoColumns.of(b - a, [(row - a, facts_of(photo(row))) for row in range(a, b)]),
+            codes=sign_codes(rows[a:b]) if by == "signs" else None,
+            int8=int8_codes(rows[a:b]) if by == "int8" else None,
+        )
+        for a, b in pairwise(bounds.tolist())
+    ]
+    return Snapshot(new_id(), new_id(), 1, tuple(chunks))
+
+
+def brute_force(
+    rows: Rows, query: Rows, k: int, asked: NDArray[np.bool_], min_score: float = -2.0
+) -> list[tuple[UUID, float]]:
+    exact = query.astype(np.float64)
+    exact /= np.linalg.norm(exact)
+    scores = np.round([row.astype(np.float64) @ exact for row in rows], DECIMALS)
+    scored = [
+        (-min(1.0, score), photo(number))
+        for number, score in enumerate(scores.tolist())
+        if asked[number] and score >= min_score
+    ]
+    return [(photo_id, -score) for score, photo_id in sorted(scored)[:k]]
+
+
+def answer(snapshot: Snapshot, query: Rows, asked: NDArray[np.bool_], question: Question) -> Answer:
+    """Of a query that comes alone."""
+    return answer_module.answer(snapshot, query, asked, question, Glances())
+
+
+def hits_of(found: Answer) -> list[tuple[UUID, float]]:
+    return [(hit.photo_id, hit.score) for hit in found.hits]
+
+
+def places(seed: int, count: int, dimension: int = DIMENSION) -> Rows:
+    """Rows in neighbourhoods: some places were photographed many times."""
+    rng = np.random.default_rng(seed)
+    centres = rng.standard_normal((max(1, count // 5), dimension))
+    near = centres[rng.integers(len(centres), size=count)]
+    rows = near + rng.uniform(0.1, 3.0, size=(count, 1)) * rng.standard_normal((count, dimension))
+    found: Rows = (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32)
+    return found

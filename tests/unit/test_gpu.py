@@ -1,0 +1,282 @@
+"""Search on a device: PyTorch's CPU stands for a GPU. The same answers as brute force, whatever
+lies on the device, and the CPU's way where it fails."""
+
+from __future__ import annotations
+
+import gc
+import logging
+import math
+import weakref
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from services.search import answer as answer_module
+from services.search import device as device_module
+from services.search import gpu
+from services.search.answer import Question
+from services.search.device import Residency, open_device
+from services.search.gpu import Asked, Device, DeviceFailed, Unfit
+from services.search.snapshot import Snapshot
+from shared.errors import Misconfigured
+from shared.search_protocol import Mode
+from tests.support.search_rows import answer, brute_force, hits_of, places, snapshot_of
+
+DIMENSION = 512
+KINDS = ("float16", "int8")
+
+
+@pytest.fixture(autouse=True)
+def always_worth_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(answer_module, "worth_codes", lambda selected, k: True)
+
+
+def device_with(free_bytes: float = math.inf) -> Device:
+    return Device(torch.device("cpu"), lambda: free_bytes, 0)
+
+
+def on_device(snapshot: Snapshot, kind: str) -> Snapshot:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(gpu, "KINDS", (kind,))
+        found = Residency(device_with()).fill(snapshot)
+    assert found.resident is not None
+    assert found.resident.kind == kind
+    return found
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    seed=st.integers(0, 2**31),
+    count=st.integers(1, 200),
+    pieces=st.integers(1, 4),
+    k=st.sampled_from([1, 10, 100, 400]),
+    asked_share=st.sampled_from([1.0, 0.5, 0.02]),
+    matched=st.booleans(),
+    duplicates=st.integers(0, 30),
+    floor=st.booleans(),
+    kind=st.sampled_from(KINDS),
+)
+def test_answers_equal_brute_force_with_order_and_ties(
+    seed: int,
+    count: int,
+    pieces: int,
+    k: int,
+    asked_share: float,
+    matched: bool,
+    duplicates: int,
+    floor: bool,
+    kind: str,
+) -> None:
+    rng = np.random.default_rng(seed)
+    rows = places(seed, count, DIMENSION)
+    for _ in range(duplicates):
+        a, b = rng.integers(0, count, 2)
+        rows[a] = rows[b]
+    rows[rng.integers(0, count)] = 0
+    query = rng.standard_normal(DIMENSION).astype(np.float32)
+    if matched:
+        query = query * np.float32(0.005) + rows[rng.integers(count)]
+    asked = rng.random(count) < asked_share
+    snapshot = on_device(snapshot_of(rows, min(pieces, count), "int8"), kind)
+    found = answer(snapshot, query, asked, Question(k, 0.1 if floor else None))
+    assert hits_of(found) == brute_force(rows, query, k, asked, 0.1 if floor else -2.0)
+    if asked.any() and query.any():
+        assert found.certificate == "bound"
+        assert found.rows_scanned == int(asked.sum())
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("dimension", [3, 100, 7168, 20_000])
+def test_no_score_is_further_off_than_its_bound(kind: str, dimension: int) -> None:
+    rows = places(3, 40, dimension)
+    rows[0], rows[0, 0] = 0, 1
+    rows[1] = 1 / math.sqrt(dimension)
+    rows[2] = 0
+    snapshot = on_device(snapshot_of(rows, 2, "int8"), kind)
+    resident = snapshot.resident
+    assert resident is not None
+    queries = np.stack([rows[0], rows[1], rows[5] * np.float32(1e-20), -rows[9]])
+    chunks = list(resident.chunks.values())
+    scores, bounds = gpu._scores(chunks, kind, queries, torch.device("cpu"))
+    unit = queries.astype(np.float64)
+    unit /= np.linalg.norm(unit, axis=1, keepdims=True)
+    errors = np.abs(scores.numpy() - unit @ rows.astype(np.float64).T)
+    assert np.all(errors <= bounds.numpy())
+    assert bounds.max() < (2e-3 if kind == "float16" else 0.04)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_queries_of_a_batch_do_not_see_each_other(kind: str) -> None:
+    rows = places(5, 120, DIMENSION)
+    snapshot = on_device(snapshot_of(rows, by="int8"), kind)
+    assert snapshot.resident is not None
+    rng = np.random.default_rng(1)
+    batch = [
+        Asked(rows[number], rng.random(120) < 0.7, k, least)
+        for number, k, least in ((3, 1, -math.inf), (7, 20, 0.1), (50, 400, -math.inf))
+    ]
+    together = snapshot.resident.candidates(batch)
+    for asked, found in zip(batch, together, strict=True):
+        (alone,) = snapshot.resident.candidates([asked])
+        np.testing.assert_array_equal(found.rows, alone.rows)
+        assert found.floor == pytest.approx(alone.floor, abs=1e-6)
+        assert asked.rows[found.rows].all()
+
+
+def test_only_new_chunks_are_copied_to_the_device(monkeypatch: pytest.MonkeyPatch) -> None:
+    rows = places(6, 90, DIMENSION)
+    whole = snapshot_of(rows, 3, "int8")
+    first = replace(whole, chunks=whole.chunks[:2])
+    residency = Residency(device_with())
+    old = residency.fill(first)
+    copied: list[int] = []
+    make = Device._half
+
+    def counted(self: Device, some: Any) -> Any:
+        copied.append(len(some))
+        return make(self, some)
+
+    monkeypatch.setattr(Device, "_half", counted)
+    new = residency.carry(whole, old)
+    assert copied == [30]
+    found = answer(new, rows[80], np.ones(90, bool), Question(5))
+    assert hits_of(found) == brute_force(rows, rows[80], 5, np.ones(90, bool))
+    monkeypatch.setattr(device_module, "QUICK_BYTES", 0)
+    assert residency.carry(whole, old).resident is None, "many rows are copied while none waits"
+    assert residency.wants(residency.carry(whole, old))
+
+
+def test_memory_of_a_forgotten_snapshot_and_of_merged_chunks_is_free() -> None:
+    whole = snapshot_of(places(6, 90, DIMENSION), 3, "int8")
+    residency = Residency(device_with())
+    old = residency.fill(whole)
+    assert old.resident is not None
+    resident = weakref.ref(old.resident)
+    tensors = [weakref.ref(chunk.numbers) for chunk in old.resident.chunks.values()]
+    new = residency.carry(replace(whole, chunks=whole.chunks[1:]), old)
+    del old
+    gc.collect()
+    assert [tensor() is None for tensor in tensors] == [True, False, False]
+    assert resident() is None
+    del new
+    gc.collect()
+    assert all(tensor() is None for tensor in tensors)
+
+
+def test_rows_that_do_not_fit_are_searched_by_the_cpu() -> None:
+    snapshot = snapshot_of(places(6, 90, DIMENSION), 3, "int8")
+    residency = Residency(device_with(1000))
+    found = residency.fill(snapshot)
+    assert found.resident is None
+    assert not residency.wants(found), "it is tried again later, not at every look"
+    assert not residency.lacks_int8(found)
+    unbounded = replace(snapshot, chunks=tuple(replace(c, int8=None) for c in snapshot.chunks))
+    little = Residency(device_with(90_000))
+    assert little.fill(unbounded).resident is None
+    assert little.lacks_int8(unbounded), "a byte for each number would fit"
+    assert little.fill(snapshot).resident is not None
+    assert not Residency(device_with(1000)).lacks_int8(unbounded)
+
+
+def out_of_memory(*_: object, **__: object) -> Any:
+    raise torch.OutOfMemoryError("CUDA out of memory")
+
+
+def test_device_out_of_memory_when_asked_leaves_the_query_to_the_cpu(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    rows = places(6, 90, DIMENSION)
+    residency = Residency(device_with())
+    snapshot = residency.fill(snapshot_of(rows, by="int8"))
+    everything = np.ones(90, bool)
+    with monkeypatch.context() as patch, caplog.at_level(logging.ERROR):
+        patch.setattr(gpu, "_scores", out_of_memory)
+        found = answer(snapshot, rows[3], everything, Question(7))
+    assert hits_of(found) == brute_force(rows, rows[3], 7, everything)
+    assert "searched by the CPU: CUDA out of memory" in caplog.text
+    (status,) = residency.status([snapshot])
+    assert status.failure == "CUDA out of memory"
+    assert status.generations == {}
+    assert residency.wants(snapshot), "what failed is taken from the device"
+    without = residency.fill(snapshot)
+    assert without.resident is None
+    assert not residency.wants(without), "and tried again after a while"
+    monkeypatch.setattr(residency, "_again", {})
+    (status,) = residency.status([residency.fill(without)])
+    assert status.failure is None
+    assert status.generations == {snapshot.generation_id: "float16"}
+    assert status.resident_bytes >= 90 * DIMENSION * 2
+
+
+def test_device_out_of_memory_when_loading_is_told_and_tried_again_later(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    snapshot = snapshot_of(places(6, 90, DIMENSION), by="int8")
+    residency = Residency(device_with())
+    with monkeypatch.context() as patch, caplog.at_level(logging.ERROR):
+        patch.setattr(Device, "_half", out_of_memory)
+        assert residency.fill(snapshot).resident is None
+    assert "is searched by the CPU for now: CUDA out of memory" in caplog.text
+    (status,) = residency.status([snapshot])
+    assert status.failure == "CUDA out of memory"
+    assert not residency.wants(snapshot)
+    monkeypatch.setattr(residency, "_again", {})
+    assert residency.wants(snapshot)
+
+
+def test_dense_mode_never_asks_the_device(monkeypatch: pytest.MonkeyPatch) -> None:
+    rows = places(6, 90, DIMENSION)
+    snapshot = on_device(snapshot_of(rows, by="int8"), "float16")
+    monkeypatch.setattr(gpu, "_scores", out_of_memory)
+    found = answer(snapshot, rows[3], np.ones(90, bool), Question(7, mode=Mode.DENSE))
+    assert found.certificate == "exhaustive"
+
+
+def test_device_that_adds_up_carelessly_is_found_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    device_with().trial()
+    exact = gpu._half_products
+
+    def in_float16(chunk: Any, columns: Any) -> Any:
+        return exact(chunk, columns).half().double()
+
+    monkeypatch.setattr(gpu, "_half_products", in_float16)
+    with pytest.raises(Unfit, match="less exactly"):
+        device_with().trial()
+
+
+def test_device_failures_are_told_from_other_errors(monkeypatch: pytest.MonkeyPatch) -> None:
+    snapshot = on_device(snapshot_of(places(6, 90, DIMENSION), by="int8"), "float16")
+    assert snapshot.resident is not None
+    monkeypatch.setattr(gpu, "_scores", out_of_memory)
+    with pytest.raises(DeviceFailed, match="out of memory"):
+        snapshot.resident.candidates(
+            [Asked(np.ones(DIMENSION, np.float32), np.ones(90, bool), 1, -math.inf)]
+        )
+
+
+@pytest.mark.parametrize("sees_driver", [False, True])
+def test_without_a_gpu_search_uses_the_cpu_or_says_what_is_missing(
+    monkeypatch: pytest.MonkeyPatch, sees_driver: bool, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    driver = tmp_path / "driver"
+    if sees_driver:
+        driver.touch()
+    monkeypatch.setattr(device_module, "DRIVERS", (driver,))
+    assert open_device("auto") is None
+    assert open_device("cpu") is None
+    with pytest.raises(Misconfigured, match="no CUDA device"):
+        open_device("cuda")
+
+
+def test_without_pytorch_search_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    assert open_device("auto") is None
+    with pytest.raises(Misconfigured, match="search-gpu"):
+        open_device("cuda")
