@@ -43,8 +43,8 @@ SearchMode = Annotated[
     Mode,
     Query(
         alias="mode",
-        description="How to search: `auto`, whichever reads least, or `dense`, every row. The "
-        "photos are the same.",
+        description="How to search: `auto`, whichever reads least; `dense`, every row; "
+        "`deterministic`, leaving nothing to chance. The photos are the same.",
     ),
 ]
 MostRows = Annotated[
