@@ -24,7 +24,7 @@ from shared.vision.passes import PhotoDoesNotFit
 from shared.vision.pca import Projection
 from shared.vision.pca_file import decode_whitening
 from shared.vision.precision import choose_precision
-from shared.vision.provenance import check_fits
+from shared.vision.provenance import check_fits, check_width
 from shared.vision.vocabulary import Centres
 from shared.vision.vocabulary_file import VocabularyFile, read_vocabulary
 
@@ -125,7 +125,9 @@ def own_vocabulary(recipe: Recipe, vocabulary: Path | None) -> VocabularyFile | 
             raise Unprocessable(
                 "vocabulary_unfit", f"The extractor {recipe.name} uses no vocabulary."
             )
-        return read_vocabulary(vocabulary)
+        own = read_vocabulary(vocabulary)
+        check_width(own.centres, recipe, recipe.width)  # before the weights are loaded
+        return own
     if recipe.needs_vocabulary and recipe.shipped_vocabulary is None:
         raise Misconfigured(
             "vocabulary_missing",

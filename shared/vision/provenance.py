@@ -10,6 +10,7 @@ from __future__ import annotations
 from typing import Any
 
 from shared.errors import Unprocessable
+from shared.recipes import Recipe
 from shared.vision.extractors import Extractor
 from shared.vision.fit import Fit
 from shared.vision.vocabulary import Centres
@@ -70,11 +71,17 @@ def check_fits(provenance: Provenance, centres: Centres, extractor: Extractor) -
                 learnt_with=learnt,
                 extractor_makes=made,
             )
-    if centres.dimension != extractor.backbone.width:
+    check_width(centres, extractor.recipe, extractor.backbone.width)
+
+
+def check_width(centres: Centres, recipe: Recipe, width: int | None) -> None:
+    """Unprocessable (`vocabulary_unfit`) unless the centres are as wide as the recipe's local
+    features; None: only the loaded network tells."""
+    if width is not None and centres.dimension != width:
         raise Unprocessable(
             "vocabulary_unfit",
             f"The vocabulary has {centres.dimension} dimensions, the local features of "
-            f"{extractor.recipe.name} {extractor.backbone.width}.",
+            f"{recipe.name} {width}.",
         )
 
 

@@ -35,9 +35,9 @@ class Gate:
         self.seen: list[str] = []
         describe = Extractor.describe
 
-        def described(made: Extractor, pixels: Any, centres: Any) -> Any:
+        def described(made: Extractor, pixels: Any, *made_with: Any) -> Any:
             self.seen.append(f"describe {len(pixels)}")
-            return describe(made, pixels, centres)
+            return describe(made, pixels, *made_with)
 
         def published(catalog: Any, store: Any, batch: Any, *more: Any) -> Any:
             if len(batch.jobs) == BATCH:

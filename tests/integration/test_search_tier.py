@@ -57,7 +57,7 @@ def tier_of(catalog: Catalog, store: FolderStore, settings: Settings) -> Any:
 
     def open_tier(*replicas: int, **changes: object) -> SearchTier:
         own = settings.model_copy(
-            update={"search_wait_seconds": 0.2, "search_timeout_seconds": 2.0, **changes}
+            update={"search_wait_seconds": 0.2, "search_timeout_seconds": 10.0, **changes}
         )
         tier = SearchTier(catalog, store, own, replicas)
         tier.follow()
