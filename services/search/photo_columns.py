@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from datetime import UTC, datetime
 from functools import cached_property
@@ -67,21 +67,21 @@ class PhotoColumns:
         return list(self.photo_id[rows])
 
     @cached_property
-    def rows_by_tag(self) -> Mapping[str, NDArray[np.intp]]:
+    def rows_by_tag(self) -> Mapping[str, NDArray[np.int64]]:
         return _rows_by((tag, row) for row, tags in enumerate(self.tags) for tag in tags)
 
     @cached_property
-    def rows_by_place(self) -> Mapping[str, NDArray[np.intp]]:
+    def rows_by_place(self) -> Mapping[str, NDArray[np.int64]]:
         return _rows_by((place, row) for row, place in enumerate(self.place) if place is not None)
 
     def changed(self, changes: Mapping[UUID, PhotoFacts]) -> PhotoColumns:
         """The columns with what has changed; itself when none of the photos is here."""
-        here = [(row, changes[id_]) for row, id_ in enumerate(self.photo_id) if id_ in changes]
-        if not here:
+        here = rows_of(self, changes)
+        if not len(here):
             return self
         copy = PhotoColumns(*(getattr(self, column.name).copy() for column in fields(self)))
-        for row, photo in here:
-            copy._set(row, photo)
+        for row in here.tolist():
+            copy._set(row, changes[self.photo_id[row]])
         return copy
 
     def _set(self, row: int, photo: PhotoFacts) -> None:
@@ -129,11 +129,11 @@ class JoinedColumns:
         return self._joined([part.id_ends for part in self.parts], np.uint64)
 
     @cached_property
-    def rows_by_tag(self) -> Mapping[str, NDArray[np.intp]]:
+    def rows_by_tag(self) -> Mapping[str, NDArray[np.int64]]:
         return _JoinedRows([part.rows_by_tag for part in self.parts], self.first)
 
     @cached_property
-    def rows_by_place(self) -> Mapping[str, NDArray[np.intp]]:
+    def rows_by_place(self) -> Mapping[str, NDArray[np.int64]]:
         return _JoinedRows([part.rows_by_place for part in self.parts], self.first)
 
     def ids(self, rows: NDArray[np.int64]) -> list[UUID | None]:
@@ -150,16 +150,16 @@ class JoinedColumns:
         return np.concatenate(parts) if parts else np.empty(0, dtype)
 
 
-class _JoinedRows(Mapping[str, NDArray[np.intp]]):
+class _JoinedRows(Mapping[str, NDArray[np.int64]]):
     """Rows by a text, of several chunks: found chunk by chunk, when they are asked for."""
 
     def __init__(
-        self, parts: list[Mapping[str, NDArray[np.intp]]], first: NDArray[np.int64]
+        self, parts: list[Mapping[str, NDArray[np.int64]]], first: NDArray[np.int64]
     ) -> None:
         self._parts = parts
         self._first = first
 
-    def __getitem__(self, text: str) -> NDArray[np.intp]:
+    def __getitem__(self, text: str) -> NDArray[np.int64]:
         found = [
             part[text] + begin
             for part, begin in zip(self._parts, self._first, strict=False)
@@ -176,11 +176,22 @@ class _JoinedRows(Mapping[str, NDArray[np.intp]]):
         return len(set().union(*self._parts))
 
 
-def _rows_by(pairs: Iterable[tuple[str, int]]) -> dict[str, NDArray[np.intp]]:
+Columns = PhotoColumns | JoinedColumns
+
+
+def rows_of(photos: Columns, ids: Collection[UUID]) -> NDArray[np.int64]:
+    """The rows of these photos, rising."""
+    ends = np.fromiter((id_.int & LOW for id_ in ids), np.uint64, len(ids))
+    alike = np.flatnonzero(np.isin(photos.id_ends, ends))
+    wanted = frozenset(ids)
+    return alike[np.fromiter((id_ in wanted for id_ in photos.ids(alike)), bool, len(alike))]
+
+
+def _rows_by(pairs: Iterable[tuple[str, int]]) -> dict[str, NDArray[np.int64]]:
     found: dict[str, list[int]] = {}
     for text, row in pairs:
         found.setdefault(text, []).append(row)
-    return {text: np.array(rows, np.intp) for text, rows in found.items()}
+    return {text: np.array(rows, np.int64) for text, rows in found.items()}
 
 
 def as_microseconds(when: datetime | None) -> np.datetime64:

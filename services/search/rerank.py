@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from services.search.blocks import Indices, RowBlocks
 from services.search.kernels import products_at
+from services.search.parts import in_parts
 
 STEP = 8  # rows compared exactly between two looks at the floor
 
@@ -78,10 +79,18 @@ class Rerank:
             # The first k are needed in any case.
             upto = min(len(rows), max(self.k, done + STEP), budget.rows or len(rows))
             self.read_ahead(rows[done:upto])
-            products_at(self.blocks.rows_at(rows[done:upto]), self.query, scores[done:upto])
+            self._multiply(rows[done:upto], scores[done:upto])
             scores[done:upto] /= self.norm
             done = upto
             if done >= self.k:
                 kth = float(np.partition(scores[:done], done - self.k)[done - self.k])
                 floor = max(floor, kth)
         return Compared(rows[:done], scores[:done], unseen)
+
+    def _multiply(self, rows: Indices, out: Scores) -> None:
+        at = self.blocks.rows_at(rows)
+        in_parts(
+            lambda i, j: products_at(at[i:j], self.query, out[i:j]),
+            len(rows),
+            4 * self.blocks.dimension,
+        )

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from uuid import UUID
 
 import numpy as np
 from numpy.typing import NDArray
 
-from services.search.photo_columns import LOW, JoinedColumns, PhotoColumns, as_microseconds
+from services.search.photo_columns import Columns, as_microseconds, rows_of
 from shared.geodesy import distances_m
 from shared.photo_filter import Box, PhotoFilter
 
 Mask = NDArray[np.bool_]
-Columns = PhotoColumns | JoinedColumns
+NO_ROWS = np.empty(0, np.int64)
 
 
 def select(photos: Columns, wanted: PhotoFilter, exclude: Collection[UUID]) -> Mask:
@@ -24,13 +24,13 @@ def select(photos: Columns, wanted: PhotoFilter, exclude: Collection[UUID]) -> M
     """
     mask = photos.findable.copy()
     if wanted.ids is not None:
-        mask &= _one_of(photos, wanted.ids)
+        mask &= _among(rows_of(photos, wanted.ids), len(mask))
     if wanted.place is not None:
-        mask &= _among(photos.rows_by_place, wanted.place, len(mask))
+        mask &= _among(photos.rows_by_place.get(wanted.place, NO_ROWS), len(mask))
     for tag in wanted.tags:
-        mask &= _among(photos.rows_by_tag, tag, len(mask))
+        mask &= _among(photos.rows_by_tag.get(tag, NO_ROWS), len(mask))
     if exclude:
-        mask &= ~_one_of(photos, exclude)
+        mask[rows_of(photos, exclude)] = False
     if wanted.captured_after is not None:
         mask &= photos.captured_at >= as_microseconds(wanted.captured_after)
     if wanted.captured_before is not None:
@@ -55,17 +55,7 @@ def _inside(photos: Columns, box: Box) -> Mask:
     return inside
 
 
-def _among(rows: Mapping[str, NDArray[np.intp]], text: str, count: int) -> Mask:
+def _among(rows: NDArray[np.int64], count: int) -> Mask:
     mask = np.zeros(count, bool)
-    if text in rows:
-        mask[rows[text]] = True
-    return mask
-
-
-def _one_of(photos: Columns, ids: Collection[UUID]) -> Mask:
-    ends = np.array([id_.int & LOW for id_ in ids], np.uint64)
-    mask = np.isin(photos.id_ends, ends)
-    found = np.flatnonzero(mask)
-    wanted = frozenset(ids)
-    mask[found] = np.fromiter((id_ in wanted for id_ in photos.ids(found)), bool, len(found))
+    mask[rows] = True
     return mask
