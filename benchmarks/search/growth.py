@@ -81,7 +81,7 @@ def _blocks(codes: np.ndarray[tuple[int, int], np.dtype[np.uint64]]) -> Blocks:
     return Blocks(
         dimension=DIMENSION,
         first=np.array([*begins, len(codes)], np.int64),
-        levels=((codes.ctypes.data + begins * codes.strides[0]).astype(np.uint64),),
+        levels=(codes.ctypes.data + begins * codes.strides[0]).astype(np.uint64)[np.newaxis],
         rows=nothing,
         norms=np.ones(len(codes), np.float32),
         zeros=np.empty(0, np.int64),

@@ -90,9 +90,9 @@ def touched() -> Iterator[Touched]:
     lock = threading.Lock()
     loops: dict[str, Callable[..., int]] = {
         "distances": _of_distances,
-        "distances_at": lambda at, query, _: 8 * len(query) * len(at),
-        "weighted_at": lambda at, planes, _: 8 * planes.shape[1] * len(at),
-        "products_at": lambda at, query, _: 4 * len(query) * len(at),
+        "distances_at": lambda _, __, rows, query, *___: 8 * len(query) * len(rows),
+        "weighted_at": lambda _, __, rows, ___, planes, ____: 8 * planes.shape[1] * len(rows),
+        "products_at": lambda _, __, rows, query, *___: 4 * len(query) * len(rows),
     }
 
     def counted(loop: Callable[..., Any], bytes_of: Callable[..., int]) -> Callable[..., Any]:

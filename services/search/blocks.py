@@ -39,16 +39,6 @@ class RowBlocks:
     def __len__(self) -> int:
         return int(self.first[-1])
 
-    def at(self, begins: Addresses, indices: Indices, bytes_each: int) -> Addresses:
-        """The addresses of these rows in blocks that begin at `begins`."""
-        block = np.searchsorted(self.first, indices, side="right") - 1
-        inside = (indices - self.first[block]).astype(np.uint64)
-        return begins[block] + inside * np.uint64(bytes_each)
-
-    def rows_at(self, indices: Indices) -> Addresses:
-        """The addresses of these float32 rows."""
-        return self.at(self.rows, indices, 4 * self.dimension)
-
 
 def addresses(arrays: Iterable[NDArray[Any]]) -> Addresses:
     """Where each array begins."""

@@ -47,8 +47,8 @@ FEW = 4 * FIRST_LOOK
 class Blocks(RowBlocks):
     """Where the sign codes and the rows of n photos lie, in c blocks."""
 
-    levels: tuple[Addresses, ...]
-    """(c,) for each level of the codes: where the block's begin."""
+    levels: Addresses
+    """(levels, c): where each block's codes of a level begin."""
     norms: NDArray[np.float32]
     """(n,): |x|_1 of each rotated row; 0 for a row of zeros."""
     zeros: Indices
@@ -67,7 +67,9 @@ class Blocks(RowBlocks):
             first=rows.first,
             rows=rows.rows,
             kept=rows.kept,
-            levels=tuple(map(addresses, zip(*(code.levels for code in codes), strict=True))),
+            levels=np.stack(
+                [addresses(parts) for parts in zip(*(c.levels for c in codes), strict=True)]
+            ),
             norms=norms,
             zeros=np.flatnonzero(norms == 0),
         )
@@ -186,13 +188,14 @@ def warm_up() -> None:
         first=np.array([0, 1]),
         rows=addresses([row]),
         kept=(codes, row),
-        levels=tuple(addresses([level]) for level in codes.levels),
+        levels=np.stack([addresses([level]) for level in codes.levels]),
         norms=codes.norms,
         zeros=np.empty(0, np.int64),
     )
     query = CodedQuery.of(row, rotation(len(row)))
     (first,) = glance(blocks, [query], [np.ones(1, bool)])
-    distances_at(np.empty(0, np.uint64), query.bits, np.empty(0, np.int64))
+    none = np.empty(0, np.int64)
+    distances_at(blocks.levels[0], blocks.first, none, query.bits, none)
     Refinement(blocks, query, 1, None, lambda _: None).search(first, Budget())
 
 
@@ -267,9 +270,13 @@ class Refinement:
     def _count(self, rows: Indices, level: int, differ: Indices) -> None:
         """Add the bits of a level that differ."""
         begin, end = int(self._ends[level - 1]), int(self._ends[level])
-        at = self._blocks.at(self._blocks.levels[level], rows, 8 * (end - begin))
         bits = self._query.bits[begin:end]
-        in_parts(lambda i, j: distances_at(at[i:j], bits, differ[i:j]), len(rows), 8 * len(bits))
+        codes, first = self._blocks.levels[level], self._blocks.first
+        in_parts(
+            lambda i, j: distances_at(codes, first, rows[i:j], bits, differ[i:j]),
+            len(rows),
+            8 * len(bits),
+        )
 
     def _prune(self, rows: Indices, level: int, differ: Indices) -> tuple[Indices, Indices]:
         kept = differ <= self._limit(level)
@@ -291,14 +298,15 @@ class Refinement:
         return self._estimated.of(rows)
 
     def _weigh(self, rows: Indices) -> _Estimates:
-        query = self._query
-        sums = np.zeros((len(rows), 2), np.int64)
-        begin = 0
-        for level, words in enumerate(self._words):
-            at = self._blocks.at(self._blocks.levels[level], rows, 8 * words)
-            planes = np.ascontiguousarray(query.planes[:, begin : begin + words])
-            _add_weighted(at, planes, sums)
-            begin += words
+        query, blocks, ends = self._query, self._blocks, self._ends
+        sums = np.empty((len(rows), 2), np.int64)
+        in_parts(
+            lambda i, j: weighted_at(
+                blocks.levels, blocks.first, rows[i:j], ends, query.planes, sums[i:j]
+            ),
+            len(rows),
+            5 * self._padded // 8,  # five times the work of a glance at as many bytes
+        )
         norms = self._blocks.norms[rows].astype(np.float64)
         zero = norms == 0.0
         norms[zero] = 1.0
@@ -326,12 +334,6 @@ class Refinement:
             max_z=float(np.max(errors / np.where(sure > 0, sure, np.inf), initial=0.0)),
             unseen=compared.unseen,
         )
-
-
-def _add_weighted(at: Addresses, planes: Words, sums: Indices) -> None:
-    words = planes.shape[1]
-    # Five times the work of a glance at as many bytes.
-    in_parts(lambda i, j: weighted_at(at[i:j], planes, sums[i:j]), len(at), 5 * 8 * words)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

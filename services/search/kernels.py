@@ -20,6 +20,8 @@ NOT_ASKED = 65_535  # more than any distance
 EXACT_TERMS = 1024  # so many products of a byte and 15 bits add up to less than 2^31
 ROUNDING = 1e-9  # more than what float64 loses of a score anywhere: 2^-53 for each of 100,000 terms
 PLANES = 4  # `weighted_at` is written for so many
+EACH_BYTE = np.uint64(0x0101010101010101)
+GATHER = np.uint64(0x0102040810204080)
 
 Words = NDArray[np.uint64]
 Addresses = NDArray[np.uint64]
@@ -91,6 +93,13 @@ def distances(
                 counts[number, differ] += 1
         begin = upto
         block += 1
+
+
+@compiled(IN_LANES)
+def _address(begins: Addresses, first: NDArray[np.int64], row: int, row_bytes: int) -> np.uint64:
+    """Where a row lies: blocks begin at `begins` (c,), with the rows from `first` (c + 1,) on."""
+    block = np.searchsorted(first, row, side="right") - 1
+    return begins[block] + np.uint64((row - first[block]) * row_bytes)
 
 
 @compiled(IN_LANES)
@@ -169,11 +178,19 @@ def _replace_least(heap: NDArray[np.float64], value: float) -> None:
 
 
 @compiled(IN_LANES)
-def distances_at(addresses: Addresses, query: Words, out: NDArray[np.int64]) -> None:
-    """Add to `out` how many bits differ of the code at each address."""
+def distances_at(
+    begins: Addresses,
+    first: NDArray[np.int64],
+    rows: NDArray[np.int64],
+    query: Words,
+    out: NDArray[np.int64],
+) -> None:
+    """Add to `out` how many bits of the query differ from the code of each of these rows; blocks
+    begin at `begins` (c,), with the rows from `first` (c + 1,) on."""
     words = query.shape[0]
-    for number in range(addresses.shape[0]):
-        code = nb.carray(_words_at(addresses[number]), (words,))
+    for number in range(rows.shape[0]):
+        at = _address(begins, first, rows[number], 8 * words)
+        code = nb.carray(_words_at(at), (words,))
         differ = np.uint64(0)
         for i in range(words):
             differ += _popcount(code[i] ^ query[i])
@@ -181,30 +198,51 @@ def distances_at(addresses: Addresses, query: Words, out: NDArray[np.int64]) -> 
 
 
 @compiled(IN_LANES)
-def weighted_at(addresses: Addresses, planes: Words, out: NDArray[np.int64]) -> None:
-    """Add to out (n, 2), of the code at each address: its ones, and the sum over its ones of the
-    whole numbers of which planes (PLANES, words) hold the bits."""
-    words = planes.shape[1]
-    for number in range(addresses.shape[0]):
-        code = nb.carray(_words_at(addresses[number]), (words,))
+def weighted_at(
+    begins: Addresses,
+    first: NDArray[np.int64],
+    rows: NDArray[np.int64],
+    ends: NDArray[np.int64],
+    planes: Words,
+    out: NDArray[np.int64],
+) -> None:
+    """Of the whole code of each of these rows, to out (n, 2): its ones, and the sum over its ones
+    of the whole numbers of which planes (PLANES, words) hold the bits. Level l of the codes ends
+    at word ends[l]; its blocks begin at begins[l] (c,), with the rows from `first` (c + 1,) on."""
+    for number in range(rows.shape[0]):
         ones = units = twos = fours = eights = np.uint64(0)
-        for i in range(words):
-            word = code[i]
-            ones += _popcount(word)
-            units += _popcount(word & planes[0, i])
-            twos += _popcount(word & planes[1, i])
-            fours += _popcount(word & planes[2, i])
-            eights += _popcount(word & planes[3, i])
-        out[number, 0] += np.int64(ones)
-        out[number, 1] += np.int64(units + 2 * twos + 4 * fours + 8 * eights)
+        begin = np.int64(0)
+        for level in range(ends.shape[0]):
+            words = ends[level] - begin
+            at = _address(begins[level], first, rows[number], 8 * words)
+            code = nb.carray(_words_at(at), (words,))
+            weights = planes[:, begin : ends[level]]
+            one, two, four, eight = weights[0], weights[1], weights[2], weights[3]
+            for i in range(words):
+                word = code[i]
+                ones += _popcount(word)
+                units += _popcount(word & one[i])
+                twos += _popcount(word & two[i])
+                fours += _popcount(word & four[i])
+                eights += _popcount(word & eight[i])
+            begin = ends[level]
+        out[number, 0] = np.int64(ones)
+        out[number, 1] = np.int64(units + 2 * twos + 4 * fours + 8 * eights)
 
 
 @compiled(IN_LANES)
-def products_at(addresses: Addresses, query: NDArray[np.float32], out: NDArray[np.float64]) -> None:
-    """The products of float32 rows with the query, in float64: each term is exact, and the sums
-    of equal rows are equal."""
-    for number in range(addresses.shape[0]):
-        row = nb.carray(_floats_at(addresses[number]), query.shape)
+def products_at(
+    begins: Addresses,
+    first: NDArray[np.int64],
+    rows: NDArray[np.int64],
+    query: NDArray[np.float32],
+    out: NDArray[np.float64],
+) -> None:
+    """The products of these float32 rows with the query, in float64: each term is exact, and the
+    sums of equal rows are equal. Blocks begin at `begins`, with the rows from `first` on."""
+    for number in range(rows.shape[0]):
+        at = _address(begins, first, rows[number], 4 * query.shape[0])
+        row = nb.carray(_floats_at(at), query.shape)
         total = 0.0
         for i in range(query.shape[0]):
             total += np.float64(row[i]) * np.float64(query[i])
@@ -238,6 +276,7 @@ def in_planes(
     inverse = np.float32(1.0) / step
     total = product = square = 0.0
     whole = np.empty(64, np.uint8)
+    eights = whole.view(np.uint64)
     for i in range(planes.shape[1]):
         part = numbers[64 * i : 64 * i + 64]
         sums = sums_of_products = sums_of_squares = np.float32(0.0)
@@ -253,8 +292,9 @@ def in_planes(
         square += sums_of_squares
         for plane in range(PLANES + 1):
             word = np.uint64(0)
-            for j in range(64):
-                word |= (np.uint64(whole[j] >> plane) & np.uint64(1)) << np.uint64(j)
+            for j in range(8):  # the product gathers one bit of each byte in the highest byte
+                ones = (eights[j] >> np.uint64(plane)) & EACH_BYTE
+                word |= ((ones * GATHER) >> np.uint64(56)) << np.uint64(8 * j)
             if plane < PLANES:
                 planes[plane, i] = word
             else:

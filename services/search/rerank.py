@@ -88,9 +88,9 @@ class Rerank:
         return Compared(rows[:done], scores[:done], unseen)
 
     def _multiply(self, rows: Indices, out: Scores) -> None:
-        at = self.blocks.rows_at(rows)
+        blocks = self.blocks
         in_parts(
-            lambda i, j: products_at(at[i:j], self.query, out[i:j]),
+            lambda i, j: products_at(blocks.rows, blocks.first, rows[i:j], self.query, out[i:j]),
             len(rows),
-            4 * self.blocks.dimension,
+            4 * blocks.dimension,
         )

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from shared.codes.compiled import IN_ORDER, compiled
@@ -21,31 +26,33 @@ def _radix4(a: Floats, b: Floats, c: Floats, d: Floats) -> None:
         a[j], b[j], c[j], d[j] = p + q, p - q, r + s, r - s
 
 
-@compiled(IN_ORDER)
-def _radix2(a: Floats, b: Floats) -> None:
-    for j in range(a.shape[0]):
-        a[j], b[j] = a[j] + b[j], a[j] - b[j]
+def _last_strides(numbers: int) -> Any:
+    @intrinsic
+    def last_strides(_typing: Any, _address: types.Type) -> Any:
+        """Multiply the `numbers` float32 at an address by their Hadamard matrix, in registers."""
+
+        def generate(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
+            vector = ir.VectorType(ir.FloatType(), numbers)
+            place = builder.inttoptr(arguments[0], vector.as_pointer())
+            x = builder.load(place, align=4)
+            stride = numbers >> 1
+            while stride:
+                partners = [j ^ stride for j in range(numbers)]
+                lanes = ir.Constant(ir.VectorType(ir.IntType(32), numbers), partners)
+                signs = ir.Constant(vector, [-1.0 if j & stride else 1.0 for j in range(numbers)])
+                other = builder.shuffle_vector(x, ir.Constant(vector, ir.Undefined), lanes)
+                x = builder.fadd(other, builder.fmul(x, signs))
+                stride >>= 1
+            builder.store(x, place, align=4)
+            return _context.get_dummy_value()
+
+        return types.void(types.intp), generate
+
+    return last_strides
 
 
-@compiled(IN_ORDER)
-def _strides_4_and_8(x: Floats) -> None:
-    groups = x.reshape(-1, 16)
-    for j in range(groups.shape[0]):
-        for i in range(4):
-            a, b, c, d = groups[j, i], groups[j, i + 4], groups[j, i + 8], groups[j, i + 12]
-            p, q, r, s = a + c, b + d, a - c, b - d
-            groups[j, i], groups[j, i + 4] = p + q, p - q
-            groups[j, i + 8], groups[j, i + 12] = r + s, r - s
-
-
-@compiled(IN_ORDER)
-def _strides_1_and_2(x: Floats) -> None:
-    groups = x.reshape(-1, 4)
-    for j in range(groups.shape[0]):
-        a, b, c, d = groups[j, 0], groups[j, 1], groups[j, 2], groups[j, 3]
-        p, q, r, s = a + c, b + d, a - c, b - d
-        groups[j, 0], groups[j, 1] = p + q, p - q
-        groups[j, 2], groups[j, 3] = r + s, r - s
+_last_16 = _last_strides(16)
+_last_32 = _last_strides(32)
 
 
 @compiled(IN_ORDER)
@@ -64,15 +71,16 @@ def _wide_strides(x: Floats, stride: int, least: int) -> int:
 def hadamard(x: Floats) -> None:
     """Multiply x, (n,) float32, by the n x n Hadamard matrix (Sylvester's, unscaled), in place.
 
-    n is a power of two and at least 16. Every loop runs over neighbours, so that it compiles to
-    vector instructions, and most of them over parts that the nearest cache holds.
+    n is a power of two and at least 16; x is contiguous. Every loop runs over neighbours, so that
+    it compiles to vector instructions, and most of them over parts that the nearest cache holds.
     """
     wide = _wide_strides(x, x.shape[0] >> 1, NEAR)
     for begin in range(0, x.shape[0], 2 * wide):
         near = x[begin : begin + 2 * wide]
-        stride = _wide_strides(near, wide, 16)
-        if stride == 16:
+        address = near.ctypes.data
+        if _wide_strides(near, wide, 16) == 16:
             for at in range(0, near.shape[0], 32):
-                _radix2(near[at : at + 16], near[at + 16 : at + 32])
-        _strides_4_and_8(near)
-        _strides_1_and_2(near)
+                _last_32(address + 4 * at)
+        else:
+            for at in range(0, near.shape[0], 16):
+                _last_16(address + 4 * at)

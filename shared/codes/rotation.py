@@ -35,6 +35,7 @@ ROUNDS = 2
 BLOCKS = (1, 3, 5, 7)
 LEAST_BLOCK = 64
 RUN = 16
+COLUMNS = 1024  # that are mixed at once: of all blocks they lie in the nearest cache
 
 Floats = NDArray[np.float32]
 
@@ -48,7 +49,7 @@ class Rotation:
     block: int
     signs: Floats
     """(ROUNDS, padded) of +1 and -1; those of the last round carry the scale of all."""
-    runs: NDArray[np.int64]
+    runs: NDArray[np.uint64]
     """(padded / RUN,): the run of numbers that comes to each place between two rounds."""
 
     @property
@@ -98,7 +99,7 @@ def rotation(dimension: int) -> Rotation:
     bits = np.unpackbits(draw.random_raw(ROUNDS * length // 64).astype("<u8").view(np.uint8))
     signs = (2.0 * bits.reshape(ROUNDS, length) - 1.0).astype(np.float32)
     signs[-1] *= np.float32(math.sqrt(1.0 / block) ** ROUNDS)
-    runs = np.argsort(draw.random_raw(length // RUN), kind="stable")
+    runs = np.argsort(draw.random_raw(length // RUN), kind="stable").astype(np.uint64)
     return Rotation(dimension, blocks, block, signs, runs)
 
 
@@ -108,45 +109,45 @@ def _block(dimension: int, blocks: int) -> int:
 
 
 @compiled(IN_ORDER)
-def _times(x: Floats, factors: Floats) -> None:
-    for j in range(x.shape[0]):
-        x[j] *= factors[j]
-
-
-@compiled(IN_ORDER)
 def _mix(x: Floats, total: Floats) -> None:
-    """(n, b): each column minus 2/n times its sum; `total` (b,) is room for the sums."""
+    """(n, b): each column minus 2/n times its sum; `total` is room for the sums of some."""
     blocks, block = x.shape
-    total[:] = x[0]
-    for i in range(1, blocks):
-        row = x[i]
-        for j in range(block):
-            total[j] += row[j]
     share = np.float32(2.0 / blocks)
-    for i in range(blocks):
-        row = x[i]
-        for j in range(block):
-            row[j] -= share * total[j]
+    for begin in range(0, block, total.shape[0]):
+        end = min(block, begin + total.shape[0])
+        some = total[: end - begin]
+        some[:] = x[0, begin:end]
+        for i in range(1, blocks):
+            part = x[i, begin:end]
+            for j in range(part.shape[0]):
+                some[j] += part[j]
+        for i in range(blocks):
+            part = x[i, begin:end]
+            for j in range(part.shape[0]):
+                part[j] -= share * some[j]
 
 
 @compiled(IN_ORDER)
-def _rotate(rows: Floats, signs: Floats, runs: NDArray[np.int64], blocks: int, out: Floats) -> None:
+def _rotate(
+    rows: Floats, signs: Floats, runs: NDArray[np.uint64], blocks: int, out: Floats
+) -> None:
     dimension = rows.shape[1]
     before = np.empty(out.shape[1], np.float32)
-    total = np.empty(out.shape[1] // blocks, np.float32)
+    total = np.empty(COLUMNS, np.float32)
     for number in range(rows.shape[0]):
-        rotated = out[number]
-        rotated[:dimension] = rows[number]
+        row, rotated = rows[number], out[number]
+        for j in range(dimension):
+            rotated[j] = row[j] * signs[0, j]
         rotated[dimension:] = 0.0
         for turn in range(signs.shape[0]):
             if turn > 0:
                 before[:] = rotated
+                come, there = before.reshape(-1, RUN), rotated.reshape(-1, RUN)
+                flips = signs[turn].reshape(-1, RUN)
                 for place in range(runs.shape[0]):
-                    run = before[runs[place] * RUN : runs[place] * RUN + RUN]
-                    there = rotated[place * RUN : place * RUN + RUN]
+                    run = runs[place]
                     for j in range(RUN):
-                        there[j] = run[j]
-            _times(rotated, signs[turn])
+                        there[place, j] = come[run, j] * flips[place, j]
             parts = rotated.reshape(blocks, -1)
             for part in range(blocks):
                 hadamard(parts[part])
