@@ -14,7 +14,7 @@ from benchmarks.report import Report
 from benchmarks.search.memory import ReadSpeed
 from services.search.cascade import Blocks, CodedQuery, glance
 from shared.codes.rotation import rotation
-from shared.codes.signs import level_words
+from shared.codes.signs import level_ends
 
 DIMENSION = 98_304
 MEASURED = (100_000, 1_000_000)
@@ -28,7 +28,7 @@ SEED = 20_261_121
 def measure_growth(report: Report, progress: Progress, sizes: Sequence[int] = MEASURED) -> None:
     """Scans and reads of the same codes, in turn."""
     turn = rotation(DIMENSION)
-    words = level_words(turn.padded)[0]
+    words = int(level_ends(turn.padded)[0])
     draw = np.random.default_rng(SEED)
     query = CodedQuery.of(draw.standard_normal(DIMENSION).astype(np.float32), turn)
     task = progress.add_task("growth", total=len(sizes) * ROUNDS)

@@ -36,7 +36,7 @@ from services.search.parts import in_parts
 from services.search.rerank import Budget, Rerank, Scores
 from services.search.snapshot import LoadedChunk
 from shared.codes.rotation import Rotation, rotation
-from shared.codes.signs import WORD, Words, level_words, sign_codes
+from shared.codes.signs import WORD, Words, level_ends, sign_codes
 
 BOUND = 6.0
 FIRST_LOOK = 64  # rows whose whole codes are looked at early, for a floor
@@ -162,7 +162,7 @@ def glance(
 ) -> list[Glance]:
     """Compare the first bits of the rows that each query asks for, (n,) bool: one way through
     memory for all queries, each of which sees what it would see alone."""
-    words = level_words(rotation(blocks.dimension).padded)[0]
+    words = int(level_ends(rotation(blocks.dimension).padded)[0])
     bits = np.stack([query.bits[:words] for query in queries])
     masks = np.stack(asked)
     found = np.empty((len(queries), len(blocks)), np.uint16)
@@ -227,8 +227,7 @@ class Refinement:
         self._floor = -math.inf if least is None else least  # what a row has to reach to matter
         self._read_ahead = read_ahead
         self._padded = rotation(blocks.dimension).padded
-        self._words = level_words(self._padded)
-        self._ends = np.cumsum(self._words)
+        self._ends = level_ends(self._padded)
         self._estimated = _Estimates.none()
 
     def search(self, first: Glance, budget: Budget) -> Found:
@@ -237,7 +236,7 @@ class Refinement:
             self._raise_floor(first.nearest(max(FIRST_LOOK, self._k)))
         rows = np.flatnonzero(first.distances <= self._limit(0))
         differ = first.distances[rows].astype(np.int64)
-        last = len(self._words) - 1
+        last = len(self._ends) - 1
         for level in range(1, last + 1):
             if level == last and len(rows) <= FEW:
                 break  # weighing all their bits takes no longer than counting the rest of them
@@ -250,7 +249,8 @@ class Refinement:
             if budget.spent(0):
                 return Found.nothing(first, self._reach(level, differ))
         zeros = self._blocks.zeros
-        rows = np.union1d(rows, zeros[first.distances[zeros] != NOT_ASKED])
+        if len(zeros):
+            rows = np.union1d(rows, zeros[first.distances[zeros] != NOT_ASKED])
         return self._compare(self._estimate(rows), first, budget)
 
     def _limit(self, level: int) -> int:
@@ -292,7 +292,7 @@ class Refinement:
 
     def _estimate(self, rows: Indices) -> _Estimates:
         """The scores of these rows, estimated from their whole codes, and kept."""
-        new = np.setdiff1d(rows, self._estimated.rows, assume_unique=True)
+        new = rows[~self._estimated.has(rows)]
         if len(new):
             self._estimated = self._estimated.joined(self._weigh(new))
         return self._estimated.of(rows)
@@ -358,7 +358,14 @@ class _Estimates:
             np.concatenate([self.deviations, others.deviations])[order],
         )
 
+    def has(self, rows: Indices) -> NDArray[np.bool_]:
+        """Which of any rows are among these."""
+        if not len(self.rows):
+            return np.zeros(len(rows), bool)
+        at = np.minimum(self.rows.searchsorted(rows), len(self.rows) - 1)
+        return self.rows[at] == rows
+
     def of(self, rows: Indices) -> _Estimates:
         """Of some of these rows."""
-        at = np.searchsorted(self.rows, rows)
+        at = self.rows.searchsorted(rows)
         return _Estimates(rows, self.scores[at], self.deviations[at])

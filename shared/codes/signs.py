@@ -18,6 +18,7 @@ Bits of one word: bit j of word i is the sign of number 64 i + j, 1 for what is 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,9 +49,16 @@ class SignCodes:
 
 def level_words(padded: int) -> tuple[int, ...]:
     """The 64-bit words of each level of a code of `padded` bits; their sum is the whole code."""
-    words = padded // WORD
-    ends = [end // WORD for end in (FIRST_BITS, SECOND_BITS) if 2 * end <= padded] + [words]
-    return tuple(end - begin for begin, end in zip([0, *ends[:-1]], ends, strict=True))
+    return tuple(np.diff(level_ends(padded), prepend=0).tolist())
+
+
+@lru_cache(maxsize=8)
+def level_ends(padded: int) -> NDArray[np.int64]:
+    """(levels,): up to which word each level of a code of `padded` bits goes."""
+    firsts = [end // WORD for end in (FIRST_BITS, SECOND_BITS) if 2 * end <= padded]
+    ends = np.array([*firsts, padded // WORD], np.int64)
+    ends.flags.writeable = False
+    return ends
 
 
 def sign_codes(rows: Floats) -> SignCodes:
@@ -63,8 +71,8 @@ def sign_codes(rows: Floats) -> SignCodes:
         rotated = turn.rotate(rows[part])
         words[part] = pack_signs(rotated)
         norms[part] = np.abs(rotated).sum(axis=1, dtype=np.float64)
-    ends = np.cumsum(level_words(turn.padded))[:-1]
-    levels = tuple(np.ascontiguousarray(level) for level in np.split(words, ends, axis=1))
+    parts = np.split(words, level_ends(turn.padded)[:-1], axis=1)
+    levels = tuple(np.ascontiguousarray(level) for level in parts)
     return SignCodes(levels, norms)
 
 
