@@ -92,6 +92,21 @@ class _Snapshots(Collector):
         yield GaugeMetricFamily(
             f"{prefix}_mapped_bytes", "Bytes of descriptors on disk.", status.mapped_bytes
         )
+        on_device = GaugeMetricFamily(
+            f"{prefix}_device_resident_bytes",
+            "Bytes of descriptors in a GPU's memory.",
+            labels=["device"],
+        )
+        failed = GaugeMetricFamily(
+            f"{prefix}_device_failed",
+            "1 while the CPU searches, because the GPU has failed.",
+            labels=["device"],
+        )
+        for device in status.devices:
+            on_device.add_metric([device.name], device.resident_bytes)
+            failed.add_metric([device.name], float(device.failure is not None))
+        yield on_device
+        yield failed
         yield CounterMetricFamily(
             f"{prefix}_code_scans", "Ways through the first codes.", self._worker.together.rounds
         )

@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 
 from services.search import answer, gpu
 from services.search.load import Loader
+from services.search.metrics import SearchMetrics
 from services.search.snapshot import StoredChunk
 from services.search.worker import SearchWorker
 from services.steward.compact import merge_slot
@@ -892,6 +893,15 @@ class TestSearchWorkerOnADevice(TestSearchWorker):
         assert response.certificate == "bound", "a new chunk is on the device at once"
         assert search.status().devices[0].resident_bytes == 2 * before
         assert search.status().devices[0].failure is None
+
+    def test_metrics_tell_what_lies_on_the_device(self, places: SmallMap, port: OpenPort) -> None:
+        places.add(unit_rows(1, 40))
+        search = port()
+        assert isinstance(search, SearchWorker)
+        told = SearchMetrics(search).text().decode()
+        bytes_there = search.status().devices[0].resident_bytes
+        assert f'placewise_search_device_resident_bytes{{device="cpu"}} {bytes_there:.1f}' in told
+        assert 'placewise_search_device_failed{device="cpu"} 0.0' in told
 
 
 def _once_made(search: SearchPort, request: SearchRequest) -> SearchResponse:
