@@ -17,6 +17,7 @@ from shared.catalog.session import Catalog
 from shared.chunks import Rows
 from shared.errors import NotFound, PlacewiseError
 from shared.jobs import Job, JobKind
+from shared.jobs.leases import token_of
 from shared.objects import ObjectStore
 from shared.objects.keys import query_key, thumbnail_key
 from shared.vision.decode import Decoded
@@ -44,9 +45,7 @@ class Batch:
 
     @property
     def token(self) -> UUID:
-        token = self.jobs[0].lease_token
-        assert token is not None, "a claimed job carries a token"
-        return token
+        return token_of(self.jobs[0])
 
     @property
     def kind(self) -> JobKind:

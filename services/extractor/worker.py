@@ -50,7 +50,7 @@ from shared.heartbeat import Heartbeat
 from shared.jobs import InProcessHints, Job, Priority, begin, claim, hold_lease
 from shared.jobs.claim import any_claimable
 from shared.jobs.finish import fail, release
-from shared.jobs.leases import fallen, held
+from shared.jobs.leases import fallen, held, token_of
 from shared.jobs.model_changes import abandon_generation
 from shared.jobs.table import EXTRACTOR_JOBS, MODEL_CHANGES, JobKind, WaitingFor
 from shared.objects import ObjectStore
@@ -108,9 +108,7 @@ class Work:
 
     @property
     def token(self) -> UUID:
-        token = self.jobs[0].lease_token
-        assert token is not None, "a claimed job carries a token"
-        return token
+        return token_of(self.jobs[0])
 
 
 class ExtractorWorker:

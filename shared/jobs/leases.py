@@ -24,6 +24,12 @@ from shared.jobs.table import Job, locked_under
 log = logging.getLogger(__name__)
 
 
+def token_of(job: Job) -> UUID:
+    """The token that a claimed job carries."""
+    assert job.lease_token is not None, "a claimed job carries a token"
+    return job.lease_token
+
+
 def extend_lease(session: Session, token: UUID, lease_seconds: float) -> bool:
     """Keep what was claimed under `token`; False when all of it has been taken over or ended."""
     touched = session.execute(
