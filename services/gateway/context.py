@@ -14,7 +14,6 @@ from services.gateway.job_watch import JobWatch
 from services.gateway.keys import Keys
 from shared.catalog.maps import DEFAULT_MAP
 from shared.catalog.session import Catalog
-from shared.comparison import MOST_RERANKED
 from shared.errors import NotFound, invalid_field
 from shared.jobs import Hints
 from shared.objects import ObjectStore
@@ -81,45 +80,17 @@ FileId = Annotated[UUID, _known_shape("photo")]
 UploadId = Annotated[UUID, _known_shape("upload")]
 JobId = Annotated[UUID, _known_shape("job")]
 GenerationId = Annotated[UUID, _known_shape("generation")]
-TopK = Annotated[int, Query(ge=1, le=100, description="How many photos to answer.")]
-MinScore = Annotated[
-    float | None,
-    Query(ge=-1, le=1, description="Leave out photos less similar than this."),
-]
-WordWeightsWanted = Annotated[
-    bool,
-    Query(
-        alias="word_weights",
-        description="Rank by the map's word weights, where it has any.",
-    ),
-]
-Rerank = Annotated[
-    int | None,
-    Query(
-        ge=1,
-        le=MOST_RERANKED,
-        description="Look at the first N photos patch by patch, and order them by what is seen.",
-    ),
-]
-Explain = Annotated[
-    bool, Query(description="Say of each photo which clusters and patches make it similar.")
-]
 
 __all__ = [
     "API",
     "DEFAULT_MAP",
     "NO_NUL",
-    "Explain",
     "FileId",
     "Gateway",
     "GatewayDep",
     "GenerationId",
     "JobId",
     "MapName",
-    "MinScore",
-    "Rerank",
-    "TopK",
     "UploadId",
-    "WordWeightsWanted",
     "read_cursor",
 ]

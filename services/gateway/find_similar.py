@@ -12,7 +12,6 @@ from functools import partial
 from typing import Any
 from uuid import UUID
 
-from pydantic import BaseModel, ConfigDict
 from sqlalchemy.orm import Session
 
 from services.gateway.choose_weights import choose_weights
@@ -24,6 +23,7 @@ from services.gateway.schemas import (
     SimilarPhoto,
     job_url,
 )
+from services.gateway.wanted import Wanted
 from shared.catalog.chunks import descriptor_of
 from shared.catalog.generations import Generation, active_generation
 from shared.catalog.maps import Map, get_map
@@ -49,24 +49,6 @@ class Query:
     row: int
     photo_id: UUID | None
     filename: str
-
-
-class Wanted(BaseModel):
-    """What of the ranking is asked for. Kept with the job of a photo that is described first."""
-
-    model_config = ConfigDict(frozen=True)
-
-    top_k: int
-    min_score: float | None = None
-    photos: PhotoFilter = EVERYTHING
-    word_weights: bool = True
-    rerank: int | None = None
-    explain: bool = False
-
-    @property
-    def closely(self) -> bool:
-        """Whether an extractor has to look at what the search finds."""
-        return self.rerank is not None or self.explain
 
 
 @dataclass(frozen=True, slots=True)

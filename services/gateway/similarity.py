@@ -16,29 +16,24 @@ from services.gateway.compare import (
     compare_described,
     compare_stored,
     compared_answer,
-    expired,
 )
 from services.gateway.context import (
     DEFAULT_MAP,
-    Explain,
     FileId,
     Gateway,
     GatewayDep,
     JobId,
     MapName,
-    MinScore,
-    Rerank,
-    TopK,
-    WordWeightsWanted,
 )
-from services.gateway.filters import FilterDep
-from services.gateway.find_similar import Wanted, find_similar, query_by_job, query_by_photo
+from services.gateway.find_similar import find_similar, query_by_job, query_by_photo
 from services.gateway.once import Once, OnceFormDep
 from services.gateway.receive import describe_form, receive_file
 from services.gateway.room import ROOM_FOR_QUERIES, Kind, RoomDep
-from services.gateway.schemas import JobStarted, SimilarityAnswer, job_started
+from services.gateway.schemas import JobStarted, SimilarityAnswer, started_job
 from services.gateway.waiting import preferred_wait, wait_for_job
+from services.gateway.wanted import Wanted, WantedDep
 from shared.catalog.maps import get_map
+from shared.comparison import query_expired
 from shared.errors import (
     Conflict,
     Gone,
@@ -77,12 +72,7 @@ async def similar_to_stored(
     once: OnceFormDep,
     room: RoomDep,
     file_id: Annotated[FileId, PathParameter(description="a stored photo")],
-    photos: FilterDep,
-    top_k: TopK = 10,
-    min_score: MinScore = None,
-    word_weights: WordWeightsWanted = True,
-    rerank: Rerank = None,
-    explain: Explain = False,
+    wanted: WantedDep,
     map_name: MapName = DEFAULT_MAP,
 ) -> Any:
     """The photos most similar to a stored one, without itself.
@@ -91,14 +81,6 @@ async def similar_to_stored(
     than COMPARE_WAIT_SECONDS, or than N seconds with `Prefer: wait=N`. Poll `status_url`, then GET
     `result_url`.
     """
-    wanted = Wanted(
-        top_k=top_k,
-        min_score=min_score,
-        photos=photos,
-        word_weights=word_weights,
-        rerank=rerank,
-        explain=explain,
-    )
 
     def ask() -> SimilarityAnswer | Job:
         if not wanted.closely:
@@ -130,12 +112,7 @@ async def similar_to_upload(
     gateway: GatewayDep,
     once: OnceFormDep,
     room: RoomDep,
-    photos: FilterDep,
-    top_k: TopK = 10,
-    min_score: MinScore = None,
-    word_weights: WordWeightsWanted = True,
-    rerank: Rerank = None,
-    explain: Explain = False,
+    wanted: WantedDep,
     map_name: MapName = DEFAULT_MAP,
 ) -> Any:
     """The photos most similar to one that is not stored.
@@ -144,14 +121,6 @@ async def similar_to_upload(
     itself (200) when it takes no longer than N seconds. Repeated under an `Idempotency-Key`, it is
     answered with the 202 of its job.
     """
-    wanted = Wanted(
-        top_k=top_k,
-        min_score=min_score,
-        photos=photos,
-        word_weights=word_weights,
-        rerank=rerank,
-        explain=explain,
-    )
     await run_in_threadpool(check_closely, gateway, map_name, wanted)
     job_id = new_id()
     key = query_key(job_id)
@@ -211,12 +180,10 @@ async def _when_it_ends(
         if job.state in UNFINISHED and left > 0:
             waited = await wait_for_job(gateway, job.id, left)
             if waited is None:
-                raise expired()
+                raise query_expired()
             job = waited
         if job.state in UNFINISHED:
-            started = job_started(job)
-            response.headers["Location"] = started.status_url
-            response.headers["Retry-After"] = "1"
+            started = started_job(response, job)
             # As a response of its own: the route's model is that of the 200.
             return JSONResponse(started.model_dump(mode="json"), 202, dict(response.headers))
         result = await run_in_threadpool(_result, gateway, job)
