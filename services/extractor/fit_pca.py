@@ -119,10 +119,7 @@ class FitPca:
         if source.vocabulary_id is not None:
             with self._catalog.read() as session:
                 vocabulary = session.get_one(Vocabulary, source.vocabulary_id)
-        return Made(
-            self._models.extractor(source.extractor),
-            self._models.centres(vocabulary) if vocabulary else None,
-        )
+        return self._models.made_of(source, vocabulary, None)
 
     def _gather(self, job: Job) -> None:
         """The next rows of the plan, for about a second."""
