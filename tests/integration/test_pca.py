@@ -241,6 +241,26 @@ def test_a_photo_whose_row_is_damaged_is_described_anew(
         assert same(row, projected(expected, before[photo_id]))
 
 
+def test_a_photo_whose_projected_row_is_not_finite_fails_alone(
+    described: Workplace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = described.rows()
+    refused = sorted(before)[3]
+    real = Projection.project
+
+    def project(self: Projection, rows: Rows) -> Rows:
+        found = real(self, rows)
+        found[(rows == before[refused]).all(axis=1)] = np.nan
+        return found
+
+    monkeypatch.setattr(Projection, "project", project)
+    reduce(described)
+    assert described.rows().keys() == before.keys() - {refused}
+    with described.catalog.read() as session:
+        (job,) = session.query(Job).filter_by(kind=JobKind.REINDEX, state=JobState.FAILED)
+    assert (job.photo_id, refusal(job)) == (refused, "features_not_finite")
+
+
 def test_photos_are_described_where_the_rows_that_answer_were_made_otherwise(
     reduced: Workplace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
