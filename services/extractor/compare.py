@@ -178,7 +178,8 @@ class Comparisons:
         if not found:
             raise Gone(
                 "query_expired",
-                f"The generation {generation_id} that answered is gone. Ask again.",
+                f"Nothing is left of these descriptors in the generation {generation_id} that "
+                "answered. Ask again.",
             )
         rows = np.stack(list(found.values()))
         shares = explain(target.extractor.recipe, features, target.centres, rows, word_weights)

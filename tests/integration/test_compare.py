@@ -41,6 +41,7 @@ from tests.integration.comparisons import (
 from tests.integration.gateway import Service
 from tests.support.photos import near_copy, photo_bytes
 from tests.support.problems import field_refused, problem
+from tests.support.small_gpu import make_too_heavy
 
 
 @pytest.fixture
@@ -287,6 +288,26 @@ def test_candidate_that_can_t_be_read_follows_those_that_can(service: Service) -
     assert None not in scores[:2]
     assert scores[2] is None
     assert None not in column(answer, "explanation"), "which needs its descriptor alone"
+
+
+def test_candidate_that_the_gpu_can_not_hold_is_left_out_of_the_reranking_alone(
+    service: Service, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    query, *others = service.indexed(*range(5))
+    before = compared(service, query, rerank=4)
+    heavy = others[2]
+    make_too_heavy(monkeypatch, 3)
+    answer = compared(service, query, rerank=4)
+    assert ids(answer) == [one for one in ids(before) if one != heavy] + [heavy]
+    scores = dict(zip(ids(before), column(before, "rerank_score"), strict=True))
+    assert column(answer, "rerank_score") == [
+        *(pytest.approx(scores[one]) for one in ids(answer)[:3]),
+        None,
+    ]
+    (told,) = [text for text in caplog.messages if "is not compared" in text]
+    assert heavy in told
+    assert "GPU's memory does not suffice" in told
+    assert jobs(service, "compare")[0]["state"] == "succeeded"
 
 
 def test_generation_that_was_replaced_is_compared_until_it_is_gone(service: Service) -> None:
