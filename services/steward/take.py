@@ -13,7 +13,7 @@ from shared.catalog.away import Outage
 from shared.catalog.session import Catalog
 from shared.errors import PlacewiseError, Unavailable
 from shared.jobs import Job, JobKind, claim, hold_lease
-from shared.jobs.batches import cancel_items
+from shared.jobs.cancel_batch import cancel_items
 from shared.jobs.finish import fail, release
 from shared.jobs.leases import fallen, held, token_of
 from shared.settings import Settings

@@ -16,7 +16,8 @@ from sqlalchemy.orm import Session
 from shared.catalog.away import Outage
 from shared.catalog.base import db_now, db_now_plus, rowcount
 from shared.catalog.session import Catalog
-from shared.jobs.batches import cancel_items, is_listed_batch
+from shared.jobs.batches import is_listed_batch
+from shared.jobs.cancel_batch import cancel_items
 from shared.jobs.finish import fail, release
 from shared.jobs.model_changes import abandon_generation
 from shared.jobs.table import Job, locked_under
