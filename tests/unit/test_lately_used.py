@@ -12,7 +12,11 @@ def test_value_that_was_used_least_lately_is_made_anew() -> None:
     kept: LatelyUsed[str, str] = LatelyUsed(2)
 
     def use(key: str) -> str:
-        return kept.get(key, lambda: (made.append(key), key.upper())[1])
+        def make() -> str:
+            made.append(key)
+            return key.upper()
+
+        return kept.get(key, make)
 
     assert [use(key) for key in "abaca"] == list("ABACA")
     assert made == ["a", "b", "c"], "a was used after b"
