@@ -32,6 +32,9 @@ Row = NDArray[np.float32]
 CODED_DIMENSION = 7000
 CODED_BYTES = 8_000_000
 
+# Rows are unit vectors, or zero: with a length further off than this, one is damaged.
+LENGTH_MARGIN = 1e-3
+
 HEADER_BYTES = 1024  # what is read to find out where the rows begin: NumPy's header has 128
 
 
@@ -168,6 +171,12 @@ def read_rows(store: ObjectStore, object_key: str, rows: Sequence[int]) -> Rows:
                 raise ValueError(f"the object ends {size - len(data)} bytes too early")
             found[place] = np.frombuffer(data, dtype=np.float32)
     return found
+
+
+def are_whole(rows: Rows) -> NDArray[np.bool_]:
+    """(n,) which of (n, dimension) rows can be what was written: those of length 1, or zero."""
+    lengths = np.linalg.norm(rows, axis=1)
+    return np.asarray((lengths == 0) | (np.abs(lengths - 1) < LENGTH_MARGIN))
 
 
 def _read(file: BinaryIO, size: int) -> bytes:

@@ -14,7 +14,7 @@ from uuid import UUID
 
 from pydantic import BaseModel, ConfigDict
 
-from shared.errors import Unprocessable
+from shared.errors import Gone, Unprocessable
 from shared.recipes import Recipe
 
 MOST_RERANKED = 50  # candidates: about three batches of photos, and other queries wait so long
@@ -118,3 +118,8 @@ def check_can_explain(recipe: Recipe, spec: Mapping[str, Any] | None) -> None:
             f"Answers of the extractor {recipe.name} can't be explained: {why}. Leave out "
             "`explain`, or use a map with another extractor: VLAD without PCA, or `avg`.",
         )
+
+
+def query_expired() -> Gone:
+    """What a query's job or photo left behind is no longer kept."""
+    return Gone("query_expired", "The query is no longer kept (QUERY_TTL_SECONDS). Ask again.")

@@ -5,26 +5,21 @@ Imports torch: only `vocabulary` imports this, when asked.
 
 from __future__ import annotations
 
-from collections import defaultdict
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from rich.progress import Progress
 
 from services.cli.configuration import read_settings
+from services.cli.load_extractor import load_extractor
 from services.cli.output import shown
-from services.cli.photo_files import decoded_batches
+from services.cli.photo_files import pixels_of
 from services.cli.photo_places import photo_paths
-from services.cli.whole_file import whole_or_nothing
-from shared.errors import InvalidRequest, PlacewiseError, Unprocessable
-from shared.recipes import Recipe, get_recipe
-from shared.settings import Settings
-from shared.vision.extractors import Extractor, choose_device
+from services.cli.whole_file import check_out, whole_or_nothing
+from shared.errors import Unprocessable
+from shared.recipes import get_recipe
 from shared.vision.fit_photos import fit_photos
 from shared.vision.patches import choose_photos
-from shared.vision.precision import choose_precision
-from shared.vision.resample import Pixels
 
 SAMPLE_PHOTOS = 1000  # as a map's fit learns from, unless told otherwise
 
@@ -45,7 +40,7 @@ def fit_folder(
     (`no_photos`, `bad_out`), Unprocessable (`no_photos`, `vocabulary_unfit`), Misconfigured
     (`out_unwritable`) and what loading the extractor raises.
     """
-    _check_out(out)
+    check_out(out, ".npz", "a vocabulary")
     settings = read_settings()
     recipe = get_recipe(
         extractor or settings.new_map_extractor,
@@ -57,7 +52,7 @@ def fit_folder(
             f"The extractor {recipe.name} uses no vocabulary: there is nothing to fit.",
         )
     there = photo_paths(folder)
-    loaded = _load(recipe, settings)
+    loaded = load_extractor(recipe, settings)
     seed = seed or 0
     numbers = choose_photos(len(there), sample or SAMPLE_PHOTOS, loaded.backbone.width, seed)
     photos = [there[number] for number in numbers]
@@ -65,7 +60,7 @@ def fit_folder(
     bars = {name: progress.add_task(name, total=None) for name in ("describing", "clustering")}
     fitted = fit_photos(
         loaded,
-        _pixels(photos, loaded, settings, refused),
+        pixels_of(photos, loaded.preprocessing, settings, refused),
         len(photos),
         clusters=clusters or recipe.clusters,
         seed=seed,
@@ -80,36 +75,3 @@ def fit_folder(
         "provenance": fitted.provenance,
         "refused": refused,
     }
-
-
-def _load(recipe: Recipe, settings: Settings) -> Extractor:
-    device = choose_device(settings.device)
-    return Extractor(
-        recipe,
-        device,
-        precision=choose_precision(settings.precision, recipe, device),
-        dino_weights=settings.dino_weights,
-    )
-
-
-def _pixels(
-    photos: list[Path], extractor: Extractor, settings: Settings, refused: list[dict[str, str]]
-) -> Iterator[list[Pixels]]:
-    """Batches of pixels in the order of the photos; those that can't be had join `refused`."""
-    for batch in decoded_batches(photos, extractor.preprocessing, settings, defaultdict(float)):
-        pixels = []
-        for path, outcome in batch:
-            if isinstance(outcome, PlacewiseError):
-                refused.append({"path": shown(path), "reason": outcome.detail})
-            else:
-                pixels.append(outcome.pixels)
-        if pixels:
-            yield pixels
-
-
-def _check_out(out: Path) -> None:
-    """Before the minutes that a fit takes."""
-    if out.suffix != ".npz":
-        raise InvalidRequest("bad_out", f"{shown(out)}: a vocabulary's file ends in .npz.")
-    if not out.parent.is_dir():
-        raise InvalidRequest("bad_out", f"There is no folder {shown(out.parent)}.")

@@ -5,7 +5,6 @@ Imports torch: only `pca` imports this, when asked.
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -15,14 +14,15 @@ from rich.progress import Progress
 
 from services.cli.configuration import read_settings
 from services.cli.describe_files import centres_of, own_vocabulary
+from services.cli.load_extractor import load_extractor
 from services.cli.output import shown
-from services.cli.photo_files import decoded_batches
+from services.cli.photo_files import pixels_of
 from services.cli.photo_places import photo_paths
-from services.cli.whole_file import whole_or_nothing
-from shared.errors import InvalidRequest, PlacewiseError, Unprocessable
+from services.cli.whole_file import check_out, whole_or_nothing
+from shared.errors import InvalidRequest, Unprocessable
 from shared.recipes import get_recipe
 from shared.settings import Settings
-from shared.vision.extractors import Extractor, choose_device
+from shared.vision.extractors import Extractor
 from shared.vision.pca import Rows
 from shared.vision.pca_file import WhiteningFile
 from shared.vision.pca_fit import check_can_fit
@@ -51,11 +51,12 @@ def fit_pca_file(
     Misconfigured (`out_unwritable`), and for a folder what loading the extractor and its vocabulary
     raises.
     """
-    _check_out(out)
+    check_out(out, ".safetensors", "a whitening")
     bars = {name: progress.add_task(name, total=None) for name in ("gathering", "reducing")}
     told = lambda what, done, most: progress.update(bars[what], completed=done, total=most)  # noqa: E731
     refused: list[dict[str, str]] = []
     spec = None
+    batches: Iterator[Rows]
     if source.is_dir():
         settings = read_settings()
         loaded, centres = _load(settings, extractor, vocabulary)
@@ -65,7 +66,8 @@ def fit_pca_file(
         check_can_fit(len(there), dimension, kept)
         chosen = choose_rows(len(there), sample_size(dimension, kept), SEED)
         photos = [there[number] for number in chosen]
-        batches = _described(photos, loaded, centres, settings, refused)
+        pixels = pixels_of(photos, loaded.preprocessing, settings, refused)
+        batches = (loaded.describe(batch, centres) for batch in pixels)
     else:
         if extractor is not None or vocabulary is not None:
             raise InvalidRequest(
@@ -98,27 +100,8 @@ def _load(
         allow_test_extractors=settings.allow_test_extractors,
     )
     own = own_vocabulary(recipe, vocabulary)
-    loaded = Extractor(recipe, choose_device(settings.device), dino_weights=settings.dino_weights)
+    loaded = load_extractor(recipe, settings)
     return loaded, centres_of(loaded, own)
-
-
-def _described(
-    photos: list[Path],
-    extractor: Extractor,
-    centres: Centres | None,
-    settings: Settings,
-    refused: list[dict[str, str]],
-) -> Iterator[Rows]:
-    """Rows of the photos, batch by batch; those that can't be described join `refused`."""
-    for batch in decoded_batches(photos, extractor.preprocessing, settings, defaultdict(float)):
-        pixels = []
-        for path, outcome in batch:
-            if isinstance(outcome, PlacewiseError):
-                refused.append({"path": shown(path), "reason": outcome.detail})
-            else:
-                pixels.append(outcome.pixels)
-        if pixels:
-            yield extractor.describe(pixels, centres)
 
 
 def _open_rows(file: Path) -> Rows:
@@ -150,11 +133,3 @@ def _read(rows: Rows, chosen: Any) -> Iterator[Rows]:
                 "descriptors are 1. Normalise the rows first.",
             )
         yield batch
-
-
-def _check_out(out: Path) -> None:
-    """Before the minutes that a fit takes."""
-    if out.suffix != ".safetensors":
-        raise InvalidRequest("bad_out", f"{shown(out)}: a whitening's file ends in .safetensors.")
-    if not out.parent.is_dir():
-        raise InvalidRequest("bad_out", f"There is no folder {shown(out.parent)}.")

@@ -9,11 +9,13 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+from services.cli.output import shown
 from services.extractor.decoding import DecoderPool
 from shared.errors import InvalidRequest, PlacewiseError
 from shared.settings import Settings
 from shared.vision.decode import Decoded
 from shared.vision.preprocessing import Preprocessing
+from shared.vision.resample import Pixels
 
 Outcome = Decoded | PlacewiseError
 
@@ -53,6 +55,25 @@ def decoded_batches(
             batch, ahead = ahead.result(), reader.submit(read, begin)
             yield batch
         yield ahead.result()
+
+
+def pixels_of(
+    photos: Sequence[Path],
+    preprocessing: Preprocessing,
+    settings: Settings,
+    refused: list[dict[str, str]],
+) -> Iterator[list[Pixels]]:
+    """Batches of pixels (height, width, 3) in the order of the photos; of those that can't be had,
+    path and reason join `refused`."""
+    for batch in decoded_batches(photos, preprocessing, settings, defaultdict(float)):
+        pixels = []
+        for path, outcome in batch:
+            if isinstance(outcome, PlacewiseError):
+                refused.append({"path": shown(path), "reason": outcome.detail})
+            else:
+                pixels.append(outcome.pixels)
+        if pixels:
+            yield pixels
 
 
 def _content(photo: Path) -> bytes | PlacewiseError:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from shared.datasets.utm_names import fields_of_name
 from shared.estimate.places import Spot
-from shared.word_weights.learn import Moments, Taught, nothing_taught, weigh, word_products
+from shared.word_weights.learn import Taught, nothing_taught, weigh
 from shared.word_weights.pairs import choose_pairs
 
 SEED = 0
@@ -27,11 +27,7 @@ def learn_weights(database: Rows, names: Sequence[str], words: int) -> list[floa
         return None
     taught = nothing_taught(words)
     for lesson in (*chosen.lessons[0], *chosen.lessons[1]):
-        rows = database[lesson.photos]
-        taught += Taught(
-            Moments.of(word_products(rows, lesson.near, words)),
-            Moments.of(word_products(rows, lesson.far, words)),
-        )
+        taught += Taught.of(database[lesson.photos], lesson.near, lesson.far, words)
     weights: list[float] = taught.weights().tolist()
     return weights
 

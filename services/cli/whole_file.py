@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from services.cli.output import shown
-from shared.errors import Misconfigured
+from shared.errors import InvalidRequest, Misconfigured
 
 
 @contextlib.contextmanager
@@ -33,3 +33,14 @@ def whole_or_nothing(out: Path) -> Iterator[BinaryIO]:
         # Where even the folder is missing, there is nothing to take away.
         with contextlib.suppress(OSError):
             partial.unlink(missing_ok=True)
+
+
+def check_out(out: Path, suffix: str, what: str) -> None:
+    """InvalidRequest (`bad_out`) unless `out` ends in `suffix` and its folder is there.
+
+    Asked before the minutes that it takes to make `what` ("a vocabulary", say).
+    """
+    if out.suffix != suffix:
+        raise InvalidRequest("bad_out", f"{shown(out)}: {what}'s file ends in {suffix}.")
+    if not out.parent.is_dir():
+        raise InvalidRequest("bad_out", f"There is no folder {shown(out.parent)}.")

@@ -6,6 +6,8 @@ import logging
 from collections.abc import Iterator, Sequence
 from uuid import UUID
 
+import torch
+
 from services.extractor.decoding import DecoderPool
 from services.extractor.target import Target
 from shared.catalog.photos import Photo
@@ -13,7 +15,10 @@ from shared.errors import NotFound, PlacewiseError, StorageFull
 from shared.objects import ObjectStore
 from shared.objects.keys import local_features_key
 from shared.settings import Settings
+from shared.vision.extractors import Extractor, not_finite
 from shared.vision.local_features import LocalFeatures
+from shared.vision.passes import PhotoDoesNotFit
+from shared.vision.resample import Pixels
 
 log = logging.getLogger(__name__)
 
@@ -28,8 +33,9 @@ class CandidateFeatures:
         self._at_once = settings.batch_photos
 
     def of(self, target: Target, photos: Sequence[Photo]) -> Iterator[tuple[UUID, LocalFeatures]]:
-        """Each photo's features, in any order; left out are photos that can't be read or decoded
-        any more, or whose features are not finite. No more are held than a batch has."""
+        """Each photo's features, in any order; left out, and logged by their ids, are photos that
+        can't be read or decoded any more, that the GPU can't hold, or whose features are not
+        finite. No more are held than a batch has."""
         for begin in range(0, len(photos), self._at_once):
             missing = []
             for photo in photos[begin : begin + self._at_once]:
@@ -71,17 +77,35 @@ class CandidateFeatures:
             there, self._decoders.decode(data, extractor.preprocessing), strict=True
         ):
             if isinstance(outcome, PlacewiseError):
-                log.warning("the photo %s is not compared: %s", photo_id, outcome.detail)
+                _leave_out(photo_id, outcome)
             else:
                 decoded.append((photo_id, outcome.pixels))
-        features = extractor.local_features([pixels for _, pixels in decoded])
+        features = _of_those_that_fit(extractor, decoded)
         for (photo_id, pixels), one in zip(decoded, features, strict=True):
             made = LocalFeatures.of(one, extractor.backbone.grid(*pixels.shape[:2]))
             if made.finite:
                 yield photo_id, made
+            else:
+                _leave_out(photo_id, not_finite())
 
     def _put(self, target: Target, photo_id: UUID, made: LocalFeatures) -> None:
         try:
             self._store.put(local_features_key(target.generation.id, photo_id), made.encode())
         except StorageFull as error:  # it is only made again the next time
             log.warning("local features are not kept: %s", error.detail)
+
+
+def _of_those_that_fit(
+    extractor: Extractor, decoded: list[tuple[UUID, Pixels]]
+) -> list[torch.Tensor]:
+    """Local features of each of `decoded`, which photos that the GPU can't hold have left."""
+    while True:
+        try:
+            return extractor.local_features([pixels for _, pixels in decoded])
+        except PhotoDoesNotFit as error:
+            photo_id, _ = decoded.pop(error.place)
+            _leave_out(photo_id, error)
+
+
+def _leave_out(photo_id: UUID, error: PlacewiseError) -> None:
+    log.warning("the photo %s is not compared: %s", photo_id, error.detail)

@@ -18,17 +18,15 @@ from uuid import UUID
 
 import numpy as np
 import torch
-from sqlalchemy import select
 
 from services.extractor.candidates import CandidateFeatures
 from services.extractor.decoding import DecoderPool
 from services.extractor.loaded import LoadedModels
 from services.extractor.publish import Published
+from services.extractor.stored_rows import stored_rows
 from services.extractor.target import Target, find_target
-from shared.catalog.chunks import Chunk, Descriptor
 from shared.catalog.photos import Photo, get_photo, live_photos
 from shared.catalog.session import Catalog
-from shared.chunks import read_row
 from shared.comparison import (
     Candidate,
     ClusterShare,
@@ -38,11 +36,12 @@ from shared.comparison import (
     Explanation,
     check_can_explain,
     check_can_rerank,
+    query_expired,
 )
 from shared.errors import Gone, NotFound, PlacewiseError
 from shared.jobs import Job
 from shared.jobs.finish import succeed
-from shared.jobs.leases import held
+from shared.jobs.leases import held, token_of
 from shared.objects import ObjectStore
 from shared.objects.keys import comparison_key, query_key
 from shared.settings import Settings
@@ -103,9 +102,8 @@ class Comparisons:
         job, result = prepared.job, self._compare(prepared)
         prepared.seconds["compare"] = time.perf_counter() - started
         self._store.put(comparison_key(job.id), result.model_dump_json().encode())
-        assert job.lease_token is not None, "a claimed job carries a token"
         with self._catalog.write() as session:
-            mine = held(session, job.lease_token, [job])
+            mine = held(session, token_of(job), [job])
             for own in mine:
                 succeed(own, {"candidates": len(result.candidates)})
         return Published(succeeded=len(mine))
@@ -116,10 +114,7 @@ class Comparisons:
             try:
                 return self._store.get(query_key(asked.query_job_id))
             except NotFound as error:
-                raise Gone(
-                    "query_expired",
-                    "The query is no longer kept (QUERY_TTL_SECONDS). Ask again.",
-                ) from error
+                raise query_expired() from error
         with self._catalog.read() as session:
             photo = get_photo(session, job.map_id, asked.query_photo_id)
         return self._store.get(photo.object_key)
@@ -179,22 +174,16 @@ class Comparisons:
         if not photo_ids:
             return {}
         generation_id = target.generation.id
-        with self._catalog.read() as session:
-            found = session.execute(
-                select(Descriptor.photo_id, Descriptor.row, Chunk.object_key)
-                .join(Chunk, Chunk.id == Descriptor.chunk_id)
-                .where(
-                    Descriptor.generation_id == generation_id, Descriptor.photo_id.in_(photo_ids)
-                )
-            ).all()
+        found = stored_rows(self._catalog, self._store, generation_id, photo_ids)
         if not found:
             raise Gone(
                 "query_expired",
-                f"The generation {generation_id} that answered is gone. Ask again.",
+                f"Nothing is left of these descriptors in the generation {generation_id} that "
+                "answered. Ask again.",
             )
-        rows = np.stack([read_row(self._store, key, row) for _, row, key in found])
+        rows = np.stack(list(found.values()))
         shares = explain(target.extractor.recipe, features, target.centres, rows, word_weights)
-        return {photo_id: share for (photo_id, _, _), share in zip(found, shares, strict=True)}
+        return dict(zip(found, shares, strict=True))
 
 
 def _explanation(shared: Shared, grid: tuple[int, int]) -> Explanation:

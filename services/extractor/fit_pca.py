@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import io
 import json
-import time
 from uuid import UUID
 
 import numpy as np
@@ -20,6 +19,7 @@ from sqlalchemy import select
 
 from services.extractor.loaded import LoadedModels, Made
 from services.extractor.new_generation import begin_whitened, go_on
+from services.extractor.slices import FIT_UNITS, do_steps, slice_of_work
 from services.extractor.stored_rows import stored_rows
 from shared.catalog.chunks import Descriptor
 from shared.catalog.generations import Generation
@@ -43,10 +43,8 @@ from shared.vision.pca_rows import (
     usable,
 )
 
-SLICE_SECONDS = 1.0  # about the time of a batch: what a query may have to wait
 READ_BYTES = 16_000_000  # of rows that are read together
 SEED = 0
-REDUCE_UNITS = 100  # of the job's progress: finding the directions, in per cent
 
 
 class FitPca:
@@ -98,7 +96,7 @@ class FitPca:
                 "looked_at": 0,
                 "rows": 0,
             },
-            progress_total=len(plan) + REDUCE_UNITS + len(photo_ids),
+            progress_total=len(plan) + FIT_UNITS + len(photo_ids),
         )
 
     def _check_unchanged(self, source: Generation) -> None:
@@ -119,10 +117,7 @@ class FitPca:
         if source.vocabulary_id is not None:
             with self._catalog.read() as session:
                 vocabulary = session.get_one(Vocabulary, source.vocabulary_id)
-        return Made(
-            self._models.extractor(source.extractor),
-            self._models.centres(vocabulary) if vocabulary else None,
-        )
+        return self._models.made_of(source, vocabulary, None)
 
     def _gather(self, job: Job) -> None:
         """The next rows of the plan, for about a second."""
@@ -131,16 +126,15 @@ class FitPca:
         at_once = max(1, READ_BYTES // (4 * params["dimension"]))
         sample = self._sample(job)
         looked_at = params["looked_at"]
-        until = time.monotonic() + SLICE_SECONDS
-        while looked_at < len(plan):  # at least once, however slow it is
+        for _ in slice_of_work():
+            if looked_at >= len(plan):
+                break
             wanted = [UUID(photo_id) for photo_id in plan[looked_at : looked_at + at_once]]
             found = stored_rows(self._catalog, self._store, UUID(params["source"]), wanted)
             if found:
                 rows = np.stack([found[photo_id] for photo_id in wanted if photo_id in found])
                 sample.add(rows[usable(rows)])
             looked_at += len(wanted)
-            if time.monotonic() >= until:
-                break
         go_on(
             self._catalog,
             job,
@@ -154,25 +148,21 @@ class FitPca:
         params = job.params
         sample = self._sample(job)
         fit = PcaFit(sample, params["pca"])
-        kept = work_key(job.id, "fit.npz")
-        if params.get("reducing"):
-            fit.resume(self._store.get(kept))
-        until = time.monotonic() + SLICE_SECONDS
-        while not fit.done:  # at least one step, however slow it is
+
+        def step() -> None:
             part = fit.step()
             if part is not None:
                 self._keep(job, fit.parts - 1, part)
-            if time.monotonic() >= until:
-                break
-        if not fit.done:
-            self._store.put(kept, fit.save())
-            done, most = fit.progress
-            go_on(
-                self._catalog,
-                job,
-                params={**params, "reducing": True},
-                progress_done=params["looked_at"] + REDUCE_UNITS * done // most,
-            )
+
+        if not do_steps(
+            self._catalog,
+            self._store,
+            job,
+            fit,
+            step,
+            begun="reducing",
+            progress_done=params["looked_at"],
+        ):
             return
         with self._catalog.read() as session:
             source = session.get_one(Generation, UUID(params["source"]))
@@ -186,7 +176,7 @@ class FitPca:
             Made(made.extractor, made.centres, whole),
             WhiteningFile(found, source.spec),
             source.vocabulary_id,
-            progress_done=params["looked_at"] + REDUCE_UNITS,
+            progress_done=params["looked_at"] + FIT_UNITS,
         )
 
     def _sample(self, job: Job) -> StoredColumns:

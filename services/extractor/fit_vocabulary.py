@@ -10,7 +10,6 @@ The names are objects under `work/<job>/`. Nothing of a fit is kept in the worke
 from __future__ import annotations
 
 import json
-import time
 from uuid import UUID
 
 from sqlalchemy import select
@@ -18,6 +17,7 @@ from sqlalchemy import select
 from services.extractor.decoding import DecoderPool
 from services.extractor.loaded import LoadedModels
 from services.extractor.new_generation import begin_with_new, extractor_of, go_on
+from services.extractor.slices import FIT_UNITS, do_steps
 from shared.catalog.photos import Photo, PhotoRole, live_photos
 from shared.catalog.session import Catalog
 from shared.catalog.vocabularies import VocabularyOrigin
@@ -30,9 +30,6 @@ from shared.vision.extractors import Extractor
 from shared.vision.fit import Fit
 from shared.vision.patches import PatchStore, choose_photos
 from shared.vision.provenance import of_fit
-
-SLICE_SECONDS = 1.0  # about the time of a batch: what a query may have to wait
-CLUSTER_UNITS = 100  # of the job's progress: finding the centres, in per cent
 
 
 class FitVocabulary:
@@ -96,7 +93,7 @@ class FitVocabulary:
             job,
             stage="sample",
             params={**job.params, "clusters": clusters, "sampled": 0, "described": 0},
-            progress_total=len(plan) + CLUSTER_UNITS + len(photo_ids),
+            progress_total=len(plan) + FIT_UNITS + len(photo_ids),
         )
 
     def _sample(self, job: Job, extractor: Extractor) -> None:
@@ -143,24 +140,15 @@ class FitVocabulary:
         params = job.params
         patches = self._patches(job, extractor).open()
         fit = Fit(patches, params["clusters"], params["seed"])
-        kept = work_key(job.id, "fit.npz")
-        if params.get("clustering"):
-            fit.resume(self._store.get(kept))
-        until = time.monotonic() + SLICE_SECONDS
-        while not fit.done:  # at least one step, however slow it is
-            fit.step()
-            if time.monotonic() >= until:
-                break
-        if not fit.done:
-            self._store.put(kept, fit.save())
-            done, most = fit.progress
-            go_on(
-                self._catalog,
-                job,
-                stage="cluster",
-                params={**params, "clustering": True},
-                progress_done=params["sampled"] + CLUSTER_UNITS * done // most,
-            )
+        if not do_steps(
+            self._catalog,
+            self._store,
+            job,
+            fit,
+            fit.step,
+            begun="clustering",
+            progress_done=params["sampled"],
+        ):
             return
         centres = fit.centres()
         provenance = of_fit(
@@ -179,7 +167,7 @@ class FitVocabulary:
             centres,
             VocabularyOrigin.FITTED,
             provenance,
-            progress_done=params["sampled"] + CLUSTER_UNITS,
+            progress_done=params["sampled"] + FIT_UNITS,
         )
 
     def _patches(self, job: Job, extractor: Extractor) -> PatchStore:

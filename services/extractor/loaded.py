@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import threading
-from collections import OrderedDict, defaultdict
+from collections import defaultdict
 from dataclasses import dataclass
 from typing import Any
 from uuid import UUID
 
 from sqlalchemy.orm import Session
 
+from services.extractor.lately_used import LatelyUsed
 from shared.catalog.generations import Generation
 from shared.catalog.models import Model, ensure_model
 from shared.catalog.vocabularies import Vocabulary
@@ -30,6 +31,19 @@ MOST_VOCABULARIES = 16
 MOST_WHITENINGS = 2  # one from 98,304 to 512 dimensions takes 201 MB of the device's memory
 
 
+@dataclass(frozen=True, slots=True)
+class Made:
+    """What makes the descriptors of a generation."""
+
+    extractor: Extractor
+    centres: Centres | None = None
+    projection: Projection | None = None
+
+    @property
+    def spec(self) -> dict[str, Any]:
+        return self.extractor.spec(self.centres, self.projection)
+
+
 class LoadedModels:
     """Small LRU caches, shared by the thread that prepares and the one that describes."""
 
@@ -38,11 +52,11 @@ class LoadedModels:
         self._settings = settings
         self._lock = threading.RLock()
         self._device = choose_device(settings.device)
-        self._extractors: OrderedDict[str, Extractor] = OrderedDict()
+        self._extractors: LatelyUsed[str, Extractor] = LatelyUsed(MOST_EXTRACTORS)
         # Of what was loaded once: to run out of memory again for each time would cost photos time.
         self._limits: defaultdict[tuple[object, ...], PassLimit] = defaultdict(PassLimit)
-        self._centres: OrderedDict[UUID, Centres] = OrderedDict()
-        self._projections: OrderedDict[UUID, Projection] = OrderedDict()
+        self._centres: LatelyUsed[UUID, Centres] = LatelyUsed(MOST_VOCABULARIES)
+        self._projections: LatelyUsed[UUID, Projection] = LatelyUsed(MOST_WHITENINGS)
 
     def extractor(self, name: str, precision: Precision | None = None) -> Extractor:
         """The extractor called `name`, its weights loaded.
@@ -54,12 +68,7 @@ class LoadedModels:
         if precision is None:
             precision = choose_precision(self._settings.precision, recipe, self._device)
         with self._lock:
-            found = self._extractors.get(recipe.name)
-            if found is None:
-                found = self._extractors[recipe.name] = self._load(recipe, precision)
-            self._extractors.move_to_end(recipe.name)
-            while len(self._extractors) > MOST_EXTRACTORS:
-                self._extractors.popitem(last=False)
+            found = self._extractors.get(recipe.name, lambda: self._load(recipe, precision))
             return found.at(precision)
 
     def of_generation(self, generation: Generation) -> Extractor:
@@ -104,39 +113,49 @@ class LoadedModels:
     def centres(self, vocabulary: Vocabulary) -> Centres:
         """The vocabulary's centres, checked against the catalog's hash."""
         with self._lock:
-            found = self._centres.get(vocabulary.id)
-            if found is None:
-                found = decode_centres(self._store.get(vocabulary.object_key))
-                if found.sha256 != vocabulary.sha256:
-                    raise Unavailable(
-                        "vocabulary_corrupt",
-                        f"The vocabulary {vocabulary.id} is not what was stored (its hash "
-                        "differs). Restore it from a backup, or fit a new one.",
-                    )
-                self._centres[vocabulary.id] = found
-            self._centres.move_to_end(vocabulary.id)
-            while len(self._centres) > MOST_VOCABULARIES:
-                self._centres.popitem(last=False)
-            return found
+            return self._centres.get(vocabulary.id, lambda: self._read_centres(vocabulary))
+
+    def _read_centres(self, vocabulary: Vocabulary) -> Centres:
+        found = decode_centres(self._store.get(vocabulary.object_key))
+        if found.sha256 != vocabulary.sha256:
+            raise Unavailable(
+                "vocabulary_corrupt",
+                f"The vocabulary {vocabulary.id} is not what was stored (its hash differs). "
+                "Restore it from a backup, or fit a new one.",
+            )
+        return found
 
     def projection(self, whitening: StoredWhitening) -> Projection:
         """The whitening on the device, checked against the catalog's hash."""
         with self._lock:
-            found = self._projections.get(whitening.id)
-            if found is None:
-                stored = decode_whitening(self._store.get(whitening.object_key))
-                found = Projection(stored.whitening, self._device)
-                if found.sha256 != whitening.sha256:
-                    raise Unavailable(
-                        "whitening_corrupt",
-                        f"The PCA whitening {whitening.id} is not what was stored (its hash "
-                        "differs). Restore it from a backup, or start a model change.",
-                    )
-                self._projections[whitening.id] = found
-            self._projections.move_to_end(whitening.id)
-            while len(self._projections) > MOST_WHITENINGS:
-                self._projections.popitem(last=False)
-            return found
+            return self._projections.get(whitening.id, lambda: self._read_projection(whitening))
+
+    def _read_projection(self, whitening: StoredWhitening) -> Projection:
+        stored = decode_whitening(self._store.get(whitening.object_key))
+        found = Projection(stored.whitening, self._device)
+        if found.sha256 != whitening.sha256:
+            raise Unavailable(
+                "whitening_corrupt",
+                f"The PCA whitening {whitening.id} is not what was stored (its hash differs). "
+                "Restore it from a backup, or start a model change.",
+            )
+        return found
+
+    def made_of(
+        self,
+        generation: Generation,
+        vocabulary: Vocabulary | None,
+        whitening: StoredWhitening | None,
+    ) -> Made:
+        """What makes the generation's descriptors, of the vocabulary and whitening that it names.
+
+        Raises as `of_generation`, `centres` and `projection` do.
+        """
+        return Made(
+            self.of_generation(generation),
+            self.centres(vocabulary) if vocabulary else None,
+            self.projection(whitening) if whitening else None,
+        )
 
 
 def register(session: Session, extractor: Extractor) -> Model:
@@ -145,19 +164,6 @@ def register(session: Session, extractor: Extractor) -> Model:
     return ensure_model(
         session, backbone.name, backbone.fingerprint, backbone.licence, backbone.card
     )
-
-
-@dataclass(frozen=True, slots=True)
-class Made:
-    """What makes the descriptors of a generation."""
-
-    extractor: Extractor
-    centres: Centres | None = None
-    projection: Projection | None = None
-
-    @property
-    def spec(self) -> dict[str, Any]:
-        return self.extractor.spec(self.centres, self.projection)
 
 
 def spec_columns(

@@ -3,6 +3,7 @@
     fit_vocabulary.py    plan, describe a sample, find the centres
     take_vocabulary.py   a file that was brought, or a vocabulary that the map has
     fit_pca.py           gather stored rows, find their directions
+    slices.py            how long they are, and the steps of a fit
     new_generation.py    what all of them come to
 
 Between two slices everything lies in the object store under `work/<job>/`, so that any worker can

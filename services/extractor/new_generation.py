@@ -16,7 +16,7 @@ from shared.catalog.vocabularies import VocabularyOrigin, add_vocabulary
 from shared.catalog.whitenings import add_whitening
 from shared.jobs import Job
 from shared.jobs.finish import release
-from shared.jobs.leases import held
+from shared.jobs.leases import held, token_of
 from shared.jobs.model_changes import begin_generation
 from shared.objects import ObjectStore
 from shared.objects.keys import new_vocabulary_key, new_whitening_key
@@ -52,7 +52,7 @@ def begin_with_new(
     key = new_vocabulary_key()
     store.put(key, encode_centres(centres))
     with catalog.write() as session:
-        for mine in held(session, _token(job), [job]):
+        for mine in held(session, token_of(job), [job]):
             vocabulary = add_vocabulary(
                 session,
                 job.map_id,
@@ -81,7 +81,7 @@ def begin_with_known(
 ) -> None:
     """Begin the generation of a vocabulary and a whitening that the map has, or of none."""
     with catalog.write() as session:
-        for mine in held(session, _token(job), [job]):
+        for mine in held(session, token_of(job), [job]):
             begin_generation(
                 session,
                 mine,
@@ -109,7 +109,7 @@ def begin_whitened(
     key = new_whitening_key()
     store.put(key, found.encode())
     with catalog.write() as session:
-        for mine in held(session, _token(job), [job]):
+        for mine in held(session, token_of(job), [job]):
             whitening = add_whitening(
                 session,
                 job.map_id,
@@ -138,13 +138,8 @@ def _describe_all(session: Session, job: Job, progress_done: int, **params: Any)
 def go_on(catalog: Catalog, job: Job, **columns: Any) -> None:
     """The slice is done: keep its outcome and let others go first."""
     with catalog.write() as session:
-        for mine in held(session, _token(job), [job]):
+        for mine in held(session, token_of(job), [job]):
             for name, value in columns.items():
                 setattr(mine, name, value)
             mine.attempts = 0
             release(mine)
-
-
-def _token(job: Job) -> UUID:
-    assert job.lease_token is not None, "a claimed job carries a token"
-    return job.lease_token

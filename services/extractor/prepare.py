@@ -17,6 +17,7 @@ from shared.catalog.session import Catalog
 from shared.chunks import Rows
 from shared.errors import NotFound, PlacewiseError
 from shared.jobs import Job, JobKind
+from shared.jobs.leases import token_of
 from shared.objects import ObjectStore
 from shared.objects.keys import query_key, thumbnail_key
 from shared.vision.decode import Decoded
@@ -44,9 +45,7 @@ class Batch:
 
     @property
     def token(self) -> UUID:
-        token = self.jobs[0].lease_token
-        assert token is not None, "a claimed job carries a token"
-        return token
+        return token_of(self.jobs[0])
 
     @property
     def kind(self) -> JobKind:
@@ -58,18 +57,17 @@ class Batch:
 
     def refuse(self, place: int, error: PlacewiseError) -> None:
         """The job at that place of `ready` goes to `failed`."""
-        del self.decoded[place]
+        if self.stored is None:
+            del self.decoded[place]
         self.failed.append((self.ready.pop(place), error))
 
     def refuse_not_finite(self, rows: Rows) -> Rows:
         """The rows that are finite; the jobs of the others go from `ready` to `failed`."""
-        finite = [bool(np.isfinite(row).all()) for row in rows]
-        if all(finite):
+        finite = np.isfinite(rows).all(axis=1)
+        if finite.all():
             return rows
-        found = list(zip(self.ready, self.decoded, finite, strict=True))
-        self.failed += [(job, not_finite()) for job, _, good in found if not good]
-        self.ready = [job for job, _, good in found if good]
-        self.decoded = [decoded for _, decoded, good in found if good]
+        for place in reversed(np.flatnonzero(~finite).tolist()):
+            self.refuse(place, not_finite())
         return rows[finite]
 
 

@@ -11,7 +11,7 @@ import logging
 
 from sqlalchemy import select
 
-from services.extractor.loaded import LoadedModels, Made
+from services.extractor.loaded import LoadedModels
 from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.maps import Map
 from shared.catalog.session import Catalog
@@ -38,11 +38,7 @@ def renew_outdated_generations(catalog: Catalog, models: LoadedModels) -> int:
     started = 0
     for generation, vocabulary, whitening in found:
         try:
-            made = Made(
-                models.of_generation(generation),
-                models.centres(vocabulary) if vocabulary else None,
-                models.projection(whitening) if whitening else None,
-            )
+            made = models.made_of(generation, vocabulary, whitening)
         except PlacewiseError as error:
             log.error("generation %s can't be checked: %s", generation.id, error.detail)
             continue

@@ -16,7 +16,9 @@ from typing import Any
 from celery import signals
 from sqlalchemy.exc import SQLAlchemyError
 
-from services.extractor.worker import AWAY_SECONDS, DrainResult, ExtractorWorker
+from services.extractor.drain_result import DrainResult
+from services.extractor.setbacks import AWAY_SECONDS
+from services.extractor.worker import ExtractorWorker
 from shared.catalog.away import Outage
 from shared.catalog.session import Catalog
 from shared.heartbeat import Heartbeat

@@ -12,21 +12,18 @@ from typing import Any
 from uuid import UUID
 
 import numpy as np
-from sqlalchemy import select
 
 from services.extractor.target import Target
-from shared.catalog.chunks import Chunk, Descriptor
+from shared.catalog.chunks import rows_of
 from shared.catalog.generations import active_generation
-from shared.catalog.photos import Photo
+from shared.catalog.photos import live_photos
 from shared.catalog.session import Catalog
-from shared.chunks import Row, Rows, read_row
+from shared.chunks import Row, Rows, are_whole, read_row
 from shared.errors import NotFound
 from shared.jobs import Job, JobKind
 from shared.objects import ObjectStore
 
 log = logging.getLogger(__name__)
-
-UNIT_WITHIN = 1e-3  # of a stored row's length
 
 
 def stored_rows(
@@ -38,29 +35,20 @@ def stored_rows(
     be described anew.
     """
     with catalog.read() as session:
-        found = session.execute(
-            select(Descriptor.photo_id, Descriptor.row, Chunk.object_key)
-            .join(Chunk, Chunk.id == Descriptor.chunk_id)
-            .join(Photo, Photo.id == Descriptor.photo_id)
-            .where(
-                Descriptor.generation_id == generation_id,
-                Descriptor.photo_id.in_(photo_ids),
-                Photo.deleted_at.is_(None),
-            )
-            .order_by(Chunk.object_key, Descriptor.row)
-        ).all()
+        live = live_photos(session, photo_ids)
+        located = rows_of(session, generation_id, list(live))
     rows = {}
-    for photo_id, number, object_key in found:
-        try:
-            row = read_row(store, object_key, number)
-        except (NotFound, IndexError, ValueError) as error:
-            log.error("row %d of the chunk %s can't be read: %s", number, object_key, error)
-            continue
-        length = float(np.linalg.norm(row))
-        if length == 0 or abs(length - 1) < UNIT_WITHIN:
-            rows[photo_id] = row
-        else:
-            log.error("row %d of the chunk %s is no descriptor any more", number, object_key)
+    for object_key in sorted(located):
+        for number, photo_id in located[object_key]:
+            try:
+                row = read_row(store, object_key, number)
+            except (NotFound, IndexError, ValueError) as error:
+                log.error("row %d of the chunk %s can't be read: %s", number, object_key, error)
+                continue
+            if are_whole(row[np.newaxis]).all():
+                rows[photo_id] = row
+            else:
+                log.error("row %d of the chunk %s is no descriptor any more", number, object_key)
     return rows
 
 
@@ -77,11 +65,7 @@ def rows_to_project(
     photo_ids = [job.photo_id for job in jobs if job.photo_id is not None]
     with catalog.read() as session:
         source = active_generation(session, jobs[0].map_id)
-        live = set(
-            session.scalars(
-                select(Photo.id).where(Photo.id.in_(photo_ids), Photo.deleted_at.is_(None))
-            )
-        )
+        live = live_photos(session, photo_ids).keys()
     if source is None or source.spec != whole_spec(target):
         return None
     rows = stored_rows(catalog, store, source.id, photo_ids)

@@ -54,12 +54,8 @@ def find_target(
         if first is None:
             return None
         generation, vocabulary = first
-    target = Target(
-        models.of_generation(generation),
-        models.centres(vocabulary) if vocabulary else None,
-        models.projection(whitening) if whitening else None,
-        generation=generation,
-    )
+    made = models.made_of(generation, vocabulary, whitening)
+    target = Target(made.extractor, made.centres, made.projection, generation=generation)
     # A query is compared once and thrown away: another decoder release is close enough.
     check_spec(generation, target, decoder_matters=job.kind not in QUERY_JOBS)
     return target

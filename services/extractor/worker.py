@@ -22,79 +22,40 @@ import logging
 import math
 import threading
 import time
-from collections import defaultdict
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import dataclass, replace
 from uuid import UUID
 
-import numpy as np
 from sqlalchemy.exc import SQLAlchemyError
 
 from services.extractor.compare import Comparisons, Prepared
 from services.extractor.decoding import DecoderPool
+from services.extractor.describe import describe
+from services.extractor.drain_result import DrainResult
 from services.extractor.loaded import LoadedModels
 from services.extractor.model_change import ModelChanges
 from services.extractor.prepare import Batch, prepare
-from services.extractor.publish import Published, publish
+from services.extractor.publish import publish
 from services.extractor.renew import renew_outdated_generations
+from services.extractor.setbacks import AWAY_SECONDS, Setbacks
 from services.extractor.target import find_target
 from shared.catalog.away import Outage
-from shared.catalog.generations import active_generation
-from shared.catalog.maps import lock_map
 from shared.catalog.session import Catalog
 from shared.chunks import Rows
-from shared.errors import Conflict, PlacewiseError, Unavailable
+from shared.errors import PlacewiseError
 from shared.heartbeat import Heartbeat
 from shared.jobs import InProcessHints, Job, Priority, begin, claim, hold_lease
 from shared.jobs.claim import any_claimable
-from shared.jobs.finish import fail, release
-from shared.jobs.leases import fallen, held
-from shared.jobs.model_changes import abandon_generation
-from shared.jobs.table import EXTRACTOR_JOBS, MODEL_CHANGES, JobKind, WaitingFor
+from shared.jobs.leases import token_of
+from shared.jobs.table import EXTRACTOR_JOBS, MODEL_CHANGES, JobKind
 from shared.objects import ObjectStore
 from shared.settings import Settings
-from shared.vision.passes import PhotoDoesNotFit
 
 log = logging.getLogger(__name__)
 
 QUERY_LOOK_SECONDS = 0.1  # between two looks for queries while a bulk batch is described
 IDLE_SECONDS = 1.0  # how long a lost hint can cost
-AWAY_SECONDS = 2.0  # pause of jobs when the store or the catalog is not there right now
-OPERATOR_SECONDS = 15.0  # pause of photos that need an operator first (weights missing, say)
-
-
-@dataclass(slots=True)
-class DrainResult:
-    """What one drain did: this is what the operator sees."""
-
-    maps: set[str] = field(default_factory=set)
-    claimed: int = 0
-    succeeded: int = 0
-    failed: int = 0
-    seconds: defaultdict[str, float] = field(default_factory=lambda: defaultdict(float))
-    more: bool = False
-    """It ended before the work did."""
-
-    def add(self, other: DrainResult) -> None:
-        """Count what another one has counted, too."""
-        self.maps |= other.maps
-        self.claimed += other.claimed
-        self.succeeded += other.succeeded
-        self.failed += other.failed
-        for stage, took in other.seconds.items():
-            self.seconds[stage] += took
-
-    def as_dict(self) -> dict[str, Any]:
-        """For logs and for Flower."""
-        return {
-            "maps": sorted(self.maps),
-            "claimed": self.claimed,
-            "succeeded": self.succeeded,
-            "failed": self.failed,
-            "seconds": {stage: round(took, 3) for stage, took in self.seconds.items()},
-        }
 
 
 @dataclass(slots=True)
@@ -108,9 +69,7 @@ class Work:
 
     @property
     def token(self) -> UUID:
-        token = self.jobs[0].lease_token
-        assert token is not None, "a claimed job carries a token"
-        return token
+        return token_of(self.jobs[0])
 
 
 class ExtractorWorker:
@@ -136,6 +95,7 @@ class ExtractorWorker:
         self._decoders = DecoderPool(settings)
         self._changes = ModelChanges(catalog, store, self._models, self._decoders, settings)
         self._comparisons = Comparisons(catalog, store, self._models, self._decoders, settings)
+        self._setbacks = Setbacks(catalog, settings.max_attempts)
         # Two: a query's photo does not wait until those of the next batch are read.
         self._ahead = ThreadPoolExecutor(max_workers=2, thread_name_prefix="prepare")
         self._beside = ThreadPoolExecutor(max_workers=1, thread_name_prefix="queries")
@@ -185,7 +145,8 @@ class ExtractorWorker:
         try:
             while ahead is not None:
                 if stop.is_set() or time.monotonic() > until:
-                    self._give_back(ahead)
+                    with ahead.lease:
+                        self._setbacks.give_back(ahead.jobs)
                     result.more = True
                     break
                 work = ahead
@@ -296,7 +257,7 @@ class ExtractorWorker:
 
     def _describe(self, work: Work, result: DrainResult, company: int) -> Rows | None:
         """A row for each of the batch's `ready`; None where there is nothing to publish."""
-        with self._answered(work, result):
+        with self._setbacks.answered(work.jobs, result):
             if work.batch is None:
                 started = time.perf_counter()
                 self._begin(work)
@@ -305,28 +266,21 @@ class ExtractorWorker:
                 return None
             batch = work.batch.result()
             if batch is None:
-                self._wait_for_vocabulary(work)
+                self._setbacks.wait_for_vocabulary(work.jobs)
                 return None
             self._begin(work, company)
             if isinstance(batch, Prepared):
-                self._count(self._comparisons.finish(batch), batch.seconds, result)
+                result.count(self._comparisons.finish(batch), batch.seconds)
                 return None
-            return _rows(batch)
+            return describe(batch)
         return None  # what went wrong has been answered
 
     def _publish(self, work: Work, rows: Rows, result: DrainResult) -> None:
-        with self._answered(work, result):
+        with self._setbacks.answered(work.jobs, result):
             batch = work.batch.result() if work.batch else None
             assert isinstance(batch, Batch), "it was described"
             outcome = publish(self._catalog, self._store, batch, rows, self._settings.slot_rows)
-            self._count(outcome, batch.seconds, result)
-
-    @staticmethod
-    def _count(outcome: Published, seconds: dict[str, float], result: DrainResult) -> None:
-        result.succeeded += outcome.succeeded
-        result.failed += outcome.failed
-        for stage, took in seconds.items():
-            result.seconds[stage] += took
+            result.count(outcome, batch.seconds)
 
     def _publish_behind(self, work: Work, rows: Rows) -> DrainResult:
         result = DrainResult()
@@ -340,105 +294,12 @@ class ExtractorWorker:
         if behind is not None:
             result.add(behind.result())
 
-    @contextlib.contextmanager
-    def _answered(self, work: Work, result: DrainResult) -> Iterator[None]:
-        """What goes wrong in the block is written to the jobs. Raises what can't be written."""
-        try:
-            yield
-        except (Unavailable, OSError, SQLAlchemyError) as error:
-            self._pause(work, error)
-        except PlacewiseError as error:
-            result.failed += self._refuse(work, error)
-        except Exception as error:
-            log.exception("a batch of %d jobs crashed", len(work.jobs))
-            self._crashed(work, error)
-
     def _begin(self, work: Work, company: int = 0) -> None:
         """Decoding, in other processes, is done: a fall from here on may be the photos' fault."""
         with self._catalog.write() as session:
             begin(session, work.token, len(work.jobs) + company)
 
-    def _wait_for_vocabulary(self, work: Work) -> None:
-        """Photos wait until the map has one; a query is told at once."""
-        with self._catalog.write() as session:
-            lock_map(session, work.jobs[0].map_id)
-            there = active_generation(session, work.jobs[0].map_id) is not None
-            for job in held(session, work.token, work.jobs):
-                if job.kind == JobKind.DESCRIBE and not there:
-                    fail(job, no_vocabulary().as_problem())
-                else:
-                    release(job, waiting_for=None if there else WaitingFor.VOCABULARY)
-
-    def _give_back(self, work: Work) -> None:
-        """Stopping: what was taken ahead goes to another worker, unharmed."""
-        with work.lease, self._catalog.write() as session:
-            for job in held(session, work.token, work.jobs):
-                release(job)
-
-    def _pause(self, work: Work, error: Exception) -> None:
-        """Something outside the jobs is away: try again soon, and count no attempt."""
-        log.warning("%d jobs pause for %g s: %s", len(work.jobs), AWAY_SECONDS, error)
-        with self._catalog.write() as session:
-            for job in held(session, work.token, work.jobs):
-                release(job, after_seconds=AWAY_SECONDS)
-                job.error = error.as_problem() if isinstance(error, PlacewiseError) else None
-
-    def _refuse(self, work: Work, error: PlacewiseError) -> int:
-        """The request can't be met. Stored photos wait for the operator, all else fails."""
-        log.error("%s", error.detail)
-        failed = 0
-        with self._catalog.write() as session:
-            for job in held(session, work.token, work.jobs):
-                if job.kind in (JobKind.INDEX, JobKind.REINDEX):
-                    release(job, after_seconds=OPERATOR_SECONDS)
-                    job.error = error.as_problem()
-                    continue
-                fail(job, error.as_problem())
-                failed += 1
-                abandon_generation(session, job)
-        return failed
-
-    def _crashed(self, work: Work, error: Exception) -> None:
-        """As if the worker had died: what fell in a batch is tried alone, then counted."""
-        with self._catalog.write() as session:
-            for job in held(session, work.token, work.jobs):
-                job.claimed_together = len(work.jobs)
-                fallen(
-                    session,
-                    job,
-                    self._settings.max_attempts,
-                    cause=type(error).__name__,
-                )
-
-
-def _rows(batch: Batch) -> Rows:
-    """A row for each of the batch's `ready`, which photos that the GPU can't hold have left."""
-    target = batch.target
-    while batch.ready:
-        started = time.perf_counter()
-        try:
-            if batch.stored is not None:
-                assert target.projection is not None
-                rows = target.projection.project(batch.stored)
-            else:
-                pixels = batch.pixels()
-                rows = target.extractor.describe(pixels, target.centres, target.projection)
-        except PhotoDoesNotFit as error:
-            batch.refuse(error.place, error)
-            continue
-        batch.seconds["describe"] = time.perf_counter() - started
-        return rows
-    return np.empty((0, target.generation.dimension), np.float32)
-
 
 def _has_to_be_alone(work: Work) -> bool:
     """Else nobody knows who felled the worker. Model changes come as a batch of one, too."""
     return work.batch is None or work.jobs[0].alone
-
-
-def no_vocabulary() -> Conflict:
-    return Conflict(
-        "no_vocabulary",
-        "The map's extractor needs a vocabulary and the map has none yet. Fit one on its photos "
-        "(POST /api/v1/vocabularies) or import one (POST /api/v1/vocabularies/import).",
-    )

@@ -33,8 +33,9 @@ from shared.comparison import (
     Comparison,
     check_can_explain,
     check_can_rerank,
+    query_expired,
 )
-from shared.errors import Gone, NotFound
+from shared.errors import NotFound
 from shared.ids import new_id
 from shared.jobs import Job, JobKind, Priority
 from shared.jobs.hints import Lane
@@ -89,7 +90,7 @@ def compare_described(gateway: Gateway, described: Job, query: Query, wanted: Wa
     with gateway.catalog.write() as session:
         current = session.get(Job, described.id, with_for_update=True, populate_existing=True)
         if current is None:
-            raise expired()
+            raise query_expired()
         found = _comparison_of(session, current)
         if found is not None:  # another call was first
             return found
@@ -105,7 +106,7 @@ def compared_answer(gateway: Gateway, job: Job) -> SimilarityAnswer:
     try:
         data = gateway.store.get(comparison_key(job.id))
     except NotFound:
-        raise expired() from None
+        raise query_expired() from None
     candidates = Compared.model_validate_json(data).candidates
     scores = {one.photo_id: one for one in params.request.candidates}
     with gateway.catalog.read() as session:
@@ -125,10 +126,6 @@ def compared_answer(gateway: Gateway, job: Job) -> SimilarityAnswer:
         )
         for one in live[: params.top_k]
     )
-
-
-def expired() -> Gone:
-    return Gone("query_expired", "The query is no longer kept (QUERY_TTL_SECONDS). Ask again.")
 
 
 def _comparison_of(session: Session, described: Job) -> Job | None:

@@ -8,14 +8,15 @@ from uuid import UUID
 
 from fastapi import APIRouter, Query, Response
 from pydantic import BaseModel, ConfigDict, Field
+from sqlalchemy.orm import Session
 
 from services.gateway.context import DEFAULT_MAP, GatewayDep, MapName, read_cursor
-from services.gateway.once import OnceDep
+from services.gateway.once import Once, OnceDep
 from services.gateway.room import ROOM_FOR_JOBS
-from services.gateway.schemas import Answer, JobStarted, job_started
+from services.gateway.schemas import Answer, JobStarted, started_job
 from shared.catalog.chunks import has_located
 from shared.catalog.evaluations import Evaluation, list_evaluations
-from shared.catalog.generations import active_generation
+from shared.catalog.generations import Generation, active_generation
 from shared.catalog.maps import get_map
 from shared.catalog.photos import PhotoRole
 from shared.errors import Conflict
@@ -86,26 +87,10 @@ def evaluate(
     with gateway.catalog.write() as session:
         map_ = get_map(session, map_name)
         generation = active_generation(session, map_.id)
-        if generation is None or not has_located(session, generation.id, PhotoRole.DATABASE):
-            raise Conflict(
-                "nothing_to_evaluate",
-                "The map has no described photo with coordinates or a place. Upload some, and wait "
-                "for their jobs.",
-            )
-        job = Job(
-            id=new_id(),
-            map_id=map_.id,
-            kind=JobKind.EVALUATE,
-            priority=Priority.EVALUATION,
-            params={**params, "automatic": False},
+        job = queue_asking(
+            session, once, map_.id, generation, JobKind.EVALUATE, {**params, "automatic": False}
         )
-        session.add(job)
-        session.flush()
-        once.keep_job(session, job)
-    answer = job_started(job)
-    response.headers["Location"] = answer.status_url
-    response.headers["Retry-After"] = "1"
-    return answer
+    return started_job(response, job)
 
 
 @router.get("/evaluations", operation_id="list_evaluations", response_model=EvaluationsAnswer)
@@ -124,3 +109,26 @@ def evaluations(
         evaluations=[EvaluationAnswer.of(evaluation) for evaluation in page],
         next_cursor=str(page[-1].id) if len(found) > limit else None,
     )
+
+
+def queue_asking(
+    session: Session,
+    once: Once,
+    map_id: UUID,
+    generation: Generation | None,
+    kind: JobKind,
+    params: dict[str, Any],
+) -> Job:
+    """A job that asks the generation with the map's own photos; Conflict (`nothing_to_evaluate`)
+    where none of them has a place."""
+    if generation is None or not has_located(session, generation.id, PhotoRole.DATABASE):
+        raise Conflict(
+            "nothing_to_evaluate",
+            "The map has no described photo with coordinates or a place. Upload some, and wait "
+            "for their jobs.",
+        )
+    job = Job(id=new_id(), map_id=map_id, kind=kind, priority=Priority.EVALUATION, params=params)
+    session.add(job)
+    session.flush()
+    once.keep_job(session, job)
+    return job

@@ -22,10 +22,11 @@ from services.gateway.waiting import read_job, wait_for_job
 from shared.catalog.away import as_unavailable
 from shared.catalog.maps import get_map
 from shared.jobs import Job, JobKind, JobState
-from shared.jobs.batches import cancel_batch, retry_batch
+from shared.jobs.cancel_batch import cancel_batch
 from shared.jobs.finish import cancel, retry
 from shared.jobs.hints import lane_of
 from shared.jobs.model_changes import cancel_model_change
+from shared.jobs.retry_batch import retry_batch
 from shared.jobs.table import MODEL_CHANGES, UNFINISHED, get_job, list_jobs
 
 router = APIRouter(tags=["jobs"])

@@ -18,7 +18,7 @@ from services.gateway.schemas import (
     GenerationAnswer,
     JobStarted,
     VocabularyAnswer,
-    job_started,
+    started_job,
 )
 from shared.catalog.chunks import about_described
 from shared.catalog.generations import list_generations
@@ -255,7 +255,4 @@ def _queue_import(gateway: Gateway, map_name: str, params: dict[str, Any], once:
 
 def _started(gateway: Gateway, response: Response, job: Job) -> JobStarted:
     gateway.hints.send()
-    answer = job_started(job)
-    response.headers["Location"] = answer.status_url
-    response.headers["Retry-After"] = "1"
-    return answer
+    return started_job(response, job)

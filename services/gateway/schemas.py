@@ -7,6 +7,7 @@ from datetime import datetime
 from typing import Any
 from uuid import UUID
 
+from fastapi import Response
 from pydantic import BaseModel, ConfigDict, Field
 
 from services.gateway.context import API
@@ -335,3 +336,11 @@ def job_started(job: Job) -> JobStarted:
         status_url=job_url(job.id),
         result_url=f"{job_url(job.id)}/result" if job.kind in QUERY_JOBS else None,
     )
+
+
+def started_job(response: Response, job: Job) -> JobStarted:
+    """What a 202 says of its job, in the body and in the headers of `response`."""
+    started = job_started(job)
+    response.headers["Location"] = started.status_url
+    response.headers["Retry-After"] = "1"
+    return started

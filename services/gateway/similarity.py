@@ -16,7 +16,6 @@ from services.gateway.compare import (
     compare_described,
     compare_stored,
     compared_answer,
-    expired,
 )
 from services.gateway.context import (
     DEFAULT_MAP,
@@ -30,10 +29,11 @@ from services.gateway.find_similar import find_similar, query_by_job, query_by_p
 from services.gateway.once import Once, OnceFormDep
 from services.gateway.receive import describe_form, receive_file
 from services.gateway.room import ROOM_FOR_QUERIES, Kind, RoomDep
-from services.gateway.schemas import JobStarted, SimilarityAnswer, job_started
+from services.gateway.schemas import JobStarted, SimilarityAnswer, started_job
 from services.gateway.waiting import preferred_wait, wait_for_job
 from services.gateway.wanted import Wanted, WantedDep
 from shared.catalog.maps import get_map
+from shared.comparison import query_expired
 from shared.errors import (
     Conflict,
     Gone,
@@ -180,12 +180,10 @@ async def _when_it_ends(
         if job.state in UNFINISHED and left > 0:
             waited = await wait_for_job(gateway, job.id, left)
             if waited is None:
-                raise expired()
+                raise query_expired()
             job = waited
         if job.state in UNFINISHED:
-            started = job_started(job)
-            response.headers["Location"] = started.status_url
-            response.headers["Retry-After"] = "1"
+            started = started_job(response, job)
             # As a response of its own: the route's model is that of the 200.
             return JSONResponse(started.model_dump(mode="json"), 202, dict(response.headers))
         result = await run_in_threadpool(_result, gateway, job)

@@ -10,17 +10,15 @@ from fastapi import Path as PathParameter
 from pydantic import BaseModel, ConfigDict, Field
 
 from services.gateway.context import DEFAULT_MAP, GatewayDep, GenerationId, MapName
+from services.gateway.evaluations import queue_asking
 from services.gateway.once import OnceDep
 from services.gateway.room import ROOM_FOR_JOBS
-from services.gateway.schemas import Answer, JobStarted, job_started
-from shared.catalog.chunks import has_located
+from services.gateway.schemas import Answer, JobStarted, started_job
 from shared.catalog.generations import GenerationState, get_generation
 from shared.catalog.maps import get_map
-from shared.catalog.photos import PhotoRole
 from shared.catalog.vocabularies import why_no_word_weights
 from shared.errors import Conflict, NotFound
-from shared.ids import new_id
-from shared.jobs import Job, JobKind, Priority
+from shared.jobs import JobKind
 from shared.word_weights.record import HeldOut, Outcome, WordWeights, stored_word_weights
 
 router = APIRouter(tags=["evaluations"])
@@ -93,26 +91,9 @@ def learn_word_weights(
             )
         if reason := why_no_word_weights(session, generation):
             raise Conflict("no_word_weights", f"This generation gets no word weights: {reason}.")
-        if not has_located(session, generation.id, PhotoRole.DATABASE):
-            raise Conflict(
-                "nothing_to_evaluate",
-                "The map has no described photo with coordinates or a place. Upload some, and wait "
-                "for their jobs.",
-            )
-        job = Job(
-            id=new_id(),
-            map_id=map_.id,
-            kind=JobKind.WORD_WEIGHTS,
-            priority=Priority.EVALUATION,
-            params={**params, "generation_id": str(generation.id)},
-        )
-        session.add(job)
-        session.flush()
-        once.keep_job(session, job)
-    answer = job_started(job)
-    response.headers["Location"] = answer.status_url
-    response.headers["Retry-After"] = "1"
-    return answer
+        params["generation_id"] = str(generation.id)
+        job = queue_asking(session, once, map_.id, generation, JobKind.WORD_WEIGHTS, params)
+    return started_job(response, job)
 
 
 @router.get(

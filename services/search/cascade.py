@@ -363,7 +363,8 @@ class _Estimates:
         if not len(self.rows):
             return np.zeros(len(rows), bool)
         at = np.minimum(self.rows.searchsorted(rows), len(self.rows) - 1)
-        return self.rows[at] == rows
+        found: NDArray[np.bool_] = self.rows[at] == rows
+        return found
 
     def of(self, rows: Indices) -> _Estimates:
         """Of some of these rows."""

@@ -184,7 +184,9 @@ def rows_of(photos: Columns, ids: Collection[UUID]) -> NDArray[np.int64]:
     ends = np.fromiter((id_.int & LOW for id_ in ids), np.uint64, len(ids))
     alike = np.flatnonzero(np.isin(photos.id_ends, ends))
     wanted = frozenset(ids)
-    return alike[np.fromiter((id_ in wanted for id_ in photos.ids(alike)), bool, len(alike))]
+    meant = np.fromiter((id_ in wanted for id_ in photos.ids(alike)), bool, len(alike))
+    rows: NDArray[np.int64] = alike[meant]
+    return rows
 
 
 def _rows_by(pairs: Iterable[tuple[str, int]]) -> dict[str, NDArray[np.int64]]:

@@ -13,16 +13,13 @@ from collections import OrderedDict
 import numpy as np
 
 from services.search.snapshot import Snapshot
-from shared.chunks import Row, read_row
+from shared.chunks import Row, are_whole, read_row
 from shared.errors import Gone, NotFound, Unavailable
 from shared.objects import ObjectStore
 from shared.objects.keys import QUERIES
 from shared.search_protocol import SearchRequest
 
 KEPT_ROWS = 64  # 25 MB at 98,304 dimensions
-
-# A chunk's rows are unit vectors (or zero): with a norm further off than this, a row is damaged.
-NORM_MARGIN = 1e-3
 
 
 class QueryRows:
@@ -63,8 +60,7 @@ class QueryRows:
             raise _unreadable(object_key) from error
         if object_key.startswith(QUERIES):
             return found  # not kept: it goes with its object, after QUERY_TTL_SECONDS
-        norm = float(np.linalg.norm(found))
-        if not (norm == 0.0 or abs(norm - 1.0) < NORM_MARGIN):
+        if not are_whole(found[np.newaxis]).all():
             raise _unreadable(object_key)
         with self._lock:
             self._kept[at] = found

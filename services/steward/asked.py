@@ -5,10 +5,10 @@ from __future__ import annotations
 import threading
 import time
 
-from services.steward.take import Stopped, token_of
+from services.steward.take import Stopped
 from shared.catalog.session import Catalog
 from shared.jobs import Job
-from shared.jobs.leases import held
+from shared.jobs.leases import held, token_of
 
 REPORT_SECONDS = 0.5  # between two notes of the progress
 

@@ -15,7 +15,7 @@ from sqlalchemy.orm import Session
 
 from services.steward.asked import Asked
 from services.steward.measure import Measure
-from services.steward.take import Taker, token_of
+from services.steward.take import Taker
 from services.steward.word_weights import LearnWords
 from shared.catalog.chunks import count_searchable
 from shared.catalog.evaluations import Evaluation
@@ -27,7 +27,7 @@ from shared.estimate.calibration import Calibration
 from shared.ids import new_id
 from shared.jobs import Job, JobKind
 from shared.jobs.finish import succeed
-from shared.jobs.leases import held
+from shared.jobs.leases import held, token_of
 from shared.objects import ObjectStore
 from shared.search_protocol import SearchPort
 from shared.settings import Settings

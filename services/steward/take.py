@@ -6,7 +6,6 @@ import logging
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
-from uuid import UUID
 
 from sqlalchemy.exc import SQLAlchemyError
 
@@ -14,9 +13,9 @@ from shared.catalog.away import Outage
 from shared.catalog.session import Catalog
 from shared.errors import PlacewiseError, Unavailable
 from shared.jobs import Job, JobKind, claim, hold_lease
-from shared.jobs.batches import cancel_items
+from shared.jobs.cancel_batch import cancel_items
 from shared.jobs.finish import fail, release
-from shared.jobs.leases import fallen, held
+from shared.jobs.leases import fallen, held, token_of
 from shared.settings import Settings
 
 log = logging.getLogger(__name__)
@@ -91,9 +90,3 @@ class Taker:
         with self.catalog.write() as session:
             for mine in held(session, token_of(job), [job]):
                 fallen(session, mine, self.settings.max_attempts, cause=type(error).__name__)
-
-
-def token_of(job: Job) -> UUID:
-    """The token that a claimed job carries."""
-    assert job.lease_token is not None, "a claimed job carries a token"
-    return job.lease_token

@@ -11,17 +11,14 @@ from numpy.typing import NDArray
 from services.steward.ask import TRIES, damaged
 from shared.catalog.chunks import rows_of
 from shared.catalog.session import Catalog
-from shared.chunks import Rows, read_rows
+from shared.chunks import Rows, are_whole, read_rows
 from shared.errors import NotFound
 from shared.objects import ObjectStore
-from shared.word_weights.learn import Moments, Taught, nothing_taught, word_products
+from shared.word_weights.learn import Taught, nothing_taught
 from shared.word_weights.pairs import Lesson
 
 LESSON_BYTES = 64_000_000  # of rows in memory: 160 photos at 98,304 dimensions
 LEAST_ROWS = 8  # however long they are: the far pairs come from the same photos
-
-# A chunk's rows are unit vectors (or zero): with a norm further off than this, a row is damaged.
-NORM_MARGIN = 1e-3
 
 
 def rows_at_once(dimension: int) -> int:
@@ -47,10 +44,7 @@ def teach(
         before_each()
         rows, there = _read(catalog, store, generation_id, [photo_ids[i] for i in lesson.photos])
         near, far = (pairs[there[pairs].all(axis=1)] for pairs in (lesson.near, lesson.far))
-        taught += Taught(
-            Moments.of(word_products(rows, near, words)),
-            Moments.of(word_products(rows, far, words)),
-        )
+        taught += Taught.of(rows, near, far, words)
     return taught
 
 
@@ -84,7 +78,6 @@ def _read_checked(store: ObjectStore, object_key: str, rows: Sequence[int]) -> R
         read = read_rows(store, object_key, rows)
     except (IndexError, ValueError) as error:
         raise damaged([object_key]) from error
-    norms = np.linalg.norm(read, axis=1)
-    if not np.all((norms == 0) | (np.abs(norms - 1) < NORM_MARGIN)):
+    if not are_whole(read).all():
         raise damaged([object_key])
     return read

@@ -16,12 +16,19 @@ from sqlalchemy.orm import Session
 from shared.catalog.away import Outage
 from shared.catalog.base import db_now, db_now_plus, rowcount
 from shared.catalog.session import Catalog
-from shared.jobs.batches import cancel_items, is_listed_batch
+from shared.jobs.batches import is_listed_batch
+from shared.jobs.cancel_batch import cancel_items
 from shared.jobs.finish import fail, release
 from shared.jobs.model_changes import abandon_generation
 from shared.jobs.table import Job, locked_under
 
 log = logging.getLogger(__name__)
+
+
+def token_of(job: Job) -> UUID:
+    """The token that a claimed job carries."""
+    assert job.lease_token is not None, "a claimed job carries a token"
+    return job.lease_token
 
 
 def extend_lease(session: Session, token: UUID, lease_seconds: float) -> bool:

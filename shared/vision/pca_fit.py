@@ -11,7 +11,7 @@ comes of it. Each block is a step, and a fit can be interrupted between any two.
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
@@ -183,14 +183,18 @@ def fit(rows: Rows, kept: int, *, block_bytes: int = BLOCK_BYTES) -> Whitening:
     return fit_columns(ArrayColumns(rows, block_bytes), kept)
 
 
-def fit_columns(rows: Columns, kept: int) -> Whitening:
-    """The whitening of rows to `kept` dimensions in one go."""
+def fit_columns(
+    rows: Columns, kept: int, told: Callable[[int, int], None] = lambda done, most: None
+) -> Whitening:
+    """The whitening of rows to `kept` dimensions in one go; `told` hears how many steps are done,
+    and of how many."""
     finding = PcaFit(rows, kept)
     parts = []
     while not finding.done:
         part = finding.step()
         if part is not None:
             parts.append(part)
+        told(*finding.progress)
     return finding.whitening(parts)
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from shared.objects import FolderStore
 from shared.vision.pca import Rows, Whitening
-from shared.vision.pca_fit import PcaFit
+from shared.vision.pca_fit import fit_columns
 from shared.vision.pca_rows import StoredColumns, block_width, usable
 
 ROWS = "rows-"
@@ -36,11 +36,4 @@ def fit_stream(
                 stored.add(rows)
             seen += len(batch)
             told("gathering", seen, most)
-        fit = PcaFit(stored, kept)
-        parts = []
-        while not fit.done:
-            part = fit.step()
-            if part is not None:
-                parts.append(part)
-            told("reducing", *fit.progress)
-    return fit.whitening(parts)
+        return fit_columns(stored, kept, lambda done, steps: told("reducing", done, steps))

@@ -74,6 +74,14 @@ class Taught:
     near: Moments
     far: Moments
 
+    @classmethod
+    def of(cls, rows: Rows, near: NDArray[np.int64], far: NDArray[np.int64], words: int) -> Taught:
+        """Pairs of both kinds, (n, 2) and (m, 2), of (r, words * width) rows."""
+        return cls(
+            Moments.of(word_products(rows, near, words)),
+            Moments.of(word_products(rows, far, words)),
+        )
+
     def __add__(self, other: Taught) -> Taught:
         return Taught(self.near + other.near, self.far + other.far)
 

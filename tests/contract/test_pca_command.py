@@ -20,6 +20,7 @@ from tests.support.photos import photo_bytes
 
 PHOTOS = 9
 KEPT = 4
+LONGER = ("dimension", "whitening")  # what a projection changes of a spec
 
 
 @pytest.fixture(autouse=True)
@@ -79,6 +80,19 @@ def test_a_folders_whitening_shortens_the_rows_of_the_same_extractor(
     assert other["code"] == "pca_unfit"
     assert "aggregator is 'gem', was 'avg'" in other["detail"]
     assert not (tmp_path / "no.npy").exists()
+
+
+def test_a_folders_whitening_is_of_the_precision_that_photos_are_described_in(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PRECISION", "bfloat16")
+    file, photo = tmp_path / "city.safetensors", folder / "0.jpg"
+    run("pca", "fit", folder, "--dimension", KEPT, "--out", file)
+    spec = decode_whitening(file.read_bytes()).spec
+    assert spec is not None
+    assert spec["precision"] == "bfloat16"
+    shorter = run("describe", photo, "--out", tmp_path / "short.npy", "--pca", file)
+    assert shorter["spec"] == {**spec, **{one: shorter["spec"][one] for one in LONGER}}
 
 
 def test_a_file_of_rows_is_enough(tmp_path: Path) -> None:

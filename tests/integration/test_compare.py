@@ -6,9 +6,11 @@ import threading
 from collections.abc import Callable
 from uuid import UUID
 
+import numpy as np
 import pytest
 from sqlalchemy import select
 
+from services.extractor import stored_rows
 from services.extractor.compare import Comparisons, Prepared
 from services.extractor.worker import ExtractorWorker
 from services.steward.collect import (
@@ -16,12 +18,14 @@ from services.steward.collect import (
     collect_orphans,
     collect_queries,
 )
+from shared.catalog.chunks import rows_of
 from shared.catalog.maps import ensure_default_map
 from shared.catalog.session import Catalog
+from shared.chunks import Row, read_row
 from shared.comparison import Compared
 from shared.ids import new_id
 from shared.jobs import Job, JobKind, free_expired_leases
-from shared.objects import FolderStore
+from shared.objects import FolderStore, ObjectStore
 from shared.objects.keys import comparison_key, query_key
 from shared.settings import Settings
 from tests.integration.comparisons import (
@@ -41,6 +45,7 @@ from tests.integration.comparisons import (
 from tests.integration.gateway import Service
 from tests.support.photos import near_copy, photo_bytes
 from tests.support.problems import field_refused, problem
+from tests.support.small_gpu import make_too_heavy
 
 
 @pytest.fixture
@@ -287,6 +292,47 @@ def test_candidate_that_can_t_be_read_follows_those_that_can(service: Service) -
     assert None not in scores[:2]
     assert scores[2] is None
     assert None not in column(answer, "explanation"), "which needs its descriptor alone"
+
+
+def test_candidate_that_the_gpu_can_not_hold_is_left_out_of_the_reranking_alone(
+    service: Service, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    query, *others = service.indexed(*range(5))
+    before = compared(service, query, rerank=4)
+    heavy = others[2]
+    make_too_heavy(monkeypatch, 3)
+    answer = compared(service, query, rerank=4)
+    assert ids(answer) == [one for one in ids(before) if one != heavy] + [heavy]
+    scores = dict(zip(ids(before), column(before, "rerank_score"), strict=True))
+    assert column(answer, "rerank_score") == [
+        *(pytest.approx(scores[one]) for one in ids(answer)[:3]),
+        None,
+    ]
+    (told,) = [text for text in caplog.messages if "is not compared" in text]
+    assert heavy in told
+    assert "GPU's memory does not suffice" in told
+    assert jobs(service, "compare")[0]["state"] == "succeeded"
+
+
+def test_candidate_whose_descriptor_is_damaged_is_compared_and_not_explained(
+    service: Service, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    query = service.indexed(*range(5))[0]
+    before = plain(service, query)
+    damaged = ids(before)[0]
+    with service.catalog.read() as session:
+        found = rows_of(session, UUID(before["generation_id"]), [UUID(damaged)])
+    ((at, ((number, _),)),) = found.items()
+
+    def read(store: ObjectStore, key: str, row: int) -> Row:
+        whole = read_row(store, key, row)
+        return (whole / 2).astype(np.float32) if (key, row) == (at, number) else whole
+
+    monkeypatch.setattr(stored_rows, "read_row", read)
+    answer = compared(service, query)
+    assert set(ids(answer)) == set(ids(before))
+    for found_photo in answer["similar_images"]:
+        assert (found_photo["explanation"] is None) == (found_photo["image_id"] == damaged)
 
 
 def test_generation_that_was_replaced_is_compared_until_it_is_gone(service: Service) -> None:

@@ -16,8 +16,8 @@ import pytest
 from numpy.typing import NDArray
 from sqlalchemy import select
 
-from services.extractor import fit_vocabulary
-from services.extractor.fit_vocabulary import CLUSTER_UNITS, FitVocabulary
+from services.extractor import slices
+from services.extractor.fit_vocabulary import FitVocabulary
 from services.extractor.model_change import ModelChanges
 from services.extractor.worker import ExtractorWorker
 from services.steward.collect import collect_work
@@ -81,8 +81,8 @@ def photo_ids(workplace: Workplace) -> list[UUID]:
 def do_one_step_a_slice(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each look at the clock is a slice later than the one before."""
     looks = itertools.count()
-    clock = SimpleNamespace(monotonic=lambda: next(looks) * fit_vocabulary.SLICE_SECONDS)
-    monkeypatch.setattr(fit_vocabulary, "time", clock)
+    clock = SimpleNamespace(monotonic=lambda: next(looks) * slices.SLICE_SECONDS)
+    monkeypatch.setattr(slices, "time", clock)
 
 
 def do_slices(
@@ -136,7 +136,7 @@ def test_a_fit_replaces_the_generation_while_the_old_one_answers(fitted: Workpla
         "photos": PHOTOS,
         "failed": 0,
     }
-    assert job.progress_done == job.progress_total == 2 * PHOTOS + CLUSTER_UNITS
+    assert job.progress_done == job.progress_total == 2 * PHOTOS + slices.FIT_UNITS
     assert _version(fitted) > version
 
     vocabulary = fitted.vocabulary(new.vocabulary_id)
@@ -230,9 +230,9 @@ def test_a_fit_is_the_same_for_its_seed_and_whoever_does_its_slices(
         assert len(progress) < 120
     assert len(progress) > 20  # plan, two of the sample, 4 seeds, and the passes over one batch
     done, totals = zip(*progress, strict=True)
-    assert set(totals) == {5 + CLUSTER_UNITS + PHOTOS}, "what there is to do does not change"
+    assert set(totals) == {5 + slices.FIT_UNITS + PHOTOS}, "what there is to do does not change"
     assert list(done) == sorted(set(done)), "each slice is seen"
-    assert (done[2], done[-1]) == (5, 5 + CLUSTER_UNITS)
+    assert (done[2], done[-1]) == (5, 5 + slices.FIT_UNITS)
     again = torn.finish(job_id)
     assert again.progress_done == totals[0]
 

@@ -8,19 +8,17 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
-import torch
 
 from services.extractor.publish import publish
 from services.extractor.worker import ExtractorWorker
 from services.steward.queue import free_leases
 from shared.jobs import JobState
 from shared.objects import FolderStore
-from shared.vision.decode import decode
 from shared.vision.extractors import Extractor
-from shared.vision.preprocessing import get_preprocessing
 from tests.integration.workplace import Workplace, expected_row, same
 from tests.support.catalog_rows import set_columns
 from tests.support.photos import photo_bytes
+from tests.support.small_gpu import make_too_heavy
 
 WAIT_SECONDS = 30.0
 BATCH = 4  # tests.integration.conftest
@@ -197,15 +195,7 @@ def test_object_store_that_goes_away_while_publishing_costs_no_attempt(
 def test_photo_that_the_gpu_can_not_hold_fails_alone_and_is_not_tried_again(
     averages: Workplace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    real = Extractor.features
-    heavy = expected_pixels(7)
-
-    def features(made: Extractor, pixels: Any) -> torch.Tensor:
-        if any((one == heavy).all() for one in pixels):
-            raise torch.cuda.OutOfMemoryError("CUDA out of memory.")
-        return real(made, pixels)
-
-    monkeypatch.setattr(Extractor, "features", features)
+    make_too_heavy(monkeypatch, 7)
     photo_ids = averages.upload(1, 7, 2)
     result = averages.drain()
     assert (result.claimed, result.succeeded, result.failed) == (3, 2, 1)
@@ -216,7 +206,3 @@ def test_photo_that_the_gpu_can_not_hold_fails_alone_and_is_not_tried_again(
     rows = averages.rows()
     for number, photo_id in ((1, photo_ids[0]), (2, photo_ids[2])):
         assert same(rows[photo_id], expected_row("test-tiny-avg", photo_bytes(number)))
-
-
-def expected_pixels(number: int) -> Any:
-    return decode(photo_bytes(number), get_preprocessing("square32"), 10**9).pixels

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 
-from services.extractor import fit_pca, stored_rows
+from services.extractor import fit_pca, slices, stored_rows
 from services.extractor.loaded import LoadedModels
 from services.extractor.model_change import ModelChanges
 from services.extractor.renew import renew_outdated_generations
@@ -142,7 +142,7 @@ def test_stored_rows_are_whitened_without_a_photo(
         "rows": PHOTOS,
         "explained": pytest.approx(expected.explained),
     }
-    assert job.progress_done == job.progress_total == 2 * PHOTOS + fit_pca.REDUCE_UNITS
+    assert job.progress_done == job.progress_total == 2 * PHOTOS + slices.FIT_UNITS
     (stored,) = whitenings(workplace)
     file = decode_whitening(workplace.store.get(stored.object_key))
     assert file.whitening.sha256 == stored.sha256 == expected.sha256
@@ -184,8 +184,8 @@ def test_a_fit_is_the_same_whoever_does_its_slices(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     looks = itertools.count()
-    clock = SimpleNamespace(monotonic=lambda: next(looks) * fit_pca.SLICE_SECONDS)
-    monkeypatch.setattr(fit_pca, "time", clock)
+    clock = SimpleNamespace(monotonic=lambda: next(looks) * slices.SLICE_SECONDS)
+    monkeypatch.setattr(slices, "time", clock)
     monkeypatch.setattr(fit_pca, "READ_BYTES", 4 * 16 * 5)  # five rows at once
     monkeypatch.setattr(
         fit_pca, "block_width", lambda count, dimension: 6
@@ -239,6 +239,26 @@ def test_a_photo_whose_row_is_damaged_is_described_anew(
     reduce(described)
     for photo_id, row in described.rows().items():
         assert same(row, projected(expected, before[photo_id]))
+
+
+def test_a_photo_whose_projected_row_is_not_finite_fails_alone(
+    described: Workplace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = described.rows()
+    refused = sorted(before)[3]
+    real = Projection.project
+
+    def project(self: Projection, rows: Rows) -> Rows:
+        found = real(self, rows)
+        found[(rows == before[refused]).all(axis=1)] = np.nan
+        return found
+
+    monkeypatch.setattr(Projection, "project", project)
+    reduce(described)
+    assert described.rows().keys() == before.keys() - {refused}
+    with described.catalog.read() as session:
+        (job,) = session.query(Job).filter_by(kind=JobKind.REINDEX, state=JobState.FAILED)
+    assert (job.photo_id, refusal(job)) == (refused, "features_not_finite")
 
 
 def test_photos_are_described_where_the_rows_that_answer_were_made_otherwise(

@@ -95,6 +95,20 @@ def test_model_change_brings_the_other_precision_to_all_photos(
         assert same(rows[photo_id], row("bfloat16", number))
 
 
+def test_pca_keeps_the_precision_of_the_rows_that_it_shortens(
+    averages: Workplace, make_set: Callable[[str], ExtractorWorker]
+) -> None:
+    averages.upload(*range(6))
+    averages.drain()
+    whole = averages.active().spec
+    averages._worker = make_set("bfloat16")
+    job = averages.finish(averages.start(JobKind.PCA, pca=2))
+    assert job.state == JobState.SUCCEEDED, job.error
+    shortened = averages.active().spec
+    assert (shortened["dimension"], shortened["precision"]) == (2, "float32")
+    assert shortened.keys() - whole.keys() == {"whitening"}
+
+
 def test_another_setting_alone_describes_nothing_anew(
     averages: Workplace, make_set: Callable[[str], ExtractorWorker]
 ) -> None:

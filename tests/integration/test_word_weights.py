@@ -19,19 +19,17 @@ from services.steward.auto_evaluate import evaluate_changed_maps
 from services.steward.collect import collect_superseded_chunks
 from services.steward.compact import merge_slot
 from services.steward.evaluate import Evaluator
-from shared.catalog.chunks import Chunk, Descriptor, take_slot
-from shared.catalog.generations import Generation, GenerationState, lock_generation
-from shared.catalog.maps import bump_version, get_map
+from shared.catalog.generations import Generation, GenerationState
+from shared.catalog.maps import get_map
 from shared.catalog.session import Catalog
 from shared.catalog.vocabularies import VocabularyOrigin, add_vocabulary
-from shared.chunks import write_chunk
 from shared.ids import new_id
 from shared.jobs import Job, JobKind, JobState, Priority
 from shared.objects import ObjectStore
 from shared.settings import Settings
 from shared.word_weights.record import Outcome, WordWeights, stored_word_weights
 from tests.integration.gateway import Service
-from tests.support.catalog_rows import add_generation, add_photo, read_job
+from tests.support.catalog_rows import add_chunk, add_generation, add_photo, read_job
 from tests.support.problems import problem
 
 WORDS, WIDTH = 4, 8
@@ -67,38 +65,9 @@ class City:
     photos: list[UUID]
 
     def publish(self, rows: Rows, spots: list[dict[str, Any]]) -> None:
-        photo_ids, chunk_id = [new_id() for _ in rows], new_id()
-        written = write_chunk(
-            self.store,
-            generation_id=self.generation_id,
-            chunk_id=chunk_id,
-            rows=rows,
-            photo_ids=photo_ids,
-            spec={},
-        )
         with self.catalog.write() as session:
-            generation = lock_generation(session, self.generation_id)
-            for photo_id, columns in zip(photo_ids, spots, strict=True):
-                add_photo(session, self.map_id, id=photo_id, **columns)
-            session.add(
-                Chunk(
-                    id=chunk_id,
-                    generation_id=self.generation_id,
-                    slot=take_slot(generation, len(rows), 1000),
-                    object_key=written.object_key,
-                    rows=written.rows,
-                    size_bytes=written.size_bytes,
-                    sha256=written.sha256,
-                )
-            )
-            session.flush()
-            session.add_all(
-                Descriptor(
-                    generation_id=self.generation_id, photo_id=photo_id, chunk_id=chunk_id, row=row
-                )
-                for row, photo_id in enumerate(photo_ids)
-            )
-            bump_version(session, self.map_id)
+            photo_ids = [add_photo(session, self.map_id, **columns).id for columns in spots]
+        add_chunk(self.catalog, self.store, self.generation_id, photo_ids, rows=rows)
         self.photos += photo_ids
 
     def work(self) -> bool:

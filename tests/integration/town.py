@@ -18,18 +18,16 @@ from sqlalchemy import select
 
 from services.search.worker import SearchWorker
 from services.steward.evaluate import Evaluator
-from shared.catalog.chunks import Chunk, Descriptor, take_slot
 from shared.catalog.evaluations import Evaluation
-from shared.catalog.generations import Generation, lock_generation
-from shared.catalog.maps import DEFAULT_MAP, bump_version
+from shared.catalog.generations import Generation
+from shared.catalog.maps import DEFAULT_MAP
 from shared.catalog.session import Catalog
-from shared.chunks import write_chunk
 from shared.ids import new_id
 from shared.jobs import Job, JobKind, Priority
 from shared.objects import FolderStore
 from shared.search_protocol import SearchPort, SearchRequest, SearchResponse, SearchStatus
 from shared.settings import Settings
-from tests.support.catalog_rows import add_generation, add_map, add_photo, read_job
+from tests.support.catalog_rows import add_chunk, add_generation, add_map, add_photo, read_job
 
 Seen = tuple[float, dict[str, Any]]
 """A photo: its angle in degrees, and what is known of it (columns of `Photo`)."""
@@ -48,37 +46,11 @@ class Town:
     def publish(self, photos: Sequence[Seen], generation_id: UUID | None = None) -> list[UUID]:
         """A chunk of described photos; their ids."""
         into = generation_id or self.generation_id
-        photo_ids, chunk_id = [new_id() for _ in photos], new_id()
         angles = np.radians([angle for angle, _ in photos])
-        written = write_chunk(
-            self.store,
-            generation_id=into,
-            chunk_id=chunk_id,
-            rows=np.column_stack([np.cos(angles), np.sin(angles)]).astype(np.float32),
-            photo_ids=photo_ids,
-            spec={},
-        )
+        rows = np.column_stack([np.cos(angles), np.sin(angles)]).astype(np.float32)
         with self.catalog.write() as session:
-            generation = lock_generation(session, into)
-            for photo_id, (_, columns) in zip(photo_ids, photos, strict=True):
-                add_photo(session, self.map_id, id=photo_id, **columns)
-            session.add(
-                Chunk(
-                    id=chunk_id,
-                    generation_id=into,
-                    slot=take_slot(generation, len(photos), 1000),
-                    object_key=written.object_key,
-                    rows=written.rows,
-                    size_bytes=written.size_bytes,
-                    sha256=written.sha256,
-                )
-            )
-            session.flush()
-            session.add_all(
-                Descriptor(generation_id=into, photo_id=photo_id, chunk_id=chunk_id, row=row)
-                for row, photo_id in enumerate(photo_ids)
-            )
-            bump_version(session, self.map_id)
+            photo_ids = [add_photo(session, self.map_id, **columns).id for _, columns in photos]
+        add_chunk(self.catalog, self.store, into, photo_ids, rows=rows)
         return photo_ids
 
     def start(self, **params: Any) -> UUID:

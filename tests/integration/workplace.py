@@ -13,7 +13,8 @@ import numpy as np
 import torch
 from sqlalchemy import select
 
-from services.extractor.worker import DrainResult, ExtractorWorker
+from services.extractor.drain_result import DrainResult
+from services.extractor.worker import ExtractorWorker
 from services.steward.model_changes import advance_model_changes
 from shared.catalog.chunks import count_searchable
 from shared.catalog.generations import Generation, active_generation, building_generation

@@ -150,14 +150,15 @@ def add_chunk(
     generation_id: UUID,
     photo_ids: list[UUID],
     slot_rows: int = 1000,
+    rows: Rows | None = None,
 ) -> UUID:
-    """A published chunk with `row_of(photo)` for each photo; its id."""
+    """A published chunk with a row for each photo, `row_of` it unless given; its id."""
     chunk_id = new_id()
     written = write_chunk(
         store,
         generation_id=generation_id,
         chunk_id=chunk_id,
-        rows=np.stack([row_of(photo_id) for photo_id in photo_ids]),
+        rows=np.stack([row_of(one) for one in photo_ids]) if rows is None else rows,
         photo_ids=photo_ids,
         spec={},
     )

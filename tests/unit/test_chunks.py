@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from shared.chunks import (
     HEADER_BYTES,
     WrittenChunk,
+    are_whole,
     chunk_key,
     decode_rows,
     delete_chunk,
@@ -229,3 +230,10 @@ def test_a_row_of_a_damaged_object_is_not_made_up(store: FolderStore, damage: st
         read_row(store, chunk.object_key, 4)
     with pytest.raises(NotFound):
         read_row(store, "chunks/no/such.npy", 0)
+
+
+def test_row_is_whole_with_the_length_of_a_descriptor_and_damaged_with_any_other() -> None:
+    direction = np.full(4, 0.5)
+    lengths = [1, 0, 1.0009, 0.9991, 1.0011, 0.5, np.nan, np.inf]
+    rows = np.stack([direction * length for length in lengths]).astype(np.float32)
+    assert are_whole(rows).tolist() == [True, True, True, True, False, False, False, False]

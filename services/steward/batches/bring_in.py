@@ -15,7 +15,7 @@ from sqlalchemy.orm import Session
 
 from services.steward.archives import Archive, Limits, open_archive
 from services.steward.batches.list_archive import member_at
-from services.steward.take import Stopped, token_of
+from services.steward.take import Stopped
 from shared.catalog.session import Catalog
 from shared.errors import InvalidRequest, PlacewiseError, Unavailable
 from shared.intake.incoming import Incoming, examine
@@ -23,7 +23,7 @@ from shared.intake.received import PassingFile, Received, base_name, check_photo
 from shared.intake.store_photo import Stored, put_photo, try_again_once
 from shared.jobs import Hints, Job, JobState, Priority
 from shared.jobs.batches import BatchItem, BatchSource
-from shared.jobs.leases import held
+from shared.jobs.leases import held, token_of
 from shared.objects import ObjectStore
 from shared.objects.keys import new_original_key
 from shared.photo_formats import SNIFFED_BYTES

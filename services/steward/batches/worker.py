@@ -15,7 +15,7 @@ from sqlalchemy.orm import Session
 
 from services.steward.batches.bring_in import BringIn
 from services.steward.batches.list_archive import list_archive
-from services.steward.take import Stopped, Taker, token_of
+from services.steward.take import Stopped, Taker
 from shared.catalog.session import Catalog
 from shared.errors import PlacewiseError
 from shared.jobs import Hints, Job, JobKind, JobState
@@ -31,7 +31,7 @@ from shared.jobs.batches import (
     waits_for_vocabulary,
 )
 from shared.jobs.finish import release, succeed
-from shared.jobs.leases import held
+from shared.jobs.leases import held, token_of
 from shared.jobs.table import WaitingFor, claimable
 from shared.objects import ObjectStore
 from shared.settings import Settings

@@ -1,0 +1,34 @@
+"""A few values that are costly to make: those used last."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable, Hashable, ValuesView
+from typing import Generic, TypeVar
+
+Key = TypeVar("Key", bound=Hashable)
+Value = TypeVar("Value")
+
+
+class LatelyUsed(Generic[Key, Value]):
+    """At most `most` values, which is 1 or more; the one that was used least lately goes first.
+    Not thread-safe.
+    """
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self._kept: OrderedDict[Key, Value] = OrderedDict()
+
+    def get(self, key: Key, make: Callable[[], Value]) -> Value:
+        """The key's value, made if it is not there; raises what `make` raises, and keeps nothing
+        then."""
+        if key not in self._kept:
+            self._kept[key] = make()
+        self._kept.move_to_end(key)
+        while len(self._kept) > self._most:
+            self._kept.popitem(last=False)
+        return self._kept[key]
+
+    def values(self) -> ValuesView[Value]:
+        """Those that are there; asking for them is no use of them."""
+        return self._kept.values()
