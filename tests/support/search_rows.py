@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from itertools import pairwise
 from uuid import UUID
 
 import numpy as np
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from services.search import answer as answer_module
@@ -75,3 +77,42 @@ def places(seed: int, count: int, dimension: int = DIMENSION) -> Rows:
     rows = near + rng.uniform(0.1, 3.0, size=(count, 1)) * rng.standard_normal((count, dimension))
     found: Rows = (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32)
     return found
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Case:
+    """A map of rows, with duplicates and zeros among them, and what it is asked."""
+
+    rows: Rows
+    pieces: int
+    query: Rows
+    asked: NDArray[np.bool_]
+    k: int
+    min_score: float | None
+
+    @property
+    def expected(self) -> list[tuple[UUID, float]]:
+        least = -2.0 if self.min_score is None else self.min_score
+        return brute_force(self.rows, self.query, self.k, self.asked, least)
+
+
+@st.composite
+def cases(draw: st.DrawFn, dimension: int) -> Case:
+    count = draw(st.integers(1, 300))
+    rng = np.random.default_rng(draw(st.integers(0, 2**31)))
+    rows = places(int(rng.integers(2**31)), count, dimension)
+    for _ in range(draw(st.integers(0, 30))):
+        a, b = rng.integers(0, count, 2)
+        rows[a] = rows[b]
+    rows[rng.integers(0, count, draw(st.integers(0, 3)))] = 0
+    query = rng.standard_normal(dimension).astype(np.float32)
+    if draw(st.booleans()):  # of a place on the map
+        query = query * np.float32(0.005) + rows[rng.integers(count)]
+    return Case(
+        rows=rows,
+        pieces=draw(st.integers(1, 4)),
+        query=query,
+        asked=rng.random(count) < draw(st.sampled_from([1.0, 0.5, 0.02])),
+        k=draw(st.sampled_from([1, 2, 10, 100, 400])),
+        min_score=draw(st.sampled_from([None, 0.1])),
+    )

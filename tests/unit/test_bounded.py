@@ -14,7 +14,16 @@ from services.search import answer as answer_module
 from services.search.answer import Question, lacks_int8, worth_int8
 from shared.ids import new_id
 from shared.search_protocol import Mode
-from tests.support.search_rows import answer, brute_force, hits_of, photo, places, snapshot_of
+from tests.support.search_rows import (
+    Case,
+    answer,
+    brute_force,
+    cases,
+    hits_of,
+    photo,
+    places,
+    snapshot_of,
+)
 
 DIMENSION = 512
 
@@ -25,47 +34,15 @@ def by_int8(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @settings(max_examples=60, deadline=None)
-@given(
-    seed=st.integers(0, 2**31),
-    count=st.integers(1, 300),
-    pieces=st.integers(1, 4),
-    k=st.sampled_from([1, 2, 10, 100, 400]),
-    asked_share=st.sampled_from([1.0, 0.5, 0.02]),
-    matched=st.booleans(),
-    duplicates=st.integers(0, 30),
-    zeros=st.integers(0, 3),
-    floor=st.booleans(),
-    mode=st.sampled_from([Mode.AUTO, Mode.DETERMINISTIC]),
-)
-def test_answers_equal_brute_force_with_order_and_ties(
-    seed: int,
-    count: int,
-    pieces: int,
-    k: int,
-    asked_share: float,
-    matched: bool,
-    duplicates: int,
-    zeros: int,
-    floor: bool,
-    mode: Mode,
-) -> None:
-    rng = np.random.default_rng(seed)
-    rows = places(seed, count, DIMENSION)
-    for _ in range(duplicates):
-        a, b = rng.integers(0, count, 2)
-        rows[a] = rows[b]
-    rows[rng.integers(0, count, zeros)] = 0
-    query = rng.standard_normal(DIMENSION).astype(np.float32)
-    if matched:
-        query = query * np.float32(0.005) + rows[rng.integers(count)]
-    asked = rng.random(count) < asked_share
-    question = Question(k, 0.1 if floor else None, mode)
-    found = answer(snapshot_of(rows, pieces, "int8"), query, asked, question)
-    assert hits_of(found) == brute_force(rows, query, k, asked, 0.1 if floor else -2.0)
-    if asked.any():
+@given(case=cases(DIMENSION), mode=st.sampled_from([Mode.AUTO, Mode.DETERMINISTIC]))
+def test_answers_equal_brute_force_with_order_and_ties(case: Case, mode: Mode) -> None:
+    snapshot = snapshot_of(case.rows, case.pieces, "int8")
+    found = answer(snapshot, case.query, case.asked, Question(case.k, case.min_score, mode))
+    assert hits_of(found) == case.expected
+    if case.asked.any():
         assert found.certificate == "bound"
         assert found.certified_k == len(found.hits)
-        assert found.rows_scanned == int(asked.sum())
+        assert found.rows_scanned == int(case.asked.sum())
         assert found.max_z is None
 
 

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from services.search import answer as answer_module
 from services.search import cascade, kernels
@@ -20,7 +19,16 @@ from services.search.together import Glances
 from shared.codes.signs import sign_codes
 from shared.ids import new_id
 from shared.search_protocol import Mode
-from tests.support.search_rows import answer, brute_force, hits_of, photo, places, snapshot_of
+from tests.support.search_rows import (
+    Case,
+    answer,
+    brute_force,
+    cases,
+    hits_of,
+    photo,
+    places,
+    snapshot_of,
+)
 from tests.support.servers.handle import wait_until
 
 DIMENSION = 7168
@@ -32,45 +40,15 @@ def by_codes(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @settings(max_examples=40, deadline=None)
-@given(
-    seed=st.integers(0, 2**31),
-    count=st.integers(1, 300),
-    pieces=st.integers(1, 4),
-    k=st.sampled_from([1, 2, 10, 100, 400]),
-    asked_share=st.sampled_from([1.0, 0.5, 0.02]),
-    matched=st.booleans(),
-    duplicates=st.integers(0, 30),
-    zeros=st.integers(0, 3),
-    floor=st.booleans(),
-)
-def test_answers_equal_brute_force_with_order_and_ties(
-    seed: int,
-    count: int,
-    pieces: int,
-    k: int,
-    asked_share: float,
-    matched: bool,
-    duplicates: int,
-    zeros: int,
-    floor: bool,
-) -> None:
-    rng = np.random.default_rng(seed)
-    rows = places(seed, count)
-    for _ in range(duplicates):
-        a, b = rng.integers(0, count, 2)
-        rows[a] = rows[b]
-    rows[rng.integers(0, count, zeros)] = 0
-    query = rng.standard_normal(DIMENSION).astype(np.float32)
-    if matched:
-        query = query * np.float32(0.005) + rows[rng.integers(count)]
-    asked = rng.random(count) < asked_share
-    min_score = 0.1 if floor else None
-    found = answer(snapshot_of(rows, pieces), query, asked, Question(k, min_score))
-    assert hits_of(found) == brute_force(rows, query, k, asked, -2.0 if not floor else 0.1)
-    if asked.any():
+@given(case=cases(DIMENSION))
+def test_answers_equal_brute_force_with_order_and_ties(case: Case) -> None:
+    snapshot = snapshot_of(case.rows, case.pieces)
+    found = answer(snapshot, case.query, case.asked, Question(case.k, case.min_score))
+    assert hits_of(found) == case.expected
+    if case.asked.any():
         assert found.certificate == "statistical"
         assert found.certified_k == len(found.hits)
-        assert found.rows_scanned == int(asked.sum())
+        assert found.rows_scanned == int(case.asked.sum())
         assert found.max_z is not None
         assert found.max_z < 5.5
 

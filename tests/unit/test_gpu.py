@@ -26,7 +26,15 @@ from services.search.gpu import Asked, Device, DeviceFailed, Unfit
 from services.search.snapshot import Snapshot
 from shared.errors import Misconfigured
 from shared.search_protocol import Mode
-from tests.support.search_rows import answer, brute_force, hits_of, places, snapshot_of
+from tests.support.search_rows import (
+    Case,
+    answer,
+    brute_force,
+    cases,
+    hits_of,
+    places,
+    snapshot_of,
+)
 
 DIMENSION = 512
 KINDS = ("float16", "int8")
@@ -51,44 +59,15 @@ def on_device(snapshot: Snapshot, kind: str) -> Snapshot:
 
 
 @settings(max_examples=25, deadline=None)
-@given(
-    seed=st.integers(0, 2**31),
-    count=st.integers(1, 200),
-    pieces=st.integers(1, 4),
-    k=st.sampled_from([1, 10, 100, 400]),
-    asked_share=st.sampled_from([1.0, 0.5, 0.02]),
-    matched=st.booleans(),
-    duplicates=st.integers(0, 30),
-    floor=st.booleans(),
-    kind=st.sampled_from(KINDS),
-)
-def test_answers_equal_brute_force_with_order_and_ties(
-    seed: int,
-    count: int,
-    pieces: int,
-    k: int,
-    asked_share: float,
-    matched: bool,
-    duplicates: int,
-    floor: bool,
-    kind: str,
-) -> None:
-    rng = np.random.default_rng(seed)
-    rows = places(seed, count, DIMENSION)
-    for _ in range(duplicates):
-        a, b = rng.integers(0, count, 2)
-        rows[a] = rows[b]
-    rows[rng.integers(0, count)] = 0
-    query = rng.standard_normal(DIMENSION).astype(np.float32)
-    if matched:
-        query = query * np.float32(0.005) + rows[rng.integers(count)]
-    asked = rng.random(count) < asked_share
-    snapshot = on_device(snapshot_of(rows, min(pieces, count), "int8"), kind)
-    found = answer(snapshot, query, asked, Question(k, 0.1 if floor else None))
-    assert hits_of(found) == brute_force(rows, query, k, asked, 0.1 if floor else -2.0)
-    if asked.any() and query.any():
+@given(case=cases(DIMENSION), kind=st.sampled_from(KINDS))
+def test_answers_equal_brute_force_with_order_and_ties(case: Case, kind: str) -> None:
+    pieces = min(case.pieces, len(case.rows))
+    snapshot = on_device(snapshot_of(case.rows, pieces, "int8"), kind)
+    found = answer(snapshot, case.query, case.asked, Question(case.k, case.min_score))
+    assert hits_of(found) == case.expected
+    if case.asked.any() and case.query.any():
         assert found.certificate == "bound"
-        assert found.rows_scanned == int(asked.sum())
+        assert found.rows_scanned == int(case.asked.sum())
 
 
 @pytest.mark.parametrize("kind", KINDS)
