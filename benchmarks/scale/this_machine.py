@@ -17,9 +17,9 @@ from sqlalchemy import insert
 from threadpoolctl import threadpool_limits
 
 from benchmarks.report import Report
+from services.search.loaded_chunk import LoadedChunk
 from services.search.photo_columns import PhotoColumns
 from services.search.scan import scan
-from services.search.snapshot import LoadedChunk
 from shared.catalog.chunks import Chunk, live_chunks
 from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.maps import create_map

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from services.search.snapshot import LoadedChunk
+from services.search.loaded_chunk import LoadedChunk
 
 Addresses = NDArray[np.uint64]
 Indices = NDArray[np.int64]

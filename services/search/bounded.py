@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from services.search.blocks import Addresses, Indices, RowBlocks, addresses
 from services.search.kernels import above_floor
+from services.search.loaded_chunk import LoadedChunk
 from services.search.rerank import Budget, Scores
-from services.search.snapshot import LoadedChunk
 from shared.codes.int8 import Int8Query
 
 LOOK_BYTES = 1 << 28  # of codes between two looks at the clock: about a hundredth of a second

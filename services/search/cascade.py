@@ -32,9 +32,9 @@ from services.search.kernels import (
     squares,
     weighted_at,
 )
+from services.search.loaded_chunk import LoadedChunk
 from services.search.parts import in_parts
 from services.search.rerank import Budget, Rerank, Scores
-from services.search.snapshot import LoadedChunk
 from shared.codes.rotation import Rotation, rotation
 from shared.codes.signs import WORD, Words, level_ends, sign_codes
 

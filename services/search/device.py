@@ -103,8 +103,8 @@ class Residency:
 
         if self._device is None or snapshot.bounded:
             return False
-        return not self._device.has_room(snapshot, FLOAT16) and self._device.has_room(
-            snapshot, INT8
+        return not self._device.has_room(snapshot.chunks, FLOAT16) and self._device.has_room(
+            snapshot.chunks, INT8
         )
 
     def status(self, snapshots: Iterable[Snapshot]) -> tuple[DeviceStatus, ...]:
@@ -127,7 +127,7 @@ class Residency:
         if self._device is None or (old is not None and old.failure is not None):
             return None
         try:
-            resident = self._device.load(snapshot, old, most)
+            resident = self._device.load(snapshot.chunks, old, most)
         except DeviceFailed as error:
             log.error(
                 "generation %s is searched by the CPU for now: %s", snapshot.generation_id, error

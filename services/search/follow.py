@@ -12,9 +12,10 @@ from uuid import UUID
 from sqlalchemy import select
 
 from services.search.load import Loader, hold, loader_of, parts_of
+from services.search.loaded_chunk import LoadedChunk
 from services.search.memory import Memory
 from services.search.photo_columns import PhotoColumns
-from services.search.snapshot import LoadedChunk, Snapshot
+from services.search.snapshot import Snapshot
 from shared.catalog.chunks import live_chunks, live_facts
 from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.maps import Map

@@ -35,7 +35,7 @@ import torch
 from numpy.typing import NDArray
 
 from services.search.bounded import Candidates
-from services.search.snapshot import LoadedChunk, Snapshot
+from services.search.loaded_chunk import LoadedChunk
 from shared.codes.int8 import MOST, Int8Query
 from shared.codes.rotation import rotation
 
@@ -141,30 +141,34 @@ class Device:
             if not np.all(np.abs(scores[0].cpu().numpy() - exact) <= bounds[0].cpu().numpy()):
                 raise Unfit(f"{self.name} adds up products less exactly than float32 does")
 
-    def load(self, snapshot: Snapshot, old: Resident | None, most_bytes: float) -> Resident | None:
-        """The snapshot's rows on the device, of which those in `old` stay; None when they don't
-        fit, or more than `most_bytes` would have to be copied. DeviceFailed."""
-        kind = next((kind for kind in KINDS if self.has_room(snapshot, kind, old)), None)
-        if kind is None or (kind == INT8 and not snapshot.bounded):
+    def load(
+        self, chunks: Sequence[LoadedChunk], old: Resident | None, most_bytes: float
+    ) -> Resident | None:
+        """A snapshot's rows on the device, of which those in `old` stay; None when they don't fit,
+        or more than `most_bytes` would have to be copied. DeviceFailed."""
+        kind = next((kind for kind in KINDS if self.has_room(chunks, kind, old)), None)
+        if kind is None or (kind == INT8 and any(chunk.int8 is None for chunk in chunks)):
             return None
-        if _copied_bytes(snapshot, kind, old) > most_bytes:
+        if _copied_bytes(chunks, kind, old) > most_bytes:
             return None
         known = _known(kind, old)
         try:
-            chunks = {
+            there = {
                 chunk.chunk_id: known.get(chunk.chunk_id) or self._chunk(chunk, kind)
-                for chunk in snapshot.chunks
+                for chunk in chunks
             }
         except RuntimeError as error:  # out of memory is one
             raise DeviceFailed(str(error)) from error
-        return Resident(self.where, kind, chunks)
+        return Resident(self.where, kind, there)
 
-    def has_room(self, snapshot: Snapshot, kind: str, old: Resident | None = None) -> bool:
-        """Whether the snapshot's rows fit, of this kind, beside what is there."""
-        dimension = snapshot.chunks[0].rows.shape[1]
+    def has_room(
+        self, chunks: Sequence[LoadedChunk], kind: str, old: Resident | None = None
+    ) -> bool:
+        """Whether the chunks' rows fit, of this kind, beside what is there."""
+        dimension = chunks[0].rows.shape[1]
         if kind == INT8 and rotation(dimension).padded > MOST_INT8_TERMS:
             return False
-        needed = _copied_bytes(snapshot, kind, old) + self._headroom_bytes
+        needed = _copied_bytes(chunks, kind, old) + self._headroom_bytes
         return needed <= self._free_bytes()
 
     def _chunk(self, chunk: LoadedChunk, kind: str) -> DeviceChunk:
@@ -320,9 +324,9 @@ def _device_bytes(chunk: LoadedChunk, kind: str) -> int:
     return _up(count, ROWS_ALIGNED) * (terms + 24)
 
 
-def _copied_bytes(snapshot: Snapshot, kind: str, old: Resident | None) -> int:
+def _copied_bytes(chunks: Sequence[LoadedChunk], kind: str, old: Resident | None) -> int:
     known = _known(kind, old)
-    return sum(_device_bytes(c, kind) for c in snapshot.chunks if c.chunk_id not in known)
+    return sum(_device_bytes(c, kind) for c in chunks if c.chunk_id not in known)
 
 
 def _known(kind: str, old: Resident | None) -> Mapping[UUID, DeviceChunk]:

@@ -14,8 +14,8 @@ from uuid import UUID
 import numpy as np
 from numpy.typing import NDArray
 
+from services.search.loaded_chunk import LoadedChunk, StoredChunk
 from services.search.local_files import LocalFiles
-from services.search.snapshot import LoadedChunk, StoredChunk
 from shared.catalog.chunks import Chunk
 from shared.chunks import codes_key, decode_rows
 from shared.errors import NotFound

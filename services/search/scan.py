@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from services.search.snapshot import LoadedChunk
+from services.search.loaded_chunk import LoadedChunk
 
 # float32 dot products of unit rows err by less than this at 98,304 dimensions (measured 4e-7):
 # candidates this close to the k-th are scored again in float64 before they are ranked.

@@ -11,9 +11,8 @@ from uuid import UUID
 import numpy as np
 from numpy.typing import NDArray
 
-from services.search.local_files import Mapped
-from services.search.photo_columns import JoinedColumns, PhotoColumns
-from shared.chunks import Rows
+from services.search.loaded_chunk import LoadedChunk
+from services.search.photo_columns import JoinedColumns
 from shared.search_protocol import Held, Part
 
 if TYPE_CHECKING:  # numba takes a while to load, and small maps need no codes
@@ -21,42 +20,6 @@ if TYPE_CHECKING:  # numba takes a while to load, and small maps need no codes
     from services.search.bounded import Int8Blocks
     from services.search.cascade import Blocks
     from services.search.gpu import Resident
-    from shared.codes.int8 import Int8Codes
-    from shared.codes.signs import SignCodes
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class LoadedChunk:
-    """A chunk's rows, (n, dimension) float32, and what is known of their photos."""
-
-    chunk_id: UUID
-    object_key: str
-    rows: Rows
-    photos: PhotoColumns
-    codes: SignCodes | None = None
-    """None while search does without."""
-    stored: StoredChunk | None = None
-    """Where rows and codes lie on the disk; None for rows that were never there."""
-    int8: Int8Codes | None = None
-    """None while search does without."""
-
-    def read_ahead(self, row: int) -> None:
-        """Say that a row is read next, where it is mapped from a file."""
-        if self.stored is not None and self.rows is self.stored.rows:
-            size_bytes = self.rows.strides[0]
-            begin = self.stored.file.size_bytes - self.rows.nbytes  # a header goes before
-            self.stored.file.read_ahead(begin + row * size_bytes, size_bytes)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class StoredChunk:
-    """A chunk's files, mapped into memory."""
-
-    file: Mapped
-    rows: Rows
-    sha256: str
-    codes: SignCodes | None = None
-    int8: Int8Codes | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -30,8 +30,8 @@ from numpy.typing import NDArray
 
 from services.search import answer, gpu
 from services.search.load import Loader
+from services.search.loaded_chunk import StoredChunk
 from services.search.metrics import SearchMetrics
-from services.search.snapshot import StoredChunk
 from services.search.worker import SearchWorker
 from services.steward.compact import merge_slot
 from shared.catalog.chunks import Chunk, Descriptor, live_chunks

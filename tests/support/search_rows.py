@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from services.search import answer as answer_module
 from services.search.answer import DECIMALS, Answer, Question
+from services.search.loaded_chunk import LoadedChunk
 from services.search.photo_columns import PhotoColumns
-from services.search.snapshot import LoadedChunk, Snapshot
+from services.search.snapshot import Snapshot
 from services.search.together import Glances
 from shared.codes.int8 import int8_codes
 from shared.codes.signs import sign_codes

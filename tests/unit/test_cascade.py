@@ -14,7 +14,8 @@ from services.search import answer as answer_module
 from services.search import cascade, kernels
 from services.search.answer import Answer, Question
 from services.search.cascade import glance
-from services.search.snapshot import LoadedChunk, Snapshot
+from services.search.loaded_chunk import LoadedChunk
+from services.search.snapshot import Snapshot
 from services.search.together import Glances
 from shared.codes.signs import sign_codes
 from shared.ids import new_id

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 import shared.codes.stored
 from services.search.load import Loader, hold, parts_of, remove_others
+from services.search.loaded_chunk import LoadedChunk, StoredChunk
 from services.search.memory import Memory, held
 from services.search.photo_columns import PhotoColumns
-from services.search.snapshot import LoadedChunk, StoredChunk
 from shared.catalog.chunks import Chunk
 from shared.chunks import CODED_BYTES, codes_key, delete_chunk, write_chunk
 from shared.codes.signs import sign_codes

@@ -13,10 +13,11 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from services.search.answer import DECIMALS, Answer, Question, answer
+from services.search.loaded_chunk import LoadedChunk
 from services.search.photo_columns import PhotoColumns
 from services.search.scan import FLOAT32_MARGIN
 from services.search.select import select
-from services.search.snapshot import LoadedChunk, Snapshot
+from services.search.snapshot import Snapshot
 from services.search.together import Glances
 from shared.ids import new_id
 from shared.photo_filter import EVERYTHING
