@@ -760,7 +760,7 @@ class TestSearchWorkerByInt8(TestSearchWorker):
         places.add(unit_rows(1, 30))
         vector = unit_rows(2, 1)[0]
         first = port().search(places.request(places.query(vector)))
-        (path,) = settings.search_cache(WHOLE).glob("*.int8")
+        (path,) = settings.search_cache(WHOLE).rglob("*.int8")
         whole = path.read_bytes()
         path.unlink()
         if damage != "gone":

@@ -20,7 +20,7 @@ from tests.support.catalog_rows import set_columns
 from tests.support.photos import photo_bytes
 from tests.support.small_gpu import make_too_heavy
 
-WAIT_SECONDS = 30.0
+WAIT_SECONDS = 90.0
 BATCH = 4  # tests.integration.conftest
 
 

@@ -35,7 +35,7 @@ from tests.support.catalog_rows import ask, delete, read_job, set_columns, store
 from tests.support.photos import photo_bytes
 
 ROUNDS = 60  # of draining and stewarding, before a model change that does not end is a failure
-WAIT_SECONDS = 20.0
+WAIT_SECONDS = 90.0
 FIT = {"clusters": 8, "sample": 100, "seed": 0}
 
 
