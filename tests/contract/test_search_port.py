@@ -929,9 +929,10 @@ class TestSearchOverHttp(SearchPortContract):
         with contextlib.ExitStack() as running:
 
             def open_port(**changes: object) -> SearchPort:
-                # Whoever waits less for a version waits less for the shards, too.
+                # Whoever waits longer for a version waits longer for the shards, too.
                 wait = float(str(changes.get("search_wait_seconds", settings.search_wait_seconds)))
-                own = settings.model_copy(update={"search_timeout_seconds": 5 * wait, **changes})
+                patience = {"search_timeout_seconds": max(10.0, 5 * wait)}
+                own = settings.model_copy(update=patience | changes)
                 tier = SearchTier(catalog, store, own, request.param)
                 tier.follow()  # a search brings only one replica of a shard up to date
                 return running.enter_context(tier).port
