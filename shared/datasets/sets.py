@@ -34,7 +34,7 @@ __all__ = [
     "open_training_set",
 ]
 
-PARTS = frozenset({"database", "queries", "train", "val", "test", "images"})
+PARTS = frozenset({"database", "queries", "train", "val", "test", "train_val", "images"})
 """folders of a data set that are never a data set of their own"""
 HOW_SETS_LIE = "docs/how-to/data-sets.md shows every layout."
 
