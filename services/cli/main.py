@@ -28,7 +28,7 @@ COMMANDS = {
     "vocabulary": ("vocabulary", "app"),
     "pca": ("pca", "app"),
     "models": ("models", "app"),
-    "datasets": ("datasets", "app"),
+    "datasets": ("datasets.commands", "app"),
     "storage": ("storage", "app"),
     "bench": ("bench", "app"),
 }
