@@ -80,11 +80,11 @@ def test_angular_finds_the_librarys_triplets_in_its_order_however_small_its_step
         assert torch.equal(ours, theirs)
 
 
-class Largest(TorchDispatchMode):
+class Largest(TorchDispatchMode):  # type: ignore[no-untyped-call]
     """How many numbers the largest tensor of floats has that is made meanwhile."""
 
     def __init__(self) -> None:
-        super().__init__()
+        super().__init__()  # type: ignore[no-untyped-call]
         self.numbers = 0
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
@@ -106,22 +106,29 @@ def test_memory_of_the_angular_miner_does_not_grow_with_its_triplets() -> None:
     assert theirs.numbers == 48 * 3 * 44 * 128
 
 
+def nearest(i: int, candidates: list[tuple[int, int]], beyond: float = -1.0) -> int:
+    """The photo nearest to i, of the pairs of i, and farther than `beyond`."""
+    return min((D[i, j], j) for a, j in candidates if a == i and D[i, j] > beyond)[1]
+
+
 def test_batch_hard_takes_each_photos_farthest_positive_and_nearest_negative() -> None:
     a, p, n = mine("BatchHardMiner")
     assert a == list(range(N))
-    for i in range(N):
-        assert p[i] == max((j for b, j in POSITIVES if b == i), key=lambda j, i=i: D[i, j])
-        assert n[i] == min((j for b, j in NEGATIVES if b == i), key=lambda j, i=i: D[i, j])
+    assert p == [max((D[i, j], j) for b, j in POSITIVES if b == i)[1] for i in range(N)]
+    assert n == [nearest(i, NEGATIVES) for i in range(N)]
 
 
 def test_batch_easy_hard_takes_the_nearest_positive_and_the_nearest_negative_beyond_it() -> None:
     a1, p, a2, n = mine("BatchEasyHardMiner")
     assert a1 == a2
-    assert a1
-    for i, positive, negative in zip(a1, p, n, strict=True):
-        assert positive == min((j for b, j in POSITIVES if b == i), key=lambda j, i=i: D[i, j])
-        beyond = [j for b, j in NEGATIVES if b == i and D[i, j] > D[i, positive]]
-        assert negative == min(beyond, key=lambda j, i=i: D[i, j])
+    assert a1 == [
+        i
+        for i in range(N)
+        if max(D[a, n] for a, n in NEGATIVES if a == i)
+        > min(D[a, p] for a, p in POSITIVES if a == i)
+    ]
+    assert p == [nearest(i, POSITIVES) for i in a1]
+    assert n == [nearest(i, NEGATIVES, D[i, near]) for i, near in zip(a1, p, strict=True)]
 
 
 @pytest.mark.parametrize("margin", [0.1, 0.3])
