@@ -1,0 +1,1 @@
+"""The trainer: GSV-Cities training of place models, and their evaluation."""
