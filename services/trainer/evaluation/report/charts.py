@@ -81,7 +81,9 @@ def chart(title: str, x: Axis, y: Axis, series: Sequence[Series]) -> str:
 
 def _grid(x: Axis, y: Axis) -> list[str]:
     bottom, right = HEIGHT - BOTTOM, WIDTH - RIGHT
-    parts = [f'<rect x="{LEFT}" y="{TOP}" width="{right - LEFT}" height="{bottom - TOP}" class="p"/>']
+    parts = [
+        f'<rect x="{LEFT}" y="{TOP}" width="{right - LEFT}" height="{bottom - TOP}" class="p"/>'
+    ]
     for tick in x.ticks:
         at = _x(x, tick)
         parts.append(f'<line x1="{at:.1f}" y1="{TOP}" x2="{at:.1f}" y2="{bottom}" class="g"/>')

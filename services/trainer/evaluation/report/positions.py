@@ -35,13 +35,13 @@ def positions_chart(result: Result) -> tuple[str, str] | None:
         x = MARGIN + (point[0] - low[0]) * scale
         return x, height - 24 - MARGIN - (point[1] - low[1]) * scale
 
-    parts = [
-        f'<svg viewBox="0 0 {SIDE} {height}" role="img" class="m" '
-        'aria-label="Map of queries and their first matches">'
-    ]
+    label = "Map of queries and their first matches"
+    parts = [f'<svg viewBox="0 0 {SIDE} {height}" role="img" class="m" aria-label="{label}">']
     there = [point for point in database if point is not None]
-    for point in there[:: max(1, -(-len(there) // DATABASE_SHOWN))]:
-        parts.append('<circle cx="{:.1f}" cy="{:.1f}" r="1.5" class="d"/>'.format(*at(point)))
+    parts += [
+        '<circle cx="{:.1f}" cy="{:.1f}" r="1.5" class="d"/>'.format(*at(point))
+        for point in there[:: max(1, -(-len(there) // DATABASE_SHOWN))]
+    ]
     shown = drawn[:: max(1, -(-len(drawn) // QUERIES_SHOWN))]
     for query in shown:
         asked = queries[query]
