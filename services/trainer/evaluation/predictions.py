@@ -64,20 +64,6 @@ def check_predictions(
         )
 
 
-def check_positives(path: Path, positives: Sequence[Indices], database: int) -> None:
-    """Whether a ground truth can be about a database of that many photos.
-
-    Raises InvalidRequest (`ground_truth_of_other_lists`).
-    """
-    highest = max((int(found.max()) for found in positives if len(found)), default=-1)
-    if highest >= database:
-        raise InvalidRequest(
-            "ground_truth_of_other_lists",
-            f"{path} names the database photo {highest}, and the database has {database}: it was "
-            "made for other lists.",
-        )
-
-
 def _out_of_range(
     path: Path, ranked: Indices, wrong: np.ndarray[tuple[int, ...], np.dtype[np.bool_]], why: str
 ) -> InvalidRequest:
