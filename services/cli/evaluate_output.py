@@ -84,10 +84,9 @@ def finish(run: Run, results: Sequence[Result], wanted: Wanted) -> None:
         raise _unwritable(wanted.out or wanted.pairs, error) from error
     if wanted.as_json:
         found = metrics(run, results)
-        # A program that asks about one set does not want to know its name first.
-        print_json(
-            {**found, **found["sets"][results[0].asked.name]} if len(results) == 1 else found
-        )
+        if len(results) == 1:  # a program that asks about one set need not know its name
+            found |= found["sets"][results[0].asked.name]
+        print_json(found)
         return
     for result in results:
         _print(result)

@@ -1,4 +1,4 @@
-"""`placewise evaluate --predictions P.npy --ground-truth GT.npy`: figures of what was found before."""
+"""`placewise evaluate --predictions P.npy --ground-truth GT.npy`: what was found before, judged."""
 
 from __future__ import annotations
 
