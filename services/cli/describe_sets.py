@@ -91,7 +91,9 @@ def describer_of_checkpoint(
 ) -> Describer:
     """`image_size`: `same` as the model was built for, `native`, or (height, width)."""
     loaded = load_checkpoint(checkpoint)
-    size = {"same": loaded.config.image_size, "native": None}.get(image_size, image_size)  # type: ignore[arg-type,call-overload]
+    size = None if image_size == "native" else loaded.config.image_size
+    if not isinstance(image_size, str):
+        size = image_size
     device = choose_device(settings.device)
     describe = DescribeModel(
         loaded.model.to(device),

@@ -13,6 +13,8 @@ import typer
 from services.cli.output import JsonOption, KeyOption, MapOption, ServerOption, explained
 from shared.errors import InvalidRequest
 
+Given = dict[str, object]
+
 SIZE = re.compile(r"([1-9][0-9]{1,3})[x ]([1-9][0-9]{1,3})")
 
 
@@ -146,13 +148,17 @@ def evaluate(
     asked about a data set.
     """
     wanted = Wanted(out, against, pairs, depth, grids, only_wrong, faiss_gpu, as_json)
-    of_a_map = {"--sample": sample, "--seed": seed, "--word-weights": word_weights}
-    of_photos = {
+    of_a_map: Given = {"--sample": sample, "--seed": seed, "--word-weights": word_weights}
+    of_photos: Given = {
         "--checkpoint": checkpoint, "--extractor": extractor, "--vocabulary": vocabulary,
         "--fit-vocabulary": fit_vocabulary, "--protocol": protocol, "--rule": rule,
     }  # fmt: skip
-    of_a_file = {"--ground-truth": ground_truth, "--database": database, "--queries": queries}
-    of_results = {"--out": out, "--against": against, "--pairs": pairs, "--set": sets}
+    of_a_file: Given = {
+        "--ground-truth": ground_truth,
+        "--database": database,
+        "--queries": queries,
+    }
+    of_results: Given = {"--out": out, "--against": against, "--pairs": pairs, "--set": sets}
     with explained(as_json):
         # Read when torch is loaded, which is below; see services/cli/__init__.py.
         os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
@@ -182,7 +188,7 @@ def evaluate(
         evaluate_map(sample, seed, word_weights, map_name, server, key, as_json)
 
 
-def _refuse(when: str, options: dict[str, object]) -> None:
+def _refuse(when: str, options: Given) -> None:
     given = [name for name, value in options.items() if value]
     if given:
         raise InvalidRequest("options_contradict", f"{', '.join(given)}: not {when}.")

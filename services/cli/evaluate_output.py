@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -96,25 +97,28 @@ def finish(run: Run, results: Sequence[Result], wanted: Wanted) -> None:
 
 def _print(result: Result) -> None:
     asked, measured = result.asked, result.measured
+    recalls = measured.recalls
     table = Table(
         asked.name,
-        *(Column(f"R@{k}", justify="right", no_wrap=True) for k in measured.recalls.of_all),
-        Column(f"mAP@{measured.depth}", justify="right", no_wrap=True),
+        Column(f"all {recalls.queries} queries", justify="right"),
+        Column(f"{recalls.queries - recalls.without_positive} with a positive", justify="right"),
     )
-    table.add_row(
-        f"all {measured.recalls.queries} queries",
-        *_cells(list(measured.recalls.of_all.values()), measured.recall_intervals),
-        "",
-    )
-    table.add_row(
-        f"{measured.recalls.queries - measured.recalls.without_positive} with a positive",
-        *_cells(list(measured.recalls.of_findable.values()), measured.findable_intervals),
-        _cell(measured.mean_average_precision, measured.map_interval),
-    )
+    for at, (k, share) in enumerate(recalls.of_all.items()):
+        table.add_row(
+            f"R@{k}",
+            _cell(share, measured.recall_intervals, at),
+            _cell(recalls.of_findable[k], measured.findable_intervals, at),
+        )
+    mean, within = measured.mean_average_precision, measured.map_interval
+    table.add_row(f"mAP@{measured.depth}", "", _cell(mean, [within] if within else None, 0))
     answers.print(table)
     answers.print(
         f"Right: {asked.rule}; protocol {asked.protocol}; fingerprint {asked.fingerprint[:16]}; "
-        f"intervals over {measured.clusters.count} {measured.clusters.kind}.",
+        + (
+            f"95 % intervals over {measured.clusters.count} {measured.clusters.kind}."
+            if measured.recall_intervals
+            else f"{measured.clusters.count} {measured.clusters.kind} are too few for intervals."
+        ),
         soft_wrap=True,
         markup=False,
     )
@@ -133,16 +137,12 @@ def _print(result: Result) -> None:
             )
 
 
-def _cells(shares: Sequence[float], found: Sequence[Interval] | None) -> list[str]:
-    return [_cell(share, found[at] if found else None) for at, share in enumerate(shares)]
-
-
-def _cell(share: float, interval: Interval | None) -> str:
-    if share != share:  # NaN: no query to take it of
+def _cell(share: float, found: Sequence[Interval] | None, at: int) -> str:
+    if math.isnan(share):  # no query to take it of
         return "-"
-    if interval is None:
-        return f"{100 * share:.1f}"
-    return f"{100 * share:.1f} ({100 * interval.low:.1f}-{100 * interval.high:.1f})"
+    if found is None:
+        return f"{100 * share:.1f} %"
+    return f"{100 * share:.1f} % ({100 * found[at].low:.1f} to {100 * found[at].high:.1f})"
 
 
 def _unwritable(path: Path | None, error: OSError) -> Misconfigured:

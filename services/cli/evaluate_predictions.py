@@ -6,14 +6,14 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from shared.datasets.ground_truth_files import read_ground_truth
-from shared.datasets.integer_lists import read_integer_lists, read_names
 
 from services.cli.evaluate import Wanted
 from services.cli.evaluate_output import check_out, finish, result_of
 from services.trainer.evaluation.nearest import Ranked
 from services.trainer.evaluation.predictions import check_predictions, read_predictions
 from services.trainer.evaluation.result import Run
+from shared.datasets.ground_truth_files import read_ground_truth
+from shared.datasets.integer_lists import read_integer_lists, read_names
 from shared.datasets.layouts.named_photos import shot_of
 from shared.datasets.sets import EvaluationSet, Shot
 from shared.errors import InvalidRequest

@@ -113,7 +113,8 @@ class DescribeModel:
         with torch.inference_mode():
             stacked = torch.from_numpy(np.ascontiguousarray(pixels)).to(self._device)
             photos = stacked.permute(0, 3, 1, 2).float()
-            return self._model((photos - self._mean) / self._deviation).float().cpu()
+            rows: torch.Tensor = self._model((photos - self._mean) / self._deviation)
+            return rows.float().cpu()
 
 
 def _as_it_is(image: Image.Image) -> Pixels:

@@ -52,7 +52,7 @@ class Result:
         """The database photo at that rank, from 0; None where no list names it."""
         if not self.asked.database:
             return None
-        return self.asked.database[self.ranked.indices[query, rank]]
+        return self.asked.database[int(self.ranked.indices[query, rank])]
 
     def match_name(self, query: int, rank: int) -> str:
         """Its name, or else its number."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from html import escape
 from typing import Any
@@ -171,7 +172,7 @@ def _facts(facts: dict[str, Any]) -> str:
 
 
 def _share(share: float, interval: Interval | None) -> str:
-    if share != share:  # no query to take it of
+    if math.isnan(share):  # no query to take it of
         return "-"
     if interval is None:
         return f"{share:.1%}"
