@@ -11,6 +11,7 @@ from typing import Annotated
 import typer
 
 from services.cli.output import JsonOption, KeyOption, MapOption, ServerOption, explained
+from services.cli.trainer_packages import check_trainer_packages
 from shared.errors import InvalidRequest
 
 Given = dict[str, object]
@@ -166,14 +167,14 @@ def evaluate(
             _refuse("with --predictions", of_a_map | of_photos)
             if ground_truth is None:
                 raise InvalidRequest("no_ground_truth", "Say what is right: --ground-truth GT.npy")
-            _check_trainer()
+            check_trainer_packages()
             from services.cli.evaluate_predictions import evaluate_predictions
 
             evaluate_predictions(predictions, ground_truth, database, queries, data, sets, wanted)
             return
         if data is not None:
             _refuse("with --data", of_a_map | of_a_file)
-            _check_trainer()
+            check_trainer_packages()
             from services.cli.evaluate_sets import Asking, evaluate_sets
 
             size = _image_size(image_size, checkpoint)
@@ -209,18 +210,3 @@ def _image_size(text: str, checkpoint: Path | None) -> str | tuple[int, int]:
             "bad_image_size", f"--image-size {text}: same, native or HEIGHTxWIDTH is needed."
         )
     return int(match[1]), int(match[2])
-
-
-def _check_trainer() -> None:
-    """Before anything is opened: data sets are evaluated with packages that serving needs not."""
-    from importlib.util import find_spec
-
-    from shared.errors import Misconfigured
-
-    missing = [name for name in ("faiss", "torch") if find_spec(name) is None]
-    if missing:
-        raise Misconfigured(
-            "trainer_missing",
-            f"Data sets are evaluated with {', '.join(missing)}, which is not installed: "
-            "pip install 'placewise[trainer]'.",
-        )
