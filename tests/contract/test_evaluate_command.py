@@ -258,7 +258,8 @@ def test_people_are_shown_a_table(city: Path) -> None:
 def test_descriptors_are_compared_by_recall_time_and_size(
     city: Path, tmp_path: Path, checkpoint: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked = f"test-tiny-avg,test-tiny-vlad:clusters=3,preprocessing=square32+fit+pca4,{checkpoint}"
+    vlad = "test-tiny-vlad:clusters=3,preprocessing=demo1024+fit+pca4"
+    asked = f"test-tiny-avg,{vlad},{checkpoint}"
     report = run_json("compare", city, "--extractors", asked, "--out", tmp_path / "out")
     sizes = [one["bytes_a_photo"] for one in report["extractors"]]
     assert sizes == [16 * 4, 4 * 4, 128 * 4]
