@@ -1,0 +1,1 @@
+"""Training and evaluating place descriptors: `placewise train`, `evaluate`, `compare`."""
