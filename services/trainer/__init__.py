@@ -1,1 +1,1 @@
-"""Training and evaluating place descriptors: `placewise train`, `evaluate`, `compare`."""
+"""The trainer: GSV-Cities training of place models, and their evaluation."""

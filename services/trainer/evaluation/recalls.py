@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -31,8 +32,8 @@ class Recalls:
         return {
             "queries": self.queries,
             "without_positive": self.without_positive,
-            "recall": {str(k): share for k, share in self.of_all.items()},
-            "recall_findable": {str(k): share for k, share in self.of_findable.items()},
+            "recall": _by_k(self.of_all),
+            "recall_findable": _by_k(self.of_findable),
         }
 
 
@@ -98,3 +99,8 @@ def count_recalls(ranked: Indices, positives: Sequence[Indices], ks: Sequence[in
         queries=len(positives),
         without_positive=len(positives) - len(findable),
     )
+
+
+def _by_k(shares: dict[int, float]) -> dict[str, float | None]:
+    """JSON has no NaN."""
+    return {str(k): None if math.isnan(share) else share for k, share in shares.items()}

@@ -1,0 +1,56 @@
+"""Means over the map: the descriptor is as long as the map has channels.
+
+    AVG:  row_c = mean over (h, w) of x_c
+    GeM:  row_c = (mean over (h, w) of max(x_c, eps)^p)^(1 / p)      p is learnt
+
+and row <- row / |row|. GeM is the generalised mean of Radenovic, Tolias and Chum (TPAMI 2019, eq. 3
+and 4), one p for all channels as in their code.
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import torch
+from pydantic import PositiveFloat, PositiveInt
+from torch import nn
+
+from shared.vision.place_models.aggregators.base import Aggregator, unit_rows
+
+
+class Average(Aggregator):
+    inferred: ClassVar = {"in_channels": "channels"}
+
+    def __init__(self, in_channels: PositiveInt) -> None:
+        super().__init__(in_channels)
+
+    def forward(self, maps: torch.Tensor) -> torch.Tensor:
+        return unit_rows(maps.mean(dim=(-2, -1)))
+
+
+class GeM(Aggregator):
+    inferred: ClassVar = {"in_channels": "channels"}
+
+    def __init__(
+        self, in_channels: PositiveInt, p: PositiveFloat = 3.0, eps: PositiveFloat = 1e-6
+    ) -> None:
+        super().__init__(in_channels)
+        self.pool = GeneralisedMean(p, eps)
+
+    def forward(self, maps: torch.Tensor) -> torch.Tensor:
+        return unit_rows(self.pool(maps))
+
+
+class GeneralisedMean(nn.Module):
+    """(B, C, h, w) -> (B, C) float32, not normalised."""
+
+    def __init__(self, p: float, eps: float) -> None:
+        super().__init__()
+        self.p = nn.Parameter(torch.tensor([float(p)]))
+        self.eps = eps
+
+    def forward(self, maps: torch.Tensor) -> torch.Tensor:
+        # In float32 also where the network computes in half: cubes leave its range.
+        powers = maps.float().clamp(min=self.eps).pow(self.p)
+        found: torch.Tensor = powers.mean(dim=(-2, -1)).pow(1.0 / self.p)
+        return found

@@ -1,0 +1,106 @@
+"""torchvision's networks with their published ImageNet weights, from the cache or a given file.
+
+Random weights are never a fallback: what can't be had is a Misconfigured that names the ways.
+"""
+
+from __future__ import annotations
+
+import pickle
+from pathlib import Path
+from typing import Any
+
+import httpx2
+import torch
+
+from shared.errors import Misconfigured
+from shared.vision.download import download
+
+UNREADABLE = (
+    OSError, EOFError, RuntimeError, AssertionError, KeyError, ValueError, TypeError,
+    pickle.UnpicklingError,
+)  # fmt: skip
+
+
+def torchvision_network(name: str, pretrained: bool, weights: Path | None) -> Any:
+    """The network `torchvision.models.NAME`; without `pretrained` its tensors are random.
+
+    `weights`: a `.pth` or `.safetensors` in torchvision's naming instead of its own IMAGENET1K_V1,
+    which is looked for in torch.hub's cache and else downloaded. Raises Misconfigured:
+    `weights_missing`, `weights_unfit`, `download_corrupt`.
+    """
+    from torchvision import models  # takes seconds, which not every command need pay
+
+    network = models.get_model(name, weights=None)
+    if pretrained:
+        url = models.get_model_weights(name)["IMAGENET1K_V1"].url
+        path = find_torchvision_weights(name, url, weights)
+        fill(network, read_tensors(path, name), path, name)
+    return network
+
+
+def find_torchvision_weights(name: str, url: str, given: Path | None) -> Path:
+    """The file of the weights, downloaded to torch.hub's cache if need be."""
+    if given is not None:
+        if not given.is_file():
+            what = "is not a file" if given.exists() else "does not exist"
+            raise _missing(name, url, f"{given} {what}.")
+        return given
+    filename = url.rpartition("/")[2]
+    cached = Path(torch.hub.get_dir(), "checkpoints", filename)
+    if not cached.exists():
+        # By torchvision's custom the name ends with the beginning of the hash.
+        sha256 = cached.stem.rpartition("-")[2]
+        try:
+            download(url, cached, sha256=sha256)
+        except (OSError, httpx2.HTTPError) as error:
+            reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+            raise _missing(name, url, f"{url} can't be downloaded: {reason}.") from error
+    return cached
+
+
+def read_tensors(path: Path, name: str) -> dict[str, torch.Tensor]:
+    """The tensors of a `.safetensors` or PyTorch file, by name; weights only, no code is run.
+
+    Misconfigured (`weights_unfit`) for what is no such file.
+    """
+    from safetensors import SafetensorError
+    from safetensors.torch import load_file
+
+    try:
+        with path.open("rb") as file:
+            begin = file.read(9)
+        if begin[8:] == b"{":
+            return load_file(path)
+        state = torch.load(path, map_location="cpu", weights_only=True)
+    except (*UNREADABLE, SafetensorError) as error:
+        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+        raise unfit(path, name, f"it can't be read as a file of tensors: {reason}") from error
+    if not isinstance(state, dict) or not all(isinstance(v, torch.Tensor) for v in state.values()):
+        raise unfit(path, name, "it holds something else than named tensors")
+    return state
+
+
+def fill(network: Any, state: dict[str, torch.Tensor], path: Path, name: str) -> None:
+    """Give the network its tensors; Misconfigured (`weights_unfit`) where they don't fit."""
+    wanted: dict[str, torch.Tensor] = network.state_dict()
+    missing = sorted(set(wanted) - set(state))
+    differing = sorted(n for n in set(wanted) & set(state) if wanted[n].shape != state[n].shape)
+    if missing or differing:
+        which = f"no tensor {missing[0]}" if missing else f"another shape of {differing[0]}"
+        raise unfit(path, name, f"it has {which} ({len(missing) + len(differing)} faults in all)")
+    network.load_state_dict({n: state[n] for n in wanted})
+
+
+def unfit(path: Path, name: str, reason: str) -> Misconfigured:
+    return Misconfigured("weights_unfit", f"The weights {path} can't be used for {name}: {reason}.")
+
+
+def _missing(name: str, url: str, reason: str) -> Misconfigured:
+    folder = Path(torch.hub.get_dir(), "checkpoints")
+    return Misconfigured(
+        "weights_missing",
+        f"{reason} Ways to get the pretrained weights of {name}: (1) with internet access they are "
+        f"downloaded on first use; (2) bring {url} from another machine into {folder}; (3) name a "
+        "file of them; (4) pretrained=False begins with random weights, which takes far more "
+        "photos and epochs.",
+    )

@@ -1,0 +1,130 @@
+"""Checkpoints of place models: Lightning's `.ckpt`, which say themselves which network they hold.
+
+    state_dict         tensors whose names begin with `model.`
+    hyper_parameters   {"model": ModelConfig.model_dump(), ...}
+    epoch, global_step, callbacks, ...     as Lightning writes them
+
+They are read with `weights_only=True`: tensors and plain values; nothing in them is executed. The
+network is laid out without memory first and then takes the file's own tensors, so that a
+checkpoint can't ask for more memory than it has bytes.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import pickle
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from shared.errors import NotFound, Unprocessable
+from shared.vision.backbones.torchhub import weights_fingerprint
+from shared.vision.place_models.config import ModelConfig
+from shared.vision.place_models.model import PlaceModel, build_model
+
+PREFIX = "model."
+WITHOUT_EFFECT = {"pretrained", "layers_to_freeze"}  # on the descriptors of given weights
+UNREADABLE = (
+    OSError, EOFError, RuntimeError, AssertionError, KeyError, ValueError, TypeError,
+    pickle.UnpicklingError,
+)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Checkpoint:
+    model: PlaceModel
+    """On the CPU, in evaluation mode, without gradients."""
+    config: ModelConfig
+    """Of `model`, complete."""
+    fingerprint: str
+    """sha256 of all that decides a descriptor: the configuration and the weights."""
+    about: dict[str, Any]
+    """Where it comes from: `epoch`, `global_step`, and the hyperparameters beside the model's."""
+
+
+def load_checkpoint(path: Path) -> Checkpoint:
+    """Read a checkpoint of `placewise train`, or what `checkpoint_state` gave to `torch.save`.
+
+    Raises NotFound (`checkpoint_not_found`); Unprocessable: `checkpoint_unreadable` (no PyTorch
+    file, a torn one, or one with more in it than tensors and plain values), `checkpoint_unfit`
+    (another network's), and those of ModelConfig and `build_model`.
+    """
+    stored = _read(path)
+    parameters = stored.get("hyper_parameters")
+    said = parameters.get("model") if isinstance(parameters, Mapping) else None
+    tensors = stored.get("state_dict")
+    if not isinstance(said, Mapping) or not isinstance(tensors, Mapping):
+        raise _unfit(path, 'it has no hyper_parameters["model"] or no state_dict')
+    config = ModelConfig.read({**said, "pretrained": False})
+    with torch.device("meta"):
+        model = build_model(config)
+    _fill(
+        model, {n.removeprefix(PREFIX): t for n, t in tensors.items() if n.startswith(PREFIX)}, path
+    )
+    model.eval().requires_grad_(False)
+    assert isinstance(parameters, Mapping)
+    about = {name: value for name, value in parameters.items() if name != "model"}
+    about |= {name: stored[name] for name in ("epoch", "global_step") if name in stored}
+    return Checkpoint(model, model.config, fingerprint(model), about)
+
+
+def checkpoint_state(model: PlaceModel, **about: Any) -> dict[str, Any]:
+    """What `torch.save` writes and `load_checkpoint` reads; `about` are further hyperparameters, of
+    plain types."""
+    return {
+        "state_dict": {PREFIX + name: tensor for name, tensor in model.state_dict().items()},
+        "hyper_parameters": {**about, "model": model.config.model_dump()},
+    }
+
+
+def fingerprint(model: PlaceModel) -> str:
+    """sha256 of the configuration, as far as it has an effect, and of the weights."""
+    said = model.config.model_dump(mode="json", exclude=WITHOUT_EFFECT)
+    weights, _ = weights_fingerprint(model)
+    return hashlib.sha256(f"{json.dumps(said, sort_keys=True)}\n{weights}".encode()).hexdigest()
+
+
+def _read(path: Path) -> dict[str, Any]:
+    if not path.is_file():
+        raise NotFound("checkpoint_not_found", f"There is no checkpoint {path}.")
+    try:
+        stored = torch.load(path, map_location="cpu", weights_only=True)
+    except UNREADABLE as error:
+        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+        raise Unprocessable(
+            "checkpoint_unreadable",
+            f"The checkpoint {path.name} can't be read as tensors and plain values, and nothing "
+            f"else is loaded from one: {reason}",
+        ) from error
+    if not isinstance(stored, dict):
+        raise _unfit(path, f"it holds a {type(stored).__name__}")
+    return stored
+
+
+def _fill(model: PlaceModel, tensors: dict[str, Any], path: Path) -> None:
+    """Give the layout its tensors, every one in its shape and none besides."""
+    wanted = model.state_dict()
+    faults = [f"{name} is missing" for name in wanted if name not in tensors]
+    faults += [f"{name} is of no layer" for name in tensors if name not in wanted]
+    faults += [
+        f"{name} is {tuple(tensor.shape)}, expected {tuple(wanted[name].shape)}"
+        for name, tensor in tensors.items()
+        if name in wanted and tensor.shape != wanted[name].shape
+    ]
+    if faults:
+        more = f" and {len(faults) - 3} more" if len(faults) > 3 else ""
+        raise _unfit(path, "; ".join(faults[:3]) + more)
+    model.load_state_dict(
+        {name: tensors[name].to(wanted[name].dtype) for name in wanted}, assign=True
+    )
+
+
+def _unfit(path: Path, reason: str) -> Unprocessable:
+    return Unprocessable(
+        "checkpoint_unfit",
+        f"{path.name} is no checkpoint of a place model: {reason}. `placewise train` writes them.",
+    )
