@@ -1,8 +1,8 @@
 """The options of `placewise train`, made from the class of its arguments.
 
-Underscores and hyphens are both accepted. A true-or-false option stands alone (`--pretrained`),
-negated (`--no-pretrained`) or before a word (`--pretrained False`), as the predecessor's commands
-write it.
+Underscores and hyphens are both accepted; the help shows the predecessor's underscores. A
+true-or-false option stands alone (`--pretrained`), negated (`--no-pretrained`) or before a word
+(`--pretrained False`), as the predecessor's commands write it.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import typer
 from typer.core import TyperCommand
 
 from services.trainer.arguments import TrainingArguments, group_of, is_flag
-from services.trainer.configuration import ALIASES, NAMES, known_name, nearest
+from services.trainer.configuration import NAMES, known_name, nearest
 from services.trainer.read_value import FALSE, TRUE
 from shared.errors import InvalidRequest
 
@@ -59,13 +59,9 @@ def chosen(arguments: dict[str, str | None]) -> dict[str, str]:
 def _option(name: str) -> inspect.Parameter:
     field = TrainingArguments.model_fields[name]
     shown = field.default
-    default = "" if shown in (None, ()) or name == "cities" else f" [default: {_brief(shown)}]"
-    spelled = [name, *(alias for alias, of in ALIASES.items() if of == name)]
-    declared = dict.fromkeys(
-        f"--{text}" for one in spelled for text in (one, one.replace("_", "-"))
-    )
+    default = "" if shown in (None, ()) or name == "cities" else f" (default: {_brief(shown)})"
     option = typer.Option(
-        *declared,
+        f"--{name}",
         help=f"{field.description}{default}",
         rich_help_panel=group_of(name),
         metavar="BOOL" if is_flag(name) else "VALUE",

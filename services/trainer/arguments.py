@@ -19,10 +19,13 @@ from services.trainer.read_value import (
     read_structure,
 )
 
+# fmt: off
 CITIES = (
-    "Bangkok BuenosAires LosAngeles MexicoCity OSL Rome Barcelona Chicago Madrid Miami Phoenix TRT "
-    "Boston Lisbon Medellin Minneapolis PRG WashingtonDC Brussels London Melbourne Osaka PRS"
-).split()
+    "Bangkok", "BuenosAires", "LosAngeles", "MexicoCity", "OSL", "Rome", "Barcelona", "Chicago",
+    "Madrid", "Miami", "Phoenix", "TRT", "Boston", "Lisbon", "Medellin", "Minneapolis", "PRG",
+    "WashingtonDC", "Brussels", "London", "Melbourne", "Osaka", "PRS",
+)
+# fmt: on
 SMALLEST_IMAGE = 32
 """pixels of a side: below, a residual network's last map is smaller than one position"""
 
@@ -52,7 +55,7 @@ class TrainingArguments(BaseModel):
         DATA, (), "JSON list of folders with the evaluation sets; empty: data_root."
     )
     cities: Names = _said(
-        DATA, tuple(CITIES), "The cities to learn from, in that order; left out: all in the folder."
+        DATA, CITIES, "The cities to learn from, in that order; left out: all in the folder."
     )
     batch_size: int = _said(DATA, 64, "Places in a batch.", ge=1)
     img_per_place: int = _said(DATA, 2, "Photos of each place in a batch.", ge=1)

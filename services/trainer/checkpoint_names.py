@@ -2,8 +2,8 @@
 
     {backbone_arch}_epoch({epoch:02d})_step({step:04d})_R1[{sfxs_val/R1:.4f}]
 
-A field is an argument's name, `epoch`, `step` or a metric. `self.` and `model.` before it, which the
-predecessor's commands write, mean the same. `R1` alone is the monitored set's.
+A field is an argument's name, `epoch`, `step` or a metric. `self.` and `model.` before it, which
+the predecessor's commands write, mean the same. `R1` alone is the monitored set's.
 """
 
 from __future__ import annotations
@@ -16,7 +16,9 @@ from shared.errors import InvalidRequest
 
 FIELD = r"\{(?P<name>[^{}:]+)(?P<format>:[^{}]*)?\}"
 # With what belongs to it: `_R1[...]`, `-loss=...`.
-LABELLED = re.compile(rf"(?P<before>[_\-. ]?(?:[A-Za-z][A-Za-z0-9]*)?[\[(=]?)?{FIELD}(?P<after>[\])])?")
+LABELLED = re.compile(
+    rf"(?P<before>[_\-. ]?(?:[A-Za-z][A-Za-z0-9]*)?[\[(=]?)?{FIELD}(?P<after>[\])])?"
+)
 SYNONYMS = {"encoder_arch": "backbone_arch"}
 
 
@@ -33,6 +35,7 @@ class NameTemplate:
         fixed: Mapping[str, Any],
         metrics: Iterable[str],
         *,
+        monitored: str = "",
         insert_names: bool = False,
     ) -> None:
         known = {"epoch", "step", *metrics}
@@ -41,6 +44,8 @@ class NameTemplate:
 
         def settle(match: re.Match[str]) -> str:
             name = _plain(match["name"])
+            if f"{monitored}/{name}" in known:
+                name = f"{monitored}/{name}"
             before, after = match["before"] or "", match["after"] or ""
             if name in known:
                 return f"{before}{{{name}{match['format'] or ''}}}{after}"
@@ -52,7 +57,8 @@ class NameTemplate:
         self._template = LABELLED.sub(settle, template)
         if not self._template.strip("_-. "):
             raise InvalidRequest(
-                "bad_argument", f"--filename: nothing is left of {template!r}; known: {_list(known)}"
+                "bad_argument",
+                f"--filename: nothing is left of {template!r}; known: {_list(known)}",
             )
 
     def filled(self, figures: Mapping[str, Any]) -> str:

@@ -60,6 +60,3 @@ class History:
             raise Unprocessable(
                 "run_unreadable", f"{folder / FILE} can't be read: {error}. Begin a new run."
             ) from error
-
-    def measured(self, epoch: int) -> bool:
-        return any(each.number == epoch for each in self.epochs)

@@ -11,7 +11,7 @@ from torch import Tensor
 from services.trainer.arguments import TrainingArguments
 from services.trainer.batches import Batch
 from services.trainer.losses import make_loss
-from services.trainer.miners import make_miner
+from services.trainer.miners import batch_accuracy, make_miner
 from services.trainer.optimise import learning_rate, make_optimizer
 from shared.errors import Unprocessable
 from shared.vision.place_models.model import PlaceModel
@@ -31,7 +31,7 @@ class Learner(lightning.LightningModule):
         self.loss = make_loss(arguments.loss_name)
         self.miner = make_miner(arguments.miner_name, arguments.miner_margin)
         self.last_loss = float("nan")
-        self.last_share_idle = 0.0
+        self.last_accuracy: float | None = None
         self._arguments = arguments
         self._about = about
 
@@ -70,9 +70,10 @@ class Learner(lightning.LightningModule):
                 f"The loss of step {self.global_step} is {self.last_loss}: the training has "
                 "diverged. Try a smaller --lr, more --warmpup_steps or --precision 32.",
             )
-        self.last_share_idle = share_idle(mined, len(rows))
-        self.log("loss", loss.detach(), prog_bar=True, batch_size=len(rows))
-        self.log("b_acc", self.last_share_idle, prog_bar=True, batch_size=len(rows))
+        self.last_accuracy = batch_accuracy(self.loss, self.miner, mined, len(rows))
+        self.log("loss", loss.detach(), batch_size=len(rows))
+        if self.last_accuracy is not None:
+            self.log("b_acc", self.last_accuracy, batch_size=len(rows))
         return loss
 
     def transfer_batch_to_device(
@@ -83,12 +84,5 @@ class Learner(lightning.LightningModule):
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         model = self.model.config.model_dump()
         checkpoint["hyper_parameters"] = {**self._about, "model": model}
-
-
-def share_idle(mined: Any, photos: int) -> float:
-    """The predecessor's `b_acc`: the share of a batch's photos that are no anchor of a mined pair
-    or triplet. 0 without a miner; says little of FastAP and the histogram miner, which take
-    (nearly) every photo."""
-    if mined is None:
-        return 0.0
-    return 1.0 - len(torch.unique(mined[0])) / photos
+        checkpoint["last_loss"] = self.last_loss
+        checkpoint["epoch_done"] = self.trainer.is_last_batch
