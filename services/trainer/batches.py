@@ -132,6 +132,7 @@ class TrainingBatches:
             collate_fn=joined,
             pin_memory=self._pin_memory,
             worker_init_fn=_begin_worker if self._num_workers else None,
+            generator=torch.Generator(),  # else it draws from that of the steps
         )
         batches = iter(loader)
         while True:

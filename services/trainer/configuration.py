@@ -10,7 +10,6 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-import yaml
 from pydantic import ValidationError
 
 from services.trainer.arguments import TrainingArguments
@@ -54,6 +53,8 @@ def read_yaml(path: Path) -> dict[str, Any]:
 
 def read_mapping(path: Path) -> dict[str, Any]:
     """A YAML file's mapping, whatever its keys; the errors of `read_yaml` but the last."""
+    import yaml  # of the extra `trainer`; the help is shown without it
+
     try:
         loaded = yaml.safe_load(path.read_text(encoding="utf-8"))
     except OSError as error:
@@ -105,5 +106,7 @@ def as_plain(arguments: TrainingArguments) -> dict[str, Any]:
 
 def write_yaml(arguments: TrainingArguments, path: Path) -> None:
     """The file from which the same run can be made."""
+    import yaml
+
     text = yaml.safe_dump(as_plain(arguments), sort_keys=False, allow_unicode=True)
     path.write_text("# Every argument of this run: placewise train --config THIS\n" + text)
