@@ -63,10 +63,11 @@ class _Cells:
         self.positions = positions[self.order]
 
     def _cell(self, positions: Positions) -> Indices:
-        return np.floor((positions - self.origin) / self.width).astype(np.int64)
+        cells: Indices = np.floor((positions - self.origin) / self.width).astype(np.int64)
+        return cells
 
     def candidates(self, queries: Positions) -> tuple[Indices, Indices]:
-        """(3, n) from where to before where, in the sorted order, a query's nine cells lie: the three
+        """(3, n) from where to before where a query's nine cells lie in the sorted order: the three
         of one column follow each other."""
         cells = self._cell(queries)
         # What is far outside has no neighbour, and its number must not overflow either.

@@ -20,4 +20,6 @@ def average_precisions(hits: Hits, positives: NDArray[np.int64]) -> NDArray[np.f
     precision = np.cumsum(hits, axis=1) / ranks
     sums = (precision * hits).sum(axis=1)
     findable = np.minimum(positives, hits.shape[1]).astype(np.float64)
-    return np.divide(sums, findable, out=np.full(len(sums), np.nan), where=findable > 0)
+    unknown = np.full(len(sums), np.nan)
+    precisions: NDArray[np.float64] = np.divide(sums, findable, out=unknown, where=findable > 0)
+    return precisions

@@ -30,7 +30,8 @@ class Calibration:
 def calibrate(
     scores: NDArray[np.floating], right: NDArray[np.bool_], findable: int, clusters: Clusters
 ) -> Calibration:
-    """(queries,) cosines of the first match, whether it is right; how many queries have a positive."""
+    """(queries,) cosines of the first match and whether it is right; `findable` queries have a
+    positive."""
     said, truth = scores.astype(np.float64).tolist(), right.tolist()
     confidence = _cross_validated(said, truth, clusters)
     return Calibration(

@@ -11,9 +11,10 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.errors import Unprocessable
+from shared.errors import PlacewiseError, Unprocessable
 
 MEMORY_BYTES = 1_000_000_000  # rows beyond it lie in a mapped file meanwhile
+NAMED = 20  # photos that an error lists; the others are counted
 
 Rows = NDArray[np.float32]
 
@@ -74,3 +75,15 @@ def _check_finite(batch: Rows, photos: Sequence[Path]) -> None:
             f"The network's descriptor of {first} is not finite, and {int((~finite).sum())} of its "
             "batch are not: check the weights; a training that has diverged makes such networks.",
         )
+
+
+def photos_refused(refused: Sequence[tuple[Path, PlacewiseError]], photos: int) -> Unprocessable:
+    """The error that names the photos that can't be described, and why."""
+    lines = [f"{photo}: {error.detail}" for photo, error in refused[:NAMED]]
+    if len(refused) > NAMED:
+        lines.append(f"and {len(refused) - NAMED} more")
+    return Unprocessable(
+        "photos_refused",
+        f"{len(refused)} of {photos} photos of the data set can't be described, and without them "
+        "it would be another data set. Mend or fetch them again.\n" + "\n".join(lines),
+    )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -11,7 +12,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from services.trainer.evaluation.describe import Rows
+from services.trainer.evaluation.describe import Rows, photos_refused
 from shared.errors import InvalidRequest, PlacewiseError, Unprocessable
 from shared.vision.decode import decode
 from shared.vision.passes import PassLimit, PhotoDoesNotFit, in_passes
@@ -21,8 +22,6 @@ from shared.vision.resample import Pixels
 # The means and deviations of ImageNet's channels, with which the backbones were trained.
 MEAN = (0.485, 0.456, 0.406)
 DEVIATION = (0.229, 0.224, 0.225)
-
-NAMED = 20  # photos that an error lists; the others are counted
 
 
 class DescribeModel:
@@ -52,6 +51,9 @@ class DescribeModel:
             else Preprocessing("native", 1, True, max_pixels, (480, 640), _as_it_is)
         )
         self._limit = PassLimit()
+        self.seconds = 0.0
+        """spent in the network, of `photos`; they are read and decoded meanwhile"""
+        self.photos = 0
         self._mean = torch.tensor(MEAN, device=device)[:, None, None] * 255
         self._deviation = torch.tensor(DEVIATION, device=device)[:, None, None] * 255
 
@@ -74,10 +76,16 @@ class DescribeModel:
                     if isinstance(outcome, PlacewiseError)
                 ]
                 if not refused:  # after a refusal, the rest is read for what else is unreadable
+                    pixels = [p for p in batch if not isinstance(p, PlacewiseError)]
+                    begun = time.perf_counter()
                     try:
-                        yield self._rows([p for p in batch if not isinstance(p, PlacewiseError)])
+                        rows = self._rows(pixels)
                     except PhotoDoesNotFit as error:
                         refused.append((here[error.place], error))
+                        continue
+                    self.seconds += time.perf_counter() - begun
+                    self.photos += len(rows)
+                    yield rows
         finally:
             threads.shutdown(cancel_futures=True)
             self._model.train(was_training)
@@ -105,19 +113,8 @@ class DescribeModel:
         with torch.inference_mode():
             stacked = torch.from_numpy(np.ascontiguousarray(pixels)).to(self._device)
             photos = stacked.permute(0, 3, 1, 2).float()
-            return self._model((photos - self._mean) / self._deviation).float().cpu()
-
-
-def photos_refused(refused: Sequence[tuple[Path, PlacewiseError]], photos: int) -> Unprocessable:
-    """The error that names the photos that can't be described, and why."""
-    lines = [f"{photo}: {error.detail}" for photo, error in refused[:NAMED]]
-    if len(refused) > NAMED:
-        lines.append(f"and {len(refused) - NAMED} more")
-    return Unprocessable(
-        "photos_refused",
-        f"{len(refused)} of {photos} photos of the data set can't be described, and without them "
-        "it would be another data set. Mend or fetch them again.\n" + "\n".join(lines),
-    )
+            rows: torch.Tensor = self._model((photos - self._mean) / self._deviation)
+            return rows.float().cpu()
 
 
 def _as_it_is(image: Image.Image) -> Pixels:

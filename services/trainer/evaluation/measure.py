@@ -46,7 +46,7 @@ class Measured:
 
     @property
     def depth(self) -> int:
-        return self.hits.shape[1]
+        return int(self.hits.shape[1])
 
     @property
     def recall_curve(self) -> list[float]:

@@ -21,7 +21,7 @@ def metres_of(queries: Sequence[Shot], database: Sequence[Shot], ranked: Indices
     longitude, on the sphere.
     """
     asked, there = _Positions(queries), _Positions(database)
-    metres = np.hypot(
+    metres: Metres = np.hypot(
         there.east[ranked] - asked.east[:, None], there.north[ranked] - asked.north[:, None]
     )
     other_zone = there.zone[ranked] != asked.zone[:, None]

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from services.trainer.evaluation.describe import MEMORY_BYTES, Describe, described
+from services.trainer.evaluation.describe import MEMORY_BYTES, Describe, Rows, described
 from services.trainer.evaluation.nearest import BLOCK_BYTES, Indices, Ranked, nearest
 from shared.datasets.recall import recall_at
 from shared.datasets.sets import EvaluationSet
@@ -62,22 +63,7 @@ def recalls(
     `told` hears what is being done (`database`, `queries`, `search`), how far it is and where it
     ends. Raises what `describe` does, and Misconfigured (`faiss_gpu_missing`).
     """
-
-    def rows_of(what: str, shots: Sequence[Any]) -> Any:
-        done = 0
-
-        def more(count: int) -> None:
-            nonlocal done
-            done += count
-            told(what, done, len(shots))
-
-        paths = [shot.path for shot in shots]
-        return described(describe, paths, memory_bytes=memory_bytes, told=more)
-
-    with (
-        rows_of("database", asked.database) as database,
-        rows_of("queries", asked.queries) as queries,
-    ):
+    with rows_of_set(describe, asked, memory_bytes=memory_bytes, told=told) as (database, queries):
         ranked = nearest(
             queries,
             database,
@@ -88,6 +74,40 @@ def recalls(
         )
         dimension = database.shape[1]
     return Asked(ranked, count_recalls(ranked.indices, asked.positives, ks), dimension)
+
+
+@contextlib.contextmanager
+def rows_of_set(
+    describe: Describe,
+    asked: EvaluationSet,
+    *,
+    memory_bytes: int = MEMORY_BYTES,
+    told: Told = lambda what, done, most: None,
+) -> Iterator[tuple[Rows, Rows]]:
+    """(m, D) rows of the database and (n, D) of the queries, for as long as the block lasts."""
+    with contextlib.ExitStack() as stack:
+        found = []
+        for what, shots in (("database", asked.database), ("queries", asked.queries)):
+            more = _counting(what, len(shots), told)
+            paths = [shot.path for shot in shots]
+            found.append(
+                stack.enter_context(
+                    described(describe, paths, memory_bytes=memory_bytes, told=more)
+                )
+            )
+        database, queries = found
+        yield database, queries
+
+
+def _counting(what: str, most: int, told: Told) -> Callable[[int], None]:
+    done = 0
+
+    def more(count: int) -> None:
+        nonlocal done
+        done += count
+        told(what, done, most)
+
+    return more
 
 
 def count_recalls(ranked: Indices, positives: Sequence[Indices], ks: Sequence[int] = KS) -> Recalls:

@@ -1,4 +1,4 @@
-"""What training layouts by city share: which cities are meant, and place numbers that don't clash."""
+"""What training layouts by city share: which cities are meant, and numbers that don't clash."""
 
 from __future__ import annotations
 
