@@ -31,6 +31,7 @@ COMMANDS = {
     "models": ("models", "app"),
     "datasets": ("datasets", "app"),
     "train": ("train", "train"),
+    "grid": ("grid", "grid"),
     "storage": ("storage", "app"),
     "bench": ("bench", "app"),
 }
