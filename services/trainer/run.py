@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -35,7 +36,7 @@ from services.trainer.run_folder import (
     resumed_arguments,
 )
 from services.trainer.sampling import BatchPlan
-from services.trainer.stop import StopRequest
+from services.trainer.stop import RunStopped, StopRequest
 from services.trainer.summary import show_data, summarise
 from services.trainer.validation import Validation, figures_of
 from services.trainer.watch import Watch, is_measured_after, note_epoch
@@ -92,7 +93,7 @@ def run(arguments: TrainingArguments, display: Display, stop: StopRequest) -> Js
     if not arguments.fast_dev_run:
         write_yaml(arguments, folder / CONFIG)
     ready = _Ready(arguments, device, places, sets, folder, history, kept, None)
-    return _learn(ready, display, stop)
+    return _kept_when_stopped(ready, display, stop)
 
 
 def resume(path: Path, changes: Json, display: Display, stop: StopRequest) -> Json:
@@ -103,19 +104,33 @@ def resume(path: Path, changes: Json, display: Display, stop: StopRequest) -> Js
     folder, checkpoint = find_run(path)
     arguments = resumed_arguments(folder, changes)
     device = check_machine(arguments)
-    places, sets = open_places(arguments), open_sets(arguments)
-    history = History.load(folder)
+    places, history = open_places(arguments), History.load(folder)
     if history.training_set["fingerprint"] != places.fingerprint:
         raise Conflict(
             "run_differs",
             f"The photos below {arguments.data_root} are not those that the run in {folder} began "
             "with. Bring them back, or begin a new run (--model_path takes this one's weights).",
         )
+    sets = open_sets(arguments)
     kept = _kept(arguments, folder, sets, display)
     kept.best = [each for each in history.best if (kept.folder / each[1]).is_file()]
     write_yaml(arguments, folder / CONFIG)
     ready = _Ready(arguments, device, places, sets, folder, history, kept, checkpoint)
-    return _learn(ready, display, stop)
+    return _kept_when_stopped(ready, display, stop)
+
+
+def _kept_when_stopped(ready: _Ready, display: Display, stop: StopRequest) -> Json:
+    try:
+        return _learn(ready, display, stop)
+    except RunStopped:
+        if not ready.kept.last_path.is_file():
+            raise RunStopped(
+                "Stopped before the first step: there is nothing to go on from."
+            ) from None
+        raise RunStopped(
+            f"Stopped. {ready.kept.last_path} holds everything; go on with\n"
+            f"  placewise train --resume {shlex.quote(str(ready.folder))}"
+        ) from None
 
 
 def _learn(ready: _Ready, display: Display, stop: StopRequest) -> Json:
