@@ -29,7 +29,7 @@ COMMANDS = {
     "vocabulary": ("vocabulary", "app"),
     "pca": ("pca", "app"),
     "models": ("models", "app"),
-    "datasets": ("datasets", "app"),
+    "datasets": ("datasets.commands", "app"),
     "train": ("train", "train"),
     "grid": ("grid", "grid"),
     "storage": ("storage", "app"),

@@ -180,6 +180,10 @@ def _encode(text: str, _: str) -> bytes:
     return text.encode("latin1")
 
 
+def _no_bytes() -> bytes:
+    return b""
+
+
 class _Unpickler(pickle.Unpickler):
     """Finds stand-ins, and nothing else."""
 
@@ -193,6 +197,7 @@ _STAND_INS: dict[tuple[str, str], Any] = {
     ("numpy", "ndarray"): _Array,
     ("numpy", "dtype"): _Dtype,
     ("_codecs", "encode"): _encode,
+    ("builtins", "bytes"): _no_bytes,
     **{
         (f"numpy.{core}.multiarray", name): stand_in
         for core in ("core", "_core")

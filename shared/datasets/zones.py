@@ -95,6 +95,13 @@ def planes(
     return found
 
 
+def degrees_of(grid: Grid, metres: Positions) -> tuple[float, float]:
+    """Latitude and longitude of one position, (2,) UTM metres of the grid."""
+    east, north = metres.tolist()
+    latitude, longitude = utm.to_latlon(east, north, grid[0], northern=grid[1], strict=False)
+    return float(latitude), float(longitude)
+
+
 def grid_of(zone: str, name: str) -> Grid:
     """`32T` -> (32, True). Raises InvalidRequest (`bad_coordinates`), which names the photo."""
     number, letter = zone[:-1], zone[-1:].upper()

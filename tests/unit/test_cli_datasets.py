@@ -9,20 +9,21 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from services.cli import datasets
+from services.cli.datasets.commands import app
+from services.cli.datasets.synth import parse_size
 from shared.datasets.city.write import NOT_COMPARABLE
 
 
 @pytest.mark.parametrize("text", ["320x240", "64x64", "1920x1080"])
 def test_size_is_width_times_height(text: str) -> None:
-    width, height = datasets.parse_size(text)
+    width, height = parse_size(text)
     assert f"{width}x{height}" == text
 
 
 @pytest.mark.parametrize("text", ["", "320", "320x", "x240", "32x240", "320x2000", "3 20x240"])
 def test_other_sizes_are_refused_with_an_example(text: str) -> None:
     with pytest.raises(typer.BadParameter, match="320x240"):
-        datasets.parse_size(text)
+        parse_size(text)
 
 
 def test_ladder_is_shown_with_the_line_that_it_is_not_comparable(
@@ -39,9 +40,9 @@ def test_ladder_is_shown_with_the_line_that_it_is_not_comparable(
             }
         ]
 
-    monkeypatch.setattr(datasets, "climb", climbed)
+    monkeypatch.setattr("services.cli.datasets.synth.climb", climbed)
     arguments = ["synth", str(tmp_path / "out"), "--places", "1", "--queries", "2"]
-    result = CliRunner().invoke(datasets.app, [*arguments, "--size", "64x64"])
+    result = CliRunner().invoke(app, [*arguments, "--size", "64x64"])
     assert result.exit_code == 0, result.output
     for part in ("average colour", "25.0%", "75.0%", "25 m", NOT_COMPARABLE):
         assert part in result.output

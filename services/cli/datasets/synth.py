@@ -20,13 +20,6 @@ Json = dict[str, Any]
 KINDS = ("R@1 in map", "R@1 other way")
 SIZE = re.compile(r"(\d{2,4})x(\d{2,4})")
 
-app = typer.Typer(help="Data sets: make a city to try things on.", no_args_is_help=True)
-
-
-@app.callback()
-def _datasets() -> None:
-    """A group, so that each way of getting a data set has its own name."""
-
 
 def parse_size(text: str) -> tuple[int, int]:
     """`320x240` -> (320, 240); typer.BadParameter for anything else, and outside 64 to 1920."""
@@ -36,7 +29,6 @@ def parse_size(text: str) -> tuple[int, int]:
     return int(match[1]), int(match[2])
 
 
-@app.command("synth")
 def synth(
     out: Annotated[Path, typer.Argument(help="Folder to write; it must not hold anything yet.")],
     places: Annotated[int, typer.Option(min=1, max=20_000)] = 1000,

@@ -1,0 +1,1 @@
+"""`placewise datasets`: data sets of the field, looked at, completed and made."""

@@ -1,0 +1,83 @@
+"""`placewise datasets ground-truth`: which photos of one list are right for those of another."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from services.cli.output import JsonOption, answers, explained, print_json, shown
+from shared.datasets.ground_truth import find_positives
+from shared.datasets.ground_truth_files import said_path, write_ground_truth
+from shared.datasets.photo_lists import read_list
+from shared.datasets.rules import Rule, parse_rule
+from shared.errors import InvalidRequest, Misconfigured
+
+List = Annotated[Path, typer.Option(help="A .npy of paths, a CSV, or a text of one path a line.")]
+
+
+def ground_truth(
+    database: List,
+    queries: List,
+    out: Annotated[Path, typer.Option(help="The .npy to write, and beside it a .json.")],
+    radius: Annotated[
+        float | None, typer.Option(min=0, help="Metres, the bound included. Left out: 25.")
+    ] = None,
+    rule: Annotated[
+        str | None,
+        typer.Option(help="Another rule: heading 25 40, frames 5, frames 5 in sequence, ..."),
+    ] = None,
+    folder: Annotated[
+        Path | None,
+        typer.Option(help="Where the paths begin, for EXIF positions. Left out: each list's."),
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Write which database photos are right for each query, in the format of sf_xs's gtImages.npy.
+
+    The rows are in the order of the lists as given. OUT.json keeps the fingerprints of both lists,
+    so that they are never taken for the rows of others.
+    """
+    with explained(as_json):
+        meant = _meant(radius, rule)
+        if out.suffix != ".npy":
+            raise InvalidRequest("bad_out", f"--out {out}: the file's name has to end in .npy.")
+        listed, asked = read_list(database, folder), read_list(queries, folder)
+        found = find_positives(meant, asked, listed)
+        try:
+            write_ground_truth(
+                out,
+                found,
+                database=[shot.name for shot in listed],
+                queries=[shot.name for shot in asked],
+                rule=str(meant),
+            )
+        except OSError as error:
+            raise Misconfigured("out_unwritable", f"Can't write {out}: {error}.") from error
+    counts = [len(positives) for positives in found]
+    figures = {
+        "out": shown(out),
+        "rule": str(meant),
+        "database": len(listed),
+        "queries": len(asked),
+        "positives": sum(counts),
+        "queries_without_positives": counts.count(0),
+    }
+    if as_json:
+        print_json(figures)
+        return
+    answers.print(
+        f"{shown(out)}, and {shown(said_path(out))} beside it: {sum(counts)} positives ({meant}) "
+        f"of {len(asked)} queries among {len(listed)} database photos; {counts.count(0)} queries "
+        "have none.",
+        soft_wrap=True,
+    )
+
+
+def _meant(radius: float | None, rule: str | None) -> Rule:
+    if rule is None:
+        return Rule("radius", radius_m=25.0 if radius is None else radius)
+    if radius is not None:
+        raise InvalidRequest("which_rule", "Give --radius or --rule, not both.")
+    return parse_rule(rule)

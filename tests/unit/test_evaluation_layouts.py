@@ -1,0 +1,415 @@
+"""Sets to measure on, in each layout that is known."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import utm
+from PIL import Image
+from PIL.ExifTags import GPS, IFD
+from scipy.io import savemat
+
+from shared.datasets.ground_truth_files import write_ground_truth
+from shared.datasets.sets import EvaluationSet, evaluation_set_names, open_evaluation_set
+from shared.errors import InvalidRequest, NotFound, PlacewiseError
+from tests.support.data_sets import (
+    save_lists,
+    save_names,
+    utm_name,
+    write_csv,
+    write_photo,
+    write_photos,
+)
+
+
+def pair(base: Path, database: list[float], queries: list[float]) -> None:
+    """Photos along one street, at these metres."""
+    for name, spots in (("database", database), ("queries", queries)):
+        write_photos(base / name, [utm_name(480_000 + m, 4_880_000) for m in spots])
+
+
+def rows(opened: EvaluationSet) -> list[list[int]]:
+    return [found.tolist() for found in opened.positives]
+
+
+def names(opened: EvaluationSet) -> tuple[list[str], list[str]]:
+    return [s.name for s in opened.database], [s.name for s in opened.queries]
+
+
+def code_of(caught: pytest.ExceptionInfo[PlacewiseError]) -> str:
+    return caught.value.code
+
+
+def test_pair_of_folders_is_a_set_named_after_its_folder(tmp_path: Path) -> None:
+    pair(tmp_path / "My-City", [0, 25, 100], [0, 50, 500])
+    opened = open_evaluation_set(tmp_path / "My-City")
+    assert (opened.name, opened.rule, opened.protocol) == ("mycity", "radius 25 m", "placewise")
+    assert rows(opened) == [[0, 1], [1], []]
+    assert opened.without_positives.tolist() == [2]
+    assert opened.database[1].name == f"database/{utm_name(480_025, 4_880_000)}"
+
+
+def test_splits_of_a_data_set_are_sets_and_so_are_several_data_sets(tmp_path: Path) -> None:
+    pair(tmp_path / "SF_XS" / "val", [0], [0])
+    pair(tmp_path / "SF_XS" / "test", [0], [0])
+    pair(tmp_path / "tokyo_xs" / "images" / "test", [0], [10])
+    assert evaluation_set_names(tmp_path) == ("sfxs_test", "sfxs_val", "tokyoxs_test")
+    assert evaluation_set_names(tmp_path / "SF_XS") == ("sfxs_test", "sfxs_val")
+    assert len(open_evaluation_set(tmp_path, "tokyoxs_test").queries) == 1
+    with pytest.raises(InvalidRequest, match="sfxs_test, sfxs_val, tokyoxs_test") as caught:
+        open_evaluation_set(tmp_path)
+    assert code_of(caught) == "which_set"
+    with pytest.raises(NotFound, match="There are: sfxs_test, sfxs_val") as missing:
+        open_evaluation_set(tmp_path / "SF_XS", "sfxs_tset")
+    assert code_of(missing) == "set_missing"
+
+
+def test_at_sign_in_a_folders_name_means_nothing(tmp_path: Path) -> None:
+    pair(tmp_path / "me@home@2024@x", [0, 100], [90])
+    assert rows(open_evaluation_set(tmp_path / "me@home@2024@x")) == [[1]]
+
+
+def test_order_is_that_of_the_names_whatever_the_disk_says(tmp_path: Path) -> None:
+    pair(tmp_path, [300, 100, 200], [0])
+    opened = open_evaluation_set(tmp_path)
+    assert names(opened)[0] == sorted(names(opened)[0])
+    assert [shot.easting for shot in opened.database] == [480_100, 480_200, 480_300]
+
+
+def test_list_beside_a_folder_is_the_set_in_its_order(tmp_path: Path) -> None:
+    pair(tmp_path, [0, 100, 200], [200])
+    listed = [f"database/{utm_name(480_000 + m, 4_880_000)}" for m in (200, 0)]
+    (tmp_path / "database_images_paths.txt").write_text("\n".join(listed) + "\n")
+    opened = open_evaluation_set(tmp_path)
+    assert names(opened)[0] == listed
+    assert rows(opened) == [[0]]
+    (tmp_path / "database_images_paths.txt").write_text("elsewhere.jpg\n")
+    with pytest.raises(InvalidRequest) as caught:
+        open_evaluation_set(tmp_path)
+    assert code_of(caught) == "bad_list"
+
+
+def test_vme_compares_metres_of_different_zones_as_it_always_did(tmp_path: Path) -> None:
+    east = utm_name(480_000, 4_880_000).replace("@32@", "@33@")
+    write_photos(tmp_path / "database", [east])
+    write_photos(tmp_path / "queries", [utm_name(480_000, 4_880_000)])
+    assert rows(open_evaluation_set(tmp_path)) == [[]]
+    assert rows(open_evaluation_set(tmp_path, protocol="vme")) == [[0]]
+    with pytest.raises(InvalidRequest, match="placewise, vme") as caught:
+        open_evaluation_set(tmp_path, protocol="msls-official")
+    assert code_of(caught) == "unknown_protocol"
+
+
+def gps_photo(path: Path, latitude: float, longitude: float) -> None:
+    def parts(degrees: float) -> tuple[float, float, float]:
+        return int(degrees), int(degrees * 60) % 60, degrees * 3600 % 60
+
+    exif = Image.Exif()
+    exif[IFD.GPSInfo] = {
+        GPS.GPSLatitudeRef: "N",
+        GPS.GPSLatitude: parts(latitude),
+        GPS.GPSLongitudeRef: "E",
+        GPS.GPSLongitude: parts(longitude),
+    }
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.new("RGB", (8, 6)).save(path, exif=exif)
+
+
+def test_photos_of_a_camera_are_placed_by_their_exif(tmp_path: Path) -> None:
+    gps_photo(tmp_path / "database" / "IMG_1.jpg", 44.07, 8.76)
+    gps_photo(tmp_path / "database" / "IMG_2.jpg", 44.0702, 8.76)
+    gps_photo(tmp_path / "queries" / "IMG_3.jpg", 44.0703, 8.76)
+    opened = open_evaluation_set(tmp_path)
+    assert rows(opened) == [[1]]
+    assert opened.database[0].zone == "32T"
+
+
+def test_folders_of_places_are_labels_where_nobody_knows_positions(tmp_path: Path) -> None:
+    write_photos(tmp_path / "database", ["hall/1.jpg", "door/2.jpg", "hall/3.jpg"])
+    write_photos(tmp_path / "queries", ["hall/9.jpg"])
+    opened = open_evaluation_set(tmp_path)
+    assert opened.rule == "place-label"
+    assert rows(opened) == [[1, 2]]
+
+
+def test_photos_without_position_or_place_are_an_error_that_says_what_helps(
+    tmp_path: Path,
+) -> None:
+    write_photos(tmp_path / "database", ["1.jpg"])
+    write_photos(tmp_path / "queries", ["2.jpg"])
+    with pytest.raises(InvalidRequest, match="CSV or EXIF") as caught:
+        open_evaluation_set(tmp_path)
+    assert code_of(caught) == "no_positions"
+
+
+def test_rule_that_is_asked_for_is_the_rule(tmp_path: Path) -> None:
+    pair(tmp_path, [0, 30, 100], [0])
+    assert rows(open_evaluation_set(tmp_path, rule="radius 100")) == [[0, 1, 2]]
+    with pytest.raises(InvalidRequest) as caught:
+        open_evaluation_set(tmp_path, rule="closeness")
+    assert code_of(caught) == "unknown_rule"
+
+
+def npy_set(base: Path, end: str = "_gtImages") -> tuple[list[str], list[str]]:
+    """Lists in another order than the names', and a ground truth that is no rule's."""
+    pair(base / "val", [0, 100, 200], [0, 100])
+    database = [f"val/database/{utm_name(480_000 + m, 4_880_000)}" for m in (200, 0, 100)]
+    queries = [f"val/queries/{utm_name(480_000 + m, 4_880_000)}" for m in (100, 0)]
+    save_names(base / "sfxs_val_dbImages.npy", database)
+    save_names(base / "sfxs_val_qImages.npy", queries)
+    save_lists(base / f"sfxs_val{end}.npy", [[2, 0], []])
+    return database, queries
+
+
+@pytest.mark.parametrize("end", ["_gtImages", "_gt", "_gt_25m"])
+def test_npy_lists_keep_their_order_and_bring_their_ground_truth(tmp_path: Path, end: str) -> None:
+    database, queries = npy_set(tmp_path / "SF_XS", end)
+    opened = open_evaluation_set(tmp_path / "SF_XS", "sfxs_val")
+    assert names(opened) == (database, queries)
+    assert rows(opened) == [[0, 2], []]
+    assert opened.rule == f"given by sfxs_val{end}.npy"
+    assert all(shot.path.is_file() for shot in (*opened.database, *opened.queries))
+    assert rows(open_evaluation_set(tmp_path / "SF_XS", rule="radius")) == [[2], [1]]
+
+
+def test_npy_lists_without_a_ground_truth_are_measured_by_their_names(tmp_path: Path) -> None:
+    npy_set(tmp_path)
+    (tmp_path / "sfxs_val_gtImages.npy").unlink()
+    opened = open_evaluation_set(tmp_path, "sfxs_val")
+    assert (rows(opened), opened.rule) == ([[2], [1]], "radius 25 m")
+
+
+def test_ground_truth_for_lists_in_another_order_is_refused(tmp_path: Path) -> None:
+    database, queries = npy_set(tmp_path)
+    truth = tmp_path / "sfxs_val_gtImages.npy"
+    positives = [np.array([2]), np.array([1])]
+    write_ground_truth(truth, positives, database=database, queries=queries, rule="radius 25 m")
+    opened = open_evaluation_set(tmp_path, "sfxs_val")
+    assert (rows(opened), opened.rule) == ([[2], [1]], "radius 25 m")
+    save_names(tmp_path / "sfxs_val_dbImages.npy", sorted(database))
+    with pytest.raises(InvalidRequest) as caught:
+        open_evaluation_set(tmp_path, "sfxs_val")
+    assert code_of(caught) == "ground_truth_of_other_lists"
+
+
+def test_lists_may_lie_apart_from_their_photos(tmp_path: Path) -> None:
+    database, _ = npy_set(tmp_path / "lists")
+    (tmp_path / "lists" / "val").rename(tmp_path / "val")
+    opened = open_evaluation_set(tmp_path / "lists")
+    assert opened.database[0].path == tmp_path / database[0] == opened.database[0].path.resolve()
+
+
+def test_sped_has_a_table_of_integers_and_msls_chooses_its_queries(tmp_path: Path) -> None:
+    write_photos(tmp_path, ["ref/0.jpg", "ref/1.jpg", "query/0.jpg", "query/1.jpg"])
+    for name in ("SPED", "msls_val"):
+        save_names(tmp_path / f"{name}_dbImages.npy", ["ref/0.jpg", "ref/1.jpg"])
+        save_names(tmp_path / f"{name}_qImages.npy", ["query/0.jpg", "query/1.jpg"])
+    np.save(tmp_path / "SPED_gt.npy", np.array([[1, -1], [0, 1]]))
+    np.save(tmp_path / "msls_val_qIdx.npy", np.array([1]))
+    save_lists(tmp_path / "msls_val_pIdx.npy", [[0]])
+    assert rows(open_evaluation_set(tmp_path, "SPED")) == [[1], [0, 1]]
+    msls = open_evaluation_set(tmp_path, "msls_val")
+    assert (names(msls)[1], rows(msls)) == (["query/1.jpg"], [[0]])
+
+
+def test_list_of_queries_that_is_missing_is_named(tmp_path: Path) -> None:
+    npy_set(tmp_path)
+    (tmp_path / "sfxs_val_qImages.npy").unlink()
+    with pytest.raises(InvalidRequest, match=r"sfxs_val_qImages\.npy") as caught:
+        open_evaluation_set(tmp_path, "sfxs_val")
+    assert code_of(caught) == "bad_list"
+
+
+def msls_city(folder: Path, photos: list[dict[str, Any]]) -> None:
+    """The four tables as Mapillary writes them; `m` is metres east of the city's corner."""
+
+    def write(name: str, header: tuple[str, ...], cells: Any) -> None:
+        table = [(number, *cells(photo)) for number, photo in enumerate(photos)]
+        write_csv(folder / name, ("", *header), table)
+
+    def degrees(photo: dict[str, Any]) -> tuple[float, float]:
+        latitude, longitude = utm.to_latlon(350_000 + photo["m"], 6_170_000, 33, "U")
+        return float(longitude), float(latitude)
+
+    write(
+        "raw.csv",
+        ("key", "lon", "lat", "ca", "captured_at", "pano"),
+        lambda p: (p["key"], *degrees(p), 370.0, "2019-01-01", p.get("pano", False)),
+    )
+    # Metres as if the city lay 7 m further east: only the official protocol shall see them.
+    write(
+        "postprocessed.csv",
+        ("key", "easting", "northing", "night", "view_direction"),
+        lambda p: (p["key"], 350_007.0 + p.get("official", p["m"]), 6_170_000.0, False, "Forward"),
+    )
+    write("seq_info.csv", ("key", "sequence_key", "frame_number"), lambda p: (p["key"], "s1", 4))
+    write("subtask_index.csv", ("all", "s2w"), lambda p: (p.get("all", True), False))
+    write_photos(folder / "images", [f"{photo['key']}.jpg" for photo in photos])
+
+
+def msls(base: Path) -> None:
+    for city, queries in (
+        (
+            "cph",
+            [
+                {"key": "q0", "m": 0},
+                {"key": "q1", "m": 30, "official": 20},
+                {"key": "pano", "m": 0, "pano": True},
+                {"key": "notask", "m": 0, "all": False},
+                {"key": "far", "m": 900},
+            ],
+        ),
+        ("sf", [{"key": "q5", "m": 5000}]),
+    ):
+        start = 0 if city == "cph" else 5000
+        database = [
+            {"key": f"{city}{number}", "m": start + metres}
+            for number, metres in enumerate((0, 100))
+        ]
+        database.append({"key": f"{city}pano", "m": start, "pano": True})
+        msls_city(base / "train_val" / city / "database", database)
+        msls_city(base / "train_val" / city / "query", queries)
+
+
+def test_msls_official_drops_panoramas_other_tasks_and_queries_without_positives(
+    tmp_path: Path,
+) -> None:
+    msls(tmp_path)
+    opened = open_evaluation_set(tmp_path)
+    assert (opened.name, opened.protocol) == ("msls_val", "msls-official")
+    stems = [[shot.path.stem for shot in shots] for shots in (opened.database, opened.queries)]
+    assert stems == [["cph0", "cph1", "sf0", "sf1"], ["q0", "q1", "q5"]]
+    assert rows(opened) == [[0], [0], [2]]
+    query = opened.queries[0]
+    assert (query.heading, query.sequence, query.frame) == (10.0, "s1", 4)
+    assert query.path.is_file()
+    assert names(opened)[1][0] == "train_val/cph/query/images/q0.jpg"
+
+
+def test_msls_vme_keeps_all_queries_and_measures_by_latitude_and_longitude(
+    tmp_path: Path,
+) -> None:
+    msls(tmp_path)
+    opened = open_evaluation_set(tmp_path / "train_val", protocol="vme")
+    assert [shot.path.stem for shot in opened.queries] == ["q0", "q1", "notask", "far", "q5"]
+    assert rows(opened) == [[0], [], [0], [], [2]]
+    official = open_evaluation_set(tmp_path / "train_val")
+    assert official.fingerprint != opened.fingerprint
+
+
+def test_msls_of_one_city_or_of_mixed_versions_is_refused(tmp_path: Path) -> None:
+    msls(tmp_path)
+    cut = tmp_path / "train_val" / "cph" / "query" / "subtask_index.csv"
+    cut.write_text("\n".join(cut.read_text().splitlines()[:-1]))
+    with pytest.raises(InvalidRequest, match="different versions") as caught:
+        open_evaluation_set(tmp_path)
+    assert code_of(caught) == "bad_table"
+    (tmp_path / "train_val" / "sf").rename(tmp_path / "train_val" / "amman")
+    with pytest.raises(NotFound, match=r"no city sf\. There are: amman, cph") as missing:
+        open_evaluation_set(tmp_path)
+    assert code_of(missing) == "city_missing"
+
+
+def test_dbstruct_of_matlab_brings_names_metres_and_its_radius(tmp_path: Path) -> None:
+    def cells(texts: list[str]) -> Any:
+        column = np.empty((len(texts), 1), object)
+        column[:, 0] = texts
+        return column
+
+    write_photos(tmp_path, ["000/a.jpg", "000/b.jpg", "queries_real/000/q.jpg"])
+    struct = {
+        "whichSet": "test",
+        "dbImageFns": cells(["000/a.jpg", "000/b.jpg"]),
+        "utmDb": np.array([[580_000.0, 580_030.0], [4_470_000.0, 4_470_000.0]]),
+        "qImageFns": cells(["000/q.jpg"]),
+        "utmQ": np.array([[580_011.0], [4_470_000.0]]),
+        "numImages": 2.0,
+        "numQueries": 1.0,
+        "posDistThr": 15.0,
+        "posDistSqThr": 225.0,
+    }
+    savemat(tmp_path / "pitts30k_test.mat", {"dbStruct": struct})
+    opened = open_evaluation_set(tmp_path, "pitts30k_test")
+    assert (rows(opened), opened.rule) == ([[0]], "radius 15 m")
+    assert all(shot.path.is_file() for shot in (*opened.database, *opened.queries))
+    savemat(tmp_path / "pitts30k_test.mat", {"other": struct})
+    with pytest.raises(InvalidRequest, match="no dbStruct") as caught:
+        open_evaluation_set(tmp_path, "pitts30k_test")
+    assert code_of(caught) == "bad_dbstruct"
+
+
+def test_csv_tables_place_photos_by_degrees_or_metres_over_zones(tmp_path: Path) -> None:
+    write_photo(tmp_path / "a.jpg")
+    header = ("path", "latitude", "longitude", "heading", "place", "frame", "sequence", "weather")
+    write_csv(
+        tmp_path / "database.csv",
+        header,
+        [("a.jpg", 48, 11.9999, 370, "x", 3, "s", "rain"), ("b.jpg", 48, 12.1, "", "", "", "", "")],
+    )
+    metres = utm.from_latlon(48, 12.0001)
+    write_csv(
+        tmp_path / "queries.csv",
+        ("filename", "easting", "northing", "zone", "frame"),
+        [("c.jpg", metres[0], metres[1], "33U", 5)],
+    )
+    opened = open_evaluation_set(tmp_path)
+    assert rows(opened) == [[0]]
+    first = opened.database[0]
+    assert (first.heading, first.place, first.frame, first.sequence) == (10, "x", 3, "s")
+    assert first.zone == "32U"
+    with pytest.raises(InvalidRequest, match="1 photos say no frame"):
+        open_evaluation_set(tmp_path, rule="frames 2")
+
+
+@pytest.mark.parametrize(
+    ("header", "row", "code"),
+    [
+        (("name", "latitude"), ("a.jpg", 1), "missing_column"),
+        (("path", "latitude", "longitude"), ("a.jpg", "north", 8), "bad_table"),
+        (("path", "latitude", "longitude"), ("a.jpg", 44, ""), "bad_table"),
+        (("path", "latitude", "longitude"), ("a.jpg", 86, 8), "bad_coordinates"),
+        (("path", "latitude", "longitude"), ("", 44, 8), "bad_table"),
+        (("path", "easting", "northing", "zone"), ("a.jpg", 1, 2, "99Q"), "bad_coordinates"),
+        (("path", "frame"), ("a.jpg", 1.5), "bad_table"),
+        (("path",), ("@x@y@.jpg",), "bad_coordinates"),
+    ],
+)
+def test_tables_that_can_not_be_understood_are_refused(
+    tmp_path: Path, header: tuple[str, ...], row: tuple[object, ...], code: str
+) -> None:
+    write_csv(tmp_path / "database.csv", header, [row])
+    write_csv(tmp_path / "queries.csv", ("path", "lat", "lon"), [("q.jpg", 44, 8)])
+    with pytest.raises(InvalidRequest) as caught:
+        open_evaluation_set(tmp_path)
+    assert code_of(caught) == code
+
+
+def test_fingerprint_is_of_names_sizes_positives_and_protocol(tmp_path: Path) -> None:
+    for folder in ("a", "b", "c", "d"):
+        pair(tmp_path / folder, [0, 100], [0])
+    Image.new("RGB", (64, 64), (1, 2, 3)).save(next((tmp_path / "b" / "queries").iterdir()))
+    next((tmp_path / "c" / "queries").iterdir()).unlink()
+    write_photo(tmp_path / "c" / "queries" / utm_name(480_100, 4_880_000))
+    base = open_evaluation_set(tmp_path / "a").fingerprint
+    others = {
+        open_evaluation_set(tmp_path / "b").fingerprint,
+        open_evaluation_set(tmp_path / "c").fingerprint,
+        open_evaluation_set(tmp_path / "a", rule="radius 100").fingerprint,
+        open_evaluation_set(tmp_path / "a", protocol="vme").fingerprint,
+    }
+    assert len(others | {base}) == 5
+    assert open_evaluation_set(tmp_path / "d").fingerprint == base
+
+
+def test_folder_of_nothing_and_empty_folders_are_explained(tmp_path: Path) -> None:
+    with pytest.raises(NotFound) as caught:
+        open_evaluation_set(tmp_path)
+    assert code_of(caught) == "no_evaluation_set"
+    (tmp_path / "database").mkdir()
+    (tmp_path / "queries").mkdir()
+    with pytest.raises(InvalidRequest, match="no database photo") as empty:
+        open_evaluation_set(tmp_path)
+    assert code_of(empty) == "empty_set"
