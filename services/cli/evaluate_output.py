@@ -20,6 +20,7 @@ from services.trainer.evaluation.recalls import KS
 from services.trainer.evaluation.report.page import page
 from services.trainer.evaluation.result import Result, Run
 from services.trainer.evaluation.write import metrics, write_files, write_pairs
+from shared.datasets.audit import find_suspects
 from shared.datasets.published import published_on
 from shared.datasets.sets import EvaluationSet
 from shared.errors import Misconfigured
@@ -69,6 +70,11 @@ def result_of(
         about,
         against=against,
         published=published_on(asked),
+        suspects=(
+            tuple(find_suspects(asked, ranked.indices, ranked.scores if has_scores else None))
+            if asked.database
+            else ()
+        ),
     )
 
 

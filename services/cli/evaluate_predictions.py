@@ -13,8 +13,8 @@ from services.trainer.evaluation.nearest import Ranked
 from services.trainer.evaluation.predictions import check_predictions, read_predictions
 from services.trainer.evaluation.result import Run
 from shared.datasets.ground_truth_files import read_ground_truth
-from shared.datasets.integer_lists import read_integer_lists, read_names
-from shared.datasets.layouts.named_photos import shot_of
+from shared.datasets.integer_lists import read_integer_lists
+from shared.datasets.photo_lists import read_list
 from shared.datasets.sets import EvaluationSet, Shot
 from shared.errors import InvalidRequest
 
@@ -42,11 +42,12 @@ def evaluate_predictions(
     ranked = read_predictions(predictions)
     name = sets[0] if sets else ground_truth.stem
     rule = None
+    shots: tuple[tuple[Shot, ...], tuple[Shot, ...]]
     if database is not None and queries is not None:
-        there, names = _read_list(database), _read_list(queries)
-        positives, rule = read_ground_truth(ground_truth, database=there, queries=names)
+        shots = read_list(database, photos), read_list(queries, photos)
+        there, asked_for = ([shot.name for shot in role] for role in shots)
+        positives, rule = read_ground_truth(ground_truth, database=there, queries=asked_for)
         check_predictions(predictions, ranked, positives, len(there))
-        shots = _shots(photos or database.parent, there), _shots(photos or queries.parent, names)
     else:
         positives = read_integer_lists(ground_truth)
         check_predictions(predictions, ranked, positives, None)
@@ -67,17 +68,3 @@ def evaluate_predictions(
     result = result_of(asked, found, wanted, has_scores=False, about={})
     run = Run(predictions.stem, None, {"predictions": predictions.name})
     finish(run, [result], wanted)
-
-
-def _read_list(path: Path) -> list[str]:
-    """Names of photos: a `.npy` array of texts, or a text with one a line."""
-    if path.suffix == ".npy":
-        return read_names(path)
-    try:
-        return [line for line in path.read_text(encoding="utf-8").splitlines() if line]
-    except (OSError, UnicodeDecodeError) as error:
-        raise InvalidRequest("bad_list", f"{path} is no list of paths: {error}.") from error
-
-
-def _shots(folder: Path, names: Sequence[str]) -> tuple[Shot, ...]:
-    return tuple(shot_of(folder / name.lstrip("/"), name) for name in names)

@@ -84,19 +84,14 @@ def test_distance_error_counts_queries_whose_first_match_lies_within_x_metres() 
     assert distance_error(np.array([np.nan])) is None
 
 
-def test_metres_are_of_the_plane_in_a_zone_and_of_the_globe_over_its_border() -> None:
-    queries = [shot(500_000.0), shot(833_000.0, zone="31T", latitude=45.0, longitude=6.001)]
-    database = [
-        shot(500_030.0, northing=5_000_040.0),
-        shot(500_000.0, zone="32U"),  # another letter, the same plane
-        shot(263_000.0, zone="32T", latitude=45.0, longitude=6.0),
-        shot(None, zone=None),
-    ]
-    metres = metres_of(queries, database, np.array([[0, 1, 3], [2, 3, 3]]))
+def test_each_ranked_photo_has_its_metres_from_its_own_query() -> None:
+    queries = [shot(500_000.0), shot(500_100.0), shot(None)]
+    database = [shot(500_030.0, northing=5_000_040.0), shot(500_000.0), shot(None)]
+    metres = metres_of(queries, database, np.array([[0, 1, 2], [1, 0, 2], [0, 1, 2]]))
     assert metres[0, :2].tolist() == [50.0, 0.0]
-    # a thousandth of a degree of longitude at 45 degrees north
-    assert metres[1, 0] == pytest.approx(78.6, abs=0.1)
-    assert np.isnan(metres[[0, 1, 1], [2, 1, 2]]).all()
+    assert metres[1, :2].tolist() == pytest.approx([100.0, np.hypot(70, 40)])
+    assert np.isnan(metres[:, 2]).all()
+    assert np.isnan(metres[2]).all()
 
 
 def test_queries_cluster_by_sequence_then_place_then_square() -> None:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from services.trainer.evaluation.against import Against
 from services.trainer.evaluation.measure import Measured
 from services.trainer.evaluation.nearest import Ranked, Scores
+from shared.datasets.audit import Suspect
 from shared.datasets.published import Published
 from shared.datasets.sets import EvaluationSet, Shot
 
@@ -36,8 +37,8 @@ class Result:
     """`dimension`, `describe_ms_per_photo`, ... as far as they are known"""
     against: Against | None = None
     published: tuple[Published, ...] = ()
-    audit: tuple[dict[str, Any], ...] | None = None
-    """Confident matches that the rule calls wrong, just outside of it; None where not looked for"""
+    suspects: tuple[Suspect, ...] = ()
+    """confident first matches that the rule calls wrong and that lie just outside of it"""
 
     @property
     def file_name(self) -> str:
@@ -69,7 +70,7 @@ class Result:
             **self.measured.as_json(),
             "against": self.against.as_json() if self.against else None,
             "published": [found.as_json() for found in self.published],
-            "audit": None if self.audit is None else list(self.audit),
+            "suspects": [asdict(suspect) for suspect in self.suspects],
         }
 
 

@@ -16,6 +16,8 @@ from services.trainer.evaluation.report.style import STYLE
 from services.trainer.evaluation.result import Result, Run
 from services.trainer.evaluation.write import versions
 
+SUSPECTS_SHOWN = 50
+
 
 def page(
     run: Run, results: Sequence[Result], *, grids_shown: int = 12, only_wrong: bool = False
@@ -127,20 +129,28 @@ def _published(result: Result) -> str:
 
 
 def _audit(result: Result) -> str:
-    if result.audit is None:
+    if not result.suspects:
         return ""
-    if not result.audit:
-        return "<h3>Audit</h3><p>No sure match lies just outside of the rule.</p>"
     rows = "".join(
-        "<tr>" + "".join(f"<td>{escape(str(value))}</td>" for value in entry.values()) + "</tr>"
-        for entry in result.audit[:50]
+        f"<tr><td>{escape(one.query_name)}</td><td>{escape(one.database_name)}</td>"
+        f'<td class="n">{_number(one.score)}</td><td class="n">{_rounded(one.metres)}</td>'
+        f'<td class="n">{_rounded(one.degrees)}</td></tr>'
+        for one in result.suspects[:SUSPECTS_SHOWN]
     )
-    heads = "".join(f"<th>{escape(name.replace('_', ' '))}</th>" for name in result.audit[0])
+    heads = "".join(
+        f"<th>{head}</th>" for head in ("query", "first match", "score", "metres", "degrees")
+    )
+    shown = min(SUSPECTS_SHOWN, len(result.suspects))
     return (
-        "<h3>Audit</h3><p>Sure matches that count as wrong but lie just outside of the rule: look "
-        f"at them before you believe the figures. {len(result.audit)} in all.</p>"
+        "<h3>Audit</h3><p>Confident first matches that count as wrong but lie just outside of the "
+        "rule. Look at them before you believe the figures: they may show the place. "
+        f"{shown} of {len(result.suspects)}, the most confident first.</p>"
         f'<div class="wide"><table><tr>{heads}</tr>{rows}</table></div>'
     )
+
+
+def _rounded(value: float | None) -> str:
+    return "-" if value is None else f"{value:.0f}"
 
 
 def _facts(facts: dict[str, Any]) -> str:
