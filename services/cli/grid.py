@@ -10,9 +10,10 @@ import typer
 from rich.table import Table
 
 from services.cli.output import JsonOption, answers, explained, messages, print_json
-from services.cli.train import STOPPED, need_trainer
+from services.cli.train import NEEDED, STOPPED
 from services.cli.train_display import TerminalDisplay
 from services.cli.train_options import chosen, with_training_options
+from services.cli.trainer_packages import check_trainer_packages
 from services.trainer.configuration import known_keys
 
 
@@ -32,7 +33,7 @@ def grid(
     and the others are made. Options of `placewise train` override every run's.
     """
     with explained(as_json):
-        need_trainer()
+        check_trainer_packages(*NEEDED)
         overrides = known_keys(chosen(arguments), "the command line")
         failed = _grid(file, out, dry_run, as_json, overrides)
     if failed:

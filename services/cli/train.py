@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -11,8 +10,9 @@ import typer
 from services.cli.output import JsonOption, explained, messages, print_json
 from services.cli.train_display import TerminalDisplay, show_report
 from services.cli.train_options import chosen, with_training_options
+from services.cli.trainer_packages import check_trainer_packages
 from services.trainer.configuration import known_keys, make_arguments, read_yaml
-from shared.errors import InvalidRequest, Misconfigured
+from shared.errors import InvalidRequest
 
 NEEDED = ("lightning", "pytorch_metric_learning", "faiss", "torch", "yaml")
 STOPPED = 130  # what a shell reports for a program that Ctrl-C ended
@@ -37,22 +37,12 @@ def train(
     False. Names may be written with hyphens. Ctrl-C keeps the run: --resume goes on with it.
     """
     with explained(as_json):
-        need_trainer()
+        check_trainer_packages(*NEEDED)
         report = _train(config, resume, known_keys(chosen(arguments), "the command line"))
     if as_json:
         print_json(report)
     else:
         show_report(report)
-
-
-def need_trainer() -> None:
-    """Misconfigured (`trainer_missing`) where what training needs is not installed."""
-    missing = [name for name in NEEDED if importlib.util.find_spec(name) is None]
-    if missing:
-        raise Misconfigured(
-            "trainer_missing",
-            f"Training needs {', '.join(missing)}: install placewise[trainer].",
-        )
 
 
 def _train(config: Path | None, resume: Path | None, said: dict[str, Any]) -> Any:

@@ -111,6 +111,6 @@ def _next(arguments: TrainingArguments, report: Json) -> list[str]:
     best = shlex.quote(report["best"]["path"])
     root = shlex.quote(str((arguments.eval_roots or (arguments.data_root,))[0]))
     return [
-        f"placewise evaluate {root} --checkpoint {best}",
+        f"placewise evaluate --data {root} --checkpoint {best}",
         f"placewise models add {best} --name NAME",
     ]
