@@ -29,7 +29,9 @@ COMMANDS = {
     "vocabulary": ("vocabulary", "app"),
     "pca": ("pca", "app"),
     "models": ("models", "app"),
-    "datasets": ("datasets", "app"),
+    "datasets": ("datasets.commands", "app"),
+    "train": ("train", "train"),
+    "grid": ("grid", "grid"),
     "storage": ("storage", "app"),
     "bench": ("bench", "app"),
 }
@@ -51,7 +53,7 @@ def tree(names: Collection[str] = COMMANDS.keys()) -> typer.Typer:
         if isinstance(command, typer.Typer):
             app.add_typer(command, name=name)
         else:
-            app.command(name)(command)
+            app.command(name, **getattr(command, "command_settings", {}))(command)
     return app
 
 

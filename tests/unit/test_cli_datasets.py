@@ -9,7 +9,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from services.cli.datasets import app
+from services.cli.datasets.commands import app
 from services.cli.datasets.synth import parse_size
 from shared.datasets.city.write import NOT_COMPARABLE
 

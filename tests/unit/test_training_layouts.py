@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -108,7 +109,7 @@ def test_too_few_photos_of_every_place_is_an_error(tmp_path: Path) -> None:
     assert code_of(caught) == "no_places"
 
 
-def gsv_cities(base: Path, rows: list[tuple[object, ...]], names: list[str]) -> None:
+def gsv_cities(base: Path, rows: Sequence[tuple[object, ...]], names: list[str]) -> None:
     write_csv(base / "Dataframes" / "Bangkok.csv", GSV_CITIES, rows)
     write_photos(base / "Images" / "Bangkok", names)
 

@@ -15,7 +15,6 @@ the three ways to get it.
 
 from __future__ import annotations
 
-import pickle
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -26,6 +25,7 @@ import torch
 
 from shared.errors import Misconfigured
 from shared.vision.download import OnProgress
+from shared.vision.tensor_files import UNREADABLE, first_line
 
 HUB_FILE = "model.safetensors"
 META_URL = "https://dl.fbaipublicfiles.com/dinov2/dinov2_{size}/dinov2_{size}_pretrain.pth"
@@ -119,7 +119,7 @@ def _download(size: str, on_progress: OnProgress) -> Path:
     except (OSError, RuntimeError, httpx2.HTTPError) as error:
         raise _missing(
             f"DINO_WEIGHTS is not set, and {hub_repository(size)} can't be downloaded: "
-            f"{_first_line(error)}",
+            f"{first_line(error)}",
             size,
         ) from error
 
@@ -129,26 +129,14 @@ def open_weights(path: Path, size: str) -> WeightsFile:
 
     Misconfigured (`weights_unfit`) when it is neither, or not a whole one.
     """
-    from safetensors import SafetensorError
-
     try:
         with path.open("rb") as file:
             begin = file.read(9)
         # By its content: in a Hugging Face cache the file itself has no suffix.
         stored = _open_safetensors(path) if begin[8:] == b"{" else _open_torch(path)
         return _under_timms_names(stored)
-    except (
-        OSError,
-        EOFError,
-        RuntimeError,
-        AssertionError,
-        KeyError,
-        ValueError,
-        TypeError,
-        SafetensorError,
-        pickle.UnpicklingError,
-    ) as error:
-        reason = f"it can't be read as a file of tensors: {_first_line(error)}"
+    except UNREADABLE as error:
+        reason = f"it can't be read as a file of tensors: {first_line(error)}"
         raise unfit(path, reason, size) from error
 
 
@@ -256,7 +244,3 @@ def _missing(reason: str, size: str) -> Misconfigured:
 def _some(faults: list[str]) -> str:
     more = len(faults) - NAMED
     return ", ".join(faults[:NAMED]) + (f" and {more} more" if more > 0 else "")
-
-
-def _first_line(error: BaseException) -> str:
-    return (str(error).strip() or type(error).__name__).splitlines()[0]

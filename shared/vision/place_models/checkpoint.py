@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import pickle
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,13 +24,10 @@ from shared.errors import NotFound, Unprocessable
 from shared.vision.backbones.torchhub import weights_fingerprint
 from shared.vision.place_models.config import ModelConfig
 from shared.vision.place_models.model import PlaceModel, build_model
+from shared.vision.tensor_files import UNREADABLE, first_line
 
 PREFIX = "model."
 WITHOUT_EFFECT = {"pretrained", "layers_to_freeze"}  # on the descriptors of given weights
-UNREADABLE = (
-    OSError, EOFError, RuntimeError, AssertionError, KeyError, ValueError, TypeError,
-    pickle.UnpicklingError,
-)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,11 +90,10 @@ def _read(path: Path) -> dict[str, Any]:
     try:
         stored = torch.load(path, map_location="cpu", weights_only=True)
     except UNREADABLE as error:
-        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
         raise Unprocessable(
             "checkpoint_unreadable",
             f"The checkpoint {path.name} can't be read as tensors and plain values, and nothing "
-            f"else is loaded from one: {reason}",
+            f"else is loaded from one: {first_line(error)}",
         ) from error
     if not isinstance(stored, dict):
         raise _unfit(path, f"it holds a {type(stored).__name__}")
@@ -110,11 +105,12 @@ def _fill(model: PlaceModel, tensors: dict[str, Any], path: Path) -> None:
     wanted = model.state_dict()
     faults = [f"{name} is missing" for name in wanted if name not in tensors]
     faults += [f"{name} is of no layer" for name in tensors if name not in wanted]
-    faults += [
-        f"{name} is {tuple(tensor.shape)}, expected {tuple(wanted[name].shape)}"
-        for name, tensor in tensors.items()
-        if name in wanted and tensor.shape != wanted[name].shape
-    ]
+    for name in wanted.keys() & tensors.keys():
+        tensor, shape = tensors[name], tuple(wanted[name].shape)
+        if not isinstance(tensor, torch.Tensor):
+            faults.append(f"{name} is no tensor")
+        elif tensor.shape != shape:
+            faults.append(f"{name} is {tuple(tensor.shape)}, expected {shape}")
     if faults:
         more = f" and {len(faults) - 3} more" if len(faults) > 3 else ""
         raise _unfit(path, "; ".join(faults[:3]) + more)

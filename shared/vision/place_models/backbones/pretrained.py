@@ -5,7 +5,6 @@ Random weights are never a fallback: what can't be had is a Misconfigured that n
 
 from __future__ import annotations
 
-import pickle
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +13,7 @@ import torch
 
 from shared.errors import Misconfigured
 from shared.vision.download import download
-
-UNREADABLE = (
-    OSError, EOFError, RuntimeError, AssertionError, KeyError, ValueError, TypeError,
-    pickle.UnpicklingError,
-)  # fmt: skip
+from shared.vision.tensor_files import UNREADABLE, first_line
 
 
 def torchvision_network(name: str, pretrained: bool, weights: Path | None) -> Any:
@@ -50,8 +45,8 @@ def find_torchvision_weights(name: str, url: str, given: Path | None) -> Path:
         try:
             download(url, cached, sha256=sha256)
         except (OSError, httpx2.HTTPError) as error:
-            reason = (str(error).strip() or type(error).__name__).splitlines()[0]
-            raise _missing(name, url, f"{url} can't be downloaded: {reason}.") from error
+            reason = f"{url} can't be downloaded: {first_line(error)}."
+            raise _missing(name, url, reason) from error
     return cached
 
 
@@ -71,7 +66,6 @@ def read_tensors(path: Path, name: str) -> dict[str, torch.Tensor]:
 
     Misconfigured (`weights_unfit`) for what is no such file.
     """
-    from safetensors import SafetensorError
     from safetensors.torch import load_file
 
     try:
@@ -80,9 +74,9 @@ def read_tensors(path: Path, name: str) -> dict[str, torch.Tensor]:
         if begin[8:] == b"{":
             return load_file(path)
         state = torch.load(path, map_location="cpu", weights_only=True)
-    except (*UNREADABLE, SafetensorError) as error:
-        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
-        raise unfit(path, name, f"it can't be read as a file of tensors: {reason}") from error
+    except UNREADABLE as error:
+        reason = f"it can't be read as a file of tensors: {first_line(error)}"
+        raise unfit(path, name, reason) from error
     if not isinstance(state, dict) or not all(isinstance(v, torch.Tensor) for v in state.values()):
         raise unfit(path, name, "it holds something else than named tensors")
     return state
@@ -90,13 +84,20 @@ def read_tensors(path: Path, name: str) -> dict[str, torch.Tensor]:
 
 def fill(network: Any, state: dict[str, torch.Tensor], path: Path, name: str) -> None:
     """Give the network its tensors; Misconfigured (`weights_unfit`) where they don't fit."""
-    wanted: dict[str, torch.Tensor] = network.state_dict()
-    missing = sorted(set(wanted) - set(state))
-    differing = sorted(n for n in set(wanted) & set(state) if wanted[n].shape != state[n].shape)
-    if missing or differing:
-        which = f"no tensor {missing[0]}" if missing else f"another shape of {differing[0]}"
-        raise unfit(path, name, f"it has {which} ({len(missing) + len(differing)} faults in all)")
-    network.load_state_dict({n: state[n] for n in wanted})
+    own: dict[str, torch.Tensor] = network.state_dict()
+    # Files of old releases count no batches, and nothing depends on that count.
+    state = {n: t for n, t in own.items() if n.endswith("num_batches_tracked")} | state
+    faults = [f"no tensor {n}" for n in own if n not in state]
+    faults += [f"a tensor {n} too many" for n in state if n not in own]
+    faults += [
+        f"{n} of {tuple(t.shape)}, not {tuple(own[n].shape)}"
+        for n, t in state.items()
+        if n in own and own[n].shape != t.shape
+    ]
+    if faults:
+        more = f" and {len(faults) - 1} faults more" if len(faults) > 1 else ""
+        raise unfit(path, name, f"it has {faults[0]}{more}")
+    network.load_state_dict(state)
 
 
 def unfit(path: Path, name: str, reason: str) -> Misconfigured:

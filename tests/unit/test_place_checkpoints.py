@@ -1,0 +1,156 @@
+"""Checkpoints of place models: what they hold comes back, and nothing in them is executed."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from shared.errors import NotFound, Unprocessable
+from shared.vision.place_models.checkpoint import checkpoint_state, fingerprint, load_checkpoint
+from shared.vision.place_models.config import ModelConfig
+from shared.vision.place_models.model import PlaceModel, build_model
+
+
+def some_model(seed: int = 0, **changes: Any) -> PlaceModel:
+    torch.manual_seed(seed)
+    values = {"pretrained": False, "agg_arch": "GeM", "layers_to_crop": [3], "image_size": (32, 48)}
+    return build_model(ModelConfig.read(values | changes))
+
+
+@pytest.fixture(scope="module")
+def model() -> PlaceModel:
+    return some_model()
+
+
+def saved(path: Path, state: Any) -> Path:
+    torch.save(state, path)
+    return path
+
+
+def refusal(path: Path) -> Unprocessable:
+    with pytest.raises(Unprocessable) as refused:
+        load_checkpoint(path)
+    return refused.value
+
+
+def test_a_checkpoint_brings_back_the_model_and_where_it_comes_from(
+    model: PlaceModel, tmp_path: Path
+) -> None:
+    file = saved(tmp_path / "model.ckpt", checkpoint_state(model, lr=0.1, cities=["Oslo"]))
+    found = load_checkpoint(file)
+    photos = torch.randn(2, 3, 32, 48)
+    with torch.inference_mode():
+        assert torch.equal(found.model(photos), model(photos))
+    assert found.config == model.config
+    assert found.fingerprint == fingerprint(model)
+    assert found.about == {"lr": 0.1, "cities": ["Oslo"]}
+    assert not found.model.training
+    assert not any(parameter.requires_grad for parameter in found.model.parameters())
+
+
+def test_what_lightning_keeps_beside_the_model_is_no_hindrance(
+    model: PlaceModel, tmp_path: Path
+) -> None:
+    state = checkpoint_state(model) | {
+        "epoch": 7,
+        "global_step": 4382,
+        "pytorch-lightning_version": "2.6.0",
+        "optimizer_states": [{"state": {0: {"exp_avg": torch.zeros(3)}}}],
+        "lr_schedulers": [{"milestones": Counter({5: 1, 10: 1})}],
+        "callbacks": {"ModelCheckpoint": {"best_model_score": torch.tensor(0.5)}},
+    }
+    state["state_dict"]["loss.weight"] = torch.zeros(2)
+    found = load_checkpoint(saved(tmp_path / "last.ckpt", state))
+    assert found.about == {"epoch": 7, "global_step": 4382}
+    assert found.fingerprint == fingerprint(model)
+
+
+def test_the_fingerprint_follows_what_decides_a_descriptor(model: PlaceModel) -> None:
+    first = fingerprint(model)
+    assert fingerprint(some_model(layers_to_freeze=-1)) == first
+    assert fingerprint(some_model(seed=1)) != first
+    assert fingerprint(some_model(image_size=(64, 96))) != first
+    assert fingerprint(some_model(agg_config={"eps": 1e-5})) != first
+
+
+class Bomb:
+    def __init__(self, target: Path) -> None:
+        self.target = target
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Path.touch, (self.target,)
+
+
+def test_a_checkpoint_that_would_execute_something_is_refused(
+    model: PlaceModel, tmp_path: Path
+) -> None:
+    target = tmp_path / "executed"
+    file = saved(tmp_path / "bomb.ckpt", checkpoint_state(model) | {"callbacks": Bomb(target)})
+    assert refusal(file).code == "checkpoint_unreadable"
+    assert not target.exists()
+    torch.load(file, weights_only=False)  # the test's own test: the bomb is one
+    assert target.exists()
+
+
+@pytest.mark.parametrize("damage", [b"", b"not a checkpoint", b"PK\x03\x04 torn"])
+def test_what_is_no_checkpoint_is_refused(damage: bytes, tmp_path: Path) -> None:
+    file = tmp_path / "damaged.ckpt"
+    file.write_bytes(damage)
+    assert refusal(file).code == "checkpoint_unreadable"
+
+
+def test_a_torn_checkpoint_is_refused(model: PlaceModel, tmp_path: Path) -> None:
+    file = saved(tmp_path / "torn.ckpt", checkpoint_state(model))
+    file.write_bytes(file.read_bytes()[:-1000])
+    assert refusal(file).code == "checkpoint_unreadable"
+
+
+def test_a_missing_checkpoint_is_not_found(tmp_path: Path) -> None:
+    with pytest.raises(NotFound) as refused:
+        load_checkpoint(tmp_path / "none.ckpt")
+    assert refused.value.code == "checkpoint_not_found"
+
+
+def test_tensors_of_another_network_are_refused_by_name(model: PlaceModel, tmp_path: Path) -> None:
+    stem = "model.backbone.stem.0.weight"
+    state = checkpoint_state(model)
+    tensors = state["state_dict"]
+    faults: dict[str, dict[str, Any]] = {
+        "stem.0.weight is missing": {n: t for n, t in tensors.items() if n != stem},
+        "extra is of no layer": tensors | {"model.extra": torch.zeros(1)},
+        "expected (64, 3, 7, 7)": tensors | {stem: torch.zeros(64, 1, 7, 7)},
+        "is no tensor": tensors | {stem: "a word"},
+    }
+    for said, changed in faults.items():
+        error = refusal(saved(tmp_path / "other.ckpt", state | {"state_dict": changed}))
+        assert error.code == "checkpoint_unfit"
+        assert said in error.detail
+
+
+@pytest.mark.parametrize(
+    "state", [[1, 2], {}, {"state_dict": {}}, {"state_dict": {}, "hyper_parameters": {"lr": 1}}]
+)
+def test_a_file_that_does_not_say_which_network_it_holds_is_refused(
+    state: Any, tmp_path: Path
+) -> None:
+    assert refusal(saved(tmp_path / "weights.ckpt", state)).code == "checkpoint_unfit"
+
+
+def test_a_checkpoint_can_not_ask_for_more_memory_than_it_has_bytes(
+    model: PlaceModel, tmp_path: Path
+) -> None:
+    """A head of 2^20 x 2^20 numbers is laid out and refused; in memory it would be 4 TB."""
+    state = checkpoint_state(model)
+    claimed = {"agg_arch": "ConvAP", "agg_config": {"out_channels": 1 << 20, "s1": 1 << 20}}
+    state["hyper_parameters"]["model"] |= claimed
+    assert refusal(saved(tmp_path / "large.ckpt", state)).code == "checkpoint_unfit"
+
+
+def test_an_unknown_network_in_a_checkpoint_is_named(model: PlaceModel, tmp_path: Path) -> None:
+    state = checkpoint_state(model)
+    state["hyper_parameters"]["model"] |= {"backbone_arch": "vgg16"}
+    assert refusal(saved(tmp_path / "other.ckpt", state)).code == "unknown_backbone"
