@@ -10,7 +10,7 @@ import pytest
 from nbclient import NotebookClient
 
 REPOSITORY = Path(__file__).parents[2]
-CELL_SECONDS = 280
+CELL_SECONDS = 850  # of a busy machine
 
 SMALL = {
     "train": """
@@ -30,6 +30,7 @@ EXTRACTOR = "test-tiny-avg"
 }
 
 
+@pytest.mark.timeout(900)
 @pytest.mark.parametrize("name", sorted(SMALL))
 @pytest.mark.filterwarnings("ignore::DeprecationWarning:jupyter_client")
 def test_notebook_runs_on_generated_places(
