@@ -40,7 +40,8 @@ def test_notebook_runs_on_generated_places(
     monkeypatch.setenv("DECODE_PROCESSES", "1")
     monkeypatch.setenv("DEVICE", "cpu")
     monkeypatch.setenv("MPLBACKEND", "agg")
-    notebook: Any = nbformat.read(REPOSITORY / "docs" / "notebooks" / f"{name}.ipynb", as_version=4)
+    file = REPOSITORY / "docs" / "notebooks" / f"{name}.ipynb"
+    notebook: Any = nbformat.read(file, as_version=4)  # type: ignore[no-untyped-call]
     assert all(not cell.get("outputs") for cell in notebook.cells), "commit it without outputs"
     (parameters,) = (c for c in notebook.cells if "parameters" in c.metadata.get("tags", []))
     parameters.source = SMALL[name]

@@ -16,7 +16,8 @@ Rows = np.ndarray[Any, np.dtype[np.float32]]
 
 def unit_rows(count: int, dimension: int, seed: int) -> Rows:
     rows = np.random.default_rng(seed).standard_normal((count, dimension)).astype(np.float32)
-    return rows / np.linalg.norm(rows, axis=1, keepdims=True)
+    rows /= np.linalg.norm(rows, axis=1, keepdims=True)
+    return rows
 
 
 def full_product(queries: Rows, database: Rows, k: int) -> Any:
