@@ -130,13 +130,13 @@ def _print(result: Result) -> None:
     )
     if result.against is not None:
         for k, found in result.against.differences.items():
-            within = (
+            interval = (
                 f" ({100 * found.low:+.1f} to {100 * found.high:+.1f})"
                 if found.low is not None and found.high is not None
                 else ""
             )
             answers.print(
-                f"R@{k} {100 * found.mean:+.1f} points{within} against {result.against.other}: "
+                f"R@{k} {100 * found.mean:+.1f} points{interval} against {result.against.other}: "
                 f"{found.won} won, {found.lost} lost.",
                 soft_wrap=True,
                 markup=False,

@@ -196,11 +196,11 @@ def test_checkpoint_is_evaluated_at_the_size_it_was_trained_for(
     stored = torch.load(checkpoint, weights_only=True)["state_dict"]
     model.load_state_dict({name.removeprefix("model."): t for name, t in stored.items()})
     describe = DescribeModel(model, CPU, (48, 64))
-    found = [
+    queries, database = (
         np.concatenate(list(describe([shot.path for shot in shots])))
         for shots in (town.queries, town.database)
-    ]
-    wanted = recall_at(rank(*found, 5), town.positives, (1, 5))
+    )
+    wanted = recall_at(rank(queries, database, 5), town.positives, (1, 5))
     assert answer["recall"]["1"] == pytest.approx(wanted[1])
     assert answer["recall"]["5"] == pytest.approx(wanted[5])
 

@@ -29,8 +29,6 @@ class Against:
     won: list[int]
     """queries that are right at rank 1 here and wrong there"""
     lost: list[int]
-    other_first: Indices
-    """(queries,) the other run's first match"""
 
     def as_json(self) -> dict[str, Any]:
         return {
@@ -80,7 +78,6 @@ def compare_with(
         differences=dict(zip(ks, found, strict=True)),
         won=np.flatnonzero(gained > 0).tolist(),
         lost=np.flatnonzero(gained < 0).tolist(),
-        other_first=ranked[:, 0],
     )
 
 

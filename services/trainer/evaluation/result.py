@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -72,7 +71,3 @@ class Result:
             "published": [found.as_json() for found in self.published],
             "suspects": [asdict(suspect) for suspect in self.suspects],
         }
-
-
-def names_of(result: Result, queries: Sequence[int]) -> list[str]:
-    return [result.asked.queries[query].name for query in queries]
