@@ -118,6 +118,36 @@ def precision(
     )
 
 
+@app.command("train")
+def train(
+    places: Annotated[int, typer.Option(min=20, help="Of the generated city.")] = 300,
+    epochs: Annotated[int, typer.Option(min=1)] = 20,
+    image_size: Annotated[int, typer.Option(min=32, help="Pixels of a side.")] = 112,
+    photos: Annotated[int, typer.Option(min=64, help="For the figures of speed.")] = 512,
+    workers: Annotated[int, typer.Option(min=1, help="Processes that read photos.")] = 2,
+    device: Annotated[str, typer.Option("--device", help="auto, cpu, gpu or mps.")] = "auto",
+    grid: Annotated[
+        bool, typer.Option("--grid", help="Three aggregators x two losses as well.")
+    ] = False,
+    seed: Annotated[int, typer.Option(min=0, help="Of the city and the network.")] = 0,
+    as_json: JsonOption = False,
+) -> None:
+    """How fast is training, does it wait for photos, and is what it learns real?"""
+    _among(device, "--device", "auto", "cpu", "gpu", "mps")
+    _measure(
+        "train",
+        as_json,
+        places=places,
+        epochs=epochs,
+        image_size=image_size,
+        photos=photos,
+        workers=workers,
+        device=device,
+        grid=grid,
+        seed=seed,
+    )
+
+
 @app.command("query-latency")
 def query_latency(
     backlog: Annotated[int, typer.Option(min=1, help="Uploads that wait.")] = 5000,

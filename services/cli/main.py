@@ -22,6 +22,7 @@ COMMANDS = {
     "query": ("ask", "query"),
     "describe": ("describe", "describe"),
     "evaluate": ("evaluate", "evaluate"),
+    "compare": ("compare", "compare"),
     "config": ("configuration", "config"),
     "doctor": ("doctor", "doctor"),
     "maps": ("maps", "app"),
@@ -29,6 +30,8 @@ COMMANDS = {
     "pca": ("pca", "app"),
     "models": ("models", "app"),
     "datasets": ("datasets.commands", "app"),
+    "train": ("train", "train"),
+    "grid": ("grid", "grid"),
     "storage": ("storage", "app"),
     "bench": ("bench", "app"),
 }
@@ -50,7 +53,7 @@ def tree(names: Collection[str] = COMMANDS.keys()) -> typer.Typer:
         if isinstance(command, typer.Typer):
             app.add_typer(command, name=name)
         else:
-            app.command(name)(command)
+            app.command(name, **getattr(command, "command_settings", {}))(command)
     return app
 
 

@@ -1,0 +1,217 @@
+"""Whether a network learns places: against itself untrained, where it has never been.
+
+It learns in the school quarter of a generated city. It is asked in that city's map quarter (other
+streets of the same style) and in another city of another catalogue (other walls, colours, windows).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from rich.table import Table
+
+from services.trainer import run
+from services.trainer.configuration import make_arguments
+from services.trainer.device import Device
+from services.trainer.display import Quiet
+from services.trainer.evaluation.bootstrap import paired
+from services.trainer.evaluation.clusters import clusters_of
+from services.trainer.evaluation.describe_model import DescribeModel
+from services.trainer.evaluation.hits import hits_of
+from services.trainer.evaluation.recalls import recalls
+from services.trainer.grid import Trainer, run_grid
+from services.trainer.grid_plan import GridPlan, PlannedRun
+from services.trainer.leaderboard import leaderboard
+from services.trainer.make_model import make_model
+from services.trainer.random_state import seed_everything
+from services.trainer.stop import StopRequest
+from shared.datasets.city.plan import CityOptions, make_plan
+from shared.datasets.city.write import write_city
+from shared.datasets.sets import open_evaluation_set
+from shared.datasets.shots import EvaluationSet
+from shared.vision.place_models.checkpoint import load_checkpoint
+from shared.vision.place_models.model import PlaceModel
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
+
+PHOTO = (160, 120)
+"""width and height of the generated photos"""
+VIEWS = 2
+PLACES_PER_BATCH = 16
+AGGREGATORS = (
+    {"agg_arch": "AVG"},
+    {"agg_arch": "GeM"},
+    {"agg_arch": "ConvAP", "agg_config": {"out_channels": 64}},
+)
+LOSSES = ("MultiSimilarityLoss", "NTXentLoss")
+
+Json = dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Gain:
+    """R@1 as shares; the gain's 95 % interval is a paired bootstrap over clusters of queries."""
+
+    untrained: float
+    trained: float
+    mean: float
+    low: float
+    high: float
+    queries: int
+    fingerprint: str
+
+    def as_json(self) -> Json:
+        return {name: getattr(self, name) for name in self.__slots__}
+
+
+class BarDisplay(Quiet):
+    """A run's progress as bars of a benchmark."""
+
+    def __init__(self, progress: Progress) -> None:
+        super().__init__()
+        self._progress = progress
+        self._bars: dict[str, Any] = {}
+
+    def progress(self, what: str, done: int, most: int, note: str = "") -> None:
+        if what not in self._bars:
+            self._bars[what] = self._progress.add_task(what, total=most)
+        self._progress.update(self._bars[what], completed=done, total=most)
+        if done >= most:
+            self._progress.remove_task(self._bars.pop(what))
+
+
+def measure_learning(
+    progress: Progress,
+    folder: Path,
+    places: int,
+    epochs: int,
+    image_size: int,
+    workers: int,
+    device: Device,
+    seed: int,
+) -> dict[str, Gain]:
+    """By where it was asked: `other streets` and `another catalogue`."""
+    width, height = PHOTO
+    here = CityOptions(places, VIEWS, places, seed, 0, 0.0, width, height)
+    elsewhere = replace(here, seed=seed + 1, catalogue_seed=1, train=False)
+    sets = {
+        "other streets": _drawn(progress, here, folder / "here"),
+        "another catalogue": _drawn(progress, elsewhere, folder / "elsewhere"),
+    }
+    said = _said(folder / "here", folder / "runs", epochs, image_size, workers, device, seed)
+    report = run.run(
+        make_arguments({**said, "run_name": "gem"}), BarDisplay(progress), StopRequest()
+    )
+    trained = load_checkpoint(Path(report["best"]["path"])).model
+    seed_everything(seed)
+    untrained = make_model(make_arguments(said), Quiet(), resuming=False)
+    return {
+        where: gain_of(untrained, trained, asked, image_size, device)
+        for where, asked in sets.items()
+    }
+
+
+def gain_of(
+    untrained: PlaceModel,
+    trained: PlaceModel,
+    asked: EvaluationSet,
+    image_size: int,
+    device: Device,
+) -> Gain:
+    """What the one network finds first beyond the other, on the same queries."""
+    found = []
+    for model in (untrained, trained):
+        describe = DescribeModel(
+            model.to(device.torch_device), device.torch_device, (image_size, image_size)
+        )
+        ranked = recalls(describe, asked, ks=(1,)).ranked.indices
+        found.append(hits_of(ranked, asked.positives)[:, :1].astype(np.float64))
+    (difference,) = paired(found[1], found[0], clusters_of(asked.queries).of)
+    assert difference.low is not None
+    assert difference.high is not None
+    return Gain(
+        float(found[0].mean()),
+        float(found[1].mean()),
+        difference.mean,
+        difference.low,
+        difference.high,
+        len(asked.queries),
+        asked.fingerprint,
+    )
+
+
+def measure_grid(
+    progress: Progress,
+    folder: Path,
+    epochs: int,
+    image_size: int,
+    workers: int,
+    device: Device,
+    seed: int,
+) -> tuple[Table, list[dict[str, str]]]:
+    """Three aggregators x two losses on the city that `measure_learning` has drawn."""
+    said = _said(folder / "here", folder / "grid", epochs, image_size, workers, device, seed)
+    del said["default_root_dir"]
+    plan = GridPlan(
+        tuple(
+            PlannedRun(
+                f"{aggregator['agg_arch']}-{loss}", {**said, **aggregator, "loss_name": loss}
+            )
+            for aggregator in AGGREGATORS
+            for loss in LOSSES
+        ),
+        {},
+    )
+    trainer = Trainer(run.run, run.resume)
+    outcomes = run_grid(
+        plan, folder / "grid", trainer, BarDisplay(progress), StopRequest(), lambda done: None
+    )
+    rows = leaderboard(plan, outcomes)
+    table = Table(*rows[0], title="six settings, other streets")
+    for row in rows:
+        table.add_row(*row.values())
+    return table, rows
+
+
+def _drawn(progress: Progress, options: CityOptions, out: Path) -> EvaluationSet:
+    plan = make_plan(options)
+    bar = progress.add_task(f"drawing {out.name}", total=len(plan.shots))
+    write_city(plan, out, lambda count: progress.advance(bar, count))
+    return open_evaluation_set(out)
+
+
+def _said(
+    data_root: Path,
+    out: Path,
+    epochs: int,
+    image_size: int,
+    workers: int,
+    device: Device,
+    seed: int,
+) -> Json:
+    return {
+        "data_root": str(data_root),
+        "default_root_dir": str(out),
+        "accelerator": device.accelerator,
+        "faiss_gpu": False,
+        "pretrained": False,
+        "layers_to_freeze": -1,
+        "agg_arch": "GeM",
+        "image_size": image_size,
+        "batch_size": PLACES_PER_BATCH,
+        "img_per_place": 4,
+        "min_img_per_place": 4,
+        "lr": 1e-3,
+        "warmpup_steps": 20,
+        "milestones": [epochs * 3 // 4, epochs * 9 // 10],
+        "max_epochs": epochs,
+        "check_val_every_n_epoch": max(1, epochs // 4),
+        "num_workers": workers,
+        "show_data_stats": False,
+        "logger": "none",
+        "seed": seed,
+    }

@@ -1,0 +1,165 @@
+"""Photos a second: read, learned from, and the time that the one waits for the other."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from PIL import Image
+
+from services.trainer.augment import augmented, to_tensor
+from services.trainer.batches import PlacePhotos, TrainingBatches
+from services.trainer.configuration import make_arguments
+from services.trainer.device import Device
+from services.trainer.display import Quiet
+from services.trainer.losses import make_loss
+from services.trainer.make_model import make_model
+from services.trainer.miners import make_miner
+from services.trainer.optimise import make_optimizer
+from services.trainer.sampling import BatchPlan
+from shared.datasets.shots import TrainingPlace
+from shared.vision.decode_small import decode_small
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
+
+SIDE = 224
+STORED = (960, 1280)
+"""height and width of a photo as cameras and street view give them"""
+DIFFERENT = 32
+"""photos drawn; they are read again and again, from the page cache"""
+PHOTOS_PER_PLACE = 4
+PLACES_PER_BATCH = 8
+WARM_UP_BATCHES = 2
+
+
+@dataclass(frozen=True, slots=True)
+class Pace:
+    reading: dict[str, float]
+    """photos a second, by how"""
+    network: float
+    """photos a second through forward, loss, backward and step, alone"""
+    training: float
+    share_waiting: float
+
+
+def measure_throughput(
+    progress: Progress, folder: Path, photos: int, workers: int, device: Device
+) -> Pace:
+    """Over so many photos; the first batches, in which workers start, are left out."""
+    files = _draw(folder)
+    places = [
+        TrainingPlace(number, "city", tuple(files[(number * 4 + i) % DIFFERENT] for i in range(4)))
+        for number in range(max(photos // PHOTOS_PER_PLACE, 4 * PLACES_PER_BATCH))
+    ]
+    bar = progress.add_task("photos a second", total=4)
+    reading = {}
+    for what, read in (("decoded in full, one process", _in_full), ("one process", _drafted)):
+        began = time.perf_counter()
+        for file in files:
+            read(file)
+        reading[what] = len(files) / (time.perf_counter() - began)
+        progress.advance(bar)
+    reading["with its workers"] = _read_all(_batches(places, workers, device))
+    progress.advance(bar)
+    network, training, waited = _learn(places, workers, device)
+    progress.advance(bar)
+    return Pace(reading, network, training, waited)
+
+
+def _draw(folder: Path) -> list[Path]:
+    folder.mkdir(parents=True)
+    files = []
+    for number in range(DIFFERENT):
+        rng = np.random.default_rng(number)
+        coarse = Image.fromarray(rng.integers(0, 255, (30, 40, 3)).astype(np.uint8))
+        pixels = np.asarray(coarse.resize(STORED[::-1], Image.Resampling.BICUBIC), np.int16)
+        grain = rng.normal(0, 6, pixels.shape)  # so that a file has a photo's 300 to 500 kB
+        path = folder / f"{number}.jpg"
+        Image.fromarray(np.clip(pixels + grain, 0, 255).astype(np.uint8)).save(path, quality=90)
+        files.append(path)
+    return files
+
+
+def _in_full(path: Path) -> None:
+    with Image.open(path) as image:
+        small = image.convert("RGB").resize((SIDE, SIDE), Image.Resampling.BILINEAR)
+    to_tensor(augmented(small, 0))
+
+
+def _drafted(path: Path) -> None:
+    to_tensor(augmented(decode_small(path, (SIDE, SIDE)), 0))
+
+
+def _batches(places: list[TrainingPlace], workers: int, device: Device) -> TrainingBatches:
+    plan = BatchPlan(places, PLACES_PER_BATCH, PHOTOS_PER_PLACE, False, True, 1, 1)
+    photos = PlacePhotos(plan, (SIDE, SIDE), bad_is_error=True)
+    pinned = device.accelerator == "gpu"
+    return TrainingBatches(plan, photos, num_workers=workers, pin_memory=pinned)
+
+
+def _read_all(batches: TrainingBatches) -> float:
+    given = iter(batches)
+    for _ in range(WARM_UP_BATCHES):
+        next(given)
+    began, count = time.perf_counter(), 0
+    for batch in given:
+        count += len(batch.photos)
+    return count / (time.perf_counter() - began)
+
+
+def _learn(places: list[TrainingPlace], workers: int, device: Device) -> tuple[float, float, float]:
+    arguments = make_arguments(
+        {"pretrained": False, "layers_to_freeze": -1, "agg_arch": "gem", "image_size": SIDE}
+    )
+    torch.manual_seed(0)
+    model = make_model(arguments, Quiet(), resuming=False).to(device.torch_device).train()
+    loss, miner = make_loss("MultiSimilarityLoss"), make_miner("MultiSimilarityMiner")
+    assert miner is not None
+    optimizer = make_optimizer(model.parameters(), arguments)
+    batches = _batches(places, workers, device)
+
+    def step(photos: torch.Tensor, labels: torch.Tensor) -> None:
+        rows = model(photos.to(device.torch_device, non_blocking=True))
+        labels = labels.to(device.torch_device, non_blocking=True)
+        value = loss(rows, labels, miner(rows, labels))
+        optimizer.zero_grad(set_to_none=True)
+        value.backward()
+        optimizer.step()
+
+    given = iter(batches)
+    for _ in range(WARM_UP_BATCHES):
+        batch = next(given)
+        step(batch.photos, batch.labels)
+    repeats = max(2, (len(batches) - WARM_UP_BATCHES) // 2)
+    _wait(device)
+    began = time.perf_counter()
+    for _ in range(repeats):
+        step(batch.photos, batch.labels)
+    _wait(device)
+    network = repeats * len(batch.photos) / (time.perf_counter() - began)
+    given = iter(_batches(places, workers, device))
+    for _ in range(WARM_UP_BATCHES):
+        batch = next(given)
+        step(batch.photos, batch.labels)
+    count, waited = 0, 0.0
+    _wait(device)
+    began = asked = time.perf_counter()
+    for batch in given:
+        waited += time.perf_counter() - asked
+        step(batch.photos, batch.labels)
+        count += len(batch.photos)
+        # The device has nothing to do from here until the next batch is there.
+        _wait(device)
+        asked = time.perf_counter()
+    seconds = time.perf_counter() - began
+    return network, count / seconds, waited / seconds
+
+
+def _wait(device: Device) -> None:
+    if device.accelerator == "gpu":
+        torch.cuda.synchronize()

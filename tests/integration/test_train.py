@@ -1,0 +1,283 @@
+"""Whole training runs on places drawn in a moment, on the processor."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from services.trainer import run
+from services.trainer.configuration import make_arguments, read_yaml
+from services.trainer.display import Quiet
+from services.trainer.stop import RunStopped, StopRequest
+from shared.errors import Conflict, InvalidRequest, NotFound, PlacewiseError, Unprocessable
+from shared.vision.place_models.checkpoint import load_checkpoint
+from tests.support.tiny_places import CITY, write_tiny_places
+
+Json = dict[str, Any]
+
+
+@pytest.fixture(scope="module")
+def places(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_tiny_places(tmp_path_factory.mktemp("places"))
+
+
+@pytest.fixture(autouse=True)
+def _one_thread() -> Iterator[None]:
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+def told(places: Path, out: Path, **others: Any) -> Json:
+    """A run of a small network: two epochs of three batches of two places."""
+    return {
+        "data_root": str(places),
+        "accelerator": "cpu",
+        "faiss_gpu": False,
+        "pretrained": False,
+        "layers_to_freeze": -1,
+        "layers_to_crop": [2],
+        "agg_arch": "gem",
+        "image_size": 32,
+        "batch_size": 2,
+        "img_per_place": 3,
+        "min_img_per_place": 3,
+        "num_workers": 0,
+        "max_epochs": 2,
+        "warmpup_steps": 2,
+        "lr": 1e-3,
+        "log_every_n_steps": 1,
+        "default_root_dir": str(out),
+        "run_name": "run",
+        "logger": "none",
+        **others,
+    }
+
+
+def train(said: Json, display: Quiet | None = None) -> Json:
+    return run.run(make_arguments(said), display or Quiet(), StopRequest())
+
+
+def weights(path: Path) -> dict[str, torch.Tensor]:
+    return dict(torch.load(path, weights_only=True)["state_dict"])
+
+
+def assert_same_weights(one: Path, other: Path) -> None:
+    first, second = weights(one), weights(other)
+    assert first.keys() == second.keys()
+    for name, tensor in first.items():
+        assert torch.equal(tensor, second[name]), name
+
+
+class StopAfter(Quiet):
+    """Asks for the end once `what` has been heard of `times` times."""
+
+    def __init__(self, stop: StopRequest, what: str, times: int) -> None:
+        super().__init__()
+        self._stop, self._what, self._left = stop, what, times
+
+    def progress(self, what: str, done: int, most: int, note: str = "") -> None:
+        if what.startswith(self._what):
+            self._left -= 1
+            if self._left == 0:
+                self._stop.asked = True
+
+
+@pytest.fixture(scope="module")
+def whole(places: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Json]:
+    """A run that nobody interrupted, its loggers and its test included."""
+    out = tmp_path_factory.mktemp("whole")
+    said = told(places, out, experiment_phase="all", logger="csv,tensorboard")
+    return out / "run", train(said)
+
+
+def test_a_run_leaves_its_summary_configuration_and_checkpoints(whole: tuple[Path, Json]) -> None:
+    folder, report = whole
+    assert json.loads((folder / "metrics.json").read_text()) == report
+    assert [epoch["step"] for epoch in report["epochs"]] == [3, 6]
+    assert report["training_set"]["places"] == 6
+    assert report["training_set"]["cities"] == [CITY]
+    (name,) = report["sets"]
+    assert report["monitor"] == f"{name}/R1"
+    assert report["images"] == 2 * 6 * 3
+    assert 0 <= report["share_waiting_for_data"] <= 1
+    assert make_arguments(read_yaml(folder / "config.yaml")).cities == (CITY,)
+    assert list((folder / "csv").rglob("metrics.csv"))
+    assert list((folder / "tensorboard").glob("events*"))
+
+
+def test_checkpoint_names_carry_the_figures_of_their_epoch(whole: tuple[Path, Json]) -> None:
+    folder, report = whole
+    monitor = report["monitor"]
+    for epoch in report["epochs"]:
+        figure = f"R1[{epoch['figures'][monitor]:.4f}]"
+        (found,) = (folder / "checkpoints").glob(f"*epoch({epoch['number']:02d})*.ckpt")
+        assert figure in found.name
+
+
+def test_the_best_checkpoint_is_what_was_tested(whole: tuple[Path, Json]) -> None:
+    _, report = whole
+    best = max(report["epochs"], key=lambda each: each["figures"][report["monitor"]])
+    assert f"epoch({best['number']:02d})" in report["best"]["path"]
+    (name,) = report["test"]
+    # Tested at the size of training, on the set that it was validated on: the same figures.
+    for k, share in report["test"][name]["recall"].items():
+        assert share == best["figures"][f"{name}/R{k}"]
+    assert (
+        load_checkpoint(Path(report["best"]["path"])).fingerprint == report["best"]["fingerprint"]
+    )
+
+
+def test_best_checkpoints_hold_weights_and_the_last_one_everything(
+    whole: tuple[Path, Json],
+) -> None:
+    folder, report = whole
+    best = torch.load(report["best"]["path"], weights_only=True)
+    last = torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)
+    assert "optimizer_states" not in best
+    assert last["optimizer_states"]
+
+
+def test_the_same_run_twice_gives_the_same_weights(
+    whole: tuple[Path, Json], places: Path, tmp_path: Path
+) -> None:
+    folder, report = whole
+    again = train(told(places, tmp_path))
+    assert [epoch["loss"] for epoch in again["epochs"]] == [
+        epoch["loss"] for epoch in report["epochs"]
+    ]
+    assert_same_weights(folder / "checkpoints/last.ckpt", Path(again["last"]))
+
+
+@pytest.mark.parametrize(
+    ("what", "times"),
+    [("epoch 1", 2), ("epoch 1", 3), ("epoch 2", 1), ("places", 1), ("places", 4)],
+    ids=["in an epoch", "at its last step", "in the next", "measuring", "measuring the last"],
+)
+def test_a_run_that_was_stopped_goes_on_as_if_it_had_not_been(
+    what: str, times: int, whole: tuple[Path, Json], places: Path, tmp_path: Path
+) -> None:
+    folder, report = whole
+    stop = StopRequest()
+    (name,) = report["sets"]
+    display = StopAfter(stop, name if what == "places" else what, times)
+    with pytest.raises(RunStopped):
+        run.run(make_arguments(told(places, tmp_path)), display, stop)
+    resumed = run.resume(tmp_path / "run", {}, Quiet(), StopRequest())
+    assert [epoch["figures"] for epoch in resumed["epochs"]] == [
+        epoch["figures"] for epoch in report["epochs"]
+    ]
+    assert resumed["images"] == report["images"]
+    assert_same_weights(folder / "checkpoints/last.ckpt", Path(resumed["last"]))
+    assert_same_weights(Path(report["best"]["path"]), Path(resumed["best"]["path"]))
+
+
+def test_a_finished_run_learns_longer(whole: tuple[Path, Json], tmp_path: Path) -> None:
+    folder, _ = whole
+    copy = Path(shutil.copytree(folder, tmp_path / "run"))
+    report = run.resume(copy, {"max_epochs": 3, "logger": "none"}, Quiet(), StopRequest())
+    assert [epoch["number"] for epoch in report["epochs"]] == [0, 1, 2]
+
+
+def test_a_resumed_run_can_not_become_another(
+    whole: tuple[Path, Json], places: Path, tmp_path: Path
+) -> None:
+    folder, _ = whole
+    copy = Path(shutil.copytree(folder, tmp_path / "run"))
+    with pytest.raises(Conflict, match="batch_size"):
+        run.resume(copy, {"batch_size": 3}, Quiet(), StopRequest())
+    more = write_tiny_places(tmp_path / "more", places=7)
+    with pytest.raises(Conflict, match="are not those"):
+        run.resume(copy, {"data_root": str(more)}, Quiet(), StopRequest())
+    with pytest.raises(NotFound, match="there is no"):
+        run.resume(tmp_path, {}, Quiet(), StopRequest())
+
+
+def test_frozen_layers_keep_their_weights_and_the_others_learn(
+    places: Path, tmp_path: Path
+) -> None:
+    display = Quiet()
+    said = told(places, tmp_path, layers_to_freeze=0, max_steps=2)
+    report = train(said, display)
+    begun = train(told(places, tmp_path, layers_to_freeze=0, lr=1e-30, max_steps=1, run_name="0"))
+    before, after = weights(Path(begun["last"])), weights(Path(report["last"]))
+    changed = {name for name in before if not torch.allclose(before[name], after[name])}
+    assert changed
+    assert not [name for name in changed if "stem" in name]
+    assert any("stem" in name for name in before)
+    assert any("never learn" in line for line in display.said)
+
+
+def test_a_photo_that_does_not_decode_is_named_and_counted(places: Path, tmp_path: Path) -> None:
+    mine = Path(shutil.copytree(places, tmp_path / "places"))
+    broken = sorted((mine / "gsv_xs" / "train" / CITY).iterdir())[0]
+    broken.write_bytes(broken.read_bytes()[:100])
+    display = Quiet()
+    said = told(mine, tmp_path, random_sample_from_each_place=False, max_epochs=1)
+    report = train(said, display)
+    assert list(report["bad_photos"]) == [str(broken)]
+    assert report["images"] == 17
+    assert any(broken.name in line for line in display.said)
+    with pytest.raises(Unprocessable, match=broken.name[:20]) as caught:
+        train({**said, "on_bad_image": "error", "run_name": "strict"})
+    assert caught.value.code == "undecodable_photo"
+
+
+def test_a_checkpoint_alone_is_tested(
+    whole: tuple[Path, Json], places: Path, tmp_path: Path
+) -> None:
+    _, trained = whole
+    said = {
+        **told(places, tmp_path, experiment_phase="test", model_path=trained["best"]["path"]),
+    }
+    del said["image_size"]  # the checkpoint knows it
+    report = train(said)
+    assert report["test"] == trained["test"]
+    native = train({**said, "test_image_size": "native", "run_name": "native"})
+    assert native["test"].keys() == trained["test"].keys()
+    with pytest.raises(InvalidRequest, match="--model_path"):
+        train({**said, "model_path": "", "run_name": "none"})
+
+
+def test_a_fast_dev_run_leaves_nothing(places: Path, tmp_path: Path) -> None:
+    train(told(places, tmp_path / "out", fast_dev_run=True, num_sanity_val_steps=1))
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("others", "code", "said"),
+    [
+        ({"data_root": None}, "data_root_missing", "--data_root DIR"),
+        ({"val_set_names": "sfxs_vla"}, "set_missing", "no set 'sfxs_vla'"),
+        ({"cities": "Nowhere"}, "city_missing", "Nowhere"),
+        ({"backbone_arch": "resnet19"}, "unknown_backbone", "resnet18"),
+        ({"agg_arch": "mean"}, "unknown_aggregator", "CosPlace"),
+        ({"loss_name": "TripleLoss"}, "unknown_loss", "TripletMarginLoss"),
+        ({"miner_name": "BestMiner"}, "unknown_miner", "BatchHardMiner"),
+        ({"monitor": "other/R1"}, "unknown_metric", "known: "),
+        ({"img_per_place": 4}, "bad_argument", "min_img_per_place"),
+        ({"faiss_gpu": True}, "faiss_gpu_missing", "--faiss_gpu False"),
+        ({"pretrained": True, "weights": "nowhere.pth"}, "weights_missing", "nowhere"),
+    ],
+)
+def test_what_is_not_there_is_named_with_what_is_known(
+    others: Json, code: str, said: str, places: Path, tmp_path: Path
+) -> None:
+    with pytest.raises(PlacewiseError) as caught:
+        train(told(places, tmp_path, **others))
+    assert caught.value.code == code
+    assert said in caught.value.detail
+
+
+def test_a_diverged_training_ends_with_an_error_that_says_so(places: Path, tmp_path: Path) -> None:
+    said = told(places, tmp_path, optimizer="sgd", lr=1e30, warmpup_steps=0)
+    with pytest.raises(Unprocessable) as caught:
+        train(said)
+    assert caught.value.code in ("loss_not_finite", "features_not_finite")
