@@ -10,7 +10,9 @@ from typing import Any
 
 import pytest
 import torch
+from typer.testing import CliRunner
 
+from services.cli.main import tree
 from services.trainer import run
 from services.trainer.configuration import make_arguments, read_yaml
 from services.trainer.display import Quiet
@@ -281,3 +283,34 @@ def test_a_diverged_training_ends_with_an_error_that_says_so(places: Path, tmp_p
     with pytest.raises(Unprocessable) as caught:
         train(said)
     assert caught.value.code in ("loss_not_finite", "features_not_finite")
+
+
+def test_the_grid_command_makes_every_run_names_the_failed_one_and_ranks_the_others(
+    places: Path, tmp_path: Path
+) -> None:
+    said = told(places, tmp_path, max_epochs=1)
+    del said["default_root_dir"], said["run_name"], said["agg_arch"]
+    file = tmp_path / "grid.yaml"
+    mixvpr = {"agg_arch": "MixVPR", "agg_config": {"nonsense": 1}}
+    file.write_text(
+        json.dumps({"base": said, "grid": {"agg": [{"agg_arch": "AVG"}, {"agg_arch": "GeM"}]},
+                    "runs": [{"name": "wrong", **mixvpr}]})
+    )  # fmt: skip
+    out = tmp_path / "grid"
+    command = ["grid", str(file), "--out", str(out)]
+    dry = CliRunner().invoke(tree(["grid"]), [*command, "--dry-run", "--json"])
+    assert dry.exit_code == 0, dry.output
+    assert [(row["run"], row["state"]) for row in json.loads(dry.stdout)] == [
+        ("AVG", "waiting"),
+        ("GeM", "waiting"),
+        ("wrong", "waiting"),
+    ]
+    assert not out.exists()
+    answer = CliRunner().invoke(tree(["grid"]), [*command, "--json"])
+    assert answer.exit_code == 1, answer.output
+    states = {each["run"]["name"]: each["state"] for each in json.loads(answer.stdout)}
+    assert states == {"AVG": "finished", "GeM": "finished", "wrong": "failed"}
+    assert "wrong failed: bad_agg_config" in answer.stderr.replace("\n", " ")
+    table = (out / "leaderboard.md").read_text()
+    assert table.index("AVG") < table.index("wrong")
+    assert "failed: bad_agg_config" in table
