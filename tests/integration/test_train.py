@@ -20,6 +20,7 @@ from services.trainer.stop import RunStopped, StopRequest
 from shared.errors import Conflict, InvalidRequest, NotFound, PlacewiseError, Unprocessable
 from shared.vision.place_models.checkpoint import load_checkpoint
 from tests.support.tiny_places import CITY, write_tiny_places
+from tests.support.train_runs import assert_same_weights, told, train, weights
 
 Json = dict[str, Any]
 
@@ -35,47 +36,6 @@ def _one_thread() -> Iterator[None]:
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(threads)
-
-
-def told(places: Path, out: Path, **others: Any) -> Json:
-    """A run of a small network: two epochs of three batches of two places."""
-    return {
-        "data_root": str(places),
-        "accelerator": "cpu",
-        "faiss_gpu": False,
-        "pretrained": False,
-        "layers_to_freeze": -1,
-        "layers_to_crop": [2],
-        "agg_arch": "gem",
-        "image_size": 32,
-        "batch_size": 2,
-        "img_per_place": 3,
-        "min_img_per_place": 3,
-        "num_workers": 0,
-        "max_epochs": 2,
-        "warmpup_steps": 2,
-        "lr": 1e-3,
-        "log_every_n_steps": 1,
-        "default_root_dir": str(out),
-        "run_name": "run",
-        "logger": "none",
-        **others,
-    }
-
-
-def train(said: Json, display: Quiet | None = None) -> Json:
-    return run.run(make_arguments(said), display or Quiet(), StopRequest())
-
-
-def weights(path: Path) -> dict[str, torch.Tensor]:
-    return dict(torch.load(path, weights_only=True)["state_dict"])
-
-
-def assert_same_weights(one: Path, other: Path) -> None:
-    first, second = weights(one), weights(other)
-    assert first.keys() == second.keys()
-    for name, tensor in first.items():
-        assert torch.equal(tensor, second[name]), name
 
 
 class StopAfter(Quiet):
