@@ -191,7 +191,7 @@ def _measure_what_is_due(
     arguments, history = ready.arguments, ready.history
     stored = torch.load(ready.resume_from, map_location="cpu", weights_only=True)
     epoch, step, epoch_done = stored["epoch"], stored["global_step"], stored["epoch_done"]
-    is_over = (arguments.max_steps is not None and step >= arguments.max_steps) or (
+    is_over: bool = (arguments.max_steps is not None and step >= arguments.max_steps) or (
         epoch_done and epoch + 1 >= arguments.max_epochs
     )
     history.epochs = [each for each in history.epochs if each.step <= step]
