@@ -150,6 +150,7 @@ def _measure(
 ) -> tuple[dict[str, Any], Measured]:
     describer = _describer(entry, asked, settings, progress)
     told = told_by(progress, entry.written)
+    describer.describe.told = lambda done, most: told("known photos", done, most)
     with rows_of_set(describer.describe, asked, told=told) as (database, queries):
         took = describer.describe.milliseconds_a_photo()
         if entry.pca is not None:

@@ -112,13 +112,14 @@ def _describer(
 def _by_describer(
     asked: EvaluationSet, describer: Describer, wanted: Wanted, progress: Progress
 ) -> Result:
-    ks = [k for k in KS if k <= wanted.depth] + [wanted.depth]
+    told = told_by(progress, asked.name)
+    describer.describe.told = lambda done, most: told("known photos", done, most)
     found = recalls(
         describer.describe,
         asked,
-        ks=ks,
+        ks=[*(k for k in KS if k <= wanted.depth), wanted.depth],
         faiss_gpu=wanted.faiss_gpu,
-        told=told_by(progress, asked.name),
+        told=told,
     )
     about: dict[str, Any] = {
         "dimension": found.dimension,
@@ -144,6 +145,6 @@ def told_by(progress: Progress, name: str) -> Told:
     def told(what: str, done: int, most: int) -> None:
         if what not in bars:
             bars[what] = progress.add_task(f"{name}: {what}", total=most)
-        progress.update(bars[what], completed=done)
+        progress.update(bars[what], completed=done, total=most)
 
     return told

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import sqlite3
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -48,15 +48,17 @@ class CachedDescribe:
         named = hashlib.sha256(json.dumps(spec, sort_keys=True).encode()).hexdigest()
         self._file = folder / f"{named[:32]}.sqlite"
         self._most_bytes = most_bytes
-        self.found = 0
-        """rows that were there already"""
+        self.told: Callable[[int, int], None] = lambda done, most: None
+        """hears how many photos have been looked for, before the first row comes"""
 
     def __call__(self, photos: Sequence[Path]) -> Iterator[Rows]:
         kept = self._open()
         try:
-            keys = [_sha256(photo) for photo in photos]
-            missing = [not _is_there(kept, key) for key in keys]
-            self.found += len(photos) - sum(missing)
+            keys, missing = [], []
+            for photo in photos:
+                keys.append(_sha256(photo))
+                missing.append(not _is_there(kept, keys[-1]))
+                self.told(len(keys), len(photos))
             made = self._made([p for p, m in zip(photos, missing, strict=True) if m])
             for begin in range(0, len(photos), BATCH):
                 rows, new = [], []

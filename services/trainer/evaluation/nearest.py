@@ -84,8 +84,9 @@ def _on_gpu() -> Callable[[Rows, Rows, int], tuple[Scores, Indices]]:
     if not hasattr(faiss, "StandardGpuResources") or faiss.get_num_gpus() == 0:
         raise Misconfigured(
             "faiss_gpu_missing",
-            "This faiss has no GPU: the package faiss-cpu is installed, or no GPU is there. Say "
-            "--faiss_gpu False, or install a faiss for GPUs.",
+            "This faiss has no GPU: the package faiss-cpu is installed, or no GPU is there. Search "
+            "on the processor (training: --faiss_gpu False; else without --faiss-gpu), or install "
+            "a faiss for GPUs.",
         )
     resources = faiss.StandardGpuResources()
 
