@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from services.cli.added_backbone import added_backbone
 from services.cli.output import shown
 from services.cli.photo_files import decoded_batches
 from services.cli.whole_file import whole_or_nothing
@@ -75,6 +76,7 @@ def describe_files(
         device,
         precision=choose_precision(settings.precision, recipe, device),
         dino_weights=settings.dino_weights,
+        backbone=added_backbone(recipe, settings, device),
     )
     centres = centres_of(extractor, own)
     projection = None

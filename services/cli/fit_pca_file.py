@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from rich.progress import Progress
 
+from services.cli.added_backbone import added_backbone
 from services.cli.configuration import read_settings
 from services.cli.describe_files import centres_of, own_vocabulary
 from services.cli.output import shown
@@ -98,7 +99,13 @@ def _load(
         allow_test_extractors=settings.allow_test_extractors,
     )
     own = own_vocabulary(recipe, vocabulary)
-    loaded = Extractor(recipe, choose_device(settings.device), dino_weights=settings.dino_weights)
+    device = choose_device(settings.device)
+    loaded = Extractor(
+        recipe,
+        device,
+        dino_weights=settings.dino_weights,
+        backbone=added_backbone(recipe, settings, device),
+    )
     return loaded, centres_of(loaded, own)
 
 

@@ -31,7 +31,7 @@ from shared.objects.keys import new_checkpoint_key
 
 MOST_LICENCE_CHARACTERS = 1000
 MOST_NOTE_CHARACTERS = 4000
-FIELDS = {
+FIELDS: dict[str, dict[str, Any]] = {
     "name": {
         "type": "string",
         "pattern": MODEL_NAME,
@@ -175,9 +175,7 @@ def delete_model(gateway: GatewayDep, name: ModelPath) -> ModelRemoved:
     """
     new_map_extractor = gateway.settings.new_map_extractor
     gateway.catalog.run(lambda session: remove_model(session, name, new_map_extractor))
-    return ModelRemoved(
-        success=True, message=f"The model {name} is removed.", removed_model=name
-    )
+    return ModelRemoved(success=True, message=f"The model {name} is removed.", removed_model=name)
 
 
 def _read_fields(fields: dict[str, str]) -> dict[str, str | None]:

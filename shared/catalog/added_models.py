@@ -1,7 +1,7 @@
 """Models that were added: trained elsewhere, named once, fetched by whoever describes with them.
 
-A name is given once and for all. Rows of descriptors, manifests and caches say `gsv:N`, so `N` never
-comes to mean other weights, not even after the model was removed.
+A name is given once and for all. Rows of descriptors, manifests and caches say `gsv:N`, so `N`
+never comes to mean other weights, not even after the model was removed.
 """
 
 from __future__ import annotations
@@ -190,6 +190,8 @@ def _missing(name: str) -> str:
 
 def _listed(maps: list[str]) -> str:
     shown = ", ".join(repr(name) for name in maps[:5])
-    return ("the map " if len(maps) == 1 else "the maps ") + shown + (
-        f" and {len(maps) - 5} more" if len(maps) > 5 else ""
+    return (
+        ("the map " if len(maps) == 1 else "the maps ")
+        + shown
+        + (f" and {len(maps) - 5} more" if len(maps) > 5 else "")
     )
