@@ -101,8 +101,8 @@ class TrainedModel:
             raise _unfit(f"of 2 photos it makes numbers of the shape {tuple(both.shape)}")
         if not torch.isfinite(both).all() or not torch.isfinite(alone).all():
             raise _unfit("its descriptors hold NaN or infinite numbers")
-        if bool((both.norm(dim=-1) == 0).any()):
-            raise _unfit("its descriptors are zero")
+        if bool((both.norm(dim=-1) == 0).any()) or torch.equal(both[0], both[1]):
+            raise _unfit("of two different photos its descriptors are zero, or the same")
         cosine = float(unit_features(both[0]) @ unit_features(alone[0]))
         if cosine < LEAST_COSINE:
             raise _unfit(
