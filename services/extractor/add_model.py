@@ -6,7 +6,6 @@ import contextlib
 import hashlib
 import json
 import math
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ import torch
 from shared.catalog.added_models import NewModel, add_model
 from shared.catalog.session import Catalog
 from shared.errors import NotFound, Unprocessable
+from shared.ids import new_id
 from shared.jobs import Job
 from shared.jobs.finish import succeed
 from shared.jobs.leases import held
@@ -33,9 +33,13 @@ PIECE_BYTES = 1 << 20
 class AddModel:
     """One piece of work, on the CPU: nothing is described with the model yet."""
 
-    def __init__(self, catalog: Catalog, store: ObjectStore) -> None:
+    def __init__(self, catalog: Catalog, store: ObjectStore, folder: Path) -> None:
+        """`folder`: that of ModelCache, which has room for large files and removes what is left
+        over.
+        """
         self._catalog = catalog
         self._store = store
+        self._folder = folder
 
     def from_checkpoint(self, job: Job) -> None:
         """Check the checkpoint under `object_key`, store what describes photos, add its row.
@@ -43,9 +47,14 @@ class AddModel:
         Unprocessable: those of `load_checkpoint`, `model_unfit`, `checkpoint_lost`; Conflict
         (`model_name_taken`).
         """
+        filename = job.params["filename"]
         with self._file(job.params["object_key"]) as path:
-            checkpoint = load_checkpoint(path)
-        card = {"source": job.params["filename"], **about(checkpoint)}
+            try:
+                checkpoint = load_checkpoint(path)
+            except Unprocessable as error:  # it speaks of the file as it is called here
+                said = error.detail.replace(path.name, filename)
+                raise Unprocessable(error.code, said, **error.extra) from error
+        card = {"source": filename, **about(checkpoint)}
         name = job.params["name"]
         TrainedModel(
             f"{PREFIX}{name}",
@@ -98,15 +107,17 @@ class AddModel:
         if there is not None:
             yield there
             return
-        with tempfile.TemporaryDirectory(prefix="placewise-") as folder:
-            path = Path(folder, "checkpoint.ckpt")
-            try:
-                with self._store.open(key) as source, path.open("xb") as file:
-                    while piece := source.read(PIECE_BYTES):
-                        file.write(piece)
-            except NotFound as error:
-                raise _lost() from error
+        self._folder.mkdir(parents=True, exist_ok=True)
+        path = self._folder / f"{new_id()}.partial"
+        try:
+            with self._store.open(key) as source, path.open("xb") as file:
+                while piece := source.read(PIECE_BYTES):
+                    file.write(piece)
             yield path
+        except NotFound as error:
+            raise _lost() from error
+        finally:
+            path.unlink(missing_ok=True)
 
 
 def about(checkpoint: Checkpoint) -> dict[str, Any]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import torch
 
 from services.extractor.model_cache import ModelCache
@@ -14,14 +16,17 @@ from shared.vision.backbones.trained import TrainedModel
 from shared.vision.place_models.model_file import read_model
 
 
+def cache_folder(settings: Settings) -> Path:
+    """Where files of models lie for a while, when objects are no files of this machine."""
+    return settings.placewise_home / "model-cache"
+
+
 class AddedModels:
     """By their names; the catalog says where each lies and what it is."""
 
     def __init__(self, catalog: Catalog, store: ObjectStore, settings: Settings) -> None:
         self._catalog = catalog
-        self._cache = ModelCache(
-            store, settings.placewise_home / "model-cache", settings.model_cache_bytes
-        )
+        self._cache = ModelCache(store, cache_folder(settings), settings.model_cache_bytes)
 
     def load(self, name: str, device: torch.device) -> TrainedModel:
         """The model `name`, its weights on the device.

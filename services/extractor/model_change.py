@@ -13,6 +13,7 @@ take the next one.
 from __future__ import annotations
 
 from services.extractor.add_model import AddModel
+from services.extractor.added_models import cache_folder
 from services.extractor.decoding import DecoderPool
 from services.extractor.fit_pca import FitPca
 from services.extractor.fit_vocabulary import FitVocabulary
@@ -38,7 +39,7 @@ class ModelChanges:
         self._fit = FitVocabulary(catalog, store, models, decoders, settings)
         self._take = TakeVocabulary(catalog, store, models)
         self._pca = FitPca(catalog, store, models)
-        self._add = AddModel(catalog, store)
+        self._add = AddModel(catalog, store, cache_folder(settings))
 
     def slice(self, job: Job) -> None:
         """The next piece of work of the claimed job; PlacewiseError when it can't go on."""

@@ -106,6 +106,7 @@ class ModelRemoved(Answer):
     response_model=JobStarted,
     openapi_extra=describe_form(
         "a checkpoint (`.ckpt`) of `placewise train`",
+        ["name"],
         **FIELDS,
     ),
     dependencies=[ROOM_FOR_JOBS],

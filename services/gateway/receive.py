@@ -6,7 +6,7 @@ photo, is refused as soon as that is seen, without reading the rest.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from fastapi import Request
@@ -79,13 +79,17 @@ def _finish(store: ObjectStore, key: str, writer: ObjectWriter | None, rest: byt
     writer.commit()
 
 
-def describe_form(file: str, **fields: dict[str, Any]) -> dict[str, Any]:
-    """The OpenAPI description of a form with a file: FastAPI sees only a stream."""
+def describe_form(
+    file: str, required: Sequence[str] = (), **fields: dict[str, Any]
+) -> dict[str, Any]:
+    """The OpenAPI description of a form with a file, and of `fields`, of which some are `required`,
+    too: FastAPI sees only a stream.
+    """
     properties = {
         FILE_FIELD: {"type": "string", "format": "binary", "description": file},
         **fields,
     }
-    schema = {"type": "object", "required": [FILE_FIELD], "properties": properties}
+    schema = {"type": "object", "required": [FILE_FIELD, *required], "properties": properties}
     return {
         "requestBody": {"required": True, "content": {"multipart/form-data": {"schema": schema}}}
     }

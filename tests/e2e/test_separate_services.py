@@ -207,7 +207,7 @@ def test_an_extractor_that_has_never_seen_a_model_fetches_it(
         (fetched,) = (second / "model-cache").iterdir()
         assert fetched.name == f"{model['sha256']}.safetensors"
         assert fetched.stat().st_size == model["size_bytes"]
-    assert not (tmp_path / "first" / "model-cache").exists(), "it only looked at the checkpoint"
+    assert list((tmp_path / "first" / "model-cache").iterdir()) == [], "it only looked at a file"
     assert "Traceback" not in deployment.logs()
 
 

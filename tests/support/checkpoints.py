@@ -7,7 +7,6 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
 from shared.chunks import Rows
@@ -66,7 +65,7 @@ def own_output(model: PlaceModel, photo: bytes) -> Rows:
     """What the model itself makes of a photo that is brought to its size."""
     height, width = model.config.image_size
     preprocessing = get_preprocessing(f"resize{height}x{width}")
-    pixels = np.ascontiguousarray(decode(photo, preprocessing, 10**9).pixels)
+    pixels = decode(photo, preprocessing, 10**9).pixels.copy()
     with torch.inference_mode():
         batch = normalise_pixels(torch.from_numpy(pixels)[None], MEAN, STD)
         row: Rows = model(batch)[0].numpy()
