@@ -212,6 +212,11 @@ class Settings(BaseSettings):
     batch_ahead_photos: int = Field(
         500, ge=1, description="queued photos at which batches wait for the extractors"
     )
+    descriptor_cache_bytes: int = Field(
+        20_000_000_000,
+        ge=0,
+        description="of PLACEWISE_HOME/descriptors, where evaluate and compare keep their rows",
+    )
     auto_fit_photos: int = Field(
         200, ge=1, description="photos at which a map without a vocabulary fits its own"
     )

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -26,6 +28,7 @@ from services.cli.output import (
     progress_bar,
     shown,
 )
+from services.cli.trainer_packages import check_trainer_packages
 from shared.errors import InvalidRequest
 from shared.recipes import get_recipe
 
@@ -33,7 +36,12 @@ from shared.recipes import get_recipe
 def describe(
     photos: Annotated[list[Path], typer.Argument(metavar="PHOTOS...", help="Files, in order.")],
     out: Annotated[
-        Path, typer.Option("--out", metavar="FILE.npy", help="What to write: a row for each photo.")
+        Path,
+        typer.Option(
+            "--out",
+            metavar="FILE.npy|FILE.h5",
+            help="What to write: a row for each photo; as .h5, hloc's global features by name.",
+        ),
     ],
     extractor: Annotated[
         str | None,
@@ -69,15 +77,26 @@ def describe(
             help="Shorten the rows: .safetensors of `pca fit ROWS.npy` or `pca fit DIR`.",
         ),
     ] = None,
+    root: Annotated[
+        Path | None,
+        typer.Option(
+            "--root",
+            exists=True,
+            file_okay=False,
+            help="With FILE.h5: photos are named from this folder on; left out: as they are given.",
+        ),
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Write the descriptors of photos into a .npy file: float32, a row for each, in their order.
 
-    A photo that can't be described is named, and then no file is written at all.
+    Into an .h5 file: a group for each photo's name with a dataset `global_descriptor`. A photo that
+    can't be described is named, and then no file is written at all.
     """
     # Read when torch is loaded, which is below; see services/cli/__init__.py.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     with explained(as_json):
+        names = _names(photos, out, root)
         settings = read_settings()
         name = extractor_name(
             extractor or (settings.new_map_extractor if backbone is None else None),
@@ -103,7 +122,14 @@ def describe(
         with progress_bar() as progress:
             bar = progress.add_task("describing", total=len(photos))
             found = describe_files(
-                photos, out, recipe, vocabulary, pca, settings, lambda n: progress.advance(bar, n)
+                photos,
+                out,
+                recipe,
+                vocabulary,
+                pca,
+                settings,
+                lambda n: progress.advance(bar, n),
+                names=names,
             )
     if as_json:
         print_json(found.as_json())
@@ -114,3 +140,25 @@ def describe(
         soft_wrap=True,
         markup=False,
     )
+
+
+def _names(photos: Sequence[Path], out: Path, root: Path | None) -> list[str] | None:
+    """What an .h5 file calls the photos; None for a file of rows alone.
+
+    InvalidRequest: `options_contradict`, `bad_names` (not below the root, or the same name twice);
+    Misconfigured (`trainer_missing`).
+    """
+    if out.suffix not in (".h5", ".hdf5"):
+        if root is not None:
+            raise InvalidRequest("options_contradict", "--root: only with --out FILE.h5.")
+        return None
+    check_trainer_packages("h5py")
+    try:
+        named = [(p.absolute().relative_to(root.absolute()) if root else p) for p in photos]
+    except ValueError as error:
+        raise InvalidRequest("bad_names", f"Not every photo lies below --root: {error}.") from error
+    names = [path.as_posix().lstrip("/") for path in named]
+    twice = [name for name, count in Counter(names).items() if count > 1]
+    if twice:
+        raise InvalidRequest("bad_names", f"{twice[0]} is given twice: one name is one photo.")
+    return names

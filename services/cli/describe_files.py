@@ -16,6 +16,7 @@ import numpy as np
 from services.cli.added_backbone import added_backbone
 from services.cli.output import shown
 from services.cli.photo_files import decoded_batches
+from services.cli.row_files import open_rows
 from services.cli.whole_file import whole_or_nothing
 from shared.errors import Misconfigured, PlacewiseError, Unprocessable
 from shared.recipes import Recipe
@@ -60,8 +61,11 @@ def describe_files(
     pca: Path | None,
     settings: Settings,
     advance: Callable[[int], None],
+    *,
+    names: Sequence[str] | None = None,
 ) -> DescribedFiles:
-    """Write (photos, dimension) float32 to `out`, whole or not at all.
+    """Write (photos, dimension) float32 to `out`, whole or not at all: an `.npy` of rows, or with
+    `names`, one for each photo, an `.h5` of hloc's global features.
 
     `advance` is told how many more photos are done. Raises Unprocessable: `photos_refused`, which
     names every photo that can't be described and why; `vocabulary_unfit`, `pca_unfit`;
@@ -87,10 +91,7 @@ def describe_files(
     described.seconds["load"] = time.perf_counter() - started
     shape = (len(photos), extractor.dimension(centres, projection))
     refused: list[tuple[Path, PlacewiseError]] = []
-    with whole_or_nothing(out) as file:
-        np.lib.format.write_array_header_1_0(
-            file, {"descr": "<f4", "fortran_order": False, "shape": shape}
-        )
+    with whole_or_nothing(out) as file, open_rows(file, shape, names) as write:
         for batch in decoded_batches(photos, extractor.preprocessing, settings, described.seconds):
             pixels = []
             for photo, outcome in batch:
@@ -108,7 +109,7 @@ def describe_files(
                     for (photo, _), row in zip(batch, rows, strict=True):
                         if not np.isfinite(row).all():
                             refused.append((photo, not_finite()))
-                    file.write(np.ascontiguousarray(rows, "<f4").tobytes())
+                    write(rows)
                 described.seconds["describe"] += time.perf_counter() - begun
             advance(len(batch))
         if refused:

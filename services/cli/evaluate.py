@@ -1,44 +1,140 @@
-"""`placewise evaluate`: how often the right place comes first, in a live map."""
+"""`placewise evaluate`: how often the right place comes first, in a live map or on a data set."""
 
 from __future__ import annotations
 
+import os
+import re
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.progress import Progress
-from rich.table import Column, Table
 
-from services.cli.connect import connect
-from services.cli.output import (
-    JsonOption,
-    KeyOption,
-    MapOption,
-    ServerOption,
-    answers,
-    explained,
-    print_json,
-    progress_bar,
-)
-from services.cli.wait import wait_with_bar
-from shared.client import Client, Json
-from shared.errors import Conflict
-from shared.estimate.calibration import LEAST_LABELLED, LEAST_OF_A_KIND
+from services.cli.output import JsonOption, KeyOption, MapOption, ServerOption, explained
+from services.cli.trainer_packages import check_trainer_packages
+from shared.errors import InvalidRequest
 
-SHOWN = 6  # evaluations that were asked for, this one and those before
-LOOKED_AT = 100
+Given = dict[str, object]
+
+SIZE = re.compile(r"([1-9][0-9]{1,3})[x ]([1-9][0-9]{1,3})")
+
+
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """Where results go and what they show."""
+
+    out: Path | None
+    against: Path | None
+    pairs: Path | None
+    depth: int
+    grids: int
+    only_wrong: bool
+    faiss_gpu: bool
+    as_json: bool
 
 
 def evaluate(
-    sample: Annotated[
-        int | None, typer.Option(min=1, help="Photos of the map to ask with; default 1000.")
+    data: Annotated[
+        Path | None,
+        typer.Option(
+            exists=True,
+            file_okay=False,
+            help="Evaluate a data set instead of a live map: a folder that `datasets check` knows. "
+            "With --predictions: where the photos of the lists lie.",
+        ),
     ] = None,
-    seed: Annotated[int | None, typer.Option(min=0)] = None,
+    sets: Annotated[
+        list[str] | None,
+        typer.Option("--set", help="Of --data; may be repeated. Left out: all of them."),
+    ] = None,
+    protocol: Annotated[
+        str | None, typer.Option(help="How the set is put together: msls-official, vme, ...")
+    ] = None,
+    rule: Annotated[
+        str | None,
+        typer.Option(help="Who is right: `radius 25`, `heading 25 40`, `frames 5`, `place-label`."),
+    ] = None,
+    checkpoint: Annotated[
+        Path | None,
+        typer.Option(exists=True, dir_okay=False, help="Of `placewise train`: F.ckpt."),
+    ] = None,
+    image_size: Annotated[
+        str,
+        typer.Option(
+            help="Of --checkpoint: `same` as in training, `native`, or HEIGHTxWIDTH in pixels."
+        ),
+    ] = "same",
+    extractor: Annotated[
+        str | None, typer.Option(help="By name, with options as in EXTRACTOR.")
+    ] = None,
+    vocabulary: Annotated[
+        Path | None,
+        typer.Option(exists=True, dir_okay=False, help="Of VLAD: .npz, .npy or c_centers.pt."),
+    ] = None,
+    fit_vocabulary: Annotated[
+        bool,
+        typer.Option(
+            "--fit-vocabulary",
+            help="Of VLAD: learn one from the database's own photos, as where none is shipped.",
+        ),
+    ] = False,
+    predictions: Annotated[
+        Path | None,
+        typer.Option(
+            exists=True, dir_okay=False, help="(queries, k) database indices, .npy: what was found."
+        ),
+    ] = None,
+    ground_truth: Annotated[
+        Path | None,
+        typer.Option(exists=True, dir_okay=False, help="With --predictions: what is right, .npy."),
+    ] = None,
+    database: Annotated[
+        Path | None,
+        typer.Option(
+            exists=True, dir_okay=False, help="With --predictions: the photos' names, .npy or text."
+        ),
+    ] = None,
+    queries: Annotated[
+        Path | None,
+        typer.Option(exists=True, dir_okay=False, help="With --predictions: the queries' names."),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(help="Folder for predictions, metrics.json and report.html."),
+    ] = None,
+    against: Annotated[
+        Path | None,
+        typer.Option(
+            exists=True, file_okay=False, help="--out of another run: what was won and lost."
+        ),
+    ] = None,
+    pairs: Annotated[
+        Path | None,
+        typer.Option(dir_okay=False, help="File for the pairs found, as hloc reads them."),
+    ] = None,
+    depth: Annotated[
+        int, typer.Option(min=1, max=1000, help="Database photos ranked for each query.")
+    ] = 20,
+    grids: Annotated[
+        int, typer.Option(min=0, max=500, help="Queries of a kind that the report shows.")
+    ] = 12,
+    only_wrong: Annotated[
+        bool, typer.Option("--only-wrong", help="The report shows no query that was right.")
+    ] = False,
+    faiss_gpu: Annotated[
+        bool, typer.Option("--faiss-gpu", "--faiss_gpu", help="Search on the GPU.")
+    ] = False,
+    sample: Annotated[
+        int | None,
+        typer.Option(min=1, help="Of a live map: photos to ask with; default 1000."),
+    ] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Of a live map.")] = None,
     word_weights: Annotated[
         bool,
         typer.Option(
             "--word-weights",
-            help="First learn which words of the vocabulary tell the map's places apart, and keep "
-            "their weights where recall rises.",
+            help="Of a live map: first learn which words of the vocabulary tell the map's places "
+            "apart, and keep their weights where recall rises.",
         ),
     ] = False,
     map_name: MapOption = None,
@@ -46,114 +142,71 @@ def evaluate(
     key: KeyOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Ask the map about its own photos (each left out in turn) and its labelled queries."""
-    wanted = {"sample": sample, "seed": seed}
-    given = {name: value for name, value in wanted.items() if value is not None}
-    with explained(as_json):
-        learnt: Json | None = None
-        with connect(server, map_name, key) as client, progress_bar() as progress:
-            if word_weights:
-                learnt = _learn(client, given, progress)
-            job = wait_with_bar(client, client.evaluate(**given)["job_id"], progress, "asking")
-            asked_for = [e for e in client.evaluations(LOOKED_AT) if not e["automatic"]][:SHOWN]
-            vocabularies = _vocabularies(client)
-        if as_json:
-            print_json({**job["result"], "word_weights": learnt} if learnt else job["result"])
-            return
-        _print(asked_for, vocabularies)
-        if learnt:
-            answers.print(
-                f"Word weights: {learnt['outcome']}. {learnt['reason']}",
-                soft_wrap=True,
-                markup=False,
-            )
+    """Ask a live map about its own photos; or with --data, evaluate on a data set.
 
-
-def _learn(client: Client, given: dict[str, int], progress: Progress) -> Json:
-    """Learn the active generation's word weights; what came of it."""
-    active = [g["generation_id"] for g in client.generations() if g["state"] == "active"]
-    if not active:
-        raise Conflict(
-            "nothing_to_evaluate",
-            "The map has no described photo yet. Upload some: placewise index.",
-        )
-    started = client.learn_word_weights(active[0], **given)
-    result: Json = wait_with_bar(client, started["job_id"], progress, "word weights")["result"]
-    return result
-
-
-def _vocabularies(client: Client) -> dict[str, str]:
-    """The origin of each generation's vocabulary, by generation."""
-    origins = {v["vocabulary_id"]: v["origin"] for v in client.vocabularies()}
-    return {
-        g["generation_id"]: origins.get(g["vocabulary_id"], "none") for g in client.generations()
+    Without --data and --predictions: the map is asked about its own photos, each left out in turn,
+    and about its labelled queries. With --data: a --checkpoint, an --extractor or a --server is
+    asked about a data set.
+    """
+    wanted = Wanted(out, against, pairs, depth, grids, only_wrong, faiss_gpu, as_json)
+    of_a_map: Given = {"--sample": sample, "--seed": seed, "--word-weights": word_weights}
+    of_photos: Given = {
+        "--checkpoint": checkpoint, "--extractor": extractor, "--vocabulary": vocabulary,
+        "--fit-vocabulary": fit_vocabulary, "--protocol": protocol, "--rule": rule,
+    }  # fmt: skip
+    of_a_file: Given = {
+        "--ground-truth": ground_truth,
+        "--database": database,
+        "--queries": queries,
     }
+    of_results: Given = {"--out": out, "--against": against, "--pairs": pairs, "--set": sets}
+    with explained(as_json):
+        # Read when torch is loaded, which is below; see services/cli/__init__.py.
+        os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+        if predictions is not None:
+            _refuse("with --predictions", of_a_map | of_photos)
+            if ground_truth is None:
+                raise InvalidRequest("no_ground_truth", "Say what is right: --ground-truth GT.npy")
+            check_trainer_packages()
+            from services.cli.evaluate_predictions import evaluate_predictions
 
+            evaluate_predictions(predictions, ground_truth, database, queries, data, sets, wanted)
+            return
+        if data is not None:
+            _refuse("with --data", of_a_map | of_a_file)
+            check_trainer_packages()
+            from services.cli.evaluate_sets import Asking, evaluate_sets
 
-def _print(evaluations: list[Json], vocabularies: dict[str, str]) -> None:
-    table = Table(
-        Column("evaluated", no_wrap=True),
-        "vocabulary",
-        "photos",
-        "asked with",
-        *(Column(f"R@{k}", justify="right", no_wrap=True) for k in (1, 5, 10)),
-    )
-    for found in evaluations:
-        figures = found["figures"]
-        rows = _recalls(figures)
-        # Evaluations of earlier releases don't speak of weights.
-        if weighted := figures.get("with_word_weights"):
-            rows += [(f"{what}, word weights", recall) for what, recall in _recalls(weighted)]
-        for what, recall in rows:
-            table.add_row(
-                found["evaluated_at"][5:19].replace("T", " "),
-                vocabularies.get(found["generation_id"], ""),
-                str(found["searchable"]),
-                f"{recall['queries']} {what}",
-                *(_percent(recall[f"R@{k}"]) for k in (1, 5, 10)),
+            size = _image_size(image_size, checkpoint)
+            asking = Asking(
+                checkpoint, size, extractor, vocabulary, fit_vocabulary, server, map_name, key
             )
-    answers.print(table)
-    figures = evaluations[0]["figures"]
-    for line in _estimate_lines(figures.get("with_word_weights") or figures):
-        answers.print(line, soft_wrap=True)
+            evaluate_sets(data, sets, protocol, rule, asking, wanted)
+            return
+        _refuse("without --data", of_photos | of_a_file | of_results)
+        from services.cli.evaluate_map import evaluate_map
+
+        evaluate_map(sample, seed, word_weights, map_name, server, key, as_json)
 
 
-def _recalls(figures: Json) -> list[tuple[str, Json]]:
-    rows = [("own photos", figures["leave_one_out"])]
-    if figures["labelled_queries"]:
-        rows.append(("labelled queries", figures["labelled_queries"]))
-    return rows
+def _refuse(when: str, options: Given) -> None:
+    given = [name for name, value in options.items() if value]
+    if given:
+        raise InvalidRequest("options_contradict", f"{', '.join(given)}: not {when}.")
 
 
-def _estimate_lines(figures: Json) -> list[str]:
-    labelled, estimate = figures["labelled_queries"], figures["estimate"]
-    lines = [f"Right means within {figures['radius_m']:g} m, or the same label."]
-    if labelled is None:
-        lines.append(
-            "Confidence is uncalibrated: upload photos of another day, with coordinates, as "
-            "labelled queries (placewise index DIR --role query)."
+def _image_size(text: str, checkpoint: Path | None) -> str | tuple[int, int]:
+    """`same`, `native` or (height, width) of `320x320`."""
+    if checkpoint is None and text != "same":
+        raise InvalidRequest(
+            "options_contradict",
+            "--image-size: only with --checkpoint; an extractor has its own preprocessing.",
         )
-        return lines
-    if estimate["calibration"] == "uncalibrated":
-        teaching = labelled["queries"] + labelled["out_of_map"] - labelled["same_session"]
-        lines.append(
-            f"Confidence is uncalibrated: {teaching} labelled queries of another session are "
-            f"there, at least {LEAST_LABELLED} are needed, with {LEAST_OF_A_KIND} whose answer is "
-            f"right and {LEAST_OF_A_KIND} whose answer is wrong."
+    if text in ("same", "native"):
+        return text
+    match = SIZE.fullmatch(text)
+    if match is None:
+        raise InvalidRequest(
+            "bad_image_size", f"--image-size {text}: same, native or HEIGHTxWIDTH is needed."
         )
-    lines.append(
-        f"Of {labelled['queries']} queries in the map {_percent(labelled['accepted_in_map'])} are "
-        f"accepted; of {labelled['out_of_map']} out of it {_percent(labelled['false_accepts'])}; "
-        f"of all accepted {_percent(labelled['right_of_accepted'])} are right."
-    )
-    if labelled["auroc"] is not None:
-        lines.append(
-            f"Confidence ({estimate['calibration']}, cross-validated): calibration error "
-            f"{labelled['calibration_error']:.3f}, AUROC {labelled['auroc']:.3f}, recall at 99 % "
-            f"precision {_percent(labelled['recall_at_99_precision'])}."
-        )
-    return lines
-
-
-def _percent(share: float | None) -> str:
-    return "-" if share is None else f"{100 * share:.1f} %"
+    return int(match[1]), int(match[2])

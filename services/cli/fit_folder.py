@@ -57,7 +57,7 @@ def fit_folder(
             f"The extractor {recipe.name} uses no vocabulary: there is nothing to fit.",
         )
     there = photo_paths(folder)
-    loaded = _load(recipe, settings)
+    loaded = load_extractor(recipe, settings)
     seed = seed or 0
     numbers = choose_photos(len(there), sample or SAMPLE_PHOTOS, loaded.backbone.width, seed)
     photos = [there[number] for number in numbers]
@@ -65,7 +65,7 @@ def fit_folder(
     bars = {name: progress.add_task(name, total=None) for name in ("describing", "clustering")}
     fitted = fit_photos(
         loaded,
-        _pixels(photos, loaded, settings, refused),
+        pixels_of(photos, loaded, settings, refused),
         len(photos),
         clusters=clusters or recipe.clusters,
         seed=seed,
@@ -82,7 +82,8 @@ def fit_folder(
     }
 
 
-def _load(recipe: Recipe, settings: Settings) -> Extractor:
+def load_extractor(recipe: Recipe, settings: Settings) -> Extractor:
+    """On the device and in the precision that the settings say; raises what loading it does."""
     device = choose_device(settings.device)
     return Extractor(
         recipe,
@@ -92,7 +93,7 @@ def _load(recipe: Recipe, settings: Settings) -> Extractor:
     )
 
 
-def _pixels(
+def pixels_of(
     photos: list[Path], extractor: Extractor, settings: Settings, refused: list[dict[str, str]]
 ) -> Iterator[list[Pixels]]:
     """Batches of pixels in the order of the photos; those that can't be had join `refused`."""

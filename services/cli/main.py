@@ -22,6 +22,7 @@ COMMANDS = {
     "query": ("ask", "query"),
     "describe": ("describe", "describe"),
     "evaluate": ("evaluate", "evaluate"),
+    "compare": ("compare", "compare"),
     "config": ("configuration", "config"),
     "doctor": ("doctor", "doctor"),
     "maps": ("maps", "app"),

@@ -20,7 +20,7 @@ def whole_or_nothing(out: Path) -> Iterator[BinaryIO]:
     """
     partial = out.with_name(f".{out.name}.{os.getpid()}.partial")
     try:
-        with partial.open("wb") as file:
+        with partial.open("w+b") as file:
             yield file
             file.flush()
             os.fsync(file.fileno())

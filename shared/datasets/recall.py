@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 
 POSITIVE_WITHIN_M = 25.0
 QUERIES_AT_ONCE = 256
+CANDIDATES_AT_ONCE = 2_000_000
+"""pairs that are measured at a time: about 150 MB"""
 
 Positions = NDArray[np.float64]
 Descriptors = NDArray[np.float32]
@@ -22,13 +24,72 @@ Indices = NDArray[np.int64]
 def true_positives(
     queries: Positions, database: Positions, within_m: float = POSITIVE_WITHIN_M
 ) -> list[Indices]:
-    """(n, 2) and (m, 2) UTM metres of one zone -> for each query its positives, ascending."""
+    """(n, 2) and (m, 2) UTM metres of one zone -> for each query its positives, ascending.
+
+    The database is sorted into square cells as wide as the radius, so that a query looks at nine of
+    them: memory grows with the photos and the positives, not with n times m.
+    """
+    if not len(queries) or not len(database):
+        return [np.empty(0, np.int64) for _ in queries]
+    cells = _Cells(database, within_m)
+    first, last = cells.candidates(queries)
+    counts = (last - first).sum(axis=0)
     found: list[Indices] = []
-    for start in range(0, len(queries), QUERIES_AT_ONCE):
-        away = queries[start : start + QUERIES_AT_ONCE, None] - database[None]
-        near = np.hypot(away[..., 0], away[..., 1]) <= within_m
-        found += [np.flatnonzero(row) for row in near]
+    start = 0
+    while start < len(queries):
+        taken = np.searchsorted(np.cumsum(counts[start:]), CANDIDATES_AT_ONCE, "right")
+        stop = start + max(1, int(taken))
+        found += cells.near(queries[start:stop], first[:, start:stop], last[:, start:stop])
+        start = stop
     return found
+
+
+class _Cells:
+    """(m, 2) positions, sorted by the square cell that they lie in."""
+
+    def __init__(self, positions: Positions, within_m: float) -> None:
+        self.within_m = within_m
+        self.origin = positions.min(axis=0)
+        extent = float((positions.max(axis=0) - self.origin).max())
+        # A hair wider than the radius, lest rounding puts two neighbours two cells apart; and not
+        # so small that a cell's number overflows.
+        self.width = max(within_m * 1.000001, extent / 2**30, 1e-3)
+        cells = self._cell(positions)
+        self.columns = int(cells[:, 0].max()) + 1
+        self.rows = int(cells[:, 1].max()) + 3
+        keys = cells[:, 0] * self.rows + cells[:, 1] + 1
+        self.order = np.argsort(keys, kind="stable")
+        self.keys = keys[self.order]
+        self.positions = positions[self.order]
+
+    def _cell(self, positions: Positions) -> Indices:
+        cells: Indices = np.floor((positions - self.origin) / self.width).astype(np.int64)
+        return cells
+
+    def candidates(self, queries: Positions) -> tuple[Indices, Indices]:
+        """(3, n) from where to before where a query's nine cells lie in the sorted order: the three
+        of one column follow each other."""
+        cells = self._cell(queries)
+        # What is far outside has no neighbour, and its number must not overflow either.
+        columns = np.clip(cells[:, 0], -2, self.columns + 1) + np.array([[-1], [0], [1]])
+        low = np.clip(cells[:, 1], 0, self.rows - 1)
+        high = np.clip(cells[:, 1] + 2, 0, self.rows - 1)
+        first = np.searchsorted(self.keys, columns * self.rows + low, "left")
+        last = np.searchsorted(self.keys, columns * self.rows + high, "right")
+        return first, np.maximum(first, last)
+
+    def near(self, queries: Positions, first: Indices, last: Indices) -> list[Indices]:
+        counts = (last - first).ravel()
+        starts = np.cumsum(counts) - counts
+        place = np.repeat(first.ravel() - starts, counts) + np.arange(int(counts.sum()))
+        query = np.repeat(np.tile(np.arange(len(queries)), 3), counts)
+        away = queries[query] - self.positions[place]
+        # Squares, as the trees of published ground truths compare: a root would round once more.
+        near = away[:, 0] ** 2 + away[:, 1] ** 2 <= self.within_m**2
+        query, number = query[near], self.order[place[near]]
+        ordered = np.lexsort((number, query))
+        ends = np.cumsum(np.bincount(query, minlength=len(queries)))
+        return np.split(number[ordered], ends[:-1])
 
 
 def rank(queries: Descriptors, database: Descriptors, k: int) -> Indices:

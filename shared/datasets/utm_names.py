@@ -8,6 +8,7 @@ heading @ pitch @ roll @ height @ timestamp @ note @ .jpg`; only the first two a
 from __future__ import annotations
 
 import contextlib
+import math
 from dataclasses import dataclass
 from datetime import UTC, datetime
 
@@ -60,6 +61,46 @@ class PhotoName:
         return f"@{'@'.join(fields)}@{suffix}"
 
 
+@dataclass(frozen=True, slots=True)
+class Spot:
+    """Where a photo was taken, as its name says; None means "not said"."""
+
+    east: float
+    """metres"""
+    north: float
+    zone: str | None
+    """such as `32T`"""
+    latitude: float | None
+    """degrees"""
+    longitude: float | None
+    heading: float | None
+    """degrees clockwise from north, in [0, 360)"""
+    note: str
+    """free text; gsv_xs has the place and the city there"""
+
+
+def spot_of_name(name: str) -> Spot | None:
+    """What a file name of the convention says of its place; None for any other name.
+
+    `name` is that of the file alone: an `@` in a folder's name has no meaning. Raises
+    InvalidRequest (`bad_coordinates`).
+    """
+    position = position_of_name(name)
+    if position is None:
+        return None
+    parts = name.split("@")
+    parts += [""] * (FIELDS - len(parts))
+    number, letter, latitude, longitude = parts[3:7]
+    return Spot(
+        *position,
+        zone=f"{number}{letter}" if number and letter else None,
+        latitude=_number(latitude) if longitude else None,
+        longitude=_number(longitude) if latitude else None,
+        heading=None if (heading := _number(parts[9])) is None else heading % 360,
+        note=parts[14],
+    )
+
+
 def position_of_name(name: str) -> tuple[float, float] | None:
     """UTM east and north in metres as the name says them; None for any other name.
 
@@ -69,9 +110,12 @@ def position_of_name(name: str) -> tuple[float, float] | None:
     if len(parts) < 4 or parts[0]:
         return None
     try:
-        return float(parts[1]), float(parts[2])
+        east, north = float(parts[1]), float(parts[2])
+        if not math.isfinite(east + north):
+            raise ValueError(f"{parts[1]} and {parts[2]} are no metres")
     except ValueError as error:
         raise _bad_coordinates(name, error) from error
+    return east, north
 
 
 def fields_of_name(name: str, utm_zone: str | None) -> dict[str, str]:
@@ -105,6 +149,14 @@ def fields_of_name(name: str, utm_zone: str | None) -> dict[str, str]:
     if captured_at:
         fields["captured_at"] = captured_at.isoformat()
     return fields
+
+
+def _number(text: str) -> float | None:
+    try:
+        number = float(text)
+    except ValueError:
+        return None
+    return number if math.isfinite(number) else None
 
 
 def _degrees(east: float, north: float, number: int, letter: str) -> tuple[float, float]:

@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 import torch
@@ -248,3 +249,33 @@ def test_the_program_itself_describes(photos: list[Path], out: Path) -> None:
     assert ended.returncode == 0, ended.stderr
     assert "5 rows of 16 numbers" in ended.stdout.replace("\n", " ")
     assert np.load(out).shape == (5, 16)
+
+
+def test_h5_file_holds_hlocs_global_features_by_name(
+    photos: list[Path], out: Path, tmp_path: Path
+) -> None:
+    features = out.with_suffix(".h5")
+    run_json(*photos, "--out", features, "--root", tmp_path)
+    wanted = expected("test-tiny-avg", photos)
+    with h5py.File(features) as file:
+        assert set(file) == {photo.name for photo in photos}
+        for photo, row in zip(photos, wanted, strict=True):
+            found = file[photo.name]["global_descriptor"]
+            assert found.dtype == np.float32
+            np.testing.assert_allclose(found[()], row, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code"),
+    [
+        (["{photo}", "--out", "{out}.npy", "--root", "{folder}"], "options_contradict"),
+        (["{photo}", "--out", "{out}.h5", "--root", "{out}"], "bad_names"),
+        (["{photo}", "{photo}", "--out", "{out}.h5"], "bad_names"),
+    ],
+)
+def test_names_that_an_h5_file_can_not_hold_are_refused(
+    photos: list[Path], out: Path, tmp_path: Path, arguments: list[str], code: str
+) -> None:
+    said = {"photo": photos[0], "out": out.parent, "folder": tmp_path}
+    problem = run_json(*(argument.format(**said) for argument in arguments), code=1)
+    assert problem["code"] == code

@@ -46,7 +46,7 @@ def test_weights_that_fit_are_named_without_being_loaded(
     def load(*_arguments: object) -> None:
         raise AssertionError("the weights were loaded")
 
-    monkeypatch.setattr(dinov2, "_fill", load)
+    monkeypatch.setattr(dinov2, "fill", load)
     settings = settings_with(
         monkeypatch, DINO_MODEL="dinov2_vits14", DESC_LAYER="0", DINO_WEIGHTS=small
     )

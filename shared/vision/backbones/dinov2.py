@@ -38,6 +38,7 @@ from shared.vision.backbones.dinov2_weights import (
 PATCH = 14  # pixels
 GRID = 37  # patches along a side of the training's 518 x 518 photos
 INTERPOLATE_OFFSET = 0.1  # Meta's, against rounding of the output's size
+WITHOUT_MEMORY = torch.device("meta")
 MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # ImageNet
 
 
@@ -86,8 +87,8 @@ class Dinov2:
         self.facet: str | None = facet
         self.device = device
         file = open_weights(find_weights(size, weights), size)
-        self._vit = _outline(self._shape, layer, facet)
-        self.fingerprint = _fill(self._vit, file, self._shape, size, device)
+        self._vit = outline(self._shape, layer, facet)
+        self.fingerprint = fill(self._vit, file, self._shape, size, device)
         if facet != "token":
             _keep_one_third(self._vit.blocks[layer].attn, FACETS.index(facet))
         self.card: dict[str, Any] = {
@@ -134,7 +135,7 @@ def check_weights(
 ) -> None:
     """Misconfigured (`weights_unfit`) when loading would refuse the file; reads its index only."""
     shape = shape or SHAPES[size]
-    check_fit(file, _shapes(_outline(shape, layer, facet)), size, shape.registers)
+    check_fit(file, _shapes(outline(shape, layer, facet)), size, shape.registers)
 
 
 def resample_positions(
@@ -158,11 +159,20 @@ def resample_positions(
     return moved.permute(0, 2, 3, 1).flatten(1, 2)
 
 
-def _outline(shape: VitShape, layer: int, facet: str) -> Any:
-    """timm's network up to where the facet is known, without memory for its tensors."""
+def outline(
+    shape: VitShape,
+    layer: int,
+    facet: str,
+    *,
+    with_norm: bool = False,
+    device: torch.device = WITHOUT_MEMORY,
+) -> Any:
+    """timm's network up to where the facet is known, and to the norm after it on demand; without
+    memory for its tensors unless a device is given, where they are random.
+    """
     import timm  # takes seconds, which other extractors and commands need not pay
 
-    with torch.device("meta"):
+    with device:
         vit: Any = timm.create_model(
             shape.timm_name,
             pretrained=False,
@@ -174,7 +184,8 @@ def _outline(shape: VitShape, layer: int, facet: str) -> Any:
             img_size=GRID * PATCH,
             num_classes=0,
         )
-    vit.norm = Identity()
+    if not with_norm:
+        vit.norm = Identity()
     if facet != "token":
         last = vit.blocks[layer]
         last.ls1 = last.norm2 = last.mlp = last.ls2 = last.attn.proj = Identity()
@@ -190,15 +201,18 @@ def weights_fingerprint(size: str, layer: int, facet: str, file: WeightsFile) ->
 
     Misconfigured: `weights_unfit`.
     """
-    vit = _outline(SHAPES[size], layer, facet)
+    vit = outline(SHAPES[size], layer, facet)
     digest = hashlib.sha256()
     for name, tensor in _tensors(vit, file, SHAPES[size], size):
         _add(digest, name, tensor)
     return digest.hexdigest()
 
 
-def _fill(vit: Any, file: WeightsFile, shape: VitShape, size: str, device: torch.device) -> str:
-    """Give the outline its tensors; returns their sha256: name-sorted, as float32 bytes."""
+def fill(vit: Any, file: WeightsFile, shape: VitShape, size: str, device: torch.device) -> str:
+    """Give the outline its tensors; returns their sha256: name-sorted, as float32 bytes.
+
+    Misconfigured: `weights_unfit`.
+    """
     digest = hashlib.sha256()
     state = {}
     for name, tensor in _tensors(vit, file, shape, size):

@@ -31,8 +31,6 @@ class EfficientNetLite0:
     facet: str | None = None
 
     def __init__(self, device: torch.device) -> None:
-        import timm  # takes seconds, which other extractors and commands need not pay
-
         path = weights_path()
         data = path.read_bytes()
         self.fingerprint = hashlib.sha256(data).hexdigest()
@@ -41,11 +39,7 @@ class EfficientNetLite0:
             "file": path.name,
             "size_bytes": len(data),
         }
-        model = timm.create_model("tf_efficientnet_lite0", pretrained=False)
-        model.load_state_dict(
-            _in_order(torch.load(path, map_location="cpu", weights_only=True), model)
-        )
-        model.eval().requires_grad_(False)
+        model = published_network().eval().requires_grad_(False)
         self._trunk = torch.nn.Sequential(
             *_modules(model, "conv_stem", "bn1"), *_modules(model, "blocks")[0][:STRIDE_16_STAGES]
         ).to(device=device, memory_format=torch.channels_last)  # type: ignore[call-overload]
@@ -59,6 +53,17 @@ class EfficientNetLite0:
 
     def grid(self, height: int, width: int) -> tuple[int, int]:
         return math.ceil(height / STRIDE), math.ceil(width / STRIDE)
+
+
+def published_network() -> Any:
+    """timm's whole network with the package's weights; Misconfigured as `weights_path`, and
+    `weights_unfit`."""
+    import timm  # takes seconds, which other extractors and commands need not pay
+
+    model = timm.create_model("tf_efficientnet_lite0", pretrained=False)
+    state = torch.load(weights_path(), map_location="cpu", weights_only=True)
+    model.load_state_dict(_in_order(state, model))
+    return model
 
 
 def weights_path() -> Path:

@@ -68,7 +68,7 @@ def build_model(config: ModelConfig, *, weights: Path | None = None) -> PlaceMod
 
 
 def check_patches(backbone: StagedBackbone, height: int, width: int, config: ModelConfig) -> None:
-    side = backbone.patch_side()
+    side = backbone.patch
     if height % side or width % side:
         nearest = [max(1, round(length / side)) * side for length in (height, width)]
         raise Unprocessable(

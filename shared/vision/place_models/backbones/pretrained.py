@@ -41,10 +41,7 @@ def torchvision_network(name: str, pretrained: bool, weights: Path | None) -> An
 def find_torchvision_weights(name: str, url: str, given: Path | None) -> Path:
     """The file of the weights, downloaded to torch.hub's cache if need be."""
     if given is not None:
-        if not given.is_file():
-            what = "is not a file" if given.exists() else "does not exist"
-            raise _missing(name, url, f"{given} {what}.")
-        return given
+        return given_file(given, name)
     filename = url.rpartition("/")[2]
     cached = Path(torch.hub.get_dir(), "checkpoints", filename)
     if not cached.exists():
@@ -56,6 +53,17 @@ def find_torchvision_weights(name: str, url: str, given: Path | None) -> Path:
             reason = (str(error).strip() or type(error).__name__).splitlines()[0]
             raise _missing(name, url, f"{url} can't be downloaded: {reason}.") from error
     return cached
+
+
+def given_file(path: Path, name: str) -> Path:
+    """`path`, if it is a file; else Misconfigured (`weights_missing`)."""
+    if not path.is_file():
+        what = "is not a file" if path.exists() else "does not exist"
+        raise Misconfigured(
+            "weights_missing",
+            f"{path} {what}: it was named as the file of the pretrained weights of {name}.",
+        )
+    return path
 
 
 def read_tensors(path: Path, name: str) -> dict[str, torch.Tensor]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import torch
 from torch import nn
@@ -14,43 +14,54 @@ class Features(NamedTuple):
 
     maps: torch.Tensor
     """(B, C, h, w)."""
-    token: torch.Tensor | None
+    token: torch.Tensor | None = None
     """(B, C), a transformer's class token; None of networks that have none."""
 
 
 class StagedBackbone(nn.Module):
     """(B, 3, H, W) float32, normalised as for ImageNet -> Features."""
 
-    def __init__(self, stem: nn.Module, stages: Sequence[nn.Module]) -> None:
+    patch: ClassVar[int] = 1
+    """Height and width of a photo have to be multiples of so many pixels."""
+
+    def __init__(
+        self, stem: nn.Module, stages: Sequence[nn.Module], norm: nn.Module | None = None
+    ) -> None:
+        """`norm` comes after the last stage."""
         super().__init__()
         self.stem = stem
         self.stages = nn.ModuleList(stages)
+        self.norm = nn.Identity() if norm is None else norm
         self._frozen: list[nn.Module] = []
 
     def forward(self, photos: torch.Tensor) -> Features:
-        maps = self.stem(photos)
-        for stage in self.stages:
-            maps = stage(maps)
-        return Features(maps, None)
+        return Features(self._run(photos))
 
-    def patch_side(self) -> int:
-        """Photos are this many pixels, or a multiple of it, high and wide."""
-        return 1
+    def _run(self, photos: torch.Tensor) -> torch.Tensor:
+        found: torch.Tensor = self.stem(photos)
+        for stage in self.stages:
+            found = stage(found)
+        normed: torch.Tensor = self.norm(found)
+        return normed
 
     def crop(self, count: int) -> None:
         """Keep the first `count` stages."""
         self.stages = self.stages[:count]
 
     def freeze(self, count: int) -> None:
-        """Freeze the stem and the first `count` stages; nothing where `count` is negative.
+        """Freeze the stem and the first `count` stages, and with all of them what comes after;
+        nothing where `count` is negative.
 
         Frozen layers have no gradients, and stay in evaluation mode: their BatchNorms neither use
         nor gather a batch's statistics.
         """
-        self._frozen = [] if count < 0 else [self.stem, *self.stages[:count]]
+        if count < 0:
+            return
+        self._frozen = [self.stem, *self.stages[:count]]
+        if count >= len(self.stages):
+            self._frozen.append(self.norm)
         for module in self._frozen:
             module.requires_grad_(False)
-        self.train(self.training)
 
     def train(self, mode: bool = True) -> StagedBackbone:
         super().train(mode)

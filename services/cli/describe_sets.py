@@ -1,0 +1,173 @@
+"""What describes the photos of a data set: an extractor by name, or a checkpoint. Imports torch."""
+
+from __future__ import annotations
+
+import time
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from rich.progress import Progress
+
+from services.cli.describe_files import centres_of, own_vocabulary
+from services.cli.fit_folder import load_extractor, pixels_of
+from services.cli.photo_files import decoded_batches
+from services.trainer.evaluation.cache import CachedDescribe, Timed
+from services.trainer.evaluation.describe import Rows, photos_refused
+from services.trainer.evaluation.describe_model import DescribeModel
+from shared.errors import PlacewiseError
+from shared.recipes import Recipe
+from shared.settings import Settings
+from shared.vision.decode import DECODER
+from shared.vision.extractors import Extractor, choose_device, spec_fingerprint
+from shared.vision.fit_photos import fit_photos
+from shared.vision.passes import PhotoDoesNotFit
+from shared.vision.patches import choose_photos
+from shared.vision.place_models.checkpoint import load_checkpoint
+from shared.vision.vocabulary import Centres
+
+CACHE = "descriptors"
+FIT_PHOTOS = 1000  # as a map's fit learns from
+SEED = 0
+
+
+@dataclass(slots=True)
+class Describer:
+    """Photos to rows, with what a result says of it."""
+
+    name: str
+    describe: CachedDescribe
+    spec: dict[str, Any]
+    """everything that decides a row's value"""
+    about: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def fingerprint(self) -> str:
+        return spec_fingerprint(self.spec)
+
+
+class DescribeExtractor:
+    """An extractor's rows, by the decoding children of every upload."""
+
+    def __init__(self, extractor: Extractor, centres: Centres | None, settings: Settings) -> None:
+        self._extractor = extractor
+        self._centres = centres
+        self._settings = settings
+        self.seconds = 0.0
+        """spent in the network, of `photos`; they are read and decoded meanwhile"""
+        self.photos = 0
+
+    def __call__(self, photos: Sequence[Path]) -> Iterator[Rows]:
+        refused: list[tuple[Path, PlacewiseError]] = []
+        batches = decoded_batches(
+            photos, self._extractor.preprocessing, self._settings, defaultdict(float)
+        )
+        for batch in batches:
+            pixels = []
+            for photo, outcome in batch:
+                if isinstance(outcome, PlacewiseError):
+                    refused.append((photo, outcome))
+                else:
+                    pixels.append(outcome.pixels)
+            if refused or not pixels:  # after a refusal, the rest is read for what else is wrong
+                continue
+            begun = time.perf_counter()
+            try:
+                rows = self._extractor.describe(pixels, self._centres)
+            except PhotoDoesNotFit as error:
+                refused.append((batch[error.place][0], error))
+                continue
+            self.seconds += time.perf_counter() - begun
+            self.photos += len(rows)
+            yield rows
+        if refused:
+            raise photos_refused(refused, len(photos))
+
+
+def describer_of_checkpoint(
+    checkpoint: Path, image_size: str | tuple[int, int], settings: Settings
+) -> Describer:
+    """`image_size`: `same` as the model was built for, `native`, or (height, width)."""
+    loaded = load_checkpoint(checkpoint)
+    size = None if image_size == "native" else loaded.config.image_size
+    if not isinstance(image_size, str):
+        size = image_size
+    device = choose_device(settings.device)
+    describe = DescribeModel(
+        loaded.model.to(device),
+        device,
+        size,
+        batch_photos=settings.batch_photos if size else 1,
+        max_pixels=settings.max_image_pixels,
+    )
+    spec = {
+        "checkpoint": loaded.fingerprint,
+        "preprocessing": describe.preprocessing.as_spec(),
+        "decoder": DECODER,
+    }
+    about = {
+        "checkpoint": checkpoint.name,
+        "model": loaded.config.model_dump(mode="json"),
+        "image size": "native" if size is None else f"{size[0]} x {size[1]}",
+        "device": device.type,
+    }
+    about |= {name: loaded.about[name] for name in ("epoch",) if name in loaded.about}
+    return Describer(checkpoint.stem, _cached(describe, spec, settings), spec, about)
+
+
+def describer_of_extractor(
+    recipe: Recipe,
+    vocabulary: Path | None,
+    database: Sequence[Path],
+    settings: Settings,
+    progress: Progress,
+    *,
+    fit: bool = False,
+) -> Describer:
+    """VLAD takes the vocabulary of the file; with `fit`, or where none is given or shipped, one
+    that is learnt from the database's own photos, never from the queries."""
+    about: dict[str, Any] = {}
+    extractor = load_extractor(recipe, settings)
+    if recipe.needs_vocabulary and vocabulary is None and (fit or not recipe.shipped_vocabulary):
+        centres: Centres | None = _fitted(extractor, database, settings, progress)
+        about["vocabulary"] = "fitted on the database's photos"
+    else:
+        centres = centres_of(extractor, own_vocabulary(recipe, vocabulary))
+        if centres is not None:
+            about["vocabulary"] = vocabulary.name if vocabulary else "the shipped one"
+    spec = extractor.spec(centres)
+    describe = DescribeExtractor(extractor, centres, settings)
+    about |= {"precision": extractor.precision, "device": extractor.backbone.device.type}
+    return Describer(recipe.name, _cached(describe, spec, settings), spec, about)
+
+
+def _fitted(
+    extractor: Extractor, database: Sequence[Path], settings: Settings, progress: Progress
+) -> Centres:
+    chosen = choose_photos(len(database), FIT_PHOTOS, extractor.backbone.width, SEED)
+    photos = [database[number] for number in chosen]
+    bars = {name: progress.add_task(name, total=None) for name in ("vocabulary", "clustering")}
+    names = {"describing": "vocabulary", "clustering": "clustering"}
+    refused: list[dict[str, str]] = []
+    fitted = fit_photos(
+        extractor,
+        pixels_of(photos, extractor, settings, refused),
+        len(photos),
+        clusters=extractor.recipe.clusters,
+        seed=SEED,
+        told=lambda what, done, most: progress.update(
+            bars[names[what]], completed=done, total=most
+        ),
+    )
+    return fitted.centres
+
+
+def _cached(describe: Timed, spec: dict[str, Any], settings: Settings) -> CachedDescribe:
+    return CachedDescribe(
+        describe,
+        settings.placewise_home / CACHE,
+        spec,
+        most_bytes=settings.descriptor_cache_bytes,
+    )

@@ -1,0 +1,1 @@
+"""One HTML file for a run: nothing in it is fetched from anywhere."""

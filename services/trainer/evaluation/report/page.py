@@ -1,0 +1,164 @@
+"""The page itself: one HTML text with its styles, charts and photos in it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from html import escape
+from typing import Any
+
+from services.trainer.evaluation.bootstrap import Interval
+from services.trainer.evaluation.report.curves import distance_chart, precision_chart, recall_chart
+from services.trainer.evaluation.report.differences import differences
+from services.trainer.evaluation.report.grids import grids
+from services.trainer.evaluation.report.positions import positions_chart
+from services.trainer.evaluation.report.style import STYLE
+from services.trainer.evaluation.result import Result, Run
+from services.trainer.evaluation.write import versions
+
+
+def page(
+    run: Run, results: Sequence[Result], *, grids_shown: int = 12, only_wrong: bool = False
+) -> str:
+    """The report of a run; at most `grids_shown` queries of a kind are shown with their photos."""
+    title = f"Evaluation of {run.name}"
+    about = {"model": run.name, "fingerprint": run.fingerprint or "not known", **run.about}
+    made_with = ", ".join(f"{name} {number}" for name, number in versions().items())
+    sections = "".join(_section(one, grids_shown, only_wrong) for one in results)
+    return (
+        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>{escape(title)}</title><style>{STYLE}</style></head><body>"
+        f"<h1>{escape(title)}</h1>{_facts(about)}"
+        f'<p class="note">Made with {escape(made_with)}.</p>{sections}</body></html>\n'
+    )
+
+
+def _section(result: Result, grids_shown: int, only_wrong: bool) -> str:
+    asked = result.asked
+    facts = {
+        "database": f"{len(asked.database)} photos" if asked.database else "not listed",
+        "queries": f"{len(asked.queries)}, of which {result.measured.recalls.without_positive} "
+        "have no right photo in the database",
+        "right is": asked.rule,
+        "protocol": asked.protocol,
+        "fingerprint": asked.fingerprint,
+    }
+    parts = [f"<h2>{escape(asked.name)}</h2>", _facts(facts), _figures(result)]
+    parts.append(_published(result))
+    charts = [recall_chart(result), precision_chart(result), distance_chart(result)]
+    drawn = "".join(f"<figure>{chart}</figure>" for chart in charts if chart)
+    parts.append(f'<div class="charts">{drawn}</div>')
+    if result.against:
+        parts.append(differences(result, result.against, grids_shown))
+    if (positions := positions_chart(result)) is not None:
+        drawn, said = positions
+        parts.append(
+            f"<h3>Map</h3><figure>{drawn}<figcaption>{escape(said)}. Each query is joined with its "
+            "first match: green where that is right, red where not. Grey: the database."
+            "</figcaption></figure>"
+        )
+    parts.append(_audit(result))
+    for heading, table in grids(result, grids_shown, only_wrong=only_wrong):
+        parts.append(f"<h3>{escape(heading)}</h3>{table}")
+    return f"<section>{''.join(parts)}</section>"
+
+
+def _figures(result: Result) -> str:
+    measured = result.measured
+    kind = measured.clusters.kind
+    rows = []
+    for place, (k, share) in enumerate(measured.recalls.of_all.items()):
+        own = measured.recall_intervals
+        other = measured.findable_intervals
+        rows.append(
+            (
+                f"R@{k}",
+                _share(share, own[place] if own else None),
+                _share(measured.recalls.of_findable[k], other[place] if other else None),
+            )
+        )
+    rows.append(
+        (
+            f"mAP@{measured.depth}",
+            "",
+            _share(measured.mean_average_precision, measured.map_interval),
+        )
+    )
+    body = "".join(
+        f'<tr><th>{name}</th><td class="n">{a}</td><td class="n">{b}</td></tr>'
+        for name, a, b in rows
+    )
+    said = (
+        f"95 % intervals: a bootstrap over {measured.clusters.count} {kind}."
+        if measured.recall_intervals
+        else "Too few queries for intervals."
+    )
+    return (
+        "<table><tr><th></th><th>of all queries</th><th>of those with a right photo</th></tr>"
+        f'{body}</table><p class="note">{escape(said)}</p>{_facts(_further(result))}'
+    )
+
+
+def _further(result: Result) -> dict[str, Any]:
+    measured, said = result.measured, dict[str, Any]()
+    if (found := measured.calibration) is not None:
+        said["AUROC of the first score"] = _number(found.auroc)
+        said["calibration error (ECE)"] = _number(found.calibration_error)
+        said["recall at 99 % precision"] = f"{found.recall_at_99_precision:.1%}"
+    if measured.curve is not None:
+        said["area under precision and recall"] = f"{measured.curve.area:.3f}"
+    return said | {name.replace("_", " "): value for name, value in result.about.items()}
+
+
+def _published(result: Result) -> str:
+    if not result.published:
+        return (
+            '<p class="note">No published figure is shown beside these: none is known that was '
+            "measured on a set of this protocol and fingerprint.</p>"
+        )
+    rows = "".join(
+        f"<tr><th>{escape(one.method)}</th><td>"
+        + ", ".join(f"R@{k} {share:.1%}" for k, share in one.recall.items())
+        + f"</td><td>{escape(one.source)}</td></tr>"
+        for one in result.published
+    )
+    return f"<h3>Published on the same set</h3><table>{rows}</table>"
+
+
+def _audit(result: Result) -> str:
+    if result.audit is None:
+        return ""
+    if not result.audit:
+        return "<h3>Audit</h3><p>No sure match lies just outside of the rule.</p>"
+    rows = "".join(
+        "<tr>" + "".join(f"<td>{escape(str(value))}</td>" for value in entry.values()) + "</tr>"
+        for entry in result.audit[:50]
+    )
+    heads = "".join(f"<th>{escape(name.replace('_', ' '))}</th>" for name in result.audit[0])
+    return (
+        "<h3>Audit</h3><p>Sure matches that count as wrong but lie just outside of the rule: look "
+        f"at them before you believe the figures. {len(result.audit)} in all.</p>"
+        f'<div class="wide"><table><tr>{heads}</tr>{rows}</table></div>'
+    )
+
+
+def _facts(facts: dict[str, Any]) -> str:
+    rows = "".join(
+        f"<tr><th>{escape(name)}</th><td><code>{escape(str(value))}</code></td></tr>"
+        for name, value in facts.items()
+        if value is not None
+    )
+    return f"<table>{rows}</table>" if rows else ""
+
+
+def _share(share: float, interval: Interval | None) -> str:
+    if math.isnan(share):  # no query to take it of
+        return "-"
+    if interval is None:
+        return f"{share:.1%}"
+    return f"{share:.1%} ({100 * interval.low:.1f} to {100 * interval.high:.1f})"
+
+
+def _number(value: float | None) -> str:
+    return "not known" if value is None else f"{value:.3f}"

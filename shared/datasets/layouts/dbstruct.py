@@ -1,0 +1,79 @@
+"""NetVLAD's `dbStruct` in a MATLAB file: how Pitts30k and Pitts250k are published.
+
+Its fields, in their order: whichSet, database names, database UTM, query names, query UTM, two
+counts, the radius in metres. (Arandjelovic et al., NetVLAD, 2016; its Pittsburgh files)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from shared.datasets.layouts.layout import PLACEWISE, Listed
+from shared.datasets.shots import Shot
+from shared.errors import InvalidRequest, Misconfigured
+
+FIELDS = 8
+"""from whichSet to posDistThr; what follows is not needed"""
+DATABASE_FOLDERS = (".", "images", "database", "..")
+QUERY_FOLDERS = ("queries_real", ".", "images", "queries", "../queries_real", "..")
+
+
+class DbStruct:
+    name = "dbStruct .mat"
+    protocols = (PLACEWISE,)
+
+    def sets(self, base: Path, prefix: str) -> Mapping[str, str]:
+        return {path.stem: path.name for path in sorted(base.glob("*.mat"))}
+
+    def open(self, base: Path, key: str, protocol: str) -> Listed:
+        path = base / key
+        fields = list(_struct(path).values())
+        if len(fields) < FIELDS:
+            raise _bad(path, f"its dbStruct has {len(fields)} fields, at least {FIELDS} are needed")
+        try:
+            radius = float(fields[7])
+            database = _shots(base, DATABASE_FOLDERS, fields[1], fields[2])
+            queries = _shots(base, QUERY_FOLDERS, fields[3], fields[4])
+        except (TypeError, ValueError) as error:
+            raise _bad(path, str(error)) from error
+        return Listed(database, queries, f"radius {radius:g} m")
+
+
+def _struct(path: Path) -> dict[str, Any]:
+    try:
+        from scipy.io import loadmat
+    except ImportError as error:
+        raise Misconfigured(
+            "trainer_missing",
+            f"{path} can only be read with SciPy, which is not installed: "
+            "pip install 'placewise[trainer]'.",
+        ) from error
+    try:
+        found = loadmat(path, simplify_cells=True).get("dbStruct")
+    except (OSError, ValueError, TypeError, NotImplementedError) as error:
+        raise _bad(path, str(error)) from error
+    if not isinstance(found, dict):
+        raise _bad(path, "it has no dbStruct")
+    return found
+
+
+def _shots(base: Path, folders: Sequence[str], names: Any, utm: Any) -> tuple[Shot, ...]:
+    listed = [str(name) for name in np.atleast_1d(names).tolist()]
+    metres = np.asarray(utm, np.float64).reshape(2, -1)
+    if metres.shape[1] != len(listed):
+        raise ValueError(f"{len(listed)} names have {metres.shape[1]} positions")
+    folder = next(
+        (base / name for name in folders if listed and (base / name / listed[0]).is_file()), base
+    )
+    return tuple(
+        Shot(folder / name, name, easting=east, northing=north)
+        for name, (east, north) in zip(listed, metres.T.tolist(), strict=True)
+    )
+
+
+def _bad(path: Path, fault: str) -> InvalidRequest:
+    return InvalidRequest("bad_dbstruct", f"{path} can't be read as a dbStruct: {fault}.")

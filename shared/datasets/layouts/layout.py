@@ -1,0 +1,89 @@
+"""What each layout can do: tell its folders from others, and read them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+from shared.datasets.shots import Indices, Shot, TrainingSet
+from shared.errors import NotFound
+from shared.photo_formats import PHOTO_SUFFIXES
+
+PLACEWISE = "placewise"
+"""The protocol of a set that is taken as it lies there: all photos, all queries, safe over zones"""
+RADIUS = "radius 25 m"
+"""The rule of nearly all published figures."""
+
+
+@dataclass(frozen=True, slots=True)
+class Listed:
+    """An evaluation set as its layout lists it, before a rule has found positives."""
+
+    database: tuple[Shot, ...]
+    queries: tuple[Shot, ...]
+    rule: str = RADIUS
+    """The rule that this set is measured by when none is asked for."""
+    positives: tuple[Indices, ...] | None = None
+    """By that rule, of a set that brings its own ground truth."""
+    drops_queries: bool = False
+    """Whether the protocol leaves queries without positives out."""
+
+
+class TrainingLayout(Protocol):
+    """Places to learn from. `base` is a folder that `recognises` has said yes to."""
+
+    @property
+    def name(self) -> str: ...
+
+    def recognises(self, base: Path) -> bool: ...
+
+    def cities(self, base: Path) -> tuple[str, ...]:
+        """In order of their names."""
+        ...
+
+    def open(self, base: Path, cities: Sequence[str] | None, min_photos: int) -> TrainingSet:
+        """The cities in the order asked; all of them when None."""
+        ...
+
+
+class EvaluationLayout(Protocol):
+    """Sets of database photos and queries."""
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def protocols(self) -> tuple[str, ...]:
+        """The first is taken when none is asked for."""
+        ...
+
+    def sets(self, base: Path, prefix: str) -> Mapping[str, str]:
+        """What `open` takes, by the name of each set in `base`; {} for a folder of another layout.
+
+        `prefix` begins the names of sets that have none of their own.
+        """
+        ...
+
+    def open(self, base: Path, key: str, protocol: str) -> Listed: ...
+
+
+def photos_below(folder: Path) -> list[Path]:
+    """Every photo below the folder, hidden ones left out, in the order of the paths' parts."""
+    return sorted(
+        path
+        for path in folder.rglob("*")
+        if path.suffix.lower() in PHOTO_SUFFIXES and not path.name.startswith(".")
+    )
+
+
+def missing_city(base: Path, missing: Iterable[str], there: Sequence[str]) -> NotFound:
+    """The error that names the cities which are not there, and those which are."""
+    return NotFound(
+        "city_missing",
+        f"{base} has no city {', '.join(missing)}. There are: {', '.join(there) or 'none'}. "
+        "Name some of these, or download the missing ones.",
+        missing=list(missing),
+        there=list(there),
+    )

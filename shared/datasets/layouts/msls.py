@@ -1,0 +1,140 @@
+"""Mapillary Street-level Sequences: `train_val/CITY/{query,database}/` with their tables.
+
+Its validation cities are measured in two ways, whose figures differ by points:
+
+- `msls-official`: both cities pooled, no panoramas, photos of the subtask `all`, metres of
+  `postprocessed.csv`, queries without a positive within 25 m left out. On the published data set
+  that is 740 queries and 18,871 database photos. (github.com/mapillary/mapillary_sls)
+- `vme`: all photos that are no panoramas, metres from latitude and longitude, cut to centimetres,
+  and all queries. (VPR-datasets-downloader, VPR-methods-evaluation)
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import utm
+
+from shared.datasets.layouts.layout import RADIUS, Listed, missing_city
+from shared.datasets.layouts.tables import bad_row, number, read_table, whole_number
+from shared.datasets.shots import Shot
+from shared.errors import InvalidRequest
+
+OFFICIAL = "msls-official"
+VME = "vme"
+CITIES = ("cph", "sf")
+"""of the validation, in the order in which both protocols pool them"""
+SET = "msls_val"
+Row = tuple[int, dict[str, str]]
+
+
+class Msls:
+    name = "Mapillary Street-level Sequences"
+    protocols = (OFFICIAL, VME)
+
+    def sets(self, base: Path, prefix: str) -> Mapping[str, str]:
+        for key in (".", "train_val"):
+            if any((base / key / city / "query" / "raw.csv").is_file() for city in CITIES):
+                return {SET: key}
+        return {}
+
+    def open(self, base: Path, key: str, protocol: str) -> Listed:
+        folder = base / key
+        missing = [city for city in CITIES if not (folder / city).is_dir()]
+        if missing:
+            there = sorted(path.name for path in folder.iterdir() if path.is_dir())
+            raise missing_city(folder, missing, there)
+        database, queries = (
+            tuple(shot for city in CITIES for shot in _shots(base, folder / city / part, protocol))
+            for part in ("database", "query")
+        )
+        return Listed(database, queries, RADIUS, drops_queries=protocol == OFFICIAL)
+
+
+def _shots(base: Path, folder: Path, protocol: str) -> Iterator[Shot]:
+    raw = folder / "raw.csv"
+    rows = list(read_table(raw, ("key", "lon", "lat", "ca", "pano")))
+    beside: dict[str, tuple[str, ...]] = {
+        "postprocessed.csv": ("key", "easting", "northing"),
+        "seq_info.csv": ("key", "sequence_key", "frame_number"),
+    }
+    if protocol == OFFICIAL:
+        beside["subtask_index.csv"] = ("all",)
+    tables = {name: _as_long(folder / name, needed, rows) for name, needed in beside.items()}
+    zone = _zone(raw, rows[0]) if rows else ""
+    for index, (line, row) in enumerate(rows):
+        if _truth(raw, line, row, "pano"):
+            continue
+        if protocol == OFFICIAL:
+            table = folder / "subtask_index.csv"
+            if not _truth(table, *tables[table.name][index], "all"):
+                continue
+        yield _shot(
+            base, folder, (line, row), {k: v[index] for k, v in tables.items()}, protocol, zone
+        )
+
+
+def _shot(
+    base: Path, folder: Path, raw: Row, beside: Mapping[str, Row], protocol: str, zone: str
+) -> Shot:
+    table = folder / "raw.csv"
+    latitude, longitude = number(table, *raw, "lat"), number(table, *raw, "lon")
+    if protocol == OFFICIAL:
+        metres = folder / "postprocessed.csv"
+        easting, northing = (
+            number(metres, *beside[metres.name], column) for column in ("easting", "northing")
+        )
+        said_zone: str | None = zone
+    else:
+        easting, northing = (_cut(value) for value in utm.from_latlon(latitude, longitude)[:2])
+        said_zone = None
+    path = folder / "images" / f"{raw[1]['key']}.jpg"
+    sequence = folder / "seq_info.csv"
+    return Shot(
+        path,
+        path.relative_to(base).as_posix(),
+        easting=easting,
+        northing=northing,
+        zone=said_zone,
+        latitude=latitude,
+        longitude=longitude,
+        heading=number(table, *raw, "ca") % 360 if raw[1]["ca"] else None,
+        frame=whole_number(sequence, *beside[sequence.name], "frame_number"),
+        sequence=beside[sequence.name][1]["sequence_key"],
+    )
+
+
+def _as_long(path: Path, needed: tuple[str, ...], rows: list[Row]) -> list[Row]:
+    """The table, whose rows are those of raw.csv one by one."""
+    found = list(read_table(path, needed))
+    if len(found) != len(rows):
+        raise InvalidRequest(
+            "bad_table",
+            f"{path} has {len(found)} rows, and raw.csv beside it {len(rows)}: they are of "
+            "different versions of the data set.",
+        )
+    for (line, row), (_, other) in zip(found, rows, strict=True):
+        if "key" in row and row["key"] != other["key"]:
+            raise bad_row(path, line, f"its photo is {row['key']}, raw.csv's is {other['key']}")
+    return found
+
+
+def _truth(path: Path, line: int, row: dict[str, str], column: str) -> bool:
+    values = {"true": True, "false": False, "1": True, "0": False}
+    try:
+        return values[row[column].lower()]
+    except KeyError:
+        raise bad_row(path, line, f"{column} {row[column]!r} is neither True nor False") from None
+
+
+def _zone(path: Path, first: Row) -> str:
+    """A city's metres are of one zone, that of its first photo."""
+    latitude, longitude = number(path, *first, "lat"), number(path, *first, "lon")
+    zone = utm.latlon_to_zone_number(latitude, longitude)
+    return f"{zone:02d}{utm.latitude_to_zone_letter(latitude)}"
+
+
+def _cut(metres: float) -> float:
+    return math.floor(float(metres) * 100) / 100

@@ -1,0 +1,65 @@
+"""Photos on disk as shots: by their file names, and by EXIF where names say nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+from shared.datasets.shots import Shot
+from shared.datasets.utm_names import spot_of_name
+from shared.errors import Unprocessable
+from shared.intake.photo_header import read_photo_header
+
+NO_LIMIT = 2**62  # of pixels: only the header is read here
+
+
+def shot_of(path: Path, name: str, place: str | None = None) -> Shot:
+    """By an `@UTM@` file name; a photo of another name has no position.
+
+    Raises InvalidRequest (`bad_coordinates`).
+    """
+    spot = spot_of_name(path.name)
+    if spot is None:
+        return Shot(path, name, place=place)
+    return Shot(
+        path,
+        name,
+        easting=spot.east,
+        northing=spot.north,
+        zone=spot.zone,
+        latitude=spot.latitude,
+        longitude=spot.longitude,
+        heading=spot.heading,
+        place=place,
+    )
+
+
+def located_by_exif(
+    shots: Iterable[Shot], done: Callable[[int], None] = lambda count: None
+) -> list[Shot]:
+    """The shots, those without a position with what EXIF says; a photo that has none, or that can't
+    be read, stays without."""
+    located = []
+    for shot in shots:
+        located.append(shot if shot.easting is not None else _by_exif(shot))
+        done(1)
+    return located
+
+
+def _by_exif(shot: Shot) -> Shot:
+    try:
+        with shot.path.open("rb") as file:
+            header = read_photo_header(file, NO_LIMIT)
+    except (OSError, Unprocessable):
+        # Whoever decodes it says so; here it is a photo of which nothing is known.
+        return shot
+    return Shot(
+        shot.path,
+        shot.name,
+        latitude=header.latitude,
+        longitude=header.longitude,
+        heading=header.heading,
+        place=shot.place,
+        frame=shot.frame,
+        sequence=shot.sequence,
+    )

@@ -1,0 +1,150 @@
+"""What a data set is, once it has been read: photos, where they were taken, what shows what.
+
+Every layout (`shared/datasets/layouts`) becomes these types, and whatever trains, evaluates or
+reports takes nothing else. `shared/datasets/sets.py` opens them.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+Indices = NDArray[np.int64]
+
+NO_FILE = -1
+"""the size that a fingerprint takes for a photo that is not there"""
+
+
+@dataclass(frozen=True, slots=True)
+class Shot:
+    """One photo of a set. None means "not said"."""
+
+    path: Path
+    """To open it."""
+    name: str
+    """As the set names it, relative and separated by `/`: what predictions and reports say."""
+    easting: float | None = None
+    """metres, UTM"""
+    northing: float | None = None
+    zone: str | None = None
+    """UTM zone, such as `32T`"""
+    latitude: float | None = None
+    """degrees, WGS 84"""
+    longitude: float | None = None
+    heading: float | None = None
+    """degrees clockwise from north, in [0, 360)"""
+    place: str | None = None
+    frame: int | None = None
+    """number along its sequence or traverse"""
+    sequence: str | None = None
+
+
+@dataclass(frozen=True)
+class EvaluationSet:
+    """Database photos, queries, and which database photos are right for each query."""
+
+    name: str
+    root: Path
+    database: tuple[Shot, ...]
+    queries: tuple[Shot, ...]
+    positives: tuple[Indices, ...]
+    """Ascending database indices, of each query; empty where it has none."""
+    rule: str
+    """Who is a positive, in words such as `radius 25 m`."""
+    protocol: str
+    """How the set was put together: `placewise`, `msls-official`, `vme`."""
+
+    def __post_init__(self) -> None:
+        if len(self.positives) != len(self.queries):
+            raise ValueError(f"{len(self.positives)} positives for {len(self.queries)} queries")
+
+    @property
+    def without_positives(self) -> Indices:
+        """Ascending indices of the queries that no database photo is right for."""
+        empty = [number for number, found in enumerate(self.positives) if not len(found)]
+        return np.array(empty, np.int64)
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """sha256 over names and sizes in bytes of all photos, positives and protocol.
+
+        Two results are comparable only where it is the same. It takes one look at each file; a
+        file that is not there counts as of size NO_FILE.
+        """
+        digest = hashlib.sha256()
+        for text in ("evaluation", self.protocol):
+            _add(digest, text)
+        for role, shots in (("database", self.database), ("queries", self.queries)):
+            _add(digest, f"{role} {len(shots)}")
+            for shot in shots:
+                _add(digest, f"{shot.name} {_size(shot.path)}")
+        for found in self.positives:
+            _add(digest, " ".join(map(str, found.tolist())))
+        return digest.hexdigest()
+
+
+@dataclass(frozen=True, slots=True)
+class TrainingPlace:
+    """Photos that show one place."""
+
+    place_id: int
+    """unique over the cities of its set"""
+    city: str
+    photos: tuple[Path, ...]
+
+
+@dataclass(frozen=True)
+class TrainingSet:
+    """Places to learn from, city after city."""
+
+    name: str
+    root: Path
+    layout: str
+    places: tuple[TrainingPlace, ...]
+
+    @property
+    def cities(self) -> tuple[str, ...]:
+        """In the order of their places."""
+        return tuple(dict.fromkeys(place.city for place in self.places))
+
+    @property
+    def photo_count(self) -> int:
+        return sum(len(place.photos) for place in self.places)
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """sha256 over cities, place numbers and photo names in their order, not over sizes: half
+        a million photos on a disk far away would take minutes."""
+        digest = hashlib.sha256()
+        _add(digest, "training")
+        for place in self.places:
+            _add(digest, f"{place.city} {place.place_id} {len(place.photos)}")
+            for photo in place.photos:
+                _add(digest, photo.name)
+        return digest.hexdigest()
+
+
+def list_fingerprint(names: Iterable[str]) -> str:
+    """sha256 over the names of a list in their order: what a ground truth is true of."""
+    digest = hashlib.sha256()
+    for name in names:
+        _add(digest, name)
+    return digest.hexdigest()
+
+
+def _add(digest: hashlib._Hash, text: str) -> None:
+    # A name may hold any character but NUL, so that NUL ends it beyond doubt.
+    digest.update(text.encode("utf-8", "surrogateescape") + b"\0")
+
+
+def _size(path: Path) -> int:
+    try:
+        return path.stat().st_size
+    except OSError:
+        return NO_FILE

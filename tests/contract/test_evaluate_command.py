@@ -1,0 +1,293 @@
+"""`placewise evaluate` and `compare` on data sets: described, ranked, written, reported."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+import xml.etree.ElementTree as ET
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from typer.testing import CliRunner
+
+from services.cli.describe_sets import DescribeExtractor
+from services.cli.main import tree
+from services.trainer.evaluation.describe_model import DescribeModel
+from shared.datasets.city.plan import CityOptions, make_plan
+from shared.datasets.city.write import write_city
+from shared.datasets.recall import rank, recall_at
+from shared.datasets.sets import EvaluationSet, open_evaluation_set
+from shared.recipes import get_recipe
+from shared.vision.decode import decode
+from shared.vision.extractors import Extractor
+from shared.vision.place_models.checkpoint import checkpoint_state
+from shared.vision.place_models.config import ModelConfig
+from shared.vision.place_models.model import build_model
+
+CPU = torch.device("cpu")
+
+
+@pytest.fixture(autouse=True)
+def _small(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DECODE_PROCESSES", "1")
+    monkeypatch.setenv("BATCH_PHOTOS", "4")
+    monkeypatch.setenv("DEVICE", "cpu")
+
+
+@pytest.fixture(scope="session")
+def city(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Ten photos of five places, and six queries, one of them outside of the map."""
+    out = tmp_path_factory.mktemp("city") / "town"
+    options = CityOptions(5, 2, 6, 0, 0, 0.17, 64, 64, False)
+    write_city(make_plan(options), out)
+    return out
+
+
+@pytest.fixture(scope="session")
+def town(city: Path) -> EvaluationSet:
+    return open_evaluation_set(city)
+
+
+@pytest.fixture(scope="session")
+def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """ResNet-18's first two stages and GeM, with random weights."""
+    torch.manual_seed(0)
+    config = ModelConfig(
+        pretrained=False, layers_to_crop=(3, 4), agg_arch="GeM", image_size=(48, 64)
+    )
+    path = tmp_path_factory.mktemp("trained") / "gem.ckpt"
+    torch.save(checkpoint_state(build_model(config)), path)
+    return path
+
+
+def run(*arguments: object, code: int = 0) -> str:
+    command = str(arguments[0])
+    result = CliRunner().invoke(tree([command]), list(map(str, arguments)))
+    assert result.exit_code == code, result.output
+    return result.stdout
+
+
+def run_json(*arguments: object, code: int = 0) -> dict[str, Any]:
+    answer: dict[str, Any] = json.loads(run(*arguments, "--json", code=code))
+    return answer
+
+
+def rows_of(shots: Any) -> np.ndarray[Any, np.dtype[np.float32]]:
+    made = Extractor(get_recipe("test-tiny-avg", allow_test_extractors=True), CPU)
+    pixels = [decode(shot.path.read_bytes(), made.preprocessing, 10**9).pixels for shot in shots]
+    return made.describe(pixels, None)
+
+
+def forbid(*_: object) -> None:
+    raise AssertionError("described again")
+
+
+def test_extractor_is_evaluated_and_everything_is_written(
+    city: Path, town: EvaluationSet, tmp_path: Path
+) -> None:
+    out, pairs = tmp_path / "out", tmp_path / "pairs.txt"
+    given = ["--data", city, "--extractor", "test-tiny-avg"]
+    answer = run_json("evaluate", *given, "--out", out, "--pairs", pairs, "--depth", 7)
+    ranked = rank(rows_of(town.queries), rows_of(town.database), 7)
+    assert answer["recall"] == {
+        str(k): pytest.approx(share)
+        for k, share in recall_at(ranked, town.positives, (1, 5)).items()
+    }
+    assert answer["fingerprint"] == town.fingerprint
+    assert (answer["rule"], answer["protocol"]) == ("radius 25 m", "placewise")
+    assert (answer["dimension"], answer["bytes_a_photo"]) == (16, 64)
+    assert answer["describe_ms_a_photo"] > 0
+    assert answer["published"] == []
+    assert {"placewise", "numpy", "torch"} <= set(answer["versions"])
+    assert answer["run"]["fingerprint"]
+
+    assert np.load(out / "predictions_town.npy").tolist() == ranked.tolist()
+    with (out / "predictions_town.csv").open() as file:
+        lines = list(csv.DictReader(file))
+    assert len(lines) == 6 * 7
+    first, best = lines[0], town.database[int(ranked[0, 0])]
+    query = town.queries[0]
+    assert (first["query"], first["rank"], first["match"]) == (query.name, "1", best.name)
+    assert query.easting is not None
+    assert query.northing is not None
+    assert best.easting is not None
+    assert best.northing is not None
+    metres = np.hypot(query.easting - best.easting, query.northing - best.northing)
+    assert float(first["metres"]) == pytest.approx(metres, abs=0.01)
+    assert first["correct"] == ("true" if metres <= 25 else "false")
+    assert pairs.read_text().splitlines()[0] == f"{query.name} {best.name}"
+    assert (
+        json.loads((out / "metrics.json").read_text())["sets"]["town"]["recall"] == answer["recall"]
+    )
+
+
+class _Page(HTMLParser):
+    """Addresses that a page would fetch, and its pictures by their frames."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.fetched: list[str] = []
+        self.framed: list[str] = []
+
+    def handle_starttag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
+        for name, value in attributes:
+            if name in ("src", "href") and not (value or "").startswith("data:image/jpeg;base64,"):
+                self.fetched.append(value or "")
+            if tag == "img" and name == "class":
+                self.framed.append(value or "")
+
+
+def test_report_is_one_file_that_fetches_nothing(
+    city: Path, town: EvaluationSet, tmp_path: Path
+) -> None:
+    run_json("evaluate", "--data", city, "--extractor", "test-tiny-avg", "--out", tmp_path / "out")
+    text = (tmp_path / "out" / "report.html").read_text()
+    page = _Page()
+    page.feed(text)
+    assert page.fetched == []
+    ranked = rank(rows_of(town.queries), rows_of(town.database), 5)
+    right = sum(int(np.isin(r, p).sum()) for r, p in zip(ranked, town.positives, strict=True))
+    assert page.framed.count("query") == 6
+    assert page.framed.count("right") == right
+    assert page.framed.count("wrong") == 6 * 5 - right
+    drawings = re.findall(r"<svg.*?</svg>", text, re.DOTALL)
+    assert len(drawings) == 4, "recall, precision, distance and the map"
+    for drawing in drawings:
+        ET.fromstring(drawing)
+    assert town.fingerprint in text
+    assert "No published figure is shown beside these" in text
+
+
+def test_only_wrong_leaves_right_queries_out_of_the_report(city: Path, tmp_path: Path) -> None:
+    given = ["--data", city, "--extractor", "test-tiny-avg", "--out", tmp_path]
+    recall = run_json("evaluate", *given, "--only-wrong")["recall"]["1"]
+    assert 0 < recall < 1, "the test needs both kinds"
+    page = _Page()
+    page.feed((tmp_path / "report.html").read_text())
+    assert page.framed.count("query") == round(6 * (1 - recall))
+
+
+def test_second_run_describes_nothing_again(
+    city: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given = ["evaluate", "--data", city, "--extractor", "test-tiny-avg"]
+    before = run_json(*given, "--out", tmp_path / "before")
+    monkeypatch.setattr(DescribeExtractor, "__call__", forbid)
+    after = run_json(*given, "--against", tmp_path / "before")
+    assert after["recall"] == before["recall"]
+    assert after["describe_ms_a_photo"] == before["describe_ms_a_photo"]
+    assert (after["against"]["won"], after["against"]["lost"]) == ([], [])
+
+
+def test_checkpoint_is_evaluated_at_the_size_it_was_trained_for(
+    city: Path, town: EvaluationSet, checkpoint: Path
+) -> None:
+    answer = run_json("evaluate", "--data", city, "--checkpoint", checkpoint)
+    assert answer["run"]["image size"] == "48 x 64"
+    assert answer["dimension"] == 128
+    model = build_model(
+        ModelConfig(pretrained=False, layers_to_crop=(3, 4), agg_arch="GeM", image_size=(48, 64))
+    )
+    stored = torch.load(checkpoint, weights_only=True)["state_dict"]
+    model.load_state_dict({name.removeprefix("model."): t for name, t in stored.items()})
+    describe = DescribeModel(model, CPU, (48, 64))
+    found = [
+        np.concatenate(list(describe([shot.path for shot in shots])))
+        for shots in (town.queries, town.database)
+    ]
+    wanted = recall_at(rank(*found, 5), town.positives, (1, 5))
+    assert answer["recall"]["1"] == pytest.approx(wanted[1])
+    assert answer["recall"]["5"] == pytest.approx(wanted[5])
+
+
+def test_checkpoint_sees_photos_as_they_are_when_told_so(city: Path, checkpoint: Path) -> None:
+    """The photos have 64 x 64 pixels."""
+    native = run_json(
+        "evaluate", "--data", city, "--checkpoint", checkpoint, "--image-size", "native"
+    )
+    brought = run_json(
+        "evaluate", "--data", city, "--checkpoint", checkpoint, "--image-size", "64x64"
+    )
+    assert native["run"]["image size"] == "native"
+    assert native["recall_curve"] == brought["recall_curve"]
+
+
+def test_vocabulary_is_fitted_on_the_database_where_none_comes_with_the_extractor(
+    city: Path,
+) -> None:
+    answer = run_json("evaluate", "--data", city, "--extractor", "test-tiny-vlad:clusters=3")
+    assert answer["dimension"] == 3 * 16
+    assert answer["run"]["vocabulary"] == "fitted on the database's photos"
+
+
+def test_photo_that_does_not_decode_is_named_and_nothing_is_measured(
+    city: Path, tmp_path: Path, checkpoint: Path
+) -> None:
+    copy = tmp_path / "town"
+    for path in city.rglob("*.jpg"):
+        target = copy / path.relative_to(city)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_bytes(path.read_bytes())
+    broken = sorted((copy / "database").iterdir())[3]
+    broken.write_bytes(b"\xff\xd8\xff but no photo")
+    for model in (["--extractor", "test-tiny-avg"], ["--checkpoint", checkpoint]):
+        problem = run_json("evaluate", "--data", copy, *model, code=1)
+        assert problem["code"] == "photos_refused"
+        assert broken.name in problem["detail"]
+        assert "1 of 10" in problem["detail"]
+
+
+def test_set_that_is_not_there_is_named(city: Path) -> None:
+    problem = run_json(
+        "evaluate", "--data", city, "--set", "tokyo", "--extractor", "test-tiny-avg", code=1
+    )
+    assert problem["code"] == "set_missing"
+
+
+def test_people_are_shown_a_table(city: Path) -> None:
+    shown = run("evaluate", "--data", city, "--extractor", "test-tiny-avg")
+    for part in ("R@1", "all 6 queries", "5 with a positive", "radius 25 m"):
+        assert part in shown
+
+
+def test_descriptors_are_compared_by_recall_time_and_size(
+    city: Path, tmp_path: Path, checkpoint: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = f"test-tiny-avg,test-tiny-vlad:clusters=3,preprocessing=square32+fit+pca4,{checkpoint}"
+    report = run_json("compare", city, "--extractors", asked, "--out", tmp_path / "out")
+    sizes = [one["bytes_a_photo"] for one in report["extractors"]]
+    assert sizes == [16 * 4, 4 * 4, 128 * 4]
+    assert all(one["milliseconds_a_photo"] > 0 for one in report["extractors"])
+    assert report["extractors"][0]["against_first"] is None
+    assert report["extractors"][1]["pareto_by_size"], "nothing is smaller"
+    page = (tmp_path / "out" / "report.html").read_text()
+    for drawing in re.findall(r"<svg.*?</svg>", page, re.DOTALL):
+        ET.fromstring(drawing)
+    assert page.count("<svg") == 2
+    monkeypatch.setattr(DescribeExtractor, "__call__", forbid)
+    monkeypatch.setattr(DescribeModel, "__call__", forbid)
+    again = run_json("compare", city, "--extractors", asked)
+    assert [one["recall"] for one in again["extractors"]] == [
+        one["recall"] for one in report["extractors"]
+    ]
+
+
+@pytest.mark.parametrize(
+    ("extractors", "code"),
+    [
+        ("test-tiny-avg+pca99999", "bad_extractors"),
+        ("test-tiny-avg+zip", "bad_extractors"),
+        ("test-tiny-avg,", "bad_extractors"),
+        ("test-tiny-avg+fit", "bad_extractors"),
+        ("nowhere.ckpt", "bad_extractors"),
+        ("test-tiny-avg,no-such-extractor", "unknown_extractor"),
+        ("test-tiny-avg+pca10", "pca_too_few_rows"),
+    ],
+)
+def test_comparison_that_can_not_be_done_is_refused(city: Path, extractors: str, code: str) -> None:
+    assert run_json("compare", city, "--extractors", extractors, code=1)["code"] == code
