@@ -30,6 +30,7 @@ COMMANDS = {
     "pca": ("pca", "app"),
     "models": ("models", "app"),
     "datasets": ("datasets", "app"),
+    "train": ("train", "train"),
     "storage": ("storage", "app"),
     "bench": ("bench", "app"),
 }
@@ -51,7 +52,7 @@ def tree(names: Collection[str] = COMMANDS.keys()) -> typer.Typer:
         if isinstance(command, typer.Typer):
             app.add_typer(command, name=name)
         else:
-            app.command(name)(command)
+            app.command(name, **getattr(command, "command_settings", {}))(command)
     return app
 
 

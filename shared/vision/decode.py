@@ -54,8 +54,8 @@ def decode(data: bytes, preprocessing: Preprocessing, max_pixels: int) -> Decode
             with open_photo(io.BytesIO(data)) as image:
                 check_pixels(image, max_pixels)
                 image.load()
-                as_stored = _to_rgb(image)
-                upright = _upright(image, as_stored)
+                as_stored = to_rgb(image)
+                upright = turn_upright(image, as_stored)
             pixels = preprocessing.apply(upright if preprocessing.upright else as_stored)
             return Decoded(pixels=pixels, thumbnail=_thumbnail(upright))
     except UnidentifiedImageError as error:
@@ -75,7 +75,7 @@ def decode(data: bytes, preprocessing: Preprocessing, max_pixels: int) -> Decode
         ) from error
 
 
-def _upright(image: Image.Image, rgb: Image.Image) -> Image.Image:
+def turn_upright(image: Image.Image, rgb: Image.Image) -> Image.Image:
     """`rgb` turned as the EXIF of `image` says. Not Pillow's `exif_transpose`: that also writes
     the EXIF anew, and fails where any other tag of it is broken.
     """
@@ -87,7 +87,8 @@ def _upright(image: Image.Image, rgb: Image.Image) -> Image.Image:
     return rgb if method is None else rgb.transpose(method)
 
 
-def _to_rgb(image: Image.Image) -> Image.Image:
+def to_rgb(image: Image.Image) -> Image.Image:
+    """Three channels of 8 bits, on black; ValueError for samples without a brightness range."""
     if image.mode.startswith("I;16"):
         # Pillow would clip 16-bit samples at 255 and make the photo white.
         samples = np.asarray(image, dtype=np.uint16)

@@ -36,9 +36,9 @@ class PlaceModel(nn.Module):
     def forward(self, photos: torch.Tensor) -> torch.Tensor:
         """Unprocessable (`image_size_unfit`) for photos of a size that the model can't take."""
         height, width = photos.shape[-2:]
-        check_patches(self.backbone, height, width, self.config)
+        _check_patches(self.backbone, height, width, self.config)
         maps, token = self.backbone(photos)
-        check_map(self.aggregator, self.config, maps, (height, width))
+        _check_map(self.aggregator, self.config, maps, (height, width))
         rows: torch.Tensor = (
             self.aggregator(maps, token) if self.aggregator.takes_token else self.aggregator(maps)
         )
@@ -56,18 +56,18 @@ def build_model(config: ModelConfig, *, weights: Path | None = None) -> PlaceMod
     `image_size_unfit`.
     """
     backbone = build_backbone(config, weights)
-    check_patches(backbone, *config.image_size, config)
+    _check_patches(backbone, *config.image_size, config)
     with torch.inference_mode():
         maps, token = backbone(torch.zeros(1, 3, *config.image_size))
     _, channels, height, width = maps.shape
     shape = MapShape(channels, height, width, has_token=token is not None)
     aggregator, arguments = build_aggregator(config, shape)
-    check_map(aggregator, config, maps, config.image_size)
+    _check_map(aggregator, config, maps, config.image_size)
     complete = config.model_copy(update={"agg_config": arguments})
     return PlaceModel(complete, backbone, aggregator).eval()
 
 
-def check_patches(backbone: StagedBackbone, height: int, width: int, config: ModelConfig) -> None:
+def _check_patches(backbone: StagedBackbone, height: int, width: int, config: ModelConfig) -> None:
     side = backbone.patch
     if height % side or width % side:
         nearest = [max(1, round(length / side)) * side for length in (height, width)]
@@ -78,14 +78,20 @@ def check_patches(backbone: StagedBackbone, height: int, width: int, config: Mod
         )
 
 
-def check_map(
+def _check_map(
     aggregator: Aggregator, config: ModelConfig, maps: torch.Tensor, photo: tuple[int, int]
 ) -> None:
     reason = aggregator.refusal(*maps.shape[-2:])
     if reason is not None:
         built = config.image_size
+        advice = (
+            "Set a larger image_size, or crop layers (layers_to_crop)."
+            if photo == built
+            else f"The model was built for {built[0]} x {built[1]}: bring photos to that size, or "
+            "train a model at theirs."
+        )
         raise Unprocessable(
             "image_size_unfit",
-            f"Photos of {photo[0]} x {photo[1]} pixels: {reason}. The model was built for "
-            f"{built[0]} x {built[1]}: bring photos to that size, or train a model at theirs.",
+            f"{config.agg_arch} can't take photos of {photo[0]} x {photo[1]} pixels: {reason}. "
+            f"{advice}",
         )

@@ -10,12 +10,27 @@ from pydantic import ConfigDict, ValidationError, create_model
 
 from shared.errors import Unprocessable
 from shared.vision.place_models.aggregators.base import Aggregator, MapShape
+from shared.vision.place_models.aggregators.boq import BoQ
+from shared.vision.place_models.aggregators.convap import ConvAP
+from shared.vision.place_models.aggregators.cosplace import CosPlace
+from shared.vision.place_models.aggregators.mixvpr import MixVPR
+from shared.vision.place_models.aggregators.netvlad import NetVLAD
 from shared.vision.place_models.aggregators.pooling import Average, GeM
+from shared.vision.place_models.aggregators.salad import SALAD
 from shared.vision.place_models.config import ModelConfig
 
 __all__ = ["Aggregator", "MapShape", "build_aggregator"]
 
-_CLASSES: dict[str, type[Aggregator]] = {"AVG": Average, "GeM": GeM}
+_CLASSES: dict[str, type[Aggregator]] = {
+    "CosPlace": CosPlace,
+    "AVG": Average,
+    "GeM": GeM,
+    "ConvAP": ConvAP,
+    "MixVPR": MixVPR,
+    "NetVLAD": NetVLAD,
+    "SALAD": SALAD,
+    "BoQ": BoQ,
+}
 
 
 def build_aggregator(config: ModelConfig, shape: MapShape) -> tuple[Aggregator, dict[str, Any]]:

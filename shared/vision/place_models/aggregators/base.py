@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, NamedTuple
+from typing import Annotated, ClassVar, NamedTuple
 
 import torch
+from pydantic import Field
 from torch import nn
 from torch.nn.functional import normalize
+
+# Arguments of aggregators come from files of others, too: these bounds keep sizes computable.
+Size = Annotated[int, Field(ge=1, le=1 << 20)]
+Layers = Annotated[int, Field(ge=1, le=64)]
+Positive = Annotated[float, Field(gt=0, le=1000)]
 
 
 class MapShape(NamedTuple):

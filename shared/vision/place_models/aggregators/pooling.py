@@ -12,16 +12,18 @@ from __future__ import annotations
 from typing import ClassVar
 
 import torch
-from pydantic import PositiveFloat, PositiveInt
 from torch import nn
 
-from shared.vision.place_models.aggregators.base import Aggregator, unit_rows
+from shared.vision.place_models.aggregators.base import Aggregator, Positive, Size, unit_rows
+
+GEM_POWER = 3.0
+GEM_EPS = 1e-6
 
 
 class Average(Aggregator):
     inferred: ClassVar = {"in_channels": "channels"}
 
-    def __init__(self, in_channels: PositiveInt) -> None:
+    def __init__(self, in_channels: Size) -> None:
         super().__init__(in_channels)
 
     def forward(self, maps: torch.Tensor) -> torch.Tensor:
@@ -31,9 +33,7 @@ class Average(Aggregator):
 class GeM(Aggregator):
     inferred: ClassVar = {"in_channels": "channels"}
 
-    def __init__(
-        self, in_channels: PositiveInt, p: PositiveFloat = 3.0, eps: PositiveFloat = 1e-6
-    ) -> None:
+    def __init__(self, in_channels: Size, p: Positive = GEM_POWER, eps: Positive = GEM_EPS) -> None:
         super().__init__(in_channels)
         self.pool = GeneralisedMean(p, eps)
 
@@ -46,7 +46,7 @@ class GeneralisedMean(nn.Module):
 
     def __init__(self, p: float, eps: float) -> None:
         super().__init__()
-        self.p = nn.Parameter(torch.tensor([float(p)]))
+        self.p = nn.Parameter(torch.tensor([p]))
         self.eps = eps
 
     def forward(self, maps: torch.Tensor) -> torch.Tensor:

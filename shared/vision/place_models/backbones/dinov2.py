@@ -30,7 +30,7 @@ class Dinov2(StagedBackbone):
     def forward(self, photos: torch.Tensor) -> Features:
         rows, columns = photos.shape[-2] // PATCH, photos.shape[-1] // PATCH
         tokens = self._run(photos)
-        maps = tokens[:, 1:].transpose(1, 2).unflatten(2, (rows, columns))
+        maps = tokens[:, 1:].transpose(1, 2).reshape(len(tokens), -1, rows, columns)
         return Features(maps, tokens[:, 0])
 
 

@@ -1,0 +1,164 @@
+"""Batches of photos for training: read by workers ahead of their use, resumable inside an epoch."""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.utils.data import DataLoader, Dataset
+
+from services.trainer.augment import augmented, to_tensor
+from services.trainer.sampling import BatchPlan, Draw
+from shared.errors import Unprocessable
+from shared.vision.decode_small import decode_small
+
+
+@dataclass(frozen=True, slots=True)
+class Batch:
+    photos: Tensor
+    """(n, 3, H, W) float32; n is P x K without the photos that do not decode"""
+    labels: Tensor
+    """(n,) int64 place ids"""
+    bad: tuple[tuple[str, str], ...] = ()
+    """path and reason of each photo left out"""
+
+    def to(self, device: torch.device, non_blocking: bool = False) -> Batch:
+        return Batch(
+            self.photos.to(device, non_blocking=non_blocking),
+            self.labels.to(device, non_blocking=non_blocking),
+            self.bad,
+        )
+
+    def pin_memory(self) -> Batch:
+        return Batch(self.photos.pin_memory(), self.labels.pin_memory(), self.bad)
+
+
+class PlacePhotos(Dataset[Batch]):
+    """The photos of one `Draw`, decoded, augmented, normalised.
+
+    A photo that does not decode is left out and named in `bad`, or is Unprocessable
+    (`undecodable_photo`) with `bad_is_error`.
+    """
+
+    def __init__(self, plan: BatchPlan, image_size: tuple[int, int], *, bad_is_error: bool) -> None:
+        self._places = plan.places
+        self._image_size = image_size
+        self._bad_is_error = bad_is_error
+
+    def __getitem__(self, draw: Draw) -> Batch:
+        place = self._places[draw.place]
+        photos: list[Tensor] = []
+        bad: list[tuple[str, str]] = []
+        for position, number in enumerate(draw.photos):
+            path = place.photos[number]
+            try:
+                image = decode_small(path, self._image_size)
+            except Unprocessable as error:
+                if self._bad_is_error:
+                    raise undecodable(str(path), error.detail) from error
+                bad.append((str(path), error.detail))
+                continue
+            photos.append(to_tensor(augmented(image, draw.seed + position)))
+        empty = torch.empty((0, 3, *self._image_size))
+        return Batch(
+            torch.stack(photos) if photos else empty,
+            torch.full((len(photos),), place.place_id, dtype=torch.int64),
+            tuple(bad),
+        )
+
+
+def undecodable(path: str, reason: str) -> Unprocessable:
+    return Unprocessable(
+        "undecodable_photo",
+        f"{path} does not decode: {reason}. Mend or remove it, or leave such photos out: "
+        "--on_bad_image skip.",
+    )
+
+
+def joined(parts: list[Batch]) -> Batch:
+    """Places one after the other."""
+    return Batch(
+        torch.cat([part.photos for part in parts]),
+        torch.cat([part.labels for part in parts]),
+        tuple(each for part in parts for each in part.bad),
+    )
+
+
+class TrainingBatches:
+    """All batches of one epoch after the other; Lightning takes it for a data loader.
+
+    Its state is the number of batches that were handed out, so that training goes on behind them.
+    `seconds_waited` counts how long whoever takes batches has waited for them.
+    """
+
+    def __init__(
+        self, plan: BatchPlan, photos: PlacePhotos, *, num_workers: int, pin_memory: bool
+    ) -> None:
+        self.plan = plan
+        self.sampler = self  # where Lightning tells the epoch: set_epoch
+        self.seconds_waited = 0.0
+        self._photos = photos
+        self._num_workers = num_workers
+        self._pin_memory = pin_memory
+        self._epoch = 0
+        self._given = 0
+
+    def __len__(self) -> int:
+        return len(self.plan)
+
+    def set_epoch(self, epoch: int) -> None:
+        if epoch != self._epoch:
+            self._epoch, self._given = epoch, 0
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"epoch": self._epoch, "given": self._given}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self._epoch, self._given = state["epoch"], state["given"]
+
+    def __iter__(self) -> Iterator[Batch]:
+        # A generator: nothing is read before the first batch is taken, when the epoch is known.
+        if self._given >= len(self.plan):
+            self._given = 0
+        loader: DataLoader[Batch] = DataLoader(
+            self._photos,
+            batch_sampler=_Drawn(self.plan, self._epoch, self._given),  # type: ignore[arg-type]
+            num_workers=self._num_workers,
+            collate_fn=joined,
+            pin_memory=self._pin_memory,
+            worker_init_fn=_begin_worker if self._num_workers else None,
+            generator=torch.Generator(),  # else it draws from that of the steps
+        )
+        batches = iter(loader)
+        while True:
+            began = time.perf_counter()
+            batch = next(batches, None)
+            self.seconds_waited += time.perf_counter() - began
+            if batch is None:
+                return
+            self._given += 1
+            yield batch
+
+
+class _Drawn:
+    """The rest of an epoch as torch's loader asks for it: lists of what to read."""
+
+    def __init__(self, plan: BatchPlan, epoch: int, start: int) -> None:
+        self._plan, self._epoch, self._start = plan, epoch, start
+
+    def __len__(self) -> int:
+        return len(self._plan) - self._start
+
+    def __iter__(self) -> Iterator[list[Draw]]:
+        return self._plan.batches(self._epoch, self._start)
+
+
+def _begin_worker(number: int) -> None:
+    # Ctrl-C is for the parent, which ends its workers after it has kept the run.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    torch.set_num_threads(1)

@@ -1,0 +1,108 @@
+"""The folder of one run: where it lies, what is in it.
+
+config.yaml       every argument, as it was meant
+history.json      what was measured so far
+metrics.json      the summary at the end
+checkpoints/      the best ones, and last.ckpt
+csv/  tensorboard/
+"""
+
+from __future__ import annotations
+
+import os
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from services.trainer.arguments import TrainingArguments
+from services.trainer.checkpoint_names import folder_from, safe
+from services.trainer.configuration import as_plain, make_arguments, read_yaml
+from shared.errors import Conflict, Misconfigured, NotFound
+
+CHECKPOINTS = "checkpoints"
+CONFIG = "config.yaml"
+METRICS = "metrics.json"
+
+# A run that went on with another of these would be another run.
+FIXED = (
+    "batch_size", "img_per_place", "min_img_per_place", "shuffle_all",
+    "random_sample_from_each_place", "image_size", "reload_dataloaders_every_n_epochs", "cities",
+    "backbone_arch", "layers_to_freeze", "layers_to_crop", "agg_arch", "agg_config", "optimizer",
+    "loss_name", "miner_name", "seed",
+)  # fmt: skip
+
+
+def new_run_folder(arguments: TrainingArguments) -> Path:
+    """An empty folder for a run that begins.
+
+    Raises Conflict (`run_exists`) for a name that is taken, Misconfigured (`out_unwritable`).
+    """
+    root = Path(folder_from(arguments.default_root_dir, as_plain(arguments)))
+    if arguments.run_name is not None:
+        folder = root / safe(arguments.run_name)
+        if folder.is_dir() and any(folder.iterdir()):
+            raise Conflict(
+                "run_exists",
+                f"{folder} holds a run already. Go on with it by --resume {folder}, or give "
+                "another --run_name.",
+            )
+        return _made(folder, exist_ok=True)
+    # Local time: the name is for whoever looks into the folder.
+    began = datetime.now().astimezone().strftime("%Y%m%d-%H%M%S")
+    stem = safe(f"{began}-{arguments.backbone_arch}-{arguments.agg_arch}-{arguments.loss_name}")
+    number = 1
+    while True:
+        name = stem if number == 1 else f"{stem}-{number}"
+        try:
+            return _made(root / name, exist_ok=False)
+        except FileExistsError:
+            number += 1
+
+
+def find_run(resume: Path) -> tuple[Path, Path]:
+    """A run's folder, or one of its checkpoints with the full state -> folder and checkpoint.
+
+    Raises NotFound (`run_not_found`).
+    """
+    if resume.is_dir():
+        folder, checkpoint = resume, resume / CHECKPOINTS / "last.ckpt"
+    else:
+        folder, checkpoint = resume.parent.parent, resume
+    for needed in (folder / CONFIG, checkpoint):
+        if not needed.is_file():
+            raise NotFound(
+                "run_not_found",
+                f"--resume {resume}: there is no {needed}. Name the folder of a run, in which "
+                f"{CONFIG} and {CHECKPOINTS}/last.ckpt lie; a run that ended before its first "
+                "step has none.",
+            )
+    return folder, checkpoint
+
+
+def resumed_arguments(folder: Path, changes: dict[str, Any]) -> TrainingArguments:
+    """What the run was told, with changes. Conflict (`run_differs`) for a change that would make
+    it another run."""
+    stored = read_yaml(folder / CONFIG)
+    before, after = make_arguments(stored), make_arguments(stored, changes)
+    differing = [name for name in FIXED if getattr(before, name) != getattr(after, name)]
+    if differing:
+        raise Conflict(
+            "run_differs",
+            f"--resume goes on with the run as it was: {', '.join(differing)} can't change. Begin "
+            "a new run (--model_path takes the weights of this one).",
+        )
+    return after
+
+
+def _made(folder: Path, *, exist_ok: bool) -> Path:
+    try:
+        folder.mkdir(parents=True, exist_ok=exist_ok)
+    except FileExistsError:
+        raise
+    except OSError as error:
+        raise Misconfigured(
+            "out_unwritable", f"Can't make the run's folder {folder}: {error.strerror}."
+        ) from error
+    if not os.access(folder, os.W_OK):
+        raise Misconfigured("out_unwritable", f"The run's folder {folder} can't be written.")
+    return folder.resolve()

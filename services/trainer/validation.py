@@ -1,0 +1,87 @@
+"""The evaluation sets of a run, measured as `placewise evaluate` measures them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import torch
+
+from services.trainer.arguments import TrainingArguments
+from services.trainer.evaluation.describe_model import DescribeModel
+from services.trainer.evaluation.recalls import Recalls, recalls
+from services.trainer.stop import StopRequest
+from shared.datasets.shots import EvaluationSet
+
+PHOTOS_AT_ONCE = 32
+
+Told = Callable[[str, int, int], None]
+
+
+class Validation:
+    """Measures a network on sets, one after the other.
+
+    Validation photos have the size that the training's have; `for_tests` uses `test_image_size`.
+    """
+
+    def __init__(
+        self,
+        arguments: TrainingArguments,
+        device: torch.device,
+        told: Told,
+        stop: StopRequest,
+    ) -> None:
+        self._arguments = arguments
+        self._device = device
+        self._told = told
+        self._stop = stop
+
+    def measure(
+        self, model: torch.nn.Module, sets: Sequence[EvaluationSet], *, for_tests: bool = False
+    ) -> dict[str, Recalls]:
+        """By the sets' names. Raises RunStopped, and what describing and searching raise."""
+        size = self._test_size() if for_tests else self._arguments.image_size
+        describe = DescribeModel(
+            model, self._device, size, batch_photos=1 if size is None else PHOTOS_AT_ONCE
+        )
+        found = {}
+        for each in sets:
+
+            def told(what: str, done: int, most: int, name: str = each.name) -> None:
+                self._stop.check()
+                self._told(f"{name}: {what}", done, most)
+
+            asked = recalls(describe, each, faiss_gpu=self._arguments.faiss_gpu, told=told)
+            found[each.name] = asked.recalls
+        return found
+
+    def try_out(self, model: torch.nn.Module, sets: Sequence[EvaluationSet]) -> None:
+        """Describe the first photos of each set, so that a fault in them shows early."""
+        batches = self._arguments.num_sanity_val_steps
+        if batches == 0:
+            return
+        if batches < 0:
+            self.measure(model, sets)
+            return
+        most = batches * PHOTOS_AT_ONCE
+        begun = [
+            replace(
+                each,
+                database=each.database[:most],
+                queries=each.queries[:most],
+                positives=tuple(found[found < most] for found in each.positives[:most]),
+            )
+            for each in sets
+        ]
+        self.measure(model, begun)
+
+    def _test_size(self) -> tuple[int, int] | None:
+        size = self._arguments.test_image_size
+        if size == "same":
+            return self._arguments.image_size
+        return None if size == "native" else size
+
+
+def figures_of(found: dict[str, Recalls]) -> dict[str, float]:
+    """`SET/R1`, `SET/R5` ... -> shares from 0 to 1; a query without a positive counts as missed."""
+    return {f"{name}/R{k}": share for name, one in found.items() for k, share in one.of_all.items()}

@@ -1,0 +1,189 @@
+"""What happens around a run's steps: keeping, measuring, stopping, counting.
+
+Everything is kept in `on_train_batch_end`, also at an epoch's end. There the state of Lightning's
+loops is always the same: one step is done and the next one has not begun.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import lightning
+
+from services.trainer.arguments import TrainingArguments
+from services.trainer.batches import Batch, TrainingBatches
+from services.trainer.display import Display
+from services.trainer.history import Epoch, History
+from services.trainer.keep import KeptCheckpoints, Save
+from services.trainer.learner import Learner
+from services.trainer.random_state import random_state, set_random_state
+from services.trainer.stop import StopRequest
+from services.trainer.validation import Validation, figures_of
+from shared.datasets.shots import EvaluationSet
+
+SHOWN_BAD_PHOTOS = 10
+
+
+class Watch(lightning.Callback):
+    """Drives `kept`, `validation` and `history` of one run. Raises RunStopped out of `fit`."""
+
+    def __init__(
+        self,
+        arguments: TrainingArguments,
+        folder: Path,
+        batches: TrainingBatches,
+        sets: Sequence[EvaluationSet],
+        validation: Validation,
+        kept: KeptCheckpoints,
+        history: History,
+        stop: StopRequest,
+        display: Display,
+    ) -> None:
+        self._arguments = arguments
+        self._folder = folder
+        self._batches = batches
+        self._sets = sets
+        self._validation = validation
+        self._kept = kept
+        self._history = history
+        self._stop = stop
+        self._display = display
+        self._random_state: dict[str, Any] | None = None
+        self._began = 0.0
+        self._step_of_last = -1
+
+    def state_dict(self) -> dict[str, Any]:
+        return random_state()
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        self._random_state = state_dict
+
+    def on_train_start(
+        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
+    ) -> None:
+        if self._random_state is not None:
+            set_random_state(self._random_state)
+        self._continue_clock()
+
+    def on_train_batch_end(
+        self,
+        trainer: lightning.Trainer,
+        pl_module: lightning.LightningModule,
+        outputs: Any,
+        batch: Batch,
+        batch_idx: int,
+    ) -> None:
+        assert isinstance(pl_module, Learner)
+        self._note_bad(batch)
+        self._history.images += len(batch.photos)
+        epoch = trainer.current_epoch
+        most = self._arguments.max_steps
+        ends = self._arguments.fast_dev_run or (most is not None and trainer.global_step >= most)
+        self._show(pl_module, epoch, batch_idx + 1)
+        if trainer.is_last_batch or ends:
+            self._stop_clock()
+            self._end_epoch(trainer, pl_module, ends)
+            self._continue_clock()
+        if ends:
+            trainer.should_stop = True
+        elif self._stop.asked:
+            self._keep(trainer)
+            self._stop.check()
+
+    def on_exception(
+        self,
+        trainer: lightning.Trainer,
+        pl_module: lightning.LightningModule,
+        exception: BaseException,
+    ) -> None:
+        self._stop_clock()
+
+    def _end_epoch(self, trainer: lightning.Trainer, learner: Learner, ends: bool) -> None:
+        if self._arguments.fast_dev_run:
+            return
+        epoch = trainer.current_epoch
+        # Before the sets are measured, which may take long and be interrupted.
+        self._keep(trainer)
+        if not is_measured_after(epoch, self._arguments) and not ends:
+            return
+        found = figures_of(self._validation.measure(learner.model, self._sets))
+        for logger in trainer.loggers:
+            logger.log_metrics({**found, "epoch": epoch}, trainer.global_step)
+        note_epoch(
+            Epoch(epoch, trainer.global_step, learner.last_loss, found),
+            self._history,
+            self._kept,
+            trainer.save_checkpoint,
+            self._display,
+        )
+        self._history.save(self._folder)
+
+    def _keep(self, trainer: lightning.Trainer) -> None:
+        if self._step_of_last == trainer.global_step:
+            return
+        self._stop_clock()
+        self._history.save(self._folder)
+        self._kept.keep_last(trainer.save_checkpoint)
+        self._step_of_last = trainer.global_step
+        self._continue_clock()
+
+    def _note_bad(self, batch: Batch) -> None:
+        for path, reason in batch.bad:
+            if path in self._history.bad_photos:
+                continue
+            self._history.bad_photos[path] = reason
+            count = len(self._history.bad_photos)
+            if count <= SHOWN_BAD_PHOTOS:
+                self._display.warn(f"{path} is left out, it does not decode: {reason}")
+            elif count == SHOWN_BAD_PHOTOS + 1:
+                self._display.warn("More photos do not decode; metrics.json names them all.")
+
+    def _show(self, learner: Learner, epoch: int, done: int) -> None:
+        accuracy = "" if learner.last_accuracy is None else f"  b_acc {learner.last_accuracy:.2f}"
+        self._display.progress(
+            f"epoch {epoch + 1}/{self._arguments.max_epochs}",
+            done,
+            len(self._batches),
+            f"loss {learner.last_loss:.4f}{accuracy}",
+        )
+
+    def _continue_clock(self) -> None:
+        self._began = time.perf_counter()
+        self._batches.seconds_waited = 0.0
+
+    def _stop_clock(self) -> None:
+        if self._began:
+            self._history.seconds += time.perf_counter() - self._began
+            self._history.seconds_waited += self._batches.seconds_waited
+        self._began = 0.0
+
+
+def is_measured_after(epoch: int, arguments: TrainingArguments) -> bool:
+    """Every so many epochs, and after the last."""
+    done = epoch + 1
+    return done % arguments.check_val_every_n_epoch == 0 or done >= arguments.max_epochs
+
+
+def note_epoch(
+    epoch: Epoch,
+    history: History,
+    kept: KeptCheckpoints,
+    save: Save,
+    display: Display,
+) -> None:
+    """An epoch's figures: into the history, on the display, and its checkpoint among the best."""
+    history.epochs.append(epoch)
+    is_best = kept.consider(save, epoch.figures, epoch.number, epoch.step)
+    history.best = list(kept.best)
+    figures = "  ".join(
+        f"{name} {share:.1%}" for name, share in epoch.figures.items() if _is_short(name)
+    )
+    place = " (kept)" if is_best else ""
+    display.say(f"epoch {epoch.number + 1}: loss {epoch.loss:.4f}  {figures}{place}")
+
+
+def _is_short(name: str) -> bool:
+    return name.endswith(("/R1", "/R5"))

@@ -1,0 +1,232 @@
+"""The arguments of `placewise train`: the predecessor's names, defaults and published command."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from services.cli.main import tree
+from services.cli.train_options import spelled_out
+from services.trainer.arguments import CITIES, TrainingArguments
+from services.trainer.configuration import known_keys, make_arguments, read_yaml, write_yaml
+from shared.errors import InvalidRequest, NotFound
+
+PREDECESSORS: dict[str, Any] = {
+    "backbone_arch": "resnet18",
+    "pretrained": True,
+    "layers_to_freeze": 2,
+    "layers_to_crop": (),
+    "agg_arch": "AVG",
+    "agg_config": {},
+    "lr": 2e-4,
+    "optimizer": "adam",
+    "weight_decay": 0,
+    "momentum": 0.9,
+    "warmpup_steps": 600,
+    "milestones": (5, 10, 15, 25),
+    "lr_mult": 0.3,
+    "loss_name": "MultiSimilarityLoss",
+    "miner_name": "MultiSimilarityMiner",
+    "miner_margin": 0.1,
+    "faiss_gpu": True,
+    "cities": CITIES,
+    "batch_size": 64,
+    "img_per_place": 2,
+    "min_img_per_place": 2,
+    "shuffle_all": False,
+    "random_sample_from_each_place": True,
+    "image_size": (320, 320),
+    "num_workers": 8,
+    "show_data_stats": True,
+    "val_set_names": ("sfxs_val",),
+    "test_set_names": ("sfxs_test", "tokyoxs_test"),
+    "model_path": None,
+    "experiment_phase": "train",
+    "monitor": "sfxs_val/R1",
+    "auto_insert_metric_name": False,
+    "save_weights_only": True,
+    "save_top_k": 3,
+    "mode": "max",
+    "accelerator": "gpu",
+    "devices": (0,),
+    "default_root_dir": "./LOGS/",
+    "num_sanity_val_steps": 0,
+    "precision": 32,
+    "max_epochs": 1,
+    "check_val_every_n_epoch": 1,
+    "reload_dataloaders_every_n_epochs": 1,
+    "log_every_n_steps": 20,
+    "fast_dev_run": False,
+}
+
+# As the predecessor's README prints it; only the program's name is another.
+PUBLISHED = r"""
+   --batch_size 100 --img_per_place 4 --min_img_per_place 4 --shuffle_all False
+   --random_sample_from_each_place True --image_size "(320, 320)" --num_workers 8
+   --show_data_stats True --val_set_names '["sfxs_val"]'
+   --test_set_names '["sfxs_test", "tokyoxs_test"]' --backbone_arch "resnet18" --pretrained True
+   --layers_to_freeze -1 --layers_to_crop '[4]' --agg_arch "Gem" --agg_config '{"p":3}'
+   --lr 0.0002 --optimizer "adam" --weight_decay 0 --momentum 0.9 --warmpup_steps 600
+   --milestones '[5, 10, 15, 25]' --lr_mult 0.3 --loss_name "MultiSimilarityLoss"
+   --miner_name "BatchHardMiner" --miner_margin 0.1 --faiss_gpu True --monitor "sfxs_val/R1"
+   --filename "{self.backbone_arch}\_epoch({epoch:02d})\_step({step:04d})\_R1[{pitts30k_val/R1:.4f}]\_R5[{sfxs_val/R5:.4f}]"
+   --auto_insert_metric_name False --save_weights_only True --save_top_k 3 --mode "max"
+   --accelerator "gpu" --devices 1 --default_root_dir "./LOGS/{self.backbone_arch}"
+   --num_sanity_val_steps 0 --precision 32 --max_epochs 8 --check_val_every_n_epoch 1
+   --reload_dataloaders_every_n_epochs 1 --log_every_n_steps 20 --fast_dev_run False
+   --model_path '' --experiment_phase "train"
+"""  # noqa: E501
+
+
+def read(tokens: list[str]) -> TrainingArguments:
+    """What the command makes of its tokens."""
+    pairs = [token.removeprefix("--").partition("=") for token in spelled_out(tokens)]
+    return make_arguments(known_keys({name: value for name, _, value in pairs}, "test"))
+
+
+@pytest.mark.parametrize("name", PREDECESSORS)
+def test_every_argument_of_the_predecessor_is_there_with_its_default(name: str) -> None:
+    assert getattr(TrainingArguments(), name) == PREDECESSORS[name]
+
+
+def test_the_published_command_means_what_its_authors_ran() -> None:
+    arguments = read(shlex.split(PUBLISHED))
+    assert arguments.batch_size == 100
+    assert arguments.image_size == (320, 320)
+    assert arguments.val_set_names == ("sfxs_val",)
+    assert arguments.test_set_names == ("sfxs_test", "tokyoxs_test")
+    assert arguments.layers_to_freeze == -1
+    assert arguments.layers_to_crop == (4,)
+    assert arguments.agg_config == {"p": 3}
+    assert arguments.milestones == (5, 10, 15, 25)
+    assert arguments.shuffle_all is False
+    assert arguments.auto_insert_metric_name is False
+    assert arguments.model_path is None
+    assert arguments.devices == 1
+    assert arguments.precision == 32
+    assert "\\" not in arguments.filename
+
+
+def test_the_published_command_ends_where_there_is_no_gpu_with_an_error_that_says_what_to_do(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    answer = CliRunner().invoke(tree(["train"]), ["train", *shlex.split(PUBLISHED)])
+    assert answer.exit_code == 1
+    assert "no_gpu" in answer.output
+    assert "--accelerator cpu" in answer.output.replace("\n", " ")
+
+
+@pytest.mark.parametrize(
+    ("tokens", "pretrained"),
+    [
+        (["--pretrained"], True),
+        (["--pretrained", "True"], True),
+        (["--pretrained", "False"], False),
+        (["--pretrained=false"], False),
+        (["--pretrained", "0"], False),
+        (["--no-pretrained"], False),
+        (["--no_pretrained"], False),
+        (["--pretrained", "--lr", "0.1"], True),
+        (["--no-pretrained", "--pretrained"], True),
+    ],
+)
+def test_true_and_false_are_what_they_say(tokens: list[str], pretrained: bool) -> None:
+    assert read(tokens).pretrained is pretrained
+
+
+def test_hyphens_are_as_good_as_underscores() -> None:
+    tokens = ["--batch-size", "7", "--agg-config", '{"p": 2}', "--warmup-steps", "3"]
+    arguments = read(tokens)
+    assert (arguments.batch_size, arguments.agg_config, arguments.warmpup_steps) == (7, {"p": 2}, 3)
+
+
+@pytest.mark.parametrize(
+    ("tokens", "name", "value"),
+    [
+        (["--val_set_names", "['a', 'b']"], "val_set_names", ("a", "b")),
+        (["--val_set_names", "a,b"], "val_set_names", ("a", "b")),
+        (["--val_set_names", "[]"], "val_set_names", ()),
+        (["--test_image_size", "native"], "test_image_size", "native"),
+        (["--test_image_size", "480", "640"], "test_image_size", (480, 640)),
+        (["--image_size", "224"], "image_size", (224, 224)),
+        (["--image_size", "[224, 336]"], "image_size", (224, 336)),
+        (["--devices", "[1]"], "devices", (1,)),
+        (["--precision", "16-mixed"], "precision", "16-mixed"),
+        (["--logger", "none"], "logger", ()),
+        (["--logger", "csv"], "logger", ("csv",)),
+        (["--lr", "1e-3"], "lr", 1e-3),
+    ],
+)
+def test_lists_sizes_and_words_are_read(tokens: list[str], name: str, value: object) -> None:
+    assert getattr(read(tokens), name) == value
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "said"),
+    [
+        ("pretrained", "maybe", "neither true nor false"),
+        ("optimizer", "adams", "'adam', 'adamw' or 'sgd'"),
+        ("batch_size", "many", "valid integer"),
+        ("batch_size", "0", "greater than or equal to 1"),
+        ("image_size", "16", "32 pixels or more"),
+        ("agg_config", "{p: 3", "neither JSON nor Python"),
+        ("experiment_phase", "tset", "'train', 'test' or 'all'"),
+        ("logger", "tensorbord", "'tensorbord' is unknown"),
+    ],
+)
+def test_a_value_that_can_not_be_names_its_argument(name: str, text: str, said: str) -> None:
+    with pytest.raises(InvalidRequest, match=said) as caught:
+        make_arguments({name: text})
+    assert f"--{name}" in caught.value.detail
+
+
+def test_an_option_that_there_is_not_names_the_nearest() -> None:
+    with pytest.raises(typer.BadParameter, match="Did you mean batch_size"):
+        spelled_out(["--batchsize", "3"])
+
+
+def test_options_override_the_file(tmp_path: Path) -> None:
+    file = tmp_path / "run.yaml"
+    file.write_text("batch-size: 8\nlr: 0.001\nimage_size: [64, 96]\nval_set_names: [a]\n")
+    arguments = make_arguments(read_yaml(file), {"lr": "0.5"})
+    assert arguments.lr == 0.5
+    assert arguments.batch_size == 8
+    assert arguments.image_size == (64, 96)
+    assert arguments.val_set_names == ("a",)
+
+
+def test_an_unknown_key_of_a_file_names_the_nearest_and_the_file(tmp_path: Path) -> None:
+    file = tmp_path / "run.yaml"
+    file.write_text("milestone: [3]\n")
+    with pytest.raises(InvalidRequest, match="milestones") as caught:
+        read_yaml(file)
+    assert str(file) in caught.value.detail
+
+
+def test_a_file_that_is_no_mapping_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "run.yaml"
+    file.write_text("- lr\n")
+    with pytest.raises(InvalidRequest, match="names with values"):
+        read_yaml(file)
+    with pytest.raises(NotFound, match="Can't read"):
+        read_yaml(tmp_path / "none.yaml")
+
+
+def test_a_written_configuration_is_read_as_the_same_run(tmp_path: Path) -> None:
+    arguments = read(shlex.split(PUBLISHED))
+    write_yaml(arguments, tmp_path / "config.yaml")
+    assert make_arguments(read_yaml(tmp_path / "config.yaml")) == arguments
+
+
+def test_the_help_shows_every_argument_in_its_group() -> None:
+    answer = CliRunner().invoke(tree(["train"]), ["train", "--help"], env={"COLUMNS": "200"})
+    assert answer.exit_code == 0
+    for name in TrainingArguments.model_fields:
+        assert f"--{name} " in answer.output
+    assert "Loss and miner" in answer.output

@@ -1,0 +1,208 @@
+"""Learning rate, optimisers, checkpoint names, the best checkpoints, devices."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+import torch
+
+from services.trainer.arguments import TrainingArguments
+from services.trainer.checkpoint_names import NameTemplate, folder_from
+from services.trainer.device import choose_device
+from services.trainer.keep import KeptCheckpoints
+from services.trainer.loggers import check_loggers
+from services.trainer.optimise import learning_rate, make_optimizer
+from services.trainer.random_state import random_state, set_random_state
+from shared.errors import InvalidRequest, Misconfigured
+
+
+def rate(step: int, epoch: int, warmup_steps: int = 600) -> float:
+    return learning_rate(
+        step, epoch, lr=2e-4, warmup_steps=warmup_steps, milestones=(5, 10, 15, 25), lr_mult=0.3
+    )
+
+
+@pytest.mark.parametrize(
+    ("step", "epoch", "expected"),
+    [
+        (0, 0, 2e-4 / 600),
+        (299, 0, 1e-4),
+        (599, 0, 2e-4),
+        (600, 0, 2e-4),
+        (3000, 4, 2e-4),
+        (3130, 5, 6e-5),
+        (6260, 10, 1.8e-5),
+        (9390, 15, 5.4e-6),
+        (15650, 25, 1.62e-6),
+        (18780, 29, 1.62e-6),
+    ],
+)
+def test_the_rate_rises_over_the_warm_up_and_falls_at_milestones(
+    step: int, epoch: int, expected: float
+) -> None:
+    assert rate(step, epoch) == pytest.approx(expected)
+
+
+def test_without_warm_up_the_first_step_has_the_full_rate() -> None:
+    assert rate(0, 0, warmup_steps=0) == pytest.approx(2e-4)
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [("adam", torch.optim.Adam), ("adamw", torch.optim.AdamW), ("sgd", torch.optim.SGD)],
+)
+def test_each_optimiser_is_what_its_name_says(name: str, kind: type) -> None:
+    network = torch.nn.Linear(2, 2)
+    network.bias.requires_grad_(False)
+    arguments = TrainingArguments(optimizer=name, momentum=0.7, weight_decay=0.1)
+    made = make_optimizer(network.parameters(), arguments)
+    assert type(made) is kind
+    assert [len(group["params"]) for group in made.param_groups] == [1]  # frozen ones are left out
+    assert made.param_groups[0]["weight_decay"] == 0.1
+    if name == "sgd":
+        assert made.param_groups[0]["momentum"] == 0.7
+
+
+METRICS = ("sfxs_val/R1", "sfxs_val/R5")
+FIGURES = {"sfxs_val/R1": 0.81, "sfxs_val/R5": 0.8927, "epoch": 7, "step": 5000}
+PUBLISHED = (
+    "{self.backbone_arch}_epoch({epoch:02d})_step({step:04d})"
+    "_R1[{pitts30k_val/R1:.4f}]_R5[{sfxs_val/R5:.4f}]"
+)
+
+
+def template(text: str, *, insert_names: bool = False) -> NameTemplate:
+    return NameTemplate(
+        text,
+        {"backbone_arch": "resnet18", "lr": 0.0002},
+        METRICS,
+        monitored="sfxs_val",
+        insert_names=insert_names,
+    )
+
+
+def test_a_name_carries_the_figures_and_drops_what_no_run_logs() -> None:
+    made = template(PUBLISHED)
+    assert made.dropped == ["pitts30k_val/R1"]
+    assert made.filled(FIGURES) == "resnet18_epoch(07)_step(5000)_R5[0.8927]"
+
+
+def test_the_predecessors_default_name_has_figures_at_last() -> None:
+    made = template("{model.encoder_arch}_epoch({epoch:02d})_R1[{R1:.4f}]_R5[{sfxs_val/R5:.4f}]")
+    assert made.dropped == []
+    assert made.filled(FIGURES) == "resnet18_epoch(07)_R1[0.8100]_R5[0.8927]"
+
+
+def test_a_name_is_no_path() -> None:
+    assert template("{sfxs_val/R1:.2f}/x").filled(FIGURES) == "0.81-x"
+    inserted = template("{sfxs_val/R1:.2f}", insert_names=True)
+    assert inserted.filled(FIGURES) == "sfxs_val-R1=0.81"
+
+
+@pytest.mark.parametrize("text", ["{pitts30k_val/R1}", ""])
+def test_a_name_of_which_nothing_is_left_is_refused(text: str) -> None:
+    with pytest.raises(InvalidRequest, match="nothing is left"):
+        template(text)
+
+
+def test_a_format_that_does_not_fit_is_refused() -> None:
+    with pytest.raises(InvalidRequest, match="can't be written"):
+        template("{epoch:02d}_{sfxs_val/R1:02d}").filled(FIGURES)
+
+
+def test_a_folder_may_name_arguments_and_nothing_else() -> None:
+    assert folder_from("./LOGS/{self.backbone_arch}", {"backbone_arch": "a/b"}) == "./LOGS/a-b"
+    with pytest.raises(InvalidRequest, match="no argument"):
+        folder_from("./LOGS/{epoch}", {})
+
+
+def kept_in(folder: Path, *, top_k: int = 2, mode: str = "max") -> KeptCheckpoints:
+    name = NameTemplate("e{epoch}", {}, ["s/R1"])
+    return KeptCheckpoints(folder, name, "s/R1", mode, top_k, True)
+
+
+def write(path: Path, weights_only: bool) -> None:
+    path.write_text("weights" if weights_only else "everything")
+
+
+@pytest.mark.parametrize(
+    ("mode", "top_k", "stay"),
+    [
+        ("max", 2, ["e2", "e4"]),
+        ("min", 2, ["e0", "e3"]),
+        ("max", -1, ["e0", "e1", "e2", "e3", "e4"]),
+        ("max", 0, []),
+    ],
+)
+def test_the_best_checkpoints_stay(tmp_path: Path, mode: str, top_k: int, stay: list[str]) -> None:
+    kept = kept_in(tmp_path, mode=mode, top_k=top_k)
+    for epoch, score in enumerate((0.1, 0.5, 0.9, 0.3, 0.7)):
+        kept.consider(write, {"s/R1": score}, epoch, step=epoch)
+    assert sorted(path.stem for path in tmp_path.glob("*")) == stay
+
+
+def test_of_equal_scores_the_earlier_checkpoint_is_the_best(tmp_path: Path) -> None:
+    kept = kept_in(tmp_path, top_k=1)
+    assert kept.consider(write, {"s/R1": 0.5}, 0, 0)
+    assert not kept.consider(write, {"s/R1": 0.5}, 1, 1)
+    assert not kept.consider(write, {"s/R1": math.nan}, 2, 2)
+    assert kept.best_path == tmp_path / "e0.ckpt"
+
+
+def test_the_last_checkpoint_holds_everything_whatever_the_best_ones_hold(tmp_path: Path) -> None:
+    kept = kept_in(tmp_path)
+    kept.consider(write, {"s/R1": 0.5}, 0, 0)
+    kept.keep_last(write)
+    assert (tmp_path / "e0.ckpt").read_text() == "weights"
+    assert kept.last_path.read_text() == "everything"
+
+
+def test_two_checkpoints_never_share_a_name(tmp_path: Path) -> None:
+    name = NameTemplate("same{lr}", {"lr": 1}, ["s/R1"])
+    kept = KeptCheckpoints(tmp_path, name, "s/R1", "max", 3, True)
+    for epoch in range(3):
+        kept.consider(write, {"s/R1": 0.5}, epoch, 0)
+    assert len(list(tmp_path.glob("*.ckpt"))) == 3
+
+
+def test_random_numbers_go_on_where_they_were_kept() -> None:
+    import random
+
+    import numpy as np
+
+    state = random_state()
+    drawn = (torch.rand(3).tolist(), np.random.rand(3).tolist(), random.random())
+    set_random_state(state)
+    assert (torch.rand(3).tolist(), np.random.rand(3).tolist(), random.random()) == drawn
+
+
+@pytest.mark.parametrize("accelerator", ["gpu", "cuda"])
+def test_a_missing_gpu_is_named(accelerator: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    with pytest.raises(Misconfigured, match="--accelerator cpu") as caught:
+        choose_device(TrainingArguments(accelerator=accelerator))
+    assert caught.value.code == "no_gpu"
+
+
+@pytest.mark.parametrize(
+    ("values", "code"),
+    [
+        ({"devices": 2}, "several_devices"),
+        ({"devices": (0, 1)}, "several_devices"),
+        ({"precision": "8-bit"}, "unknown_precision"),
+        ({"precision": 16}, "precision_unfit"),
+    ],
+)
+def test_what_a_device_can_not_do_is_named(values: dict[str, object], code: str) -> None:
+    with pytest.raises(InvalidRequest) as caught:
+        choose_device(TrainingArguments(accelerator="cpu", **values))
+    assert caught.value.code == code
+
+
+def test_a_logger_whose_package_is_missing_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(Misconfigured, match="wandb") as caught:
+        check_loggers(("csv", "wandb"))
+    assert caught.value.code == "logger_missing"
