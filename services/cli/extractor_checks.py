@@ -82,11 +82,9 @@ def extractor_check(settings: Settings) -> str:
         from shared.vision.torchhub_code import code_at_hand
 
         code_at_hand(recipe.hub)
-    from services.cli.added_backbone import added_backbone
-    from shared.vision.extractors import Extractor, choose_device
+    from services.cli.load_extractor import load_extractor
 
-    device = choose_device(settings.device)
-    extractor = Extractor(recipe, device, backbone=added_backbone(recipe, settings, device))
+    extractor = load_extractor(recipe, settings)
     shipped = extractor.shipped_vocabulary()
     return f"{recipe.name}: weights {extractor.backbone.fingerprint[:12]} load, " + (
         f"{shipped[0].clusters} shipped centres" if shipped else "no shipped vocabulary"

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from rich.progress import Progress
 
-from services.cli.added_backbone import added_backbone
 from services.cli.configuration import read_settings
 from services.cli.describe_files import centres_of, own_vocabulary
+from services.cli.load_extractor import load_extractor
 from services.cli.output import shown
 from services.cli.photo_files import decoded_batches
 from services.cli.photo_places import photo_paths
@@ -23,7 +23,7 @@ from services.cli.whole_file import whole_or_nothing
 from shared.errors import InvalidRequest, PlacewiseError, Unprocessable
 from shared.recipes import get_recipe
 from shared.settings import Settings
-from shared.vision.extractors import Extractor, choose_device
+from shared.vision.extractors import Extractor
 from shared.vision.pca import Rows
 from shared.vision.pca_file import WhiteningFile
 from shared.vision.pca_fit import check_can_fit
@@ -99,13 +99,7 @@ def _load(
         allow_test_extractors=settings.allow_test_extractors,
     )
     own = own_vocabulary(recipe, vocabulary)
-    device = choose_device(settings.device)
-    loaded = Extractor(
-        recipe,
-        device,
-        dino_weights=settings.dino_weights,
-        backbone=added_backbone(recipe, settings, device),
-    )
+    loaded = load_extractor(recipe, settings)
     return loaded, centres_of(loaded, own)
 
 

@@ -1,4 +1,7 @@
-"""Models that were added, for the commands that describe photos without a server. Imports torch."""
+"""Extractors for the commands that describe photos without a server, those of added models as well.
+
+Imports torch.
+"""
 
 from __future__ import annotations
 
@@ -16,9 +19,25 @@ from shared.objects.open_store import open_store
 from shared.recipes import Recipe
 from shared.settings import Settings
 from shared.vision.backbones import Backbone
+from shared.vision.extractors import Extractor, choose_device
+from shared.vision.precision import choose_precision
 
 
-def added_backbone(recipe: Recipe, settings: Settings, device: torch.device) -> Backbone | None:
+def load_extractor(recipe: Recipe, settings: Settings) -> Extractor:
+    """On the device and in the precision that the settings say; raises what loading it does, and as
+    `_added_backbone`.
+    """
+    device = choose_device(settings.device)
+    return Extractor(
+        recipe,
+        device,
+        precision=choose_precision(settings.precision, recipe, device),
+        dino_weights=settings.dino_weights,
+        backbone=_added_backbone(recipe, settings, device),
+    )
+
+
+def _added_backbone(recipe: Recipe, settings: Settings, device: torch.device) -> Backbone | None:
     """The model that the recipe names, from the catalog and the store of the settings, which a
     server may be using; None for an extractor that is no added model.
 
