@@ -17,7 +17,7 @@ TRAINING = {
     "layers_to_freeze": "-1",
     "layers_to_crop": "[3,4]",
     "agg_arch": "GeM",
-    "image_size": "[64,80]",
+    "image_size": "[48,64]",
     "batch_size": "4",
     "max_epochs": "1",
     "max_steps": str(STEPS),
@@ -59,7 +59,8 @@ def test_a_model_is_trained_evaluated_added_and_answers(
     server: ServerProcess, placewise: CommandLine
 ) -> None:
     city = placewise.folder / "city"
-    placewise("datasets", "synth", city, "--places", "12", "--no-ladder", "--size", "128x96")
+    small = ("--places", "6", "--views", "3", "--queries", "3", "--size", "96x72", "--no-ladder")
+    placewise("datasets", "synth", city, *small)
 
     options = [text for name, value in TRAINING.items() for text in (f"--{name}", value)]
     trained = placewise("train", "--data_root", city, *options)
