@@ -33,7 +33,7 @@ def test_what_is_neither_is_refused(name: str) -> None:
 def test_only_the_loaded_model_tells_how_photos_are_brought_to_size() -> None:
     recipe = get_recipe("gsv:walks", allow_test_extractors=False)
     assert (recipe.name, recipe.aggregator) == ("gsv:walks", "none")
-    assert recipe.width is recipe.dimension is recipe.preprocessing is None
+    assert (recipe.width, recipe.dimension, recipe.preprocessing) == (None, None, None)
     other = get_recipe("gsv:nights", allow_test_extractors=False)
     assert recipe.local_features != other.local_features
 
