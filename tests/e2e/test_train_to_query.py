@@ -12,6 +12,7 @@ from tests.support.server import ServerProcess, environment, run_command
 
 MAP = "city"
 STEPS = 3
+COMMAND_SECONDS = 600.0  # seconds of work, of which a busy machine makes minutes
 TRAINING = {
     "pretrained": "False",
     "layers_to_freeze": "-1",
@@ -38,7 +39,9 @@ class CommandLine:
         self._environment = environment(server.home)
 
     def __call__(self, *arguments: str | Path) -> Any:
-        ended = run_command(*arguments, "--json", env=self._environment, cwd=self.folder)
+        ended = run_command(
+            *arguments, "--json", env=self._environment, cwd=self.folder, seconds=COMMAND_SECONDS
+        )
         assert ended.returncode == 0, ended.stderr + ended.stdout
         return json.loads(ended.stdout)
 
@@ -55,6 +58,7 @@ def placewise(server: ServerProcess, tmp_path: Path) -> CommandLine:
     return CommandLine(server, tmp_path)
 
 
+@pytest.mark.timeout(1800)
 def test_a_model_is_trained_evaluated_added_and_answers(
     server: ServerProcess, placewise: CommandLine
 ) -> None:
