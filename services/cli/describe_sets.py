@@ -13,8 +13,7 @@ from rich.progress import Progress
 
 from services.cli.describe_files import centres_of, own_vocabulary
 from services.cli.load_extractor import load_extractor
-from services.cli.photo_files import pixels_of
-from services.cli.photo_files import decoded_batches
+from services.cli.photo_files import decoded_batches, pixels_of
 from services.trainer.evaluation.cache import CachedDescribe, Timed
 from services.trainer.evaluation.describe import Rows, photos_refused
 from services.trainer.evaluation.describe_model import DescribeModel
