@@ -11,7 +11,7 @@ import httpx2
 import numpy as np
 import pytest
 import torch
-from sqlalchemy import select
+from sqlalchemy import select, update
 
 from services.extractor import new_generation as new_generation_module
 from services.steward.collect import collect_brought, collect_orphans
@@ -330,7 +330,7 @@ def test_a_switch_says_what_is_wrong_before_it_begins(walks: Service) -> None:
 def test_photos_wait_for_a_model_that_is_not_there_yet(walks: Service) -> None:
     with walks.catalog.write() as session:  # as with EXTRACTOR=gsv:nights from the first start on
         get_map(session, "default").extractor = "gsv:nights"
-        session.execute(Generation.__table__.update().values(state="retired"))
+        session.execute(update(Generation).values(state="retired"))
     job_id = walks.upload(photo_bytes(9))["job_id"]
     asked = walks.ask(photo_bytes(8))
     walks.drain()
