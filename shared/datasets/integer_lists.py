@@ -198,6 +198,7 @@ _STAND_INS: dict[tuple[str, str], Any] = {
     ("numpy", "dtype"): _Dtype,
     ("_codecs", "encode"): _encode,
     ("builtins", "bytes"): _no_bytes,
+    ("__builtin__", "bytes"): _no_bytes,  # its name in protocols before 3
     **{
         (f"numpy.{core}.multiarray", name): stand_in
         for core in ("core", "_core")
