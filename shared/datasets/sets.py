@@ -6,9 +6,10 @@ call opens one data set, and a folder of several.
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -33,7 +34,7 @@ __all__ = [
     "open_training_set",
 ]
 
-PARTS = frozenset({"database", "queries", "train", "val", "test", "images"})
+PARTS = frozenset({"database", "queries", "train", "val", "test", "train_val", "images"})
 """folders of a data set that are never a data set of their own"""
 HOW_SETS_LIE = "docs/how-to/data-sets.md shows every layout."
 
@@ -50,10 +51,11 @@ class FoundSet:
 
 def find_training_layout(root: Path) -> tuple[TrainingLayout, Path] | None:
     """The layout of the places to learn from, and the folder at or below `root` that has it."""
-    for base, _ in _bases(root):
-        for layout in TRAINING_LAYOUTS:
-            if layout.recognises(base):
-                return layout, base
+    for _, bases in _homes(root):
+        for base in bases:
+            for layout in TRAINING_LAYOUTS:
+                if layout.recognises(base):
+                    return layout, base
     return None
 
 
@@ -89,12 +91,22 @@ def open_training_set(
 
 
 def find_evaluation_sets(root: Path) -> tuple[FoundSet, ...]:
-    """Every evaluation set at or below `root`, by name; of two of one name the first is taken."""
+    """Every evaluation set at or below `root`, by name.
+
+    Of two layouts of one name in the same data set the first is taken: lists before folders. Data
+    sets that share a name are told apart by a number: `city`, `city_2`.
+    """
     found: dict[str, FoundSet] = {}
-    for base, prefix in _bases(_checked(root)):
-        for layout in EVALUATION_LAYOUTS:
-            for name, key in layout.sets(base, prefix).items():
-                found.setdefault(name, FoundSet(name, layout, base, key))
+    for home, bases in _homes(_checked(root)):
+        here: dict[str, FoundSet] = {}
+        prefix = set_prefix(home.resolve().name)
+        for base in bases:
+            for layout in EVALUATION_LAYOUTS:
+                for name, key in layout.sets(base, prefix).items():
+                    here.setdefault(name, FoundSet(name, layout, base, key))
+        for name, one in here.items():
+            free = next(n for n in _numbered(name) if n not in found)
+            found[free] = replace(one, name=free)
     return tuple(found[name] for name in sorted(found))
 
 
@@ -173,19 +185,22 @@ def _choose(root: Path, found: Sequence[FoundSet], name: str | None) -> FoundSet
     raise NotFound("set_missing", f"{root} has no set {name}. There are: {names}.")
 
 
-def _bases(root: Path) -> Iterator[tuple[Path, str]]:
-    """Folders that may be a data set, each with what begins the names of its sets."""
-    yield from _with_images(root)
-    for child in sorted(root.iterdir()):
-        if child.is_dir() and child.name not in PARTS and not child.name.startswith("."):
-            yield from _with_images(child)
+def _homes(root: Path) -> Iterator[tuple[Path, list[Path]]]:
+    """Folders that may be a data set, each with the folders in which its parts may lie."""
+    children = sorted(
+        child
+        for child in root.iterdir()
+        if child.is_dir() and child.name not in PARTS and not child.name.startswith(".")
+    )
+    for home in (root, *children):
+        images = home / "images"
+        yield home, [home, images] if images.is_dir() else [home]
 
 
-def _with_images(folder: Path) -> Iterator[tuple[Path, str]]:
-    prefix = set_prefix(folder.resolve().name)
-    yield folder, prefix
-    if (folder / "images").is_dir():
-        yield folder / "images", prefix
+def _numbered(name: str) -> Iterator[str]:
+    yield name
+    for number in itertools.count(2):
+        yield f"{name}_{number}"
 
 
 def set_prefix(name: str) -> str:

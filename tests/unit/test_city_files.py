@@ -8,6 +8,8 @@ import pytest
 
 from shared.datasets.city import write
 from shared.datasets.city.plan import CityOptions, make_plan
+from shared.datasets.city.training_files import TrainLayout, laid_out
+from shared.datasets.sets import open_training_set
 from shared.errors import Conflict
 
 PLAN = make_plan(CityOptions(2, 4, 4, 1, 2, 0.25, 64, 64))
@@ -34,6 +36,21 @@ def test_bytes_do_not_depend_on_how_many_processes_draw(
     assert len(drawn) == 3
     assert sum(drawn) == len(PLAN.shots) == 8 + 4 + 8
     assert contents(tmp_path / "alone") == contents(tmp_path / "shared")
+
+
+def test_same_photos_can_be_laid_out_as_either_training_set(tmp_path: Path) -> None:
+    opened = {}
+    for layout in TrainLayout:
+        write.write_city(laid_out(PLAN, layout), tmp_path / layout)
+        opened[layout] = open_training_set(tmp_path / layout)
+    xs, original = opened[TrainLayout.GSV_XS], opened[TrainLayout.GSV_CITIES]
+    assert (xs.layout, original.layout) == ("gsv_xs", "GSV-Cities")
+    assert [p.place_id for p in xs.places] == [p.place_id for p in original.places] == [0, 1]
+    for one, other in zip(xs.places, original.places, strict=True):
+        assert [p.read_bytes() for p in one.photos] == [p.read_bytes() for p in other.photos]
+    assert contents(tmp_path / TrainLayout.GSV_XS / "queries") == contents(
+        tmp_path / TrainLayout.GSV_CITIES / "queries"
+    )
 
 
 def test_folder_that_holds_anything_is_refused(tmp_path: Path) -> None:

@@ -140,6 +140,7 @@ def test_ground_truth_by_another_rule_and_what_it_refuses(tmp_path: Path) -> Non
     assert asked(*lists, out, code=1)["code"] == "no_positions"
     assert asked(*lists, out, "--rule", "frames 2", "--radius", 3, code=1)["code"] == "which_rule"
     assert asked(*lists, tmp_path / "gt.txt", code=1)["code"] == "bad_out"
+    assert asked(*lists, out, "--radius", "inf", code=1)["code"] == "unknown_rule"
     missing = tmp_path / "nowhere" / "gt.npy"
     assert asked(*lists, missing, "--rule", "frames 2", code=1)["code"] == "out_unwritable"
 

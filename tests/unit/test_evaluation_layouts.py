@@ -67,6 +67,13 @@ def test_splits_of_a_data_set_are_sets_and_so_are_several_data_sets(tmp_path: Pa
     assert code_of(missing) == "set_missing"
 
 
+def test_data_sets_of_one_name_are_told_apart(tmp_path: Path) -> None:
+    pair(tmp_path / "my-city", [0], [0])
+    pair(tmp_path / "my_city", [0, 1], [0])
+    assert evaluation_set_names(tmp_path) == ("mycity", "mycity_2")
+    assert len(open_evaluation_set(tmp_path, "mycity_2").database) == 2
+
+
 def test_at_sign_in_a_folders_name_means_nothing(tmp_path: Path) -> None:
     pair(tmp_path / "me@home@2024@x", [0, 100], [90])
     assert rows(open_evaluation_set(tmp_path / "me@home@2024@x")) == [[1]]

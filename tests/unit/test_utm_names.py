@@ -6,7 +6,13 @@ from datetime import UTC, datetime
 
 import pytest
 
-from shared.datasets.utm_names import PhotoName, fields_of_name, position_of_name
+from shared.datasets.utm_names import (
+    PhotoName,
+    Spot,
+    fields_of_name,
+    position_of_name,
+    spot_of_name,
+)
 from shared.errors import InvalidRequest
 
 MOLE = PhotoName(
@@ -93,3 +99,19 @@ def test_position_that_is_no_number_names_the_file() -> None:
         position_of_name("@east@2@.jpg")
     assert caught.value.code == "bad_coordinates"
     assert "@east@2@.jpg" in caught.value.detail
+
+
+def test_spot_is_what_the_name_says_and_nothing_that_it_does_not() -> None:
+    full = spot_of_name(
+        "@0660329.93@1522162.46@47@P@013.76438@0100.48301@3TQZ-W_x@@398@@@@201905@4257_Bangkok@.jpg"
+    )
+    assert full == Spot(660329.93, 1522162.46, "47P", 13.76438, 100.48301, 38.0, "4257_Bangkok")
+    assert spot_of_name("@1@2@.jpg") == Spot(1.0, 2.0, None, None, None, None, "")
+    assert spot_of_name("IMG_1.jpg") is None
+
+
+@pytest.mark.parametrize("name", ["@x@2@.jpg", "@nan@2@.jpg", "@inf@2@.jpg"])
+def test_spot_without_two_numbers_is_refused(name: str) -> None:
+    with pytest.raises(InvalidRequest) as caught:
+        spot_of_name(name)
+    assert caught.value.code == "bad_coordinates"

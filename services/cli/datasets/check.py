@@ -48,13 +48,14 @@ def check(
 
     Exits with 1 where something is wrong.
     """
-    with explained(as_json):
+    with explained(as_json), progress_bar() as progress:
+        looking = progress.add_task("looking through the folder", total=None)
         found = recognise(folder, protocol=protocol, rule=rule, min_photos=min_photos)
+        progress.remove_task(looking)
         problems = list(found.problems)
         if decode:
-            with progress_bar() as progress:
-                bar = progress.add_task("decoding", total=len(found.photos()))
-                problems += decode_all(found, lambda count: progress.advance(bar, count))
+            bar = progress.add_task("decoding", total=len(found.photos()))
+            problems += decode_all(found, lambda count: progress.advance(bar, count))
     if as_json:
         print_json(_as_json(found, problems, decode))
     else:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Annotated
 
@@ -77,7 +78,10 @@ def ground_truth(
 
 def _meant(radius: float | None, rule: str | None) -> Rule:
     if rule is None:
-        return Rule("radius", radius_m=25.0 if radius is None else radius)
+        metres = 25.0 if radius is None else radius
+        if not math.isfinite(metres):
+            raise InvalidRequest("unknown_rule", f"--radius {metres} is no number of metres.")
+        return Rule("radius", radius_m=metres)
     if radius is not None:
         raise InvalidRequest("which_rule", "Give --radius or --rule, not both.")
     return parse_rule(rule)

@@ -13,6 +13,7 @@ from rich.table import Column, Table
 from services.cli.ladder import KS, climb
 from services.cli.output import JsonOption, answers, explained, print_json, progress_bar
 from shared.datasets.city.plan import CityOptions, Plan, make_plan
+from shared.datasets.city.training_files import TrainLayout, laid_out
 from shared.datasets.city.write import NOT_COMPARABLE, check_empty, describe, write_city
 
 Json = dict[str, Any]
@@ -49,14 +50,18 @@ def synth(
         bool, typer.Option(help="Measure how hard the city is; takes a network and minutes.")
     ] = True,
     train: Annotated[
-        bool, typer.Option(help="Draw a training set (gsv_xs) as well: nearly half of the work.")
+        bool, typer.Option(help="Draw a training set as well: nearly half of the work.")
     ] = True,
+    layout: Annotated[
+        TrainLayout, typer.Option(help="Of the training set: folders, names, table.")
+    ] = TrainLayout.GSV_XS,
     as_json: JsonOption = False,
 ) -> None:
     """Draw a made-up city: database, queries and a training set, the same for the same arguments.
 
-    OUT/database and OUT/queries have @UTM@ names; OUT/gsv_xs is what a trainer learns from, drawn
-    in streets of their own; OUT/city.json says how it was made and what kind each query is.
+    OUT/database and OUT/queries have @UTM@ names; OUT/gsv_xs (or OUT/gsv-cities) is what a trainer
+    learns from, drawn in streets of their own; OUT/city.json says how it was made and what kind
+    each query is.
     """
     width, height = parse_size(size)
     asked = queries if queries is not None else max(1, places // 2)
@@ -66,7 +71,7 @@ def synth(
     with explained(as_json):
         check_empty(out)
         started = time.perf_counter()
-        plan = make_plan(options)
+        plan = laid_out(make_plan(options), layout)
         with progress_bar() as progress:
             bar = progress.add_task("drawing", total=len(plan.shots))
             write_city(plan, out, lambda count: progress.advance(bar, count))

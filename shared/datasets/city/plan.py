@@ -58,7 +58,7 @@ class CityOptions:
     width: int
     height: int
     train: bool = True
-    """whether a training set (gsv_xs) is drawn as well"""
+    """whether a training set is drawn as well"""
 
 
 @dataclass(frozen=True, slots=True)

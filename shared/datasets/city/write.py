@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import multiprocessing
 import os
@@ -20,13 +19,13 @@ from shared.datasets.city.plan import Plan, Shot, city_name
 from shared.datasets.city.random_streams import stream
 from shared.datasets.city.render import Painter
 from shared.datasets.city.texture_memory import TextureMemory
+from shared.datasets.city.training_files import write_train_table
 from shared.errors import Conflict, Misconfigured
 
 SHOTS_PER_TASK = 160
 """a few streets: their houses are drawn once for all photos of a task"""
 MOST_WORKERS = 16
 """each keeps about 300 MB: textures, and a photo at work"""
-GSV_COLUMNS = ("place_id", "class_name", "UTMx", "UTMy", "filename")
 NOT_COMPARABLE = "generated: not comparable with published figures"
 
 
@@ -41,11 +40,11 @@ def check_empty(out: Path) -> None:
 
 
 def write_city(plan: Plan, out: Path, drawn: Callable[[int], None] = lambda count: None) -> None:
-    """Write `database/`, `queries/`, `gsv_xs/` and `city.json` below `out`.
+    """Write `database/`, `queries/`, `gsv_xs/` (or `gsv-cities/`) and `city.json` below `out`.
 
-    The gsv_xs photos are drawn for themselves, in a quarter of their own. `drawn` is told how many
-    photos are ready. Raises Conflict when `out` is not empty, Misconfigured (`out_unwritable`) when
-    it can't be written.
+    The photos to learn from are drawn for themselves, in a quarter of their own. `drawn` is told
+    how many photos are ready. Raises Conflict when `out` is not empty, Misconfigured
+    (`out_unwritable`) when it can't be written.
     """
     check_empty(out)
     try:
@@ -53,7 +52,7 @@ def write_city(plan: Plan, out: Path, drawn: Callable[[int], None] = lambda coun
             (out / folder).mkdir(parents=True, exist_ok=True)
         _draw_all(plan, out, drawn)
         if plan.options.train:
-            _write_gsv_table(plan, out)
+            write_train_table(plan, out)
         (out / "city.json").write_text(json.dumps(describe(plan), indent=1) + "\n")
     except OSError as error:
         raise Misconfigured("out_unwritable", f"Can't write below {out}: {error}.") from error
@@ -103,19 +102,6 @@ def describe(plan: Plan) -> dict[str, Any]:
             for shot in sorted(queries, key=lambda shot: shot.number)
         },
     }
-
-
-def _write_gsv_table(plan: Plan, out: Path) -> None:
-    city = city_name(plan.options)
-    path = out / "gsv_xs" / "dataframes" / f"{city}.csv"
-    path.parent.mkdir(parents=True)
-    train = sorted((s for s in plan.shots if s.role == "train"), key=lambda shot: shot.number)
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(GSV_COLUMNS)
-        for shot in train:
-            row = (shot.place, city, f"{shot.camera.x:.2f}", f"{shot.camera.y:.2f}", shot.name)
-            writer.writerow(row)
 
 
 class _Workshop:
