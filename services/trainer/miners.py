@@ -16,7 +16,6 @@ from pytorch_metric_learning.distances import CosineSimilarity, DotProductSimila
 from pytorch_metric_learning.losses import FastAPLoss
 from pytorch_metric_learning.utils import loss_and_miner_utils
 from torch import nn
-from torch.nn.functional import normalize
 
 from services.trainer.names import choose
 
@@ -25,8 +24,8 @@ NUMBERS_AT_ONCE = 1 << 22  # 16 MB of float32
 
 
 class AngularMiner(nn.Module):
-    """All triplets (a, p, n) with atan(|a - p| / (2 |n - (a + p) / 2|)) > angle, on unit rows: the
-    angle at n in the triangle of Wang et al. 2017.
+    """All triplets (a, p, n) with atan(|a - p| / (2 |n - (a + p) / 2|)) > angle: the angle
+    at n in the triangle of Wang et al. 2017.
 
     The same triplets in the same order as `miners.AngularMiner`, which copies three rows for each
     of them; here the distances to the centre of each pair are taken, some pairs at a time.
@@ -41,8 +40,7 @@ class AngularMiner(nn.Module):
 
     @torch.no_grad()
     def forward(self, rows: torch.Tensor, labels: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """(B, D), (B,) -> indices of anchors, positives and negatives."""
-        rows = normalize(rows, dim=1)
+        """(B, D) unit rows, (B,) labels -> indices of anchors, positives and negatives."""
         a, p, _, _ = loss_and_miner_utils.get_all_pairs_indices(labels)
         at_once = max(1, self.numbers_at_once // max(rows.shape))
         found = []

@@ -37,7 +37,7 @@ def randomised(aggregator: Aggregator, seed: int = 1) -> tuple[Aggregator, Weigh
     with torch.no_grad():
         for name, parameter in aggregator.named_parameters():
             if not name.endswith(".p"):
-                parameter += 0.3 * torch.randn(parameter.shape, generator=random)
+                parameter.add_(0.3 * torch.randn(parameter.shape, generator=random))
     weights = {n: v.double().numpy() for n, v in aggregator.state_dict().items()}
     return aggregator.eval(), weights
 
@@ -286,5 +286,6 @@ def test_a_descriptor_does_not_depend_on_the_batch_and_every_weight_learns(
     np.testing.assert_allclose(rows.detach(), alone.detach(), atol=1e-6)
     np.testing.assert_allclose(rows.detach().norm(dim=1), np.ones(3), atol=1e-5)
     aggregator.train()
-    (describe(maps.requires_grad_())[:, ::2].sum() + describe(maps)[0, 0]).backward()
+    loss: torch.Tensor = describe(maps.requires_grad_())[:, ::2].sum()
+    torch.autograd.backward(loss)
     assert not [n for n, p in aggregator.named_parameters() if p.grad is None]

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,6 +25,12 @@ from shared.errors import NotFound, Unprocessable
 from shared.vision.backbones.torchhub import weights_fingerprint
 from shared.vision.place_models.config import ModelConfig
 from shared.vision.place_models.model import PlaceModel, build_model
+from shared.vision.place_models.predecessor import (
+    MODEL_ARGUMENTS,
+    is_predecessors,
+    read_config,
+    rename,
+)
 from shared.vision.tensor_files import UNREADABLE, first_line
 
 PREFIX = "model."
@@ -43,27 +50,31 @@ class Checkpoint:
 
 
 def load_checkpoint(path: Path) -> Checkpoint:
-    """Read a checkpoint of `placewise train`, or what `checkpoint_state` gave to `torch.save`.
+    """Read a checkpoint of `placewise train` or of the predecessor's training, or what
+    `checkpoint_state` gave to `torch.save`.
 
     Raises NotFound (`checkpoint_not_found`); Unprocessable: `checkpoint_unreadable` (no PyTorch
     file, a torn one, or one with more in it than tensors and plain values), `checkpoint_unfit`
     (another network's), and those of ModelConfig and `build_model`.
     """
     stored = _read(path)
-    parameters = stored.get("hyper_parameters")
-    said = parameters.get("model") if isinstance(parameters, Mapping) else None
-    tensors = stored.get("state_dict")
-    if not isinstance(said, Mapping) or not isinstance(tensors, Mapping):
-        raise _unfit(path, 'it has no hyper_parameters["model"] or no state_dict')
-    config = ModelConfig.read({**said, "pretrained": False})
+    parameters, tensors = stored.get("hyper_parameters"), stored.get("state_dict")
+    if not isinstance(parameters, Mapping) or not isinstance(tensors, Mapping):
+        raise _unfit(path, "it has no hyper_parameters or no state_dict")
+    if isinstance(parameters.get("model"), Mapping):
+        config = ModelConfig.read({**parameters["model"], "pretrained": False})
+        own = {n.removeprefix(PREFIX): t for n, t in tensors.items() if n.startswith(PREFIX)}
+    elif is_predecessors(parameters):
+        config = read_config(parameters)
+        own = {rename(name): tensor for name, tensor in tensors.items()}
+    else:
+        raise _unfit(path, 'it has no hyper_parameters["model"]')
     with torch.device("meta"):
         model = build_model(config)
-    _fill(
-        model, {n.removeprefix(PREFIX): t for n, t in tensors.items() if n.startswith(PREFIX)}, path
-    )
+    _fill(model, own, path)
     model.eval().requires_grad_(False)
-    assert isinstance(parameters, Mapping)
-    about = {name: value for name, value in parameters.items() if name != "model"}
+    beside = {"model", *MODEL_ARGUMENTS}
+    about = {name: value for name, value in parameters.items() if name not in beside}
     about |= {name: stored[name] for name in ("epoch", "global_step") if name in stored}
     return Checkpoint(model, model.config, fingerprint(model), about)
 
@@ -93,11 +104,17 @@ def _read(path: Path) -> dict[str, Any]:
         raise Unprocessable(
             "checkpoint_unreadable",
             f"The checkpoint {path.name} can't be read as tensors and plain values, and nothing "
-            f"else is loaded from one: {first_line(error)}",
+            f"else is loaded from one: {_reason(error)}",
         ) from error
     if not isinstance(stored, dict):
         raise _unfit(path, f"it holds a {type(stored).__name__}")
     return stored
+
+
+def _reason(error: Exception) -> str:
+    """torch's own words, without its advice to load the file as code."""
+    refused = re.search(r"Unsupported [^\n]*?(?= was not|[\n]|$)", str(error))
+    return refused[0] if refused else first_line(error)
 
 
 def _fill(model: PlaceModel, tensors: dict[str, Any], path: Path) -> None:
