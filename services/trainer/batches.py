@@ -127,7 +127,7 @@ class TrainingBatches:
             self._given = 0
         loader: DataLoader[Batch] = DataLoader(
             self._photos,
-            batch_sampler=_Drawn(self.plan, self._epoch, self._given),  # type: ignore[arg-type]
+            batch_sampler=_Drawn(self.plan, self._epoch, self._given),
             num_workers=self._num_workers,
             collate_fn=joined,
             pin_memory=self._pin_memory,

@@ -88,7 +88,7 @@ def _combined(path: Path, axes: dict[str, Any]) -> list[tuple[str, dict[str, Any
         if not isinstance(values, list) or not values:
             raise _bad(path, f"grid, {axis}: a list of values is needed")
         options.append([_option(path, axis, value) for value in values])
-    found = []
+    found: list[tuple[str, dict[str, Any], Any]] = []
     for chosen in itertools.product(*options) if options else ():
         arguments: dict[str, Any] = {}
         for _, values in chosen:

@@ -8,27 +8,22 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
 from services.trainer.arguments import TrainingArguments
 from services.trainer.batches import PlacePhotos, TrainingBatches
-from services.trainer.checkpoint_names import NameTemplate
 from services.trainer.configuration import as_plain, write_yaml
-from services.trainer.device import Device, choose_device
+from services.trainer.device import Device
 from services.trainer.display import Display
-from services.trainer.evaluation.nearest import nearest
-from services.trainer.evaluation.recalls import KS
 from services.trainer.fit import fit
 from services.trainer.history import Epoch, History
 from services.trainer.keep import KeptCheckpoints, copy_checkpoint
 from services.trainer.learner import Learner
-from services.trainer.loggers import check_loggers, make_loggers
+from services.trainer.loggers import make_loggers
 from services.trainer.make_model import make_model
 from services.trainer.open_data import Sets, describe_training_set, open_places, open_sets
 from services.trainer.random_state import seed_everything
 from services.trainer.run_folder import (
-    CHECKPOINTS,
     CONFIG,
     METRICS,
     find_run,
@@ -36,6 +31,7 @@ from services.trainer.run_folder import (
     resumed_arguments,
 )
 from services.trainer.sampling import BatchPlan
+from services.trainer.settle import as_meant, as_values, check_machine, kept_checkpoints
 from services.trainer.stop import RunStopped, StopRequest
 from services.trainer.summary import show_data, summarise
 from services.trainer.validation import Validation, figures_of
@@ -43,6 +39,7 @@ from services.trainer.watch import Watch, is_measured_after, note_epoch
 from shared.datasets.shots import TrainingSet
 from shared.errors import Conflict, InvalidRequest
 from shared.vision.place_models.checkpoint import load_checkpoint
+from shared.vision.place_models.model import PlaceModel
 
 Json = dict[str, Any]
 
@@ -55,23 +52,11 @@ class _Ready:
     device: Device
     places: TrainingSet
     sets: Sets
+    model: PlaceModel
     folder: Path
     history: History
     kept: KeptCheckpoints
     resume_from: Path | None
-
-
-def check_machine(arguments: TrainingArguments) -> Device:
-    """The device, when all that the arguments need of this machine is there.
-
-    Raises Misconfigured (`no_gpu`, `faiss_gpu_missing`, `logger_missing`), InvalidRequest.
-    """
-    device = choose_device(arguments)
-    check_loggers(arguments.logger)
-    if arguments.faiss_gpu:
-        one = np.ones((1, 1), np.float32)
-        nearest(one, one, 1, faiss_gpu=True)
-    return device
 
 
 def run(arguments: TrainingArguments, display: Display, stop: StopRequest) -> Json:
@@ -83,16 +68,18 @@ def run(arguments: TrainingArguments, display: Display, stop: StopRequest) -> Js
     if arguments.experiment_phase == "test":
         return _test_only(arguments, device, display, stop)
     places, sets = open_places(arguments), open_sets(arguments)
-    arguments = _as_meant(arguments, places, sets)
+    arguments = as_meant(arguments, places, sets)
     if arguments.show_data_stats:
         show_data(places, sets, display)
+    seed_everything(arguments.seed)
+    model = make_model(arguments, display, resuming=False)
     folder = Path() if arguments.fast_dev_run else new_run_folder(arguments)
     arguments = arguments.model_copy(update={"run_name": folder.name})
-    kept = _kept(arguments, folder, sets, display)
+    kept = kept_checkpoints(arguments, folder, sets, display)
     history = History(describe_training_set(places))
     if not arguments.fast_dev_run:
         write_yaml(arguments, folder / CONFIG)
-    ready = _Ready(arguments, device, places, sets, folder, history, kept, None)
+    ready = _Ready(arguments, device, places, sets, model, folder, history, kept, None)
     return _kept_when_stopped(ready, display, stop)
 
 
@@ -112,10 +99,11 @@ def resume(path: Path, changes: Json, display: Display, stop: StopRequest) -> Js
             "with. Bring them back, or begin a new run (--model_path takes this one's weights).",
         )
     sets = open_sets(arguments)
-    kept = _kept(arguments, folder, sets, display)
+    kept = kept_checkpoints(arguments, folder, sets, display)
     kept.best = [each for each in history.best if (kept.folder / each[1]).is_file()]
+    model = make_model(arguments, display, resuming=True)
     write_yaml(arguments, folder / CONFIG)
-    ready = _Ready(arguments, device, places, sets, folder, history, kept, checkpoint)
+    ready = _Ready(arguments, device, places, sets, model, folder, history, kept, checkpoint)
     return _kept_when_stopped(ready, display, stop)
 
 
@@ -135,9 +123,7 @@ def _kept_when_stopped(ready: _Ready, display: Display, stop: StopRequest) -> Js
 
 def _learn(ready: _Ready, display: Display, stop: StopRequest) -> Json:
     arguments, device = ready.arguments, ready.device
-    seed_everything(arguments.seed)
-    model = make_model(arguments, display, resuming=ready.resume_from is not None)
-    learner = Learner(model, arguments, about={"training": _as_values(arguments)})
+    learner = Learner(ready.model, arguments, about={"training": as_values(arguments)})
     validation = Validation(arguments, device.torch_device, display.progress, stop)
     plan = BatchPlan(
         ready.places.places,
@@ -170,7 +156,11 @@ def _learn(ready: _Ready, display: Display, stop: StopRequest) -> Json:
         arguments.logger, ready.folder, as_plain(arguments)
     )  # fmt: skip
     if ready.resume_from is None:
-        validation.try_out(learner.model.to(device.torch_device), ready.sets.validation)
+        validation.try_out(
+            learner.model.to(device.torch_device),
+            ready.sets.validation,
+            arguments.num_sanity_val_steps,
+        )
         seed_everything(arguments.seed)
         is_over = False
     else:
@@ -178,7 +168,7 @@ def _learn(ready: _Ready, display: Display, stop: StopRequest) -> Json:
     if not is_over:
         fit(learner, batches, watch, arguments, device, ready.folder, loggers, ready.resume_from)
     if arguments.fast_dev_run:
-        validation.measure(learner.model.to(device.torch_device), ready.sets.validation)
+        validation.try_out(learner.model.to(device.torch_device), ready.sets.validation, 1)
         display.say("One batch of everything went through; nothing was kept.")
         return {"fast_dev_run": True}
     ready.history.save(ready.folder)
@@ -201,7 +191,7 @@ def _measure_what_is_due(
     arguments, history = ready.arguments, ready.history
     stored = torch.load(ready.resume_from, map_location="cpu", weights_only=True)
     epoch, step, epoch_done = stored["epoch"], stored["global_step"], stored["epoch_done"]
-    is_over = (arguments.max_steps is not None and step >= arguments.max_steps) or (
+    is_over: bool = (arguments.max_steps is not None and step >= arguments.max_steps) or (
         epoch_done and epoch + 1 >= arguments.max_epochs
     )
     history.epochs = [each for each in history.epochs if each.step <= step]
@@ -245,62 +235,3 @@ def _test_only(
     report = summarise(arguments, folder, None, None, sets, tested)
     (folder / METRICS).write_text(json.dumps(report, indent=2) + "\n")
     return report
-
-
-def _as_meant(arguments: TrainingArguments, places: TrainingSet, sets: Sets) -> TrainingArguments:
-    """The arguments with what was left to the data set filled in."""
-    if arguments.img_per_place > arguments.min_img_per_place:
-        raise InvalidRequest(
-            "bad_argument",
-            f"--img_per_place {arguments.img_per_place} is more than --min_img_per_place "
-            f"{arguments.min_img_per_place}: places without enough photos would be in the set.",
-        )
-    assert arguments.data_root is not None
-    changes: Json = {
-        **sets.names,
-        "cities": places.cities,
-        "data_root": arguments.data_root.resolve(),
-        "eval_roots": tuple(root.resolve() for root in arguments.eval_roots),
-    }
-    if "monitor" not in arguments.model_fields_set and sets.validation:
-        changes["monitor"] = f"{sets.validation[0].name}/R1"
-    return TrainingArguments(**{**arguments.model_dump(), **changes})
-
-
-def _kept(
-    arguments: TrainingArguments, folder: Path, sets: Sets, display: Display
-) -> KeptCheckpoints:
-    metrics = [f"{each.name}/R{k}" for each in sets.validation for k in KS]
-    if not metrics:
-        display.warn("There is no set to validate on: only last.ckpt is kept.")
-    elif arguments.monitor not in metrics:
-        raise InvalidRequest(
-            "unknown_metric",
-            f"--monitor {arguments.monitor} is not measured in this run; known: "
-            f"{', '.join(metrics)}.",
-        )
-    name = NameTemplate(
-        arguments.filename,
-        as_plain(arguments),
-        metrics,
-        monitored=arguments.monitor.rpartition("/")[0],
-        insert_names=arguments.auto_insert_metric_name,
-    )
-    for dropped in name.dropped if metrics else ():
-        display.warn(f"--filename: no run on these sets logs {dropped}; it drops out of the names.")
-    return KeptCheckpoints(
-        folder / CHECKPOINTS,
-        name,
-        arguments.monitor,
-        arguments.mode,
-        arguments.save_top_k,
-        arguments.save_weights_only,
-    )
-
-
-def _as_values(arguments: TrainingArguments) -> Json:
-    """What a checkpoint says of its training; no paths of this machine."""
-    plain = as_plain(arguments)
-    for name in ("data_root", "eval_roots", "weights", "model_path", "default_root_dir"):
-        plain.pop(name)
-    return plain

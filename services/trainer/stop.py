@@ -19,16 +19,27 @@ class StopRequest:
 
     def __init__(self) -> None:
         self.asked = False
+        self._is_listening = False
 
     @contextmanager
     def listening(self) -> Iterator[StopRequest]:
         """Take the signals for as long as the block lasts; only in the main thread."""
-        before = {number: signal.signal(number, self._take) for number in SIGNALS}
+        before = {number: signal.getsignal(number) for number in SIGNALS}
+        self._is_listening = True
+        self.take_signals()
         try:
             yield self
         finally:
+            self._is_listening = False
             for number, handler in before.items():
                 signal.signal(number, handler)
+
+    def take_signals(self) -> None:
+        """Take them back from Lightning, which puts a handler of its own before that of SIGTERM and
+        would end the run with nothing kept."""
+        if self._is_listening:
+            for number in SIGNALS:
+                signal.signal(number, self._take)
 
     def _take(self, number: int, frame: FrameType | None) -> None:
         if self.asked:

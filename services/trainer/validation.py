@@ -55,25 +55,23 @@ class Validation:
             found[each.name] = asked.recalls
         return found
 
-    def try_out(self, model: torch.nn.Module, sets: Sequence[EvaluationSet]) -> None:
-        """Describe the first photos of each set, so that a fault in them shows early."""
-        batches = self._arguments.num_sanity_val_steps
-        if batches == 0:
-            return
-        if batches < 0:
-            self.measure(model, sets)
-            return
-        most = batches * PHOTOS_AT_ONCE
+    def try_out(self, model: torch.nn.Module, sets: Sequence[EvaluationSet], batches: int) -> None:
+        """Measure the first batches of each set, -1: all, so that a fault in them shows early."""
+        most = batches * PHOTOS_AT_ONCE if batches >= 0 else None
         begun = [
             replace(
                 each,
                 database=each.database[:most],
                 queries=each.queries[:most],
-                positives=tuple(found[found < most] for found in each.positives[:most]),
+                positives=tuple(
+                    found if most is None else found[found < most]
+                    for found in each.positives[:most]
+                ),
             )
             for each in sets
         ]
-        self.measure(model, begun)
+        if batches:
+            self.measure(model, begun)
 
     def _test_size(self) -> tuple[int, int] | None:
         size = self._arguments.test_image_size

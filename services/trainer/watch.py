@@ -64,6 +64,7 @@ class Watch(lightning.Callback):
     def on_train_start(
         self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
     ) -> None:
+        self._stop.take_signals()
         if self._random_state is not None:
             set_random_state(self._random_state)
         self._continue_clock()

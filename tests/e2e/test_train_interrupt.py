@@ -12,9 +12,9 @@ import torch
 from services.trainer import run
 from services.trainer.display import Quiet
 from services.trainer.stop import StopRequest
-from tests.integration.test_train import assert_same_weights, told, train
 from tests.support.processes import INHERITED, PLACEWISE, start
 from tests.support.tiny_places import write_tiny_places
+from tests.support.train_runs import assert_same_weights, told, train
 
 LIMIT_SECONDS = 240
 

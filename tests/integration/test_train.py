@@ -10,7 +10,9 @@ from typing import Any
 
 import pytest
 import torch
+from typer.testing import CliRunner
 
+from services.cli.main import tree
 from services.trainer import run
 from services.trainer.configuration import make_arguments, read_yaml
 from services.trainer.display import Quiet
@@ -18,6 +20,7 @@ from services.trainer.stop import RunStopped, StopRequest
 from shared.errors import Conflict, InvalidRequest, NotFound, PlacewiseError, Unprocessable
 from shared.vision.place_models.checkpoint import load_checkpoint
 from tests.support.tiny_places import CITY, write_tiny_places
+from tests.support.train_runs import assert_same_weights, told, train, weights
 
 Json = dict[str, Any]
 
@@ -33,47 +36,6 @@ def _one_thread() -> Iterator[None]:
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(threads)
-
-
-def told(places: Path, out: Path, **others: Any) -> Json:
-    """A run of a small network: two epochs of three batches of two places."""
-    return {
-        "data_root": str(places),
-        "accelerator": "cpu",
-        "faiss_gpu": False,
-        "pretrained": False,
-        "layers_to_freeze": -1,
-        "layers_to_crop": [2],
-        "agg_arch": "gem",
-        "image_size": 32,
-        "batch_size": 2,
-        "img_per_place": 3,
-        "min_img_per_place": 3,
-        "num_workers": 0,
-        "max_epochs": 2,
-        "warmpup_steps": 2,
-        "lr": 1e-3,
-        "log_every_n_steps": 1,
-        "default_root_dir": str(out),
-        "run_name": "run",
-        "logger": "none",
-        **others,
-    }
-
-
-def train(said: Json, display: Quiet | None = None) -> Json:
-    return run.run(make_arguments(said), display or Quiet(), StopRequest())
-
-
-def weights(path: Path) -> dict[str, torch.Tensor]:
-    return dict(torch.load(path, weights_only=True)["state_dict"])
-
-
-def assert_same_weights(one: Path, other: Path) -> None:
-    first, second = weights(one), weights(other)
-    assert first.keys() == second.keys()
-    for name, tensor in first.items():
-        assert torch.equal(tensor, second[name]), name
 
 
 class StopAfter(Quiet):
@@ -281,3 +243,34 @@ def test_a_diverged_training_ends_with_an_error_that_says_so(places: Path, tmp_p
     with pytest.raises(Unprocessable) as caught:
         train(said)
     assert caught.value.code in ("loss_not_finite", "features_not_finite")
+
+
+def test_the_grid_command_makes_every_run_names_the_failed_one_and_ranks_the_others(
+    places: Path, tmp_path: Path
+) -> None:
+    said = told(places, tmp_path, max_epochs=1)
+    del said["default_root_dir"], said["run_name"], said["agg_arch"]
+    file = tmp_path / "grid.yaml"
+    mixvpr = {"agg_arch": "MixVPR", "agg_config": {"nonsense": 1}}
+    file.write_text(
+        json.dumps({"base": said, "grid": {"agg": [{"agg_arch": "AVG"}, {"agg_arch": "GeM"}]},
+                    "runs": [{"name": "wrong", **mixvpr}]})
+    )  # fmt: skip
+    out = tmp_path / "grid"
+    command = ["grid", str(file), "--out", str(out)]
+    dry = CliRunner().invoke(tree(["grid"]), [*command, "--dry-run", "--json"])
+    assert dry.exit_code == 0, dry.output
+    assert [(row["run"], row["state"]) for row in json.loads(dry.stdout)] == [
+        ("AVG", "waiting"),
+        ("GeM", "waiting"),
+        ("wrong", "waiting"),
+    ]
+    assert not out.exists()
+    answer = CliRunner().invoke(tree(["grid"]), [*command, "--json"])
+    assert answer.exit_code == 1, answer.output
+    states = {each["run"]["name"]: each["state"] for each in json.loads(answer.stdout)}
+    assert states == {"AVG": "finished", "GeM": "finished", "wrong": "failed"}
+    assert "wrong failed: bad_agg_config" in answer.stderr.replace("\n", " ")
+    table = (out / "leaderboard.md").read_text()
+    assert table.index("AVG") < table.index("wrong")
+    assert "failed: bad_agg_config" in table
