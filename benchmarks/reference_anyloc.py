@@ -31,6 +31,7 @@ class ReferenceAnyLoc:
         """(K, width) centres. The recipe is one of the `anyloc-` ones, with hard VLAD."""
         recipe, device = measured.recipe, measured.device
         assert recipe.layer is not None
+        assert recipe.preprocessing is not None
         size = recipe.backbone.removeprefix("dinov2-")
         self._device = device
         self._preprocessing = get_preprocessing(recipe.preprocessing)

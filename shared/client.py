@@ -286,11 +286,17 @@ class Client:
         return list(found)
 
     def start_generation(
-        self, *, vocabulary_id: UUID | str | None = None, pca: int | None = None
+        self,
+        *,
+        vocabulary_id: UUID | str | None = None,
+        pca: int | None = None,
+        extractor: str | None = None,
     ) -> Json:
-        """Start switching to a vocabulary that the map has, or to descriptors of `pca` dimensions;
-        with neither, to whole ones of an extractor without vocabulary."""
-        wanted = _given(vocabulary_id=vocabulary_id and str(vocabulary_id), pca=pca)
+        """Start switching to a vocabulary that the map has, to descriptors of `pca` dimensions, or
+        to another extractor; with none, to whole ones of an extractor without vocabulary."""
+        wanted = _given(
+            vocabulary_id=vocabulary_id and str(vocabulary_id), pca=pca, extractor=extractor
+        )
         return self._call("POST", "/generations", json=wanted)
 
     def generations(self) -> list[Json]:
@@ -333,6 +339,29 @@ class Client:
     def delete_map(self, name: str) -> Json:
         """Delete a map with all its photos."""
         return self._call("DELETE", f"/maps/{quote(name, safe='')}")
+
+    def add_model(
+        self,
+        checkpoint: Path,
+        name: str,
+        *,
+        licence: str | None = None,
+        note: str | None = None,
+        on_sent: Callable[[int], object] = lambda sent_bytes: None,
+    ) -> Json:
+        """Start adding a checkpoint as the model `name`; `on_sent` sees the bytes sent so far."""
+        said = _given(name=name, licence=licence, note=note)
+        with _opened(checkpoint) as opened:
+            files = {"file": (_name_of(checkpoint), _Watched(opened, on_sent))}
+            return self._call("POST", "/models", opened, files=files, data=said)
+
+    def models(self) -> list[Json]:
+        """The models that were added."""
+        found: list[Json] = self._call("GET", "/models")["models"]
+        return found
+
+    def remove_model(self, name: str) -> Json:
+        return self._call("DELETE", f"/models/{quote(name, safe='')}")
 
     def stats(self) -> Json:
         return self._call("GET", "/database/stats")

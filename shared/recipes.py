@@ -4,6 +4,7 @@
     get_recipe("anyloc-vitb14:clusters=32,facet=key,layer=9", allow_test_extractors=False)
     get_recipe("anyloc-vitg14:preprocessing=paper480x640", allow_test_extractors=False)
     get_recipe("torchhub:/models/mine:my_entry", allow_test_extractors=False)
+    get_recipe("gsv:night-walks", allow_test_extractors=False)
 
 A name may carry options. Their canonical order is the alphabet's and what equals the extractor's
 own default is left out, so that one extractor has one name wherever it is stored or compared.
@@ -20,6 +21,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from shared.errors import Misconfigured
+from shared.model_names import PREFIX as TRAINED_PREFIX
+from shared.model_names import TrainedName, read_trained_name
 from shared.torchhub_names import DEFAULT_SIDE, PREFIX, HubEntry, read_hub_name
 
 FACETS = ("query", "key", "value", "token")
@@ -30,6 +33,7 @@ PREPROCESSINGS = ("square224", *PARITY_PREPROCESSINGS)
 MOST_CLUSTERS = 4096
 MOST_PCA = 1024  # dimensions after PCA: its time and memory grow with the square
 TORCHHUB = "torchhub"  # the backbone that is a torch.hub entry
+TRAINED = "gsv"  # the backbone that is a model of `placewise train`
 SLOW = "test-slow"  # the backbone whose width and time are options
 MOST_WIDTH = 131_072
 MOST_MILLISECONDS = 60_000
@@ -48,8 +52,10 @@ class Recipe:
     """Length of one local feature; None where only the loaded network tells."""
     parameters: int | None
     """Of the whole backbone, rounded up; each takes 4 bytes. None as above."""
-    preprocessing: str
-    """A name that `shared.vision.preprocessing.get_preprocessing` knows."""
+    preprocessing: str | None
+    """A name that `shared.vision.preprocessing.get_preprocessing` knows; None where only the loaded
+    network tells.
+    """
     aggregator: str
     """One of AGGREGATORS. VLAD, hard or soft, needs a vocabulary; GeM and the mean do without. Or
     `none`: the backbone makes one feature of a photo, and that is its descriptor.
@@ -70,6 +76,8 @@ class Recipe:
     """
     hub: HubEntry | None = None
     """The torch.hub entry that makes the descriptors, for `torchhub:` names."""
+    trained: TrainedName | None = None
+    """The model that makes the descriptors, for `gsv:` names."""
     for_tests: bool = False
     milliseconds: int = 0
     """Time that a photo takes, slept, of an extractor for tests."""
@@ -94,9 +102,17 @@ class Recipe:
         return self.width * (self.clusters if self.needs_vocabulary else 1)
 
     @property
-    def local_features(self) -> tuple[int | str | HubEntry | None, ...]:
+    def local_features(self) -> tuple[int | str | HubEntry | TrainedName | None, ...]:
         """Recipes that agree in this can share one loaded backbone."""
-        return (self.backbone, self.width, self.layer, self.facet, self.milliseconds, self.hub)
+        return (
+            self.backbone,
+            self.width,
+            self.layer,
+            self.facet,
+            self.milliseconds,
+            self.hub,
+            self.trained,
+        )
 
 
 def _anyloc(size: str, *, depth: int, width: int, layer: int, parameters: int) -> Recipe:
@@ -170,18 +186,21 @@ def get_recipe(name: str, *, allow_test_extractors: bool) -> Recipe:
 
     Misconfigured: `unknown_extractor`, `test_extractor` (for tests, and not allowed),
     `bad_extractor_option` (naming the option, its value, and what is allowed), and those of
-    `read_hub_name`. Whether a torch.hub entry may be loaded, `Settings.recipe` knows.
+    `read_hub_name` and `read_trained_name`. Whether a torch.hub entry may be loaded,
+    `Settings.recipe` knows; whether a model was added, the catalog.
     """
     if name.startswith(PREFIX):
         return _hub_recipe(read_hub_name(name))
+    if name.startswith(TRAINED_PREFIX):
+        return _trained_recipe(read_trained_name(name))
     base, colon, written = name.partition(":")
     recipe = RECIPES.get(base)
     if recipe is None:
         known = ", ".join(sorted(r.name for r in RECIPES.values() if not r.for_tests))
         raise Misconfigured(
             "unknown_extractor",
-            f"There is no extractor {base!r}. Known: {known}, and {PREFIX}OWNER/NAME@COMMIT:ENTRY "
-            "(EXTRACTOR).",
+            f"There is no extractor {base!r}. Known: {known}, {PREFIX}OWNER/NAME@COMMIT:ENTRY, and "
+            f"{TRAINED_PREFIX}NAME of a model that was added (EXTRACTOR).",
         )
     if recipe.for_tests and not allow_test_extractors:
         raise Misconfigured(
@@ -202,6 +221,18 @@ def _hub_recipe(hub: HubEntry) -> Recipe:
         preprocessing="square224" if usual else f"resize{hub.height}x{hub.width}",
         aggregator="none",
         hub=hub,
+    )
+
+
+def _trained_recipe(trained: TrainedName) -> Recipe:
+    return Recipe(
+        name=trained.extractor,
+        backbone=TRAINED,
+        width=None,
+        parameters=None,
+        preprocessing=None,
+        aggregator="none",
+        trained=trained,
     )
 
 

@@ -129,6 +129,9 @@ class Settings(BaseSettings):
         description="where the objects lie that a batch may name by their keys",
     )
     max_vocabulary_bytes: int = Field(64_000_000, gt=0, description="bytes of an imported one")
+    max_model_bytes: int = Field(
+        2_000_000_000, gt=0, description="bytes of a checkpoint that is added as a model"
+    )
     presign_seconds: int = Field(
         900, ge=1, le=604_800, description="time to send and complete a direct upload"
     )
@@ -193,6 +196,12 @@ class Settings(BaseSettings):
     dino_weights: Path | None = Field(
         None,
         description="DINOv2's weights: a .pth, .pt or .safetensors file; unset: timm's on the hub",
+    )
+    model_cache_bytes: int = Field(
+        10_000_000_000,
+        ge=0,
+        description="of fetched models that an extractor keeps under PLACEWISE_HOME when objects "
+        "lie in a bucket; what was used least lately goes first",
     )
     batch_photos: int = Field(16, ge=1, le=1024, description="most photos in one batch")
     decode_processes: int = Field(2, ge=1, le=64, description="photos decoded at once")
@@ -418,11 +427,11 @@ class Settings(BaseSettings):
     @model_validator(mode="after")
     def _new_maps_have_one_extractor(self) -> Self:
         try:
-            named = get_recipe(
-                self.extractor, allow_test_extractors=self.allow_test_extractors
-            ).name
+            recipe = get_recipe(self.extractor, allow_test_extractors=self.allow_test_extractors)
+            check_served(recipe)
         except Misconfigured as error:
             raise ValueError(f"EXTRACTOR={self.extractor}: {error.detail}") from error
+        named = recipe.name
         chosen = self.new_map_extractor
         if "extractor" in self.model_fields_set and named != chosen:
             raise ValueError(
@@ -447,9 +456,11 @@ class Settings(BaseSettings):
     def recipe(self, name: str) -> Recipe:
         """The recipe of an extractor that this installation may load.
 
-        Misconfigured as `get_recipe`, and `torchhub_not_allowed` for code that nobody allowed.
+        Misconfigured as `get_recipe`, `torchhub_not_allowed` for code that nobody allowed, and
+        `model_not_added` for a checkpoint that is only a file.
         """
         recipe = get_recipe(name, allow_test_extractors=self.allow_test_extractors)
+        check_served(recipe)
         if recipe.hub is not None and recipe.name not in self.allowed_hub_extractors:
             raise Misconfigured(
                 "torchhub_not_allowed",
@@ -491,6 +502,17 @@ class Settings(BaseSettings):
         if self.database_url is not None:
             return self.database_url.get_secret_value()
         return f"sqlite:///{self.placewise_home / 'catalog.sqlite'}"
+
+
+def check_served(recipe: Recipe) -> None:
+    """Misconfigured (`model_not_added`) for a checkpoint that other machines would not find."""
+    if recipe.trained is not None and recipe.trained.file is not None:
+        raise Misconfigured(
+            "model_not_added",
+            f"{recipe.trained.file} is a file of one machine, and a map's photos are described "
+            f"wherever there is room. Add it: `placewise models add {recipe.trained.file} --name "
+            "NAME`, and use gsv:NAME.",
+        )
 
 
 def _split(value: str | None) -> list[str]:

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from services.cli.load_extractor import load_extractor
 from services.cli.output import shown
 from services.cli.photo_files import decoded_batches
 from services.cli.row_files import open_rows
@@ -20,11 +21,10 @@ from services.cli.whole_file import whole_or_nothing
 from shared.errors import Misconfigured, PlacewiseError, Unprocessable
 from shared.recipes import Recipe
 from shared.settings import Settings
-from shared.vision.extractors import Extractor, choose_device, not_finite
+from shared.vision.extractors import Extractor, not_finite
 from shared.vision.passes import PhotoDoesNotFit
 from shared.vision.pca import Projection
 from shared.vision.pca_file import decode_whitening
-from shared.vision.precision import choose_precision
 from shared.vision.provenance import check_fits, check_width
 from shared.vision.vocabulary import Centres
 from shared.vision.vocabulary_file import VocabularyFile, read_vocabulary
@@ -73,13 +73,7 @@ def describe_files(
     started = time.perf_counter()
     own = own_vocabulary(recipe, vocabulary)
     whitening = decode_whitening(pca.read_bytes()) if pca is not None else None
-    device = choose_device(settings.device)
-    extractor = Extractor(
-        recipe,
-        device,
-        precision=choose_precision(settings.precision, recipe, device),
-        dino_weights=settings.dino_weights,
-    )
+    extractor = load_extractor(recipe, settings)
     centres = centres_of(extractor, own)
     projection = None
     if whitening is not None:

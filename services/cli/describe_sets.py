@@ -12,7 +12,8 @@ from typing import Any
 from rich.progress import Progress
 
 from services.cli.describe_files import centres_of, own_vocabulary
-from services.cli.fit_folder import load_extractor, pixels_of
+from services.cli.fit_folder import pixels_of
+from services.cli.load_extractor import load_extractor
 from services.cli.photo_files import decoded_batches
 from services.trainer.evaluation.cache import CachedDescribe, Timed
 from services.trainer.evaluation.describe import Rows, photos_refused

@@ -40,7 +40,7 @@ def memory_check(settings: Settings) -> str:
     from shared.vision.preprocessing import get_preprocessing
 
     recipe = _recipe(settings)
-    if recipe.parameters is None:
+    if recipe.parameters is None or recipe.preprocessing is None:
         return f"{recipe.name} tells its size only when it is loaded"
     device = choose_device(settings.device)
     if device.type == "cuda":
@@ -82,9 +82,9 @@ def extractor_check(settings: Settings) -> str:
         from shared.vision.torchhub_code import code_at_hand
 
         code_at_hand(recipe.hub)
-    from shared.vision.extractors import Extractor, choose_device
+    from services.cli.load_extractor import load_extractor
 
-    extractor = Extractor(recipe, choose_device(settings.device))
+    extractor = load_extractor(recipe, settings)
     shipped = extractor.shipped_vocabulary()
     return f"{recipe.name}: weights {extractor.backbone.fingerprint[:12]} load, " + (
         f"{shipped[0].clusters} shipped centres" if shipped else "no shipped vocabulary"

@@ -13,17 +13,17 @@ from typing import Any
 from rich.progress import Progress
 
 from services.cli.configuration import read_settings
+from services.cli.load_extractor import load_extractor
 from services.cli.output import shown
 from services.cli.photo_files import decoded_batches
 from services.cli.photo_places import photo_paths
 from services.cli.whole_file import whole_or_nothing
 from shared.errors import InvalidRequest, PlacewiseError, Unprocessable
-from shared.recipes import Recipe, get_recipe
+from shared.recipes import get_recipe
 from shared.settings import Settings
-from shared.vision.extractors import Extractor, choose_device
+from shared.vision.extractors import Extractor
 from shared.vision.fit_photos import fit_photos
 from shared.vision.patches import choose_photos
-from shared.vision.precision import choose_precision
 from shared.vision.resample import Pixels
 
 SAMPLE_PHOTOS = 1000  # as a map's fit learns from, unless told otherwise
@@ -80,17 +80,6 @@ def fit_folder(
         "provenance": fitted.provenance,
         "refused": refused,
     }
-
-
-def load_extractor(recipe: Recipe, settings: Settings) -> Extractor:
-    """On the device and in the precision that the settings say; raises what loading it does."""
-    device = choose_device(settings.device)
-    return Extractor(
-        recipe,
-        device,
-        precision=choose_precision(settings.precision, recipe, device),
-        dino_weights=settings.dino_weights,
-    )
 
 
 def pixels_of(

@@ -15,6 +15,7 @@ from rich.progress import Progress
 
 from services.cli.configuration import read_settings
 from services.cli.describe_files import centres_of, own_vocabulary
+from services.cli.load_extractor import load_extractor
 from services.cli.output import shown
 from services.cli.photo_files import decoded_batches
 from services.cli.photo_places import photo_paths
@@ -22,7 +23,7 @@ from services.cli.whole_file import whole_or_nothing
 from shared.errors import InvalidRequest, PlacewiseError, Unprocessable
 from shared.recipes import get_recipe
 from shared.settings import Settings
-from shared.vision.extractors import Extractor, choose_device
+from shared.vision.extractors import Extractor
 from shared.vision.pca import Rows
 from shared.vision.pca_file import WhiteningFile
 from shared.vision.pca_fit import check_can_fit
@@ -98,7 +99,7 @@ def _load(
         allow_test_extractors=settings.allow_test_extractors,
     )
     own = own_vocabulary(recipe, vocabulary)
-    loaded = Extractor(recipe, choose_device(settings.device), dino_weights=settings.dino_weights)
+    loaded = load_extractor(recipe, settings)
     return loaded, centres_of(loaded, own)
 
 

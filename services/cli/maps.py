@@ -1,4 +1,4 @@
-"""`placewise maps list|create|delete`."""
+"""`placewise maps list|create|switch|delete`."""
 
 from __future__ import annotations
 
@@ -10,7 +10,16 @@ from rich.table import Table
 
 from services.cli.connect import connect
 from services.cli.extractor_options import PreprocessingOption, extractor_name
-from services.cli.output import JsonOption, KeyOption, ServerOption, answers, explained, print_json
+from services.cli.output import (
+    JsonOption,
+    KeyOption,
+    ServerOption,
+    answers,
+    explained,
+    print_json,
+    progress_bar,
+)
+from services.cli.wait import wait_with_bar
 from shared.client import Json
 from shared.errors import Conflict
 
@@ -73,6 +82,39 @@ def create(
             print_json(made)
             return
         answers.print(f"The map {name} is there, for photos described by {made['extractor']}.")
+
+
+@app.command("switch")
+def switch(
+    name: Name,
+    extractor: Annotated[
+        str, typer.Option("--extractor", help="By name: gsv:NAME of a model that was added, say.")
+    ],
+    vocabulary: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ID", help="One that the map has; left out: the one that comes with it, if any."
+        ),
+    ] = None,
+    server: ServerOption = None,
+    key: KeyOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Describe a map's photos with another extractor; search goes on, and switches at the end."""
+    with explained(as_json):
+        with connect(server, name, key) as client, progress_bar() as progress:
+            started = client.start_generation(extractor=extractor, vocabulary_id=vocabulary)
+            job = wait_with_bar(client, started["job_id"], progress, "switching")
+        if as_json:
+            print_json(job)
+            return
+        result = job["result"]
+        answers.print(
+            f"The map {name} is described by {extractor}: {result['photos']} photos, "
+            f"{result['dimension']} dimensions, {result['failed']} failed.",
+            soft_wrap=True,
+            markup=False,
+        )
 
 
 @app.command("delete")

@@ -1,4 +1,4 @@
-"""`placewise models list|fetch`."""
+"""`placewise models list|fetch`; what is added stands in `services.cli.added_models`."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from rich.progress import (
 )
 from rich.table import Column, Table
 
+from services.cli.added_models import add, added, remove
 from services.cli.configuration import read_settings
 from services.cli.fingerprints import Known, remember
 from services.cli.output import JsonOption, answers, explained, messages, print_json
@@ -32,7 +33,12 @@ from shared.torchhub_names import HubEntry
 if TYPE_CHECKING:
     from shared.vision.download import OnProgress
 
-app = typer.Typer(help="Extractors' weights: what is on this machine, and getting what is not.")
+app = typer.Typer(
+    help="Extractors' weights: what is on this machine, getting what is not, adding your own."
+)
+app.command("add")(add)
+app.command("added")(added)
+app.command("remove")(remove)
 
 
 @app.command("list")
@@ -78,6 +84,12 @@ def fetch(
         recipe = get_recipe(name, allow_test_extractors=settings.allow_test_extractors)
         if recipe.for_tests:
             raise Misconfigured("no_weights", f"The extractor {recipe.name} has no weights.")
+        if recipe.trained is not None:
+            raise Misconfigured(
+                "no_weights",
+                f"The weights of {recipe.name} lie in the object store, where extractors take them "
+                "from: there is nothing to fetch.",
+            )
         with _download_bar(recipe.name) as on_progress:
             dimension = recipe.dimension
             if recipe.hub is not None:

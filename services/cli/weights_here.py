@@ -33,11 +33,11 @@ class Weights:
 
 def listed(settings: Settings) -> Iterator[Recipe]:
     """Every extractor by its own name, that of new maps, and the torch.hub entries that are
-    allowed; not those for tests.
+    allowed; not those for tests, nor models that were added, which lie in the object store.
     """
     names = dict.fromkeys((*RECIPES, settings.new_map_extractor, *settings.allowed_hub_extractors))
     recipes = (get_recipe(name, allow_test_extractors=True) for name in names)
-    yield from (recipe for recipe in recipes if not recipe.for_tests)
+    yield from (recipe for recipe in recipes if not recipe.for_tests and recipe.trained is None)
 
 
 def look(

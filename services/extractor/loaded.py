@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict, defaultdict
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 from uuid import UUID
 
+import torch
 from sqlalchemy.orm import Session
 
+from shared.catalog.added_models import model_to_load
 from shared.catalog.generations import Generation
 from shared.catalog.models import Model, ensure_model
 from shared.catalog.vocabularies import Vocabulary
@@ -18,12 +21,15 @@ from shared.errors import Unavailable
 from shared.objects import ObjectStore
 from shared.recipes import Recipe
 from shared.settings import Settings
+from shared.vision.backbones import Backbone
 from shared.vision.extractors import Extractor, choose_device, spec_fingerprint
 from shared.vision.passes import PassLimit
 from shared.vision.pca import Projection
 from shared.vision.pca_file import decode_whitening
 from shared.vision.precision import PRECISIONS, Precision, choose_precision
 from shared.vision.vocabulary import Centres, decode_centres
+
+LoadAdded = Callable[[str, torch.device], Backbone]
 
 MOST_EXTRACTORS = 2  # a large backbone takes gigabytes of GPU memory
 MOST_VOCABULARIES = 16
@@ -33,8 +39,10 @@ MOST_WHITENINGS = 2  # one from 98,304 to 512 dimensions takes 201 MB of the dev
 class LoadedModels:
     """Small LRU caches, shared by the thread that prepares and the one that describes."""
 
-    def __init__(self, store: ObjectStore, settings: Settings) -> None:
+    def __init__(self, store: ObjectStore, settings: Settings, load_added: LoadAdded) -> None:
+        """`load_added` is that of AddedModels."""
         self._store = store
+        self._load_added = load_added
         self._settings = settings
         self._lock = threading.RLock()
         self._device = choose_device(settings.device)
@@ -90,11 +98,13 @@ class LoadedModels:
                     backbone=loaded.backbone,
                     limit=limit,
                 )
+        added = recipe.trained.registered if recipe.trained else None
         made = Extractor(
             recipe,
             self._device,
             precision=precision,
             dino_weights=self._settings.dino_weights,
+            backbone=self._load_added(added, self._device) if added else None,
             limit=limit,
         )
         if self._device.type == "cuda":
@@ -140,8 +150,14 @@ class LoadedModels:
 
 
 def register(session: Session, extractor: Extractor) -> Model:
-    """The catalog's row of the extractor's weights."""
+    """The catalog's row of the extractor's weights; Misconfigured (`model_missing`) for an added
+    model that has been removed meanwhile.
+    """
     backbone = extractor.backbone
+    trained = extractor.recipe.trained
+    if trained is not None and trained.registered is not None:
+        # Locked: from this transaction on a generation uses it, and it is removed no more.
+        return model_to_load(session, trained.registered, lock=True)
     return ensure_model(
         session, backbone.name, backbone.fingerprint, backbone.licence, backbone.card
     )

@@ -1,5 +1,6 @@
 """Model changes, in slices: each is one short piece of work, so that a query waits for one at most.
 
+    add_model.py         a checkpoint that was sent; no map changes by it
     fit_vocabulary.py    plan, describe a sample, find the centres
     take_vocabulary.py   a file that was brought, or a vocabulary that the map has
     fit_pca.py           gather stored rows, find their directions
@@ -11,6 +12,8 @@ take the next one.
 
 from __future__ import annotations
 
+from services.extractor.add_model import AddModel
+from services.extractor.added_models import cache_folder
 from services.extractor.decoding import DecoderPool
 from services.extractor.fit_pca import FitPca
 from services.extractor.fit_vocabulary import FitVocabulary
@@ -36,10 +39,13 @@ class ModelChanges:
         self._fit = FitVocabulary(catalog, store, models, decoders, settings)
         self._take = TakeVocabulary(catalog, store, models)
         self._pca = FitPca(catalog, store, models)
+        self._add = AddModel(catalog, store, cache_folder(settings))
 
     def slice(self, job: Job) -> None:
         """The next piece of work of the claimed job; PlacewiseError when it can't go on."""
-        if job.kind == JobKind.IMPORT:
+        if job.kind == JobKind.ADD_MODEL:
+            self._add.from_checkpoint(job)
+        elif job.kind == JobKind.IMPORT:
             self._take.from_file(job)
         elif job.kind == JobKind.SWITCH:
             self._take.of_map(job)

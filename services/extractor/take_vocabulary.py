@@ -45,9 +45,27 @@ class TakeVocabulary:
         )
 
     def of_map(self, job: Job) -> None:
-        """SWITCH: the vocabulary `vocabulary_id` of the map, or None for extractors without one."""
-        extractor = extractor_of(self._catalog, self._models, job)
+        """SWITCH: the vocabulary `vocabulary_id` of the map, or None for extractors without one;
+        with `extractor` to that one, where None takes the vocabulary that comes with it.
+        """
+        if job.params.get("extractor") is None:
+            extractor = extractor_of(self._catalog, self._models, job)
+            shipped = None
+        else:
+            extractor = self._models.extractor(job.params["extractor"])
+            shipped = extractor.shipped_vocabulary()
         if job.params["vocabulary_id"] is None:
+            if shipped is not None:
+                begin_with_new(
+                    self._catalog,
+                    self._store,
+                    job,
+                    extractor,
+                    shipped[0],
+                    VocabularyOrigin.SHIPPED,
+                    shipped[1],
+                )
+                return
             if extractor.recipe.needs_vocabulary:
                 raise Unprocessable(
                     "vocabulary_unfit",

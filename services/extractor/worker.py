@@ -32,6 +32,7 @@ from uuid import UUID
 import numpy as np
 from sqlalchemy.exc import SQLAlchemyError
 
+from services.extractor.added_models import AddedModels
 from services.extractor.compare import Comparisons, Prepared
 from services.extractor.decoding import DecoderPool
 from services.extractor.loaded import LoadedModels
@@ -104,7 +105,8 @@ class Work:
     jobs: list[Job]
     lease: contextlib.ExitStack
     batch: Future[Batch | Prepared | None] | None
-    """None inside: the map has no vocabulary yet. None itself: a slice of a model change."""
+    """None inside: the map has no vocabulary yet. None itself: a slice of a model change, or a
+    checkpoint to look at."""
 
     @property
     def token(self) -> UUID:
@@ -132,7 +134,7 @@ class ExtractorWorker:
         self._heartbeat = Heartbeat(settings.heartbeat_file)
         self._name = name
         self._only_worker = only_worker
-        self._models = LoadedModels(store, settings)
+        self._models = LoadedModels(store, settings, AddedModels(catalog, store, settings).load)
         self._decoders = DecoderPool(settings)
         self._changes = ModelChanges(catalog, store, self._models, self._decoders, settings)
         self._comparisons = Comparisons(catalog, store, self._models, self._decoders, settings)
@@ -267,7 +269,7 @@ class ExtractorWorker:
         work.lease.enter_context(hold_lease(self._catalog, work.token, settings.lease_seconds))
         if jobs[0].kind == JobKind.COMPARE:
             work.batch = self._ahead.submit(self._comparisons.prepare, jobs[0])
-        elif jobs[0].kind not in MODEL_CHANGES:
+        elif jobs[0].kind not in (JobKind.ADD_MODEL, *MODEL_CHANGES):
             work.batch = self._ahead.submit(self._prepare, jobs)
         return work
 

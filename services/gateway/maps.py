@@ -14,6 +14,7 @@ from sqlalchemy.orm import Session
 from services.gateway.context import DEFAULT_MAP, NO_NUL, GatewayDep
 from services.gateway.once import OnceDep
 from services.gateway.schemas import Answer
+from shared.catalog.added_models import check_model
 from shared.catalog.figures import figures_of
 from shared.catalog.generations import active_generation
 from shared.catalog.maps import (
@@ -90,11 +91,12 @@ def new_map(gateway: GatewayDep, wanted: NewMap, once: OnceDep) -> MapAnswer:
     """Make an empty map; 409 when the name is taken."""
     settings = gateway.settings
     try:
-        extractor = settings.recipe(wanted.extractor or settings.new_map_extractor).name
+        recipe = settings.recipe(wanted.extractor or settings.new_map_extractor)
     except Misconfigured as error:
         raise invalid_field("extractor", error.detail) from None
     with gateway.catalog.write() as session:
-        answer = _answer(session, create_map(session, wanted.name, extractor))
+        check_model(session, recipe)
+        answer = _answer(session, create_map(session, wanted.name, recipe.name))
         once.keep(session, 201, answer)
     return answer
 

@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from sqlalchemy.orm import Session
 from starlette.concurrency import run_in_threadpool
 
-from services.gateway.context import DEFAULT_MAP, Gateway, GatewayDep, MapName
+from services.gateway.context import DEFAULT_MAP, NO_NUL, Gateway, GatewayDep, MapName
 from services.gateway.once import Once, OnceDep, OnceFormDep
 from services.gateway.receive import describe_form, receive_file
 from services.gateway.room import ROOM_FOR_JOBS, Kind, RoomDep
@@ -20,17 +20,19 @@ from services.gateway.schemas import (
     VocabularyAnswer,
     job_started,
 )
+from shared.catalog.added_models import check_model
 from shared.catalog.chunks import about_described
 from shared.catalog.generations import list_generations
 from shared.catalog.maps import get_map
 from shared.catalog.photos import PhotoRole, has_live
 from shared.catalog.vocabularies import get_vocabulary, list_vocabularies
 from shared.catalog.whitenings import generation_to_whiten
-from shared.errors import Conflict, PlacewiseError, invalid_field
+from shared.errors import Conflict, Misconfigured, PlacewiseError, invalid_field
 from shared.jobs import Job, JobKind
 from shared.jobs.model_changes import start_model_change
 from shared.objects.keys import new_vocabulary_key
-from shared.recipes import MOST_CLUSTERS, MOST_PCA
+from shared.recipes import MOST_CLUSTERS, MOST_PCA, Recipe
+from shared.settings import Settings
 from shared.vocabulary_npz import encode_vocabulary_file
 
 router = APIRouter(tags=["model changes"])
@@ -57,8 +59,17 @@ class SwitchRequest(BaseModel):
 
     model_config = ConfigDict(extra="forbid")
 
+    extractor: str | None = Field(
+        None,
+        max_length=200,
+        pattern=NO_NUL,
+        description="another extractor, such as gsv:NAME of a model that was added; null: the "
+        "map's own",
+    )
     vocabulary_id: UUID | None = Field(
-        None, description="null for extractors without one, and with `pca`"
+        None,
+        description="null for extractors without one, with `pca`, and for the one that comes with "
+        "another `extractor`",
     )
     pca: int | None = Field(
         None,
@@ -208,23 +219,54 @@ def start_generation(
     wanted: Annotated[SwitchRequest, Field()],
     map_name: MapName = DEFAULT_MAP,
 ) -> JobStarted:
-    """Describe all photos anew with a vocabulary that the map has, and switch to it; or shorten
-    their descriptors by PCA whitening, fitted on those that the map has, and switch to these.
+    """Describe all photos anew with a vocabulary that the map has or with another extractor, and
+    switch to it; or shorten their descriptors by PCA whitening, fitted on those that the map has,
+    and switch to these.
     """
+    recipe = _other_extractor(gateway.settings, wanted)
     with gateway.catalog.write() as session:
         map_id = get_map(session, map_name).id
         if wanted.pca is not None:
             job = _queue_pca(session, map_id, wanted.pca, wanted.vocabulary_id)
         else:
-            job = _queue_switch(session, map_id, wanted.vocabulary_id)
+            job = _queue_switch(session, map_id, recipe, wanted.vocabulary_id)
         once.keep_job(session, job)
     return _started(gateway, response, job)
 
 
-def _queue_switch(session: Session, map_id: UUID, vocabulary_id: UUID | None) -> Job:
+def _other_extractor(settings: Settings, wanted: SwitchRequest) -> Recipe | None:
+    """The extractor that is asked for; 422 for one that can't be had, or not with the rest."""
+    if wanted.extractor is None:
+        return None
+    if wanted.pca is not None:
+        raise invalid_field(
+            "pca", "is fitted on descriptors that are there: switch to the extractor first"
+        )
+    try:
+        recipe = settings.recipe(wanted.extractor)
+    except Misconfigured as error:
+        raise invalid_field("extractor", error.detail) from None
+    if recipe.needs_vocabulary:
+        if wanted.vocabulary_id is None and recipe.shipped_vocabulary is None:
+            raise invalid_field(
+                "vocabulary_id",
+                f"no vocabulary comes with {recipe.name}: name one that the map has "
+                "(GET /api/v1/vocabularies), or fit one in a map of its own",
+            )
+    elif wanted.vocabulary_id is not None:
+        raise invalid_field("vocabulary_id", f"{recipe.name} uses none: leave it out")
+    return recipe
+
+
+def _queue_switch(
+    session: Session, map_id: UUID, recipe: Recipe | None, vocabulary_id: UUID | None
+) -> Job:
+    params: dict[str, Any] = {"vocabulary_id": str(vocabulary_id) if vocabulary_id else None}
     if vocabulary_id is not None:
         get_vocabulary(session, map_id, vocabulary_id)
-    params = {"vocabulary_id": str(vocabulary_id) if vocabulary_id else None}
+    if recipe is not None:
+        check_model(session, recipe)
+        params["extractor"] = recipe.name
     return start_model_change(session, map_id, JobKind.SWITCH, params)
 
 

@@ -6,14 +6,14 @@ photo, is refused as soon as that is seen, without reading the rest.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from fastapi import Request
 from starlette.concurrency import run_in_threadpool
 
 from services.gateway.form import MAX_FIELDS_BYTES, OVERHEAD_BYTES, Form, malformed
-from shared.errors import InvalidRequest, TooLarge
+from shared.errors import InvalidRequest, PlacewiseError, TooLarge
 from shared.intake.received import PassingFile, Received, base_name, file_too_large
 from shared.objects import ObjectStore, ObjectWriter
 
@@ -28,15 +28,18 @@ async def receive_file(
     key: str,
     max_bytes: int,
     check_begin: Callable[[bytes], object] = lambda begin: None,
+    *,
+    too_large: Callable[[int], PlacewiseError] = file_too_large,
 ) -> Received:
     """The form's file, stored under `key`, with its text fields.
 
-    `check_begin` sees the first bytes before anything else is read and may raise. Raises
-    InvalidRequest (no multipart body, no file, an empty file), TooLarge (`file_too_large`), and
-    UnsupportedMedia for another kind of body. Nothing is left in the store when it raises.
+    `check_begin` sees the first bytes before anything else is read and may raise; `too_large` makes
+    the refusal of more than `max_bytes`. Raises InvalidRequest (no multipart body, no file, an
+    empty file), TooLarge (`file_too_large`), and UnsupportedMedia for another kind of body. Nothing
+    is left in the store when it raises.
     """
-    parts = _OneFile(PassingFile(max_bytes, check_begin))
-    form = Form(request, parts, max_bytes + OVERHEAD_BYTES, lambda: file_too_large(max_bytes))
+    parts = _OneFile(PassingFile(max_bytes, check_begin, too_large=too_large))
+    form = Form(request, parts, max_bytes + OVERHEAD_BYTES, lambda: too_large(max_bytes))
     writer: ObjectWriter | None = None
     try:
         async for piece in request.stream():
@@ -76,13 +79,17 @@ def _finish(store: ObjectStore, key: str, writer: ObjectWriter | None, rest: byt
     writer.commit()
 
 
-def describe_form(file: str, **fields: dict[str, Any]) -> dict[str, Any]:
-    """The OpenAPI description of a form with a file: FastAPI sees only a stream."""
+def describe_form(
+    file: str, required: Sequence[str] = (), **fields: dict[str, Any]
+) -> dict[str, Any]:
+    """The OpenAPI description of a form with a file, and of `fields`, of which some are `required`,
+    too: FastAPI sees only a stream.
+    """
     properties = {
         FILE_FIELD: {"type": "string", "format": "binary", "description": file},
         **fields,
     }
-    schema = {"type": "object", "required": [FILE_FIELD], "properties": properties}
+    schema = {"type": "object", "required": [FILE_FIELD, *required], "properties": properties}
     return {
         "requestBody": {"required": True, "content": {"multipart/form-data": {"schema": schema}}}
     }

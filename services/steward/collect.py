@@ -20,6 +20,7 @@ from shared.catalog.chunks import Chunk, Descriptor
 from shared.catalog.direct_uploads import DirectUpload
 from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.maps import bump_version, lock_map
+from shared.catalog.models import Model
 from shared.catalog.photos import Photo
 from shared.catalog.session import Catalog
 from shared.catalog.vocabularies import Vocabulary
@@ -30,8 +31,10 @@ from shared.jobs.table import MODEL_CHANGES, QUERY_JOBS, UNFINISHED, Job, JobKin
 from shared.objects import ObjectStore
 from shared.objects.keys import (
     ARCHIVES,
+    CHECKPOINTS,
     FEATURES,
     INCOMING,
+    MODELS,
     ORIGINALS,
     QUERIES,
     THUMBNAILS,
@@ -236,14 +239,16 @@ def collect_work(catalog: Catalog, store: ObjectStore) -> None:
             store.delete(key)
 
 
-def collect_archives(catalog: Catalog, store: ObjectStore) -> None:
-    """Archives whose batch has ended. One that no job knows may just be coming in."""
-    keys = [info.key for info in store.list(ARCHIVES)]
+def collect_brought(catalog: Catalog, store: ObjectStore, prefix: str, kind: JobKind) -> None:
+    """Files that came for jobs of this kind, once these have ended. One that no job knows may just
+    be coming in.
+    """
+    keys = [info.key for info in store.list(prefix)]
     if not keys:
         return
     with catalog.read() as session:
         ended = session.scalars(
-            select(Job.params).where(Job.kind == JobKind.BATCH, Job.state.not_in(UNFINISHED))
+            select(Job.params).where(Job.kind == kind, Job.state.not_in(UNFINISHED))
         )
         done = {params.get("object_key") for params in ended}
     for key in keys:
@@ -281,7 +286,8 @@ def collect(catalog: Catalog, store: ObjectStore, settings: Settings) -> None:
     collect_queries(catalog, store, settings.query_ttl_seconds)
     collect_work(catalog, store)
     collect_direct_uploads(catalog, store)
-    collect_archives(catalog, store)
+    collect_brought(catalog, store, ARCHIVES, JobKind.BATCH)
+    collect_brought(catalog, store, CHECKPOINTS, JobKind.ADD_MODEL)
 
 
 def _known_originals(session: Session, keys: list[str]) -> Iterable[str]:
@@ -296,11 +302,16 @@ def _known_originals(session: Session, keys: list[str]) -> Iterable[str]:
     return [*stored, *filter(None, waiting), *(key for key in keys if not is_original_key(key))]
 
 
-def _known_archives(session: Session, keys: list[str]) -> Iterable[str]:
-    waiting = session.scalars(
-        select(Job.params).where(Job.kind == JobKind.BATCH, Job.state.in_(UNFINISHED))
-    )
-    return [params["object_key"] for params in waiting if "object_key" in params]
+def _waiting_for(kind: JobKind) -> Callable[[Session, list[str]], Iterable[str]]:
+    """Files that came for jobs of this kind which have not ended."""
+
+    def known(session: Session, keys: list[str]) -> Iterable[str]:
+        waiting = session.scalars(
+            select(Job.params).where(Job.kind == kind, Job.state.in_(UNFINISHED))
+        )
+        return [params["object_key"] for params in waiting if "object_key" in params]
+
+    return known
 
 
 def _known_incoming(session: Session, keys: list[str]) -> Iterable[str]:
@@ -342,6 +353,10 @@ def _known_whitenings(session: Session, keys: list[str]) -> Iterable[str]:
     )
 
 
+def _known_models(session: Session, keys: list[str]) -> Iterable[str]:
+    return filter(None, session.scalars(select(Model.object_key).where(Model.object_key.in_(keys))))
+
+
 def _known_queries(session: Session, keys: list[str]) -> Iterable[str]:
     job_ids = _ids(key.removeprefix(QUERIES).partition(".")[0] for key in keys)
     known = session.scalars(select(Job.id).where(Job.id.in_(job_ids)))
@@ -376,7 +391,9 @@ def _ids(names: Iterable[str]) -> set[UUID]:
 
 REFERENCED: dict[str, Callable[[Session, list[str]], Iterable[str]]] = {
     INCOMING: _known_incoming,
-    ARCHIVES: _known_archives,
+    ARCHIVES: _waiting_for(JobKind.BATCH),
+    CHECKPOINTS: _waiting_for(JobKind.ADD_MODEL),
+    MODELS: _known_models,
     ORIGINALS: _known_originals,
     THUMBNAILS: _known_thumbnails,
     "chunks/": _known_chunks,

@@ -184,15 +184,17 @@ def _local_features(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
 
 
 def _vocabularies(catalog: Catalog, store: ObjectStore, map_id: UUID) -> None:
-    """Only the objects, also those of imports that never came to a row, and those of whitenings:
-    the rows are few.
+    """Only the objects, also those of imports that never came to a row, those of whitenings, and
+    checkpoints that were sent under the map's name: the rows are few.
     """
     with catalog.read() as session:
         keys = list(
             session.scalars(select(Vocabulary.object_key).where(Vocabulary.map_id == map_id))
         )
         imports = session.scalars(
-            select(Job.params).where(Job.map_id == map_id, Job.kind == JobKind.IMPORT)
+            select(Job.params).where(
+                Job.map_id == map_id, Job.kind.in_((JobKind.IMPORT, JobKind.ADD_MODEL))
+            )
         )
         keys += [params["object_key"] for params in imports]
         keys += session.scalars(

@@ -1,4 +1,6 @@
-"""Models: the backbones that have described photos here, with their weights' fingerprint."""
+"""Models: the backbones that have described photos here, with their weights' fingerprint; and those
+that were added (`shared.catalog.added_models`), whether or not they have described one.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +8,7 @@ from datetime import datetime
 from typing import Any
 from uuid import UUID
 
-from sqlalchemy import String, Text, UniqueConstraint, Uuid, select
+from sqlalchemy import BigInteger, Index, Integer, String, Text, UniqueConstraint, Uuid, select
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
@@ -15,7 +17,12 @@ from shared.ids import new_id
 
 
 class Model(Base):
-    """One set of weights. `card` says where they come from and under which licence."""
+    """One set of weights. `card` says where they come from and under which licence.
+
+    The columns from `added_name` on are those of a model that was added: its weights are a file of
+    `shared.vision.place_models.model_file` under `object_key`, whose hash is `sha256`. A removed
+    one keeps its row, without `object_key`: its name never comes to mean other weights.
+    """
 
     __tablename__ = "models"
 
@@ -25,8 +32,19 @@ class Model(Base):
     licence: Mapped[str] = mapped_column(Text)
     card: Mapped[dict[str, Any]] = mapped_column(JsonValue, default=dict)
     first_used_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())
+    added_name: Mapped[str | None] = mapped_column(String(100))
+    added_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
+    object_key: Mapped[str | None] = mapped_column(Text)
+    sha256: Mapped[str | None] = mapped_column(String(64))
+    size_bytes: Mapped[int | None] = mapped_column(BigInteger)
+    dimension: Mapped[int | None] = mapped_column(Integer)
+    config: Mapped[dict[str, Any] | None] = mapped_column(JsonValue)
+    note: Mapped[str | None] = mapped_column(Text)
 
-    __table_args__ = (UniqueConstraint("name", "fingerprint"),)
+    __table_args__ = (
+        UniqueConstraint("name", "fingerprint"),
+        Index("uq_models_added_name", "added_name", unique=True),
+    )
 
 
 def ensure_model(

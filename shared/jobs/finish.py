@@ -132,6 +132,12 @@ def retry(session: Session, job: Job) -> None:
             "/api/v1/generations.",
             job_id=str(job.id),
         )
+    if job.kind == JobKind.ADD_MODEL:
+        raise Conflict(
+            "job_not_retryable",
+            "The checkpoint is not kept once it was looked at: send it again, POST /api/v1/models.",
+            job_id=str(job.id),
+        )
     if photo is not None:
         if photo.deleted_at is not None:
             raise Conflict("photo_deleted", "The job's photo was deleted.", job_id=str(job.id))

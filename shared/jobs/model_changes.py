@@ -80,7 +80,7 @@ def begin_generation(session: Session, job: Job, **columns: Any) -> Generation:
     In a map without an active generation it answers at once, and photos that waited for a
     vocabulary are described into it. Otherwise it is built beside the active one.
     """
-    lock_map(session, job.map_id)
+    map_ = lock_map(session, job.map_id)
     first = active_generation(session, job.map_id) is None
     generation = Generation(
         id=new_id(),
@@ -92,6 +92,7 @@ def begin_generation(session: Session, job: Job, **columns: Any) -> Generation:
     session.add(generation)
     session.flush()
     if first:
+        map_.extractor = generation.extractor
         release_vocabulary_waiters(session, job.map_id)
         bump_version(session, job.map_id)
     job.generation_id = generation.id

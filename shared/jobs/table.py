@@ -75,6 +75,7 @@ class JobKind(StrEnum):
     IMPORT = "import_vocabulary"  # check a vocabulary file and switch to it
     SWITCH = "switch"  # switch to a vocabulary that the map already has
     PCA = "pca"  # fit PCA whitening on the map's descriptors and switch to shorter ones
+    ADD_MODEL = "add_model"  # check a checkpoint and keep it as a model, for any map
     EVALUATE = "evaluate"  # ask the map about photos whose place is known, and count
     WORD_WEIGHTS = "word_weights"  # learn which words of its vocabulary tell its places apart
     BATCH = "batch"  # bring in many photos; each has a job of its own (`shared.jobs.batches`)
@@ -86,14 +87,20 @@ MODEL_CHANGES = (JobKind.FIT, JobKind.IMPORT, JobKind.SWITCH, JobKind.PCA)
 QUERY_JOBS = (JobKind.DESCRIBE, JobKind.COMPARE)
 
 # Who takes what: extractors need photos and a backbone, the steward only the search tier.
-EXTRACTOR_JOBS = (JobKind.INDEX, JobKind.REINDEX, *QUERY_JOBS, *MODEL_CHANGES)
+EXTRACTOR_JOBS = (
+    JobKind.INDEX,
+    JobKind.REINDEX,
+    JobKind.ADD_MODEL,
+    *QUERY_JOBS,
+    *MODEL_CHANGES,
+)
 STEWARD_JOBS = (JobKind.EVALUATE, JobKind.WORD_WEIGHTS, JobKind.BATCH)
 
 # Done in slices: between two of them they are running, and no one holds their lease.
 SLICED_JOBS = (*MODEL_CHANGES, JobKind.BATCH)
 
 # Claimed one at a time: each is as much work as a batch, or changes what the next one finds.
-LONE_JOBS = (*MODEL_CHANGES, JobKind.COMPARE)
+LONE_JOBS = (*MODEL_CHANGES, JobKind.ADD_MODEL, JobKind.COMPARE)
 
 
 class Priority(IntEnum):

@@ -7,6 +7,8 @@
 | `originals/<uuid>` | an uploaded photo |
 | `incoming/<upload>` | what a caller sent straight to the bucket, until the upload is completed |
 | `archives/<uuid>` | an uploaded archive, until its photos are in |
+| `checkpoints/<uuid>` | a checkpoint that was sent, until it is a model or refused |
+| `models/<sha256>/<uuid>.safetensors` | a model that was added: its configuration and weights |
 | `thumbnails/<photo>` | its thumbnail, JPEG |
 | `chunks/<generation>/<chunk>.npy`, `.json`, `.codes` | descriptor rows, what they are, codes |
 | `vocabularies/<uuid>.npy` | VLAD centres |

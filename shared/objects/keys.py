@@ -9,7 +9,9 @@ from shared.ids import new_id
 
 INCOMING = "incoming/"
 ARCHIVES = "archives/"
+CHECKPOINTS = "checkpoints/"
 FEATURES = "features/"
+MODELS = "models/"
 ORIGINALS = "originals/"
 QUERIES = "queries/"
 THUMBNAILS = "thumbnails/"
@@ -19,8 +21,10 @@ WORK = "work/"
 
 OWN = (
     ARCHIVES,
+    CHECKPOINTS,
     "chunks/",
     FEATURES,
+    MODELS,
     ORIGINALS,
     QUERIES,
     THUMBNAILS,
@@ -122,6 +126,17 @@ def new_vocabulary_key() -> str:
 
 def new_whitening_key() -> str:
     return f"{WHITENINGS}{new_id()}.safetensors"
+
+
+def new_checkpoint_key() -> str:
+    """A fresh key for a checkpoint that was sent to be added as a model."""
+    return f"{CHECKPOINTS}{new_id()}"
+
+
+def new_model_key(sha256: str) -> str:
+    """A fresh key for a model's file of this hash. Fresh, so that looking for orphans never meets
+    one that comes back under its old key."""
+    return f"{MODELS}{sha256}/{new_id()}.safetensors"
 
 
 def work_key(job_id: UUID, name: str) -> str:

@@ -13,13 +13,14 @@ import torch
 from numpy.typing import NDArray
 
 from shared.errors import Misconfigured, Unprocessable
-from shared.recipes import SLOW, TORCHHUB, Recipe
+from shared.recipes import SLOW, TORCHHUB, TRAINED, Recipe
 from shared.vision.backbones import Backbone
 from shared.vision.backbones.dinov2 import SHAPES, Dinov2
 from shared.vision.backbones.efficientnet_lite0 import EfficientNetLite0
 from shared.vision.backbones.slow import SlowBackbone
 from shared.vision.backbones.tiny import TinyBackbone
 from shared.vision.backbones.torchhub import HubModule
+from shared.vision.backbones.trained import TrainedModel
 from shared.vision.decode import DECODER
 from shared.vision.passes import PassLimit, PhotoDoesNotFit, in_passes
 from shared.vision.pca import Projection
@@ -50,11 +51,18 @@ def _torchhub(recipe: Recipe, device: torch.device, _weights: Path | None) -> Ba
     return HubModule(recipe.hub, device)
 
 
+def _trained(recipe: Recipe, device: torch.device, _weights: Path | None) -> Backbone:
+    assert recipe.trained is not None
+    assert recipe.trained.file is not None, "an added model is loaded by who knows the catalog"
+    return TrainedModel.of_checkpoint(recipe.name, Path(recipe.trained.file), device)
+
+
 BACKBONES: dict[str, Callable[[Recipe, torch.device, Path | None], Backbone]] = {
     "efficientnet-lite0": lambda _recipe, device, _weights: EfficientNetLite0(device),
     SLOW: _slow,
     "test-tiny": lambda _recipe, device, _weights: TinyBackbone(device),
     TORCHHUB: _torchhub,
+    TRAINED: _trained,
     **{f"dinov2-{size}": _dinov2 for size in SHAPES},
 }
 
@@ -86,16 +94,17 @@ class Extractor:
         limit: PassLimit | None = None,
     ) -> None:
         """`dino_weights`: DINO_WEIGHTS, for the recipes on DINOv2; None takes timm's on the hub.
-        `backbone`: one that is loaded already, of the same `recipe.local_features`; `limit` is
-        what is known of it.
+        `backbone`: one that is loaded already, of the same `recipe.local_features`, as that of an
+        added model has to be; `limit` is what is known of it.
 
-        Raises Misconfigured (`weights_missing`, `weights_unfit`, `torchhub_unfit`).
+        Raises Misconfigured (`weights_missing`, `weights_unfit`, `torchhub_unfit`), and for a
+        checkpoint as `TrainedModel.of_checkpoint`.
         """
         self.recipe = recipe
         self.precision: Precision = precision
         self.limit = limit or PassLimit()
-        self.preprocessing: Preprocessing = get_preprocessing(recipe.preprocessing)
         self.backbone = backbone or BACKBONES[recipe.backbone](recipe, device, dino_weights)
+        self.preprocessing: Preprocessing = _preprocessing(recipe, self.backbone)
         told = recipe.width
         assert told in (None, self.backbone.width), "the recipe tells others the width"
 
@@ -152,6 +161,8 @@ class Extractor:
             spec["temperature"] = self.recipe.temperature
         if isinstance(self.backbone, HubModule):
             spec["code_fingerprint"] = self.backbone.code_fingerprint
+        if isinstance(self.backbone, TrainedModel):
+            spec |= self.backbone.as_spec()
         return spec
 
     def dimension(self, centres: Centres | None, projection: Projection | None = None) -> int:
@@ -251,6 +262,13 @@ class Extractor:
         # Said outright: a comparison or a clamp on the way may hide a NaN.
         finite = torch.isfinite(features).flatten(1).all(dim=1, keepdim=True)
         return torch.where(finite, rows, torch.nan)
+
+
+def _preprocessing(recipe: Recipe, backbone: Backbone) -> Preprocessing:
+    if recipe.preprocessing is not None:
+        return get_preprocessing(recipe.preprocessing)
+    assert isinstance(backbone, TrainedModel), "only a trained model brings its own"
+    return backbone.preprocessing
 
 
 def not_finite() -> Unprocessable:

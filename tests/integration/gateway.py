@@ -33,7 +33,7 @@ class Service:
         settings: Settings,
         make_worker: Callable[[], ExtractorWorker],
     ) -> None:
-        self.catalog, self.store = catalog, store
+        self.catalog, self.store, self.settings = catalog, store, settings
         self.search = SearchWorker(catalog, store, settings)
         gateway = Gateway(catalog, store, InProcessHints(), self.search, settings, NoKeys())
         self._client = TestClient(create_app(gateway), base_url="http://localhost")

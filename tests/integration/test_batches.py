@@ -16,7 +16,7 @@ from services.extractor.worker import ExtractorWorker
 from services.steward.batches import bring_in as bring_in_module
 from services.steward.batches import worker as worker_module
 from services.steward.batches.worker import BatchWorker
-from services.steward.collect import collect_archives, collect_orphans
+from services.steward.collect import collect_brought, collect_orphans
 from services.steward.delete_maps import delete_maps
 from shared.catalog.maps import ensure_default_map
 from shared.catalog.photos import Photo
@@ -27,6 +27,7 @@ from shared.intake import store_photo as store_photo_module
 from shared.jobs import InProcessHints, Job, JobKind, JobState, free_expired_leases
 from shared.jobs.batches import BatchItem
 from shared.objects import FolderStore, ObjectStore
+from shared.objects.keys import ARCHIVES
 from shared.objects.s3 import S3Store
 from shared.settings import Settings
 from tests.integration.gateway import Service
@@ -181,7 +182,7 @@ def test_an_archive_comes_in_with_its_table_and_goes(
     assert named.latitude == 45.0691
     assert batches.store.get(two.object_key) == photo_bytes(2)
     assert [item["line"] for item in batches.items(job_id)] == [None, 2, None]
-    collect_archives(batches.catalog, batches.store)
+    collect_brought(batches.catalog, batches.store, ARCHIVES, JobKind.BATCH)
     assert batches.keys("archives/") == set()
 
 
@@ -339,7 +340,7 @@ def test_an_archive_that_makes_no_sense_fails_and_brings_in_nothing(
     assert batches.photos() == []
     answer = batches.service("POST", f"/jobs/{job_id}/retry")
     assert "Upload them again" in problem(answer, 409, "job_not_retryable")["detail"]
-    collect_archives(batches.catalog, batches.store)
+    collect_brought(batches.catalog, batches.store, ARCHIVES, JobKind.BATCH)
     assert batches.keys("archives/") == set()
     assert not batches.work()
 
@@ -523,7 +524,7 @@ def test_cancelling_ends_what_has_not_ended(batches: Batches) -> None:
     assert set(states) == {"succeeded", "cancelled"}
     assert queued_photos(batches.catalog) == 0
     assert not batches.work()
-    collect_archives(batches.catalog, batches.store)
+    collect_brought(batches.catalog, batches.store, ARCHIVES, JobKind.BATCH)
     assert batches.keys("archives/") == set()
     problem(batches.service("POST", f"/jobs/{job_id}/cancel"), 409, "job_finished")
 
@@ -757,12 +758,12 @@ def test_an_archive_that_was_removed_fails_its_batch(batches: Batches) -> None:
 def test_bytes_that_wait_in_a_batch_are_no_orphans(batches: Batches) -> None:
     job_id = batches.start(*files(1, 2))
     archive_id = batches.start(archive=zip_of(files(3)))
-    collect_archives(batches.catalog, batches.store)
+    collect_brought(batches.catalog, batches.store, ARCHIVES, JobKind.BATCH)
     collect_orphans(batches.catalog, batches.store, age_seconds=-60)
     assert counts(batches.finish(job_id)) == (2, 2, 0)
     assert counts(batches.finish(archive_id)) == (1, 1, 0)
     batches.store.put(f"archives/{UUID(int=7)}", b"of a gateway that was killed")
-    collect_archives(batches.catalog, batches.store)
+    collect_brought(batches.catalog, batches.store, ARCHIVES, JobKind.BATCH)
     assert f"archives/{UUID(int=7)}" in batches.keys("archives/")
     collect_orphans(batches.catalog, batches.store, age_seconds=-60)
     assert batches.keys("archives/") == set()

@@ -41,6 +41,7 @@ from shared.jobs.batches import BatchItem
 from shared.objects import FolderStore
 from shared.settings import Settings
 from tests.integration.gateway import Service
+from tests.support.added import none_added
 from tests.support.catalog_rows import add_job, add_photo, read_job
 from tests.support.photos import near_copy, photo_bytes
 from tests.support.problems import problem
@@ -472,7 +473,7 @@ def test_what_is_being_removed_is_neither_merged_nor_renewed_nor_held_in_memory(
     service.search.follow()
     assert service.search.status().resident_bytes == 0
     assert compact(catalog, store, compact_chunks=2) == 0
-    assert renew_outdated_generations(catalog, LoadedModels(store, settings)) == 0
+    assert renew_outdated_generations(catalog, LoadedModels(store, settings, none_added)) == 0
     with catalog.read() as session:
         kinds = set(session.scalars(select(Job.kind)))
     assert kinds == {JobKind.INDEX}

@@ -36,6 +36,7 @@ from shared.vision.pca_fit import fit
 from shared.vision.vocabulary import decode_centres
 from tests.integration.conftest import LentDecoders
 from tests.integration.workplace import Workplace, expected_row, same
+from tests.support.added import none_added
 from tests.support.photos import photo_bytes
 
 PHOTOS = 14
@@ -247,7 +248,9 @@ def test_photos_are_described_where_the_rows_that_answer_were_made_otherwise(
     """An upgrade: the rows are projected ones, by a former decoder. The whitening stays."""
     before, old = reduced.rows(), reduced.active()
     monkeypatch.setattr(extractors, "DECODER", "another release")
-    models = LoadedModels(reduced.store, reduced.settings.model_copy(update={"device": "cpu"}))
+    models = LoadedModels(
+        reduced.store, reduced.settings.model_copy(update={"device": "cpu"}), none_added
+    )
     assert renew_outdated_generations(reduced.catalog, models) == 1
     with reduced.catalog.read() as session:
         job_id = session.query(Job).filter_by(kind=JobKind.SWITCH).one().id

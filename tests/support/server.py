@@ -38,7 +38,11 @@ def environment(home: Path, **settings: Any) -> dict[str, str]:
 
 
 def run_command(
-    *arguments: str | Path, env: Mapping[str, str], cwd: Path, executed: bool = False
+    *arguments: str | Path,
+    env: Mapping[str, str],
+    cwd: Path,
+    executed: bool = False,
+    seconds: float = COMMAND_SECONDS,
 ) -> subprocess.CompletedProcess[str]:
     """`placewise ARGUMENTS` to its end. `cwd` should have no `.env`; `executed` as for `start`."""
     with tempfile.TemporaryFile("w+") as out, tempfile.TemporaryFile("w+") as err:
@@ -46,7 +50,7 @@ def run_command(
             [PLACEWISE, *arguments], env=env, cwd=cwd, stdout=out, stderr=err, executed=executed
         )
         try:
-            code = process.wait(COMMAND_SECONDS)
+            code = process.wait(seconds)
         finally:
             process.kill()
             process.wait()

@@ -10,12 +10,13 @@ from services.extractor.loaded import MOST_EXTRACTORS, LoadedModels
 from shared.errors import Misconfigured
 from shared.objects import FolderStore
 from shared.settings import Settings
+from tests.support.added import none_added
 from tests.support.hub import write_hub
 
 
 @pytest.fixture
 def models(store: FolderStore, settings: Settings) -> LoadedModels:
-    return LoadedModels(store, settings.model_copy(update={"device": "cpu"}))
+    return LoadedModels(store, settings.model_copy(update={"device": "cpu"}), none_added)
 
 
 def test_an_extractor_is_loaded_once_under_all_its_spellings(models: LoadedModels) -> None:
@@ -42,10 +43,10 @@ def test_code_that_is_no_longer_allowed_is_not_executed(
 ) -> None:
     name = f"torchhub:{write_hub(tmp_path / 'hub')}:colours"
     monkeypatch.setenv("TORCHHUB_ALLOWED", name)
-    assert LoadedModels(store, Settings()).extractor(name).dimension(None) == 24
+    assert LoadedModels(store, Settings(), none_added).extractor(name).dimension(None) == 24
     monkeypatch.setenv("TORCHHUB_ALLOWED", f"{name}:dimension=8")
     with pytest.raises(Misconfigured) as caught:
-        LoadedModels(store, Settings()).extractor(name)
+        LoadedModels(store, Settings(), none_added).extractor(name)
     assert caught.value.code == "torchhub_not_allowed"
     assert name in caught.value.detail
 
@@ -55,7 +56,7 @@ def test_networks_of_one_folder_share_nothing_unless_all_of_the_name_agrees(
 ) -> None:
     name = f"torchhub:{write_hub(tmp_path / 'hub')}:colours"
     monkeypatch.setenv("TORCHHUB_ALLOWED", f"{name} {name}:dimension=8")
-    models = LoadedModels(store, Settings())
+    models = LoadedModels(store, Settings(), none_added)
     assert models.extractor(f"{name}:dimension=8").dimension(None) == 8
     assert models.extractor(name).dimension(None) == 24
     assert models.extractor(name) is models.extractor(name)

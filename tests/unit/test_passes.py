@@ -20,6 +20,7 @@ from shared.settings import Settings
 from shared.vision.backbones.tiny import TinyBackbone
 from shared.vision.extractors import Extractor
 from shared.vision.passes import PassLimit, PhotoDoesNotFit, in_passes
+from tests.support.added import none_added
 
 CPU, CUDA = torch.device("cpu"), torch.device("cuda")
 SIDE = 224  # pixels: as large as what passes are counted by
@@ -107,7 +108,9 @@ def test_model_that_leaves_no_room_for_one_photo_is_refused_when_it_is_loaded() 
 def models(settings: Settings, tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> LoadedModels:
     """With room for one extractor at a time."""
     monkeypatch.setattr(loaded_module, "MOST_EXTRACTORS", 1)
-    return LoadedModels(FolderStore(tmp_path), settings.model_copy(update={"device": "cpu"}))
+    return LoadedModels(
+        FolderStore(tmp_path), settings.model_copy(update={"device": "cpu"}), none_added
+    )
 
 
 def test_what_fits_is_remembered_when_the_model_is_loaded_anew(models: LoadedModels) -> None:

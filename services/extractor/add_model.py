@@ -1,0 +1,157 @@
+"""ADD_MODEL: a checkpoint that was sent becomes a model, if it can be read and used safely."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from shared.catalog.added_models import NewModel, add_model
+from shared.catalog.session import Catalog
+from shared.errors import NotFound, Unprocessable
+from shared.ids import new_id
+from shared.jobs import Job
+from shared.jobs.finish import succeed
+from shared.jobs.leases import held
+from shared.model_names import PREFIX
+from shared.objects import ObjectStore
+from shared.objects.keys import new_model_key
+from shared.vision.backbones.trained import TrainedModel
+from shared.vision.place_models.checkpoint import Checkpoint, load_checkpoint
+from shared.vision.place_models.model_file import encode_model
+
+MOST_ABOUT_CHARACTERS = 20_000  # of JSON: what the training said of itself
+PIECE_BYTES = 1 << 20
+
+
+class AddModel:
+    """One piece of work, on the CPU: nothing is described with the model yet."""
+
+    def __init__(self, catalog: Catalog, store: ObjectStore, folder: Path) -> None:
+        """`folder`: that of ModelCache, which has room for large files and removes what is left
+        over.
+        """
+        self._catalog = catalog
+        self._store = store
+        self._folder = folder
+
+    def from_checkpoint(self, job: Job) -> None:
+        """Check the checkpoint under `object_key`, store what describes photos, add its row.
+
+        Unprocessable: those of `load_checkpoint`, `model_unfit`, `checkpoint_lost`; Conflict
+        (`model_name_taken`).
+        """
+        filename = job.params["filename"]
+        with self._file(job.params["object_key"]) as path:
+            try:
+                checkpoint = load_checkpoint(path)
+            except Unprocessable as error:  # it speaks of the file as it is called here
+                said = error.detail.replace(path.name, filename)
+                raise Unprocessable(error.code, said, **error.extra) from error
+        card = {"source": filename, **about(checkpoint)}
+        name = job.params["name"]
+        TrainedModel(
+            f"{PREFIX}{name}",
+            checkpoint.model,
+            checkpoint.fingerprint,
+            torch.device("cpu"),
+            licence="",
+            card=card,
+        ).check()
+        data = encode_model(checkpoint)
+        sha256 = hashlib.sha256(data).hexdigest()
+        new = NewModel(
+            name=name,
+            fingerprint=checkpoint.fingerprint,
+            object_key=new_model_key(sha256),
+            sha256=sha256,
+            size_bytes=len(data),
+            dimension=checkpoint.model.dimension,
+            config=checkpoint.config.model_dump(mode="json"),
+            licence=job.params["licence"],
+            note=job.params["note"],
+            card=card,
+        )
+        self._store.put(new.object_key, data)
+        self._commit(job, new)
+
+    def _commit(self, job: Job, new: NewModel) -> None:
+        """The row and the job's end. A file that stays without row is an orphan, and collected."""
+        token = job.lease_token
+        assert token is not None, "a claimed job carries a token"
+        with self._catalog.write() as session:
+            for mine in held(session, token, [job]):
+                model, added = add_model(session, new)
+                succeed(
+                    mine,
+                    {
+                        "name": new.name,
+                        "extractor": model.name,
+                        "fingerprint": model.fingerprint,
+                        "dimension": model.dimension,
+                        "size_bytes": model.size_bytes,
+                        "already_there": not added,
+                    },
+                )
+
+    @contextlib.contextmanager
+    def _file(self, key: str) -> Iterator[Path]:
+        """The object as a file of this machine."""
+        there = self._store.file(key)
+        if there is not None:
+            yield there
+            return
+        self._folder.mkdir(parents=True, exist_ok=True)
+        path = self._folder / f"{new_id()}.partial"
+        try:
+            with self._store.open(key) as source, path.open("xb") as file:
+                while piece := source.read(PIECE_BYTES):
+                    file.write(piece)
+            yield path
+        except NotFound as error:
+            raise _lost() from error
+        finally:
+            path.unlink(missing_ok=True)
+
+
+def about(checkpoint: Checkpoint) -> dict[str, Any]:
+    """What the checkpoint says of its training, as JSON that every database keeps.
+
+    What is no JSON becomes text; of more than MOST_ABOUT_CHARACTERS only how long it was trained
+    is left.
+    """
+    said = {str(name): _plain(value) for name, value in checkpoint.about.items()}
+    if len(json.dumps(said)) > MOST_ABOUT_CHARACTERS:
+        said = {name: said[name] for name in ("epoch", "global_step") if name in said}
+        said["left_out"] = "the hyperparameters, which are too long"
+    return said
+
+
+def _plain(value: Any, depth: int = 0) -> Any:
+    if isinstance(value, bool | int) or value is None:
+        return value
+    if isinstance(value, float):
+        return value if math.isfinite(value) else str(value)
+    if depth < 4 and isinstance(value, dict):
+        return {_text(name): _plain(member, depth + 1) for name, member in value.items()}
+    if depth < 4 and isinstance(value, list | tuple):
+        return [_plain(member, depth + 1) for member in value]
+    return _text(value)
+
+
+def _text(value: Any) -> str:
+    # PostgreSQL keeps no NUL, and no half of a character.
+    text = value if isinstance(value, str) else f"<{type(value).__name__}>"
+    return text.replace("\x00", "").encode("utf-8", "replace").decode("utf-8")
+
+
+def _lost() -> Unprocessable:
+    return Unprocessable(
+        "checkpoint_lost", "The checkpoint is gone from the object store. Send it again."
+    )

@@ -1,0 +1,115 @@
+"""A model of `placewise train` as a backbone: it makes one global descriptor of a photo.
+
+Photos are brought to the model's image size as they were for the figures of its evaluations:
+upright, bilinear, antialiased, whatever the aspect (`resizeHEIGHTxWIDTH` in
+`shared.vision.preprocessing`), then normalised by ImageNet's mean and deviation.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from shared.errors import Unprocessable
+from shared.recipes import MOST_WIDTH
+from shared.torchhub_names import IMAGENET_MEAN, IMAGENET_STD
+from shared.vision.backbones.base import normalise_pixels, unit_features
+from shared.vision.place_models.checkpoint import load_checkpoint
+from shared.vision.place_models.model import PlaceModel
+from shared.vision.preprocessing import Preprocessing, get_preprocessing
+
+SEED = 20_242
+LEAST_COSINE = 0.999  # of a photo described alone and beside another; kernels differ a little
+
+
+class TrainedModel:
+    facet: str | None = None
+
+    def __init__(
+        self,
+        name: str,
+        model: PlaceModel,
+        fingerprint: str,
+        device: torch.device,
+        *,
+        licence: str,
+        card: dict[str, Any],
+    ) -> None:
+        """`name` as in `gsv:N`; `fingerprint` of configuration and weights."""
+        self.name = name
+        self.fingerprint = fingerprint
+        self.licence = licence
+        self.card = card
+        self.device = device
+        self.layer = model.config.agg_arch
+        self.width = model.dimension
+        self._model = model.eval().requires_grad_(False).to(device)
+
+    @classmethod
+    def of_checkpoint(cls, name: str, path: Path, device: torch.device) -> TrainedModel:
+        """The model in a checkpoint of this machine; raises as `load_checkpoint` and `check`."""
+        found = load_checkpoint(path)
+        card = {"source": path.name, **found.about}
+        made = cls(name, found.model, found.fingerprint, device, licence="not said", card=card)
+        made.check()
+        return made
+
+    @property
+    def image_size(self) -> tuple[int, int]:
+        """Height and width in pixels."""
+        return self._model.config.image_size
+
+    @property
+    def preprocessing(self) -> Preprocessing:
+        return get_preprocessing("resize{}x{}".format(*self.image_size))
+
+    def as_spec(self) -> dict[str, Any]:
+        """What the network is shown, beside what every extractor's spec says."""
+        return {
+            "image_size": list(self.image_size),
+            "normalisation": {"mean": list(IMAGENET_MEAN), "std": list(IMAGENET_STD)},
+        }
+
+    @torch.inference_mode()
+    def features(self, pixels: torch.Tensor) -> torch.Tensor:
+        return unit_features(self._forward(pixels)).unsqueeze(1)
+
+    def grid(self, height: int, width: int) -> tuple[int, int]:
+        return 1, 1
+
+    def _forward(self, pixels: torch.Tensor) -> torch.Tensor:
+        batch = normalise_pixels(pixels.to(self.device), IMAGENET_MEAN, IMAGENET_STD)
+        rows: torch.Tensor = self._model(batch)
+        return rows
+
+    @torch.inference_mode()
+    def check(self) -> None:
+        """Describe two pictures of noise; Unprocessable (`model_unfit`) for weights that make no
+        descriptors."""
+        for name, tensor in self._model.state_dict().items():
+            if tensor.is_floating_point() and not bool(torch.isfinite(tensor).all()):
+                raise _unfit(f"its weights {name} hold NaN or infinite numbers")
+        if self.width > MOST_WIDTH:
+            raise _unfit(f"{self.width} dimensions are more than {MOST_WIDTH}")
+        noise = torch.Generator().manual_seed(SEED)
+        shape = (2, *self.image_size, 3)
+        photos = torch.randint(0, 256, shape, dtype=torch.uint8, generator=noise)
+        both, alone = self._forward(photos), self._forward(photos[:1])
+        if both.shape != (2, self.width) or alone.shape != (1, self.width):
+            raise _unfit(f"of 2 photos it makes numbers of the shape {tuple(both.shape)}")
+        if not torch.isfinite(both).all() or not torch.isfinite(alone).all():
+            raise _unfit("its descriptors hold NaN or infinite numbers")
+        if bool((both.norm(dim=-1) == 0).any()) or torch.equal(both[0], both[1]):
+            raise _unfit("of two different photos its descriptors are zero, or the same")
+        cosine = float(unit_features(both[0]) @ unit_features(alone[0]))
+        if cosine < LEAST_COSINE:
+            raise _unfit(
+                "it describes a photo otherwise when another one is beside it (cosine "
+                f"{cosine:.3f}), and which ones are described together is chance here"
+            )
+
+
+def _unfit(fault: str) -> Unprocessable:
+    return Unprocessable("model_unfit", f"The model can't describe photos: {fault}.")

@@ -1,0 +1,103 @@
+"""A model of one's own, by commands and over HTTP: added, described with, asked, given up again."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.support.checkpoints import own_output, untrained, write_checkpoint
+from tests.support.photos import near_copy, photo_bytes
+from tests.support.problems import problem
+from tests.support.server import ServerProcess, environment, run_command
+
+PHOTOS = 4
+
+
+class Commands:
+    """`placewise` beside the server, whose answers are JSON."""
+
+    def __init__(self, server: ServerProcess, folder: Path) -> None:
+        self._environment = environment(server.home)
+        self._folder = folder
+
+    def __call__(self, *arguments: str | Path) -> Any:
+        ended = run_command(*arguments, "--json", env=self._environment, cwd=self._folder)
+        assert ended.returncode == 0, ended.stderr + ended.stdout
+        return json.loads(ended.stdout)
+
+    def refused(self, *arguments: str | Path) -> str:
+        """The line on stderr of a command that ends with 1."""
+        ended = run_command(*arguments, env=self._environment, cwd=self._folder)
+        assert ended.returncode == 1, ended.stdout
+        return ended.stderr
+
+
+@pytest.fixture
+def placewise(server: ServerProcess, tmp_path: Path) -> Commands:
+    return Commands(server, tmp_path)
+
+
+def test_a_trained_model_describes_a_map_answers_and_makes_room_again(
+    server: ServerProcess, placewise: Commands, tmp_path: Path
+) -> None:
+    checkpoint = write_checkpoint(tmp_path / "best.ckpt")
+    added = placewise("models", "add", checkpoint, "--name", "walks", "--licence", "CC BY 4.0")
+    assert added["result"]["extractor"] == "gsv:walks"
+    (listed,) = placewise("models", "added")
+    assert (listed["name"], listed["licence"], listed["maps"]) == ("walks", "CC BY 4.0", [])
+
+    for number in range(1, PHOTOS):  # beside the one that the server has
+        server.indexed(photo_bytes(number), f"{number}.jpg")
+    before = server.client.get("/api/v1/maps/default").json()
+    switched = placewise("maps", "switch", "default", "--extractor", "gsv:walks")
+    assert (switched["result"]["dimension"], switched["result"]["failed"]) == (128, 0)
+
+    answer = server.ask(near_copy(2), top_k=PHOTOS)
+    assert answer.status_code == 200, answer.text
+    found = answer.json()["similar_images"]
+    assert found[0]["original_filename"] == "2.jpg"
+    assert answer.json()["vocabulary"] == "none"
+    problem(server.ask(near_copy(2), rerank=2), 422, "not_rerankable")
+    used = server.client.delete("/api/v1/models/walks")
+    assert problem(used, 409, "model_in_use")["maps"] == ["default"]
+    assert "model_in_use" in placewise.refused("models", "remove", "walks")
+
+    back = placewise("maps", "switch", "default", "--extractor", before["extractor"])
+    assert back["result"]["dimension"] == before["dimension"]
+    assert server.ask(near_copy(2)).json()["similar_images"][0]["original_filename"] == "2.jpg"
+    assert placewise("models", "remove", "walks")["removed_model"] == "walks"
+    assert placewise("models", "added") == []
+
+
+def test_describe_makes_of_a_file_and_of_an_added_model_what_the_model_itself_makes(
+    placewise: Commands, tmp_path: Path
+) -> None:
+    checkpoint = write_checkpoint(tmp_path / "best.ckpt")
+    placewise("models", "add", checkpoint, "--name", "described")
+    photo = tmp_path / "street.jpg"
+    photo.write_bytes(photo_bytes(7))
+    specs = []
+    for name in (f"gsv:{checkpoint}", "gsv:described"):
+        out = tmp_path / "rows.npy"
+        specs.append(placewise("describe", photo, "--extractor", name, "--out", out)["spec"])
+        (row,) = np.load(out)
+        assert np.allclose(row, own_output(untrained(), photo_bytes(7)), atol=1e-5)
+        assert specs[-1].pop("extractor") == name
+        assert specs[-1].pop("backbone") == name
+    assert specs[0] == specs[1]
+    out = tmp_path / "none.npy"
+    wanted = ("describe", photo, "--extractor", "gsv:nobody", "--out", out)
+    assert "model_missing" in placewise.refused(*wanted)
+    assert not out.exists()
+
+
+def test_a_checkpoint_that_can_not_be_used_is_one_line(placewise: Commands, tmp_path: Path) -> None:
+    bad = tmp_path / "bad.ckpt"
+    bad.write_bytes(b"no checkpoint")
+    assert "checkpoint_unreadable" in placewise.refused("models", "add", bad, "--name", "bad")
+    checkpoint = write_checkpoint(tmp_path / "best.ckpt")
+    assert "invalid_field" in placewise.refused("models", "add", checkpoint, "--name", "a/b")

@@ -1,0 +1,97 @@
+"""From generated places to an answer: drawn, trained on, evaluated, added, indexed, asked."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.support.server import ServerProcess, environment, run_command
+
+MAP = "city"
+STEPS = 3
+COMMAND_SECONDS = 600.0  # seconds of work, of which a busy machine makes minutes
+TRAINING = {
+    "pretrained": "False",
+    "layers_to_freeze": "-1",
+    "layers_to_crop": "[3,4]",
+    "agg_arch": "GeM",
+    "image_size": "[48,64]",
+    "batch_size": "4",
+    "max_epochs": "1",
+    "max_steps": str(STEPS),
+    "num_workers": "0",
+    "accelerator": "cpu",
+    "faiss_gpu": "False",
+    "logger": "none",
+    "default_root_dir": "runs",
+    "run_name": "short",
+}
+
+
+class CommandLine:
+    """`placewise` in a folder, beside a server; its answers are JSON."""
+
+    def __init__(self, server: ServerProcess, folder: Path) -> None:
+        self.folder = folder
+        self._environment = environment(server.home)
+
+    def __call__(self, *arguments: str | Path) -> Any:
+        ended = run_command(
+            *arguments, "--json", env=self._environment, cwd=self.folder, seconds=COMMAND_SECONDS
+        )
+        assert ended.returncode == 0, ended.stderr + ended.stdout
+        return json.loads(ended.stdout)
+
+
+def recall(evaluated: Any) -> dict[str, Any]:
+    """Of each set."""
+    found = {name: figures["recall"] for name, figures in evaluated["sets"].items()}
+    assert found
+    return found
+
+
+@pytest.fixture
+def placewise(server: ServerProcess, tmp_path: Path) -> CommandLine:
+    return CommandLine(server, tmp_path)
+
+
+@pytest.mark.timeout(1800)
+def test_a_model_is_trained_evaluated_added_and_answers(
+    server: ServerProcess, placewise: CommandLine
+) -> None:
+    city = placewise.folder / "city"
+    small = ("--places", "6", "--views", "3", "--queries", "3", "--size", "96x72", "--no-ladder")
+    placewise("datasets", "synth", city, *small)
+
+    options = [text for name, value in TRAINING.items() for text in (f"--{name}", value)]
+    trained = placewise("train", "--data_root", city, *options)
+    best = Path(trained["best"]["path"])
+    if not best.is_absolute():
+        best = placewise.folder / best
+    assert trained["epochs"]
+
+    evaluated = placewise("evaluate", "--data", city, "--checkpoint", best, "--out", "of-file")
+
+    added = placewise("models", "add", best, "--name", "short")["result"]
+    assert added["fingerprint"] == trained["best"]["fingerprint"]
+    assert added["dimension"] == trained["best"]["dimension"]
+    served = placewise("evaluate", "--data", city, "--extractor", "gsv:short", "--out", "of-added")
+    assert recall(served) == recall(evaluated), "the figures carry over"
+
+    made = placewise("maps", "create", MAP, "--extractor", "gsv:short")
+    assert made["extractor"] == "gsv:short"
+    database = sorted((city / "database").glob("*.jpg"))
+    indexed = placewise("index", city / "database", "--map", MAP)
+    assert indexed["searchable"] == len(database)
+    query = min((city / "queries").glob("*.jpg"))
+    found = placewise("query", query, "--map", MAP, "--top-k", "3")["similar_images"]
+    names = {path.name for path in database}
+    assert len({photo["original_filename"] for photo in found} & names) == 3
+    # A photo of the map itself, asked anew, is its own best match: what is stored is the model's.
+    asked = database[len(database) // 2]
+    (first,) = placewise("query", asked, "--map", MAP, "--top-k", "1")["similar_images"]
+    assert first["original_filename"] == asked.name
+    assert first["similarity_score"] > 1 - 1e-5

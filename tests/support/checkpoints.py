@@ -1,0 +1,72 @@
+"""Checkpoints as `placewise train` writes them, of networks that nobody has trained."""
+
+from __future__ import annotations
+
+import io
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from shared.chunks import Rows
+from shared.vision.backbones.base import normalise_pixels
+from shared.vision.decode import decode
+from shared.vision.place_models.checkpoint import checkpoint_state
+from shared.vision.place_models.config import ModelConfig
+from shared.vision.place_models.model import PlaceModel, build_model
+from shared.vision.preprocessing import get_preprocessing
+
+SIDES = (48, 64)  # pixels
+MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+
+
+def untrained(seed: int = 0, **config: Any) -> PlaceModel:
+    """A cropped ResNet-18 with random weights: 128 dimensions, photos of SIDES."""
+    said: dict[str, Any] = {
+        "backbone_arch": "resnet18",
+        "pretrained": False,
+        "layers_to_crop": (3, 4),
+        "agg_arch": "GeM",
+        "image_size": SIDES,
+        **config,
+    }
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        return build_model(ModelConfig(**said))
+
+
+def checkpoint_of(model: PlaceModel, **about: Any) -> bytes:
+    """A Lightning checkpoint of the model: beside the weights, what a run goes on with."""
+    moments = {name: torch.zeros_like(tensor) for name, tensor in model.state_dict().items()}
+    state = {
+        **checkpoint_state(model, lr=0.0001, **about),
+        "epoch": 3,
+        "global_step": 120,
+        "optimizer_states": [{"state": {"exp_avg": moments}}],
+    }
+    buffer = io.BytesIO()
+    torch.save(state, buffer)
+    return buffer.getvalue()
+
+
+@cache
+def some_checkpoint(seed: int = 0) -> bytes:
+    """One of each seed."""
+    return checkpoint_of(untrained(seed))
+
+
+def write_checkpoint(path: Path, seed: int = 0) -> Path:
+    path.write_bytes(some_checkpoint(seed))
+    return path
+
+
+def own_output(model: PlaceModel, photo: bytes) -> Rows:
+    """What the model itself makes of a photo that is brought to its size."""
+    height, width = model.config.image_size
+    preprocessing = get_preprocessing(f"resize{height}x{width}")
+    pixels = decode(photo, preprocessing, 10**9).pixels.copy()
+    with torch.inference_mode():
+        batch = normalise_pixels(torch.from_numpy(pixels)[None], MEAN, STD)
+        row: Rows = model(batch)[0].numpy()
+    return row

@@ -1,0 +1,73 @@
+"""The file in which an added model is kept: all that describes a photo, and nothing else."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors import safe_open
+from safetensors.torch import save
+
+from shared.errors import Unavailable
+from shared.vision.place_models.checkpoint import Checkpoint, load_checkpoint
+from shared.vision.place_models.model_file import METADATA, encode_model, read_model
+from tests.support.checkpoints import SIDES, write_checkpoint
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Checkpoint:
+    return load_checkpoint(write_checkpoint(tmp_path_factory.mktemp("run") / "best.ckpt"))
+
+
+def test_what_is_read_describes_as_what_was_written(checkpoint: Checkpoint, tmp_path: Path) -> None:
+    data = encode_model(checkpoint)
+    path = tmp_path / "model.safetensors"
+    path.write_bytes(data)
+    found = read_model(path)
+    assert found.fingerprint == checkpoint.fingerprint
+    assert found.model.config == checkpoint.config
+    assert not found.model.training
+    assert not any(parameter.requires_grad for parameter in found.model.parameters())
+    photos = torch.rand(2, 3, *SIDES, generator=torch.Generator().manual_seed(1))
+    with torch.inference_mode():
+        assert torch.equal(found.model(photos), checkpoint.model(photos))
+
+
+def test_the_same_model_makes_the_same_bytes(checkpoint: Checkpoint) -> None:
+    assert encode_model(checkpoint) == encode_model(checkpoint)
+
+
+def test_the_file_holds_the_models_tensors_and_says_which_network_they_are_of(
+    checkpoint: Checkpoint, tmp_path: Path
+) -> None:
+    path = tmp_path / "model.safetensors"
+    path.write_bytes(encode_model(checkpoint))
+    with safe_open(path, framework="pt") as file:
+        assert set(file.keys()) == checkpoint.model.state_dict().keys()
+        about = json.loads(file.metadata()[METADATA])
+    assert (about["format"], about["fingerprint"]) == (1, checkpoint.fingerprint)
+    assert about["config"]["image_size"] == list(SIDES)
+
+
+def test_a_file_that_this_release_does_not_understand_is_refused(
+    checkpoint: Checkpoint, tmp_path: Path
+) -> None:
+    path = tmp_path / "model.safetensors"
+    tensors = {name: t.clone() for name, t in checkpoint.model.state_dict().items()}
+    config = checkpoint.config.model_dump(mode="json")
+    said = {"format": 1, "config": config, "fingerprint": checkpoint.fingerprint}
+    for metadata, weights in (
+        ({}, tensors),
+        ({METADATA: json.dumps({**said, "format": 2})}, tensors),
+        ({METADATA: json.dumps({**said, "config": {**config, "agg_arch": "New"}})}, tensors),
+        ({METADATA: json.dumps(said)}, {"one": torch.zeros(1)}),
+    ):
+        path.write_bytes(save(weights, metadata))
+        with pytest.raises(Unavailable) as caught:
+            read_model(path)
+        assert caught.value.code == "model_unreadable"
+    path.write_bytes(b"not at all")
+    with pytest.raises(Unavailable):
+        read_model(path)
