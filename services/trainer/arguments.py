@@ -69,6 +69,9 @@ class TrainingArguments(BaseModel):
     image_size: HeightWidth = _said(DATA, (320, 320), "Height and width of a photo, pixels.")
     num_workers: int = _said(DATA, 8, "Processes that read photos; 0: none of their own.", ge=0)
     show_data_stats: Flag = _said(DATA, True, "Print what the data sets hold before training.")
+    augmentation: Literal["randaugment", "none"] = _said(
+        DATA, "randaugment", "What photos go through before the network learns from them."
+    )
     on_bad_image: Literal["skip", "error"] = _said(
         DATA, "skip", "A photo that does not decode: left out, named and counted; or an error."
     )

@@ -45,9 +45,17 @@ class PlacePhotos(Dataset[Batch]):
     (`undecodable_photo`) with `bad_is_error`.
     """
 
-    def __init__(self, plan: BatchPlan, image_size: tuple[int, int], *, bad_is_error: bool) -> None:
+    def __init__(
+        self,
+        plan: BatchPlan,
+        image_size: tuple[int, int],
+        *,
+        augment: bool = True,
+        bad_is_error: bool,
+    ) -> None:
         self._places = plan.places
         self._image_size = image_size
+        self._augment = augment
         self._bad_is_error = bad_is_error
 
     def __getitem__(self, draw: Draw) -> Batch:
@@ -63,7 +71,9 @@ class PlacePhotos(Dataset[Batch]):
                     raise undecodable(str(path), error.detail) from error
                 bad.append((str(path), error.detail))
                 continue
-            photos.append(to_tensor(augmented(image, draw.seed + position)))
+            if self._augment:
+                image = augmented(image, draw.seed + position)
+            photos.append(to_tensor(image))
         empty = torch.empty((0, 3, *self._image_size))
         return Batch(
             torch.stack(photos) if photos else empty,

@@ -134,7 +134,12 @@ def _learn(ready: _Ready, display: Display, stop: StopRequest) -> Json:
         arguments.reload_dataloaders_every_n_epochs,
         arguments.seed,
     )
-    photos = PlacePhotos(plan, arguments.image_size, bad_is_error=arguments.on_bad_image == "error")
+    photos = PlacePhotos(
+        plan,
+        arguments.image_size,
+        augment=arguments.augmentation == "randaugment",
+        bad_is_error=arguments.on_bad_image == "error",
+    )
     batches = TrainingBatches(
         plan,
         photos,

@@ -1,0 +1,63 @@
+"""What is learned is real: against the untrained network, where it has never been."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from benchmarks.train.learning import gain_of
+from services.trainer import run
+from services.trainer.configuration import make_arguments
+from services.trainer.device import choose_device
+from services.trainer.display import Quiet
+from services.trainer.make_model import make_model
+from services.trainer.random_state import seed_everything
+from services.trainer.stop import StopRequest
+from shared.datasets.city.plan import CityOptions, make_plan
+from shared.datasets.city.write import write_city
+from shared.datasets.sets import open_evaluation_set
+from shared.vision.place_models.checkpoint import load_checkpoint
+
+SIDE = 64
+EPOCHS = 8
+
+
+def test_a_short_run_clearly_beats_the_untrained_network_on_held_out_places(
+    tmp_path: Path,
+) -> None:
+    city = tmp_path / "city"
+    write_city(make_plan(CityOptions(250, 2, 300, 0, 0, 0.0, 96, 72)), city)
+    arguments = make_arguments(
+        {
+            "data_root": city,
+            "default_root_dir": str(tmp_path),
+            "run_name": "run",
+            "accelerator": "cpu",
+            "faiss_gpu": False,
+            "pretrained": False,
+            "layers_to_freeze": -1,
+            "layers_to_crop": (3,),
+            "agg_arch": "GeM",
+            "loss_name": "MultiSimilarityLoss",
+            "augmentation": "none",
+            "image_size": SIDE,
+            "batch_size": 16,
+            "img_per_place": 4,
+            "min_img_per_place": 4,
+            "lr": 1e-3,
+            "warmpup_steps": 20,
+            "milestones": (),
+            "max_epochs": EPOCHS,
+            "check_val_every_n_epoch": EPOCHS,
+            "num_workers": 0,
+            "logger": "none",
+        }
+    )
+    report = run.run(arguments, Quiet(), StopRequest())
+    seed_everything(arguments.seed)
+    untrained = make_model(arguments, Quiet(), resuming=False)
+    trained = load_checkpoint(Path(report["best"]["path"])).model
+    device, asked = choose_device(arguments), open_evaluation_set(city)
+    gain = gain_of(untrained, trained, asked, SIDE, device, k=5)
+    assert gain.queries == 300
+    # The whole 95 % interval lies above nothing gained.
+    assert gain.low > 0, gain.as_json()
