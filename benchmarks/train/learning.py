@@ -131,7 +131,7 @@ def gain_of(
         )
         ranked = recalls(describe, asked, ks=(k,)).ranked.indices
         hits = hits_of(ranked, asked.positives)[:, :k]
-        found.append(hits.any(axis=1, keepdims=True).astype(np.float64))
+        found.append(np.any(hits, axis=1)[:, np.newaxis].astype(np.float64))
     (difference,) = paired(found[1], found[0], clusters_of(asked.queries).of)
     assert difference.low is not None
     assert difference.high is not None
