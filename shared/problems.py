@@ -46,6 +46,16 @@ PROBLEM_RESPONSES: dict[int | str, dict[str, Any]] = {
     },
 }
 
+# The same for whoever calls without a key, with too little of one, or too often.
+KEY_RESPONSES: dict[int | str, dict[str, Any]] = {
+    401: {**PROBLEM_RESPONSES["4XX"], "description": "No key, or one that is no longer good."},
+    403: {**PROBLEM_RESPONSES["4XX"], "description": "The key lacks the scope of this call."},
+    429: {
+        **PROBLEM_RESPONSES["4XX"],
+        "description": "Too much at once; again after `Retry-After` seconds.",
+    },
+}
+
 
 def install_problem_handlers(app: FastAPI) -> None:
     """Turn whatever is raised in a route into a problem document."""

@@ -39,8 +39,36 @@ class Settings(BaseSettings):
     port: int = Field(8000, ge=0, le=65535, description="0 takes a free one")
     admin_key: SecretStr | None = Field(
         None,
-        description="the key that every call needs; unset: made and shown at the first start "
-        "beyond loopback, and none is needed on loopback",
+        description="a key that may do everything, beside those of `placewise keys`; unset: the "
+        "embedded Placewise needs none on loopback, and makes one at its first start beyond",
+    )
+    cors_origins: str | None = Field(
+        None,
+        description="pages of elsewhere whose scripts may call, by their origins, separated by "
+        "commas: https://maps.example.com; unset: none",
+    )
+    hsts_seconds: int = Field(
+        0,
+        ge=0,
+        description="how long browsers shall use HTTPS alone (Strict-Transport-Security); 0: not "
+        "said. For servers that are reached over HTTPS only",
+    )
+
+    # What a key may do, unless it has limits of its own; ADMIN_KEY has none.
+    key_requests_per_minute: int | None = Field(
+        None, ge=1, description="calls of one key; unset: any number"
+    )
+    key_upload_bytes_per_day: int | None = Field(
+        None, ge=1, description="bytes that one key sends; unset: any number"
+    )
+    key_max_photos: int | None = Field(
+        None, ge=1, description="photos that are stored through one key; unset: any number"
+    )
+
+    webhook_private_addresses: bool = Field(
+        False,
+        description="lets webhooks lead to private addresses and over plain HTTP: whoever makes "
+        "one then reaches what the steward reaches",
     )
     placewise_home: Path = Field(
         Path("./var"), description="folder of the embedded catalog and object store"
@@ -310,6 +338,17 @@ class Settings(BaseSettings):
             )
         return value
 
+    @field_validator("cors_origins")
+    @classmethod
+    def _are_origins(cls, value: str | None) -> str | None:
+        for origin in _split(value):
+            if not re.fullmatch(r"https?://([a-z0-9.-]+|\[[0-9a-f:]+\])(:\d+)?", origin):
+                raise ValueError(
+                    f"{origin!r} is no origin: scheme, name and port in small letters, without a "
+                    "path: https://maps.example.com"
+                )
+        return value
+
     @field_validator("search_shard")
     @classmethod
     def _names_a_shard(cls, value: str) -> str:
@@ -480,6 +519,11 @@ class Settings(BaseSettings):
     def search_addresses(self) -> tuple[str, ...]:
         """The search workers' addresses, each once; () when search is in this process."""
         return tuple(dict.fromkeys(url.rstrip("/") for url in _split(self.search_urls)))
+
+    @property
+    def trusted_origins(self) -> tuple[str, ...]:
+        """Whose pages may call; () for our own alone."""
+        return tuple(dict.fromkeys(_split(self.cors_origins)))
 
     def catalog_url(self) -> str:
         """The SQLAlchemy URL of the catalog."""

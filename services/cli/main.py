@@ -24,6 +24,7 @@ COMMANDS = {
     "evaluate": ("evaluate", "evaluate"),
     "config": ("configuration", "config"),
     "doctor": ("doctor", "doctor"),
+    "keys": ("keys", "app"),
     "maps": ("maps", "app"),
     "vocabulary": ("vocabulary", "app"),
     "pca": ("pca", "app"),

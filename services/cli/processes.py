@@ -18,8 +18,10 @@ from services.cli.configuration import read_settings
 from services.cli.output import explained, messages
 from services.cli.serve import set_log_levels
 from services.parts import start_part
+from shared.api_keys import hash_key
 from shared.catalog.connections import Limits
 from shared.catalog.installation import ensure_installation, open_own_store
+from shared.catalog.keys import has_admin_key
 from shared.catalog.maps import ensure_default_map
 from shared.catalog.open_catalog import open_catalog
 from shared.catalog.schema import migrate as migrate_catalog
@@ -34,11 +36,12 @@ if TYPE_CHECKING:
 
 
 def gateway() -> None:
-    """Answer the HTTP API (HOST, PORT). Beyond loopback it needs ADMIN_KEY."""
+    """Answer the HTTP API (HOST, PORT). Every call needs a key: ADMIN_KEY, or one of `placewise
+    keys`."""
     with _service("gateway") as (settings, catalog):
         from services.gateway.app import create_app
         from services.gateway.context import Gateway
-        from services.gateway.keys import keys_of
+        from services.gateway.keys import CatalogKeys
         from services.http_server import http_server, listening, stopped_by_signals, url_of
 
         with (
@@ -47,11 +50,12 @@ def gateway() -> None:
             _search(settings) as search,
         ):
             url = url_of(*listener.getsockname()[:2])
-            keys = keys_of(settings)
+            admins = _admin_hashes(settings, catalog)
             with catalog.write() as session:
                 ensure_default_map(session, settings.new_map_extractor)
             store = open_own_store(catalog, settings, alone=False)
             requests = catalog.limited(Limits.of_requests(settings))
+            keys = CatalogKeys(requests, *admins)
             context = Gateway(requests, store, hints, search, settings, keys)
             server = http_server(
                 create_app(context),
@@ -137,6 +141,20 @@ def _service(name: str) -> Iterator[tuple[Settings, Catalog]]:
             yield settings, catalog
         finally:
             catalog.close()
+
+
+def _admin_hashes(settings: Settings, catalog: Catalog) -> list[str]:
+    """Of ADMIN_KEY. Misconfigured (`admin_key_missing`) where nobody could make a call."""
+    if settings.admin_key is not None:
+        return [hash_key(settings.admin_key.get_secret_value())]
+    with catalog.read() as session:
+        if has_admin_key(session):
+            return []
+    raise Misconfigured(
+        "admin_key_missing",
+        "Every call needs a key, and there is none that could make others. Make one (placewise "
+        "keys create NAME --scope admin), or set ADMIN_KEY: openssl rand -hex 24",
+    )
 
 
 @contextlib.contextmanager

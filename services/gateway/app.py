@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from fastapi import Depends, FastAPI, Security
-from fastapi.security import HTTPBearer
+from fastapi import Depends, FastAPI
 
 from services.gateway import (
     batches,
@@ -13,6 +12,7 @@ from services.gateway import (
     health,
     history,
     jobs,
+    key_calls,
     maps,
     model_changes,
     photos,
@@ -22,21 +22,14 @@ from services.gateway import (
 )
 from services.gateway.body_limit import BodyLimit
 from services.gateway.context import API, Gateway
-from services.gateway.key_check import KeyCheck
+from services.gateway.key_check import KeyCheck, check_scopes
 from services.gateway.once import Replay, answer_again
 from services.gateway.parameters import no_unknown_parameters
 from services.gateway.room import Room
-from shared.problems import PROBLEM_RESPONSES, install_problem_handlers
+from shared.problems import KEY_RESPONSES, PROBLEM_RESPONSES, install_problem_handlers
 
 DESCRIPTION = """Photo in, place out. Upload geotagged photos, poll their jobs, and ask which known
 place a photo shows. Every error is an RFC 9457 problem with a stable `code`."""
-
-# Only describes: `KeyCheck` is what asks for the key, before a route is looked for.
-BEARER = HTTPBearer(
-    auto_error=False,
-    scheme_name="key",
-    description="The admin key. A server on loopback without an ADMIN_KEY needs none.",
-)
 
 
 def create_app(gateway: Gateway) -> FastAPI:
@@ -66,12 +59,15 @@ def create_app(gateway: Gateway) -> FastAPI:
         word_weights,
         history,
         figures,
+        key_calls,
         health,
     ):
+        check_scopes(module.router)
         app.include_router(
             module.router,
             prefix=API,
-            dependencies=[Security(BEARER), Depends(no_unknown_parameters)],
+            responses=KEY_RESPONSES,
+            dependencies=[Depends(no_unknown_parameters)],
         )
     app.include_router(health.probes)
     return app

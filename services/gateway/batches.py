@@ -12,6 +12,7 @@ from pydantic import Field
 from starlette.concurrency import run_in_threadpool
 
 from services.gateway.context import DEFAULT_MAP, Gateway, GatewayDep, JobId, MapName
+from services.gateway.key_check import READ, WRITE, caller_of
 from services.gateway.once import Once, OnceFormDep, Replay
 from services.gateway.receive_batch import (
     ARCHIVE,
@@ -105,7 +106,7 @@ class BatchItemsAnswer(Answer):
     status_code=202,
     response_model=BatchStarted,
     openapi_extra=BODY,
-    dependencies=[ROOM_FOR_JOBS],
+    dependencies=[WRITE, ROOM_FOR_JOBS],
 )
 async def upload_batch(
     request: Request,
@@ -122,14 +123,18 @@ async def upload_batch(
     """
     with room.receiving(Kind.UPLOAD):
         received = await receive_batch(request, gateway.store, gateway.settings)
-    started = await run_in_threadpool(_queue, gateway, map_name, received, once)
+    key_id = caller_of(request).key_id
+    started = await run_in_threadpool(_queue, gateway, map_name, received, key_id, once)
     response.headers["Location"] = started.status_url
     response.headers["Retry-After"] = "1"
     return started
 
 
 @router.get(
-    "/jobs/{job_id}/items", operation_id="list_batch_items", response_model=BatchItemsAnswer
+    "/jobs/{job_id}/items",
+    operation_id="list_batch_items",
+    response_model=BatchItemsAnswer,
+    dependencies=[READ],
 )
 def items(
     gateway: GatewayDep,
@@ -161,10 +166,14 @@ def _after(cursor: str | None) -> int:
     return int(cursor)
 
 
-def _queue(gateway: Gateway, map_name: str, received: ReceivedBatch, once: Once) -> BatchStarted:
+def _queue(
+    gateway: Gateway, map_name: str, received: ReceivedBatch, key_id: UUID | None, once: Once
+) -> BatchStarted:
     try:
         once.begin(received.as_said())
         rows, source, params = _read(gateway, received)
+        if key_id is not None:
+            params["key_id"] = str(key_id)
         with gateway.catalog.write() as session:
             job = start_batch(session, get_map(session, map_name).id, source, params)
             if source != BatchSource.ARCHIVE:

@@ -80,6 +80,8 @@ FileId = Annotated[UUID, _known_shape("photo")]
 UploadId = Annotated[UUID, _known_shape("upload")]
 JobId = Annotated[UUID, _known_shape("job")]
 GenerationId = Annotated[UUID, _known_shape("generation")]
+KeyId = Annotated[UUID, _known_shape("key")]
+WebhookId = Annotated[UUID, _known_shape("webhook")]
 
 __all__ = [
     "API",
@@ -90,7 +92,9 @@ __all__ = [
     "GatewayDep",
     "GenerationId",
     "JobId",
+    "KeyId",
     "MapName",
     "UploadId",
+    "WebhookId",
     "read_cursor",
 ]

@@ -32,6 +32,7 @@ from services.gateway.context import (
     MapName,
     UploadId,
 )
+from services.gateway.key_check import WRITE, caller_of
 from services.gateway.once import OnceDep, Replay
 from services.gateway.photos import PhotoPatch
 from services.gateway.room import ROOM_FOR_JOBS, Kind, RoomDep
@@ -87,7 +88,7 @@ class PresignAnswer(Answer):
     operation_id="presign_upload",
     status_code=201,
     response_model=PresignAnswer,
-    dependencies=[ROOM_FOR_JOBS],
+    dependencies=[WRITE, ROOM_FOR_JOBS],
 )
 def presign(
     gateway: GatewayDep, wanted: PresignRequest, once: OnceDep, map_name: MapName = DEFAULT_MAP
@@ -141,7 +142,7 @@ def presign(
     status_code=202,
     response_model=UploadAnswer,
     responses=UPLOAD_ANSWERS,
-    dependencies=[ROOM_FOR_JOBS],
+    dependencies=[WRITE, ROOM_FOR_JOBS],
 )
 async def complete(
     request: Request,
@@ -155,7 +156,8 @@ async def complete(
     again, it answers the same again."""
     key = new_original_key()
     with room.receiving(Kind.UPLOAD):
-        stored = await run_in_threadpool(_complete, gateway, map_name, upload_id, key)
+        key_id = caller_of(request).key_id
+        stored = await run_in_threadpool(_complete, gateway, map_name, upload_id, key, key_id)
 
     def replace(said: Said) -> None:
         with gateway.catalog.write() as session:
@@ -166,7 +168,9 @@ async def complete(
     return await answer_upload(request, response, gateway, stored, key, replace)
 
 
-def _complete(gateway: Gateway, map_name: str, upload_id: UUID, key: str) -> Stored:
+def _complete(
+    gateway: Gateway, map_name: str, upload_id: UUID, key: str, key_id: UUID | None
+) -> Stored:
     """The photo, whose bytes lie under `key` unless the map had them. Raises Replay for an upload
     that was completed before."""
     store = _direct_store(gateway)
@@ -196,7 +200,7 @@ def _complete(gateway: Gateway, map_name: str, upload_id: UUID, key: str) -> Sto
         media_type = check_photo_begin(received.begin)
         with store.open(key) as file:
             header = read_photo_header(file, gateway.settings.max_image_pixels)
-        incoming = Incoming(received, media_type, header, _fields(upload.said))
+        incoming = Incoming(received, media_type, header, _fields(upload.said), key_id)
         stored = store_photo(gateway.catalog, gateway.hints, map_name, incoming, keep)
     except (PlacewiseError, Replay):
         store.delete(key)
