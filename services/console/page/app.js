@@ -33,7 +33,7 @@ async function route() {
     link.toggleAttribute("aria-current", here);
     if (here) link.setAttribute("aria-current", "page");
   }
-  const element = h("div", { class: `view ${name}` });
+  const element = h("div", { class: "view" });
   fill(main, element);
   window.scrollTo(0, 0);
   if (!first) main.focus({ preventScroll: true });
@@ -77,6 +77,11 @@ choice.addEventListener("change", async () => {
   }
   if (/^#\/(photo|ask)\//.test(location.hash)) location.hash = location.hash.startsWith("#/photo/") ? "#/photos" : "#/ask";
   else route();
+});
+// Its address is no view's.
+document.querySelector(".skip").addEventListener("click", (event) => {
+  event.preventDefault();
+  main.focus();
 });
 window.addEventListener("hashchange", route);
 listMaps().then(route, (error) => {

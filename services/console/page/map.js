@@ -1,6 +1,7 @@
 // The map: Leaflet, with the tiles of MAP_TILES or else a graticule.
 
 import { h } from "./dom.js";
+import { serverSettings } from "./settings.js";
 
 const MOST_ZOOM = 21;
 const LINES = 6; // about so many across the map
@@ -12,12 +13,13 @@ let loaded = null;
 function load() {
   loaded ??= Promise.all([
     new Promise((resolve, reject) => {
-      document.head.append(h("link", { rel: "stylesheet", href: "/console/leaflet/leaflet.css", onload: resolve, onerror: reject }));
+      // Before the page's own style sheet, which has the last word.
+      document.head.prepend(h("link", { rel: "stylesheet", href: "/console/leaflet/leaflet.css", onload: resolve, onerror: reject }));
     }),
     new Promise((resolve, reject) => {
       document.head.append(h("script", { src: "/console/leaflet/leaflet.js", onload: resolve, onerror: reject }));
     }),
-    fetch("/console/settings.json").then((response) => response.json()),
+    serverSettings(),
   ]).then(([, , settings]) => settings);
   return loaded;
 }

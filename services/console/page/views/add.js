@@ -1,9 +1,9 @@
 // Add photos: a few one by one, many in batches, archives as they are.
 
-import { get } from "../api.js";
 import { bar, button, field, fill, h, note, noteError } from "../dom.js";
 import { takesDrops, takesPastes } from "../drop.js";
 import { bytes, count, plural } from "../format.js";
+import { serverSettings } from "../settings.js";
 import { UploadQueue } from "../uploads.js";
 import { readTags } from "./photos.js";
 
@@ -11,7 +11,7 @@ import { readTags } from "./photos.js";
 const queue = new UploadQueue();
 
 export async function showAdd(view, { signal }) {
-  const settings = await get("/console/settings.json", { signal });
+  const settings = await serverSettings();
   const said = saidForm();
   const list = h("ul", { class: "queue" });
   const summary = h("div", { class: "summary" });

@@ -8,6 +8,7 @@ import { stateInWords, watchJob } from "../jobs.js";
 import { original, thumbnail } from "../photo.js";
 
 const TOP_K = 12;
+const NEWEST = 14;
 const WAIT_SECONDS = 10;
 
 export async function showAsk(view, { signal, id }) {
@@ -33,7 +34,17 @@ export async function showAsk(view, { signal, id }) {
     view.classList.add("asked");
     return showAnswer(answer, asked, signal);
   }, signal);
-  fill(view, entry, answer);
+  const newest = h("section", { class: "newest" });
+  fill(view, entry, answer, newest);
+  if (map.searchable) await showNewest(newest, signal);
+}
+
+/** Photos of the map, to ask with one of them. */
+async function showNewest(newest, signal) {
+  const { images } = await get("/search", { query: { limit: NEWEST, role: "database" }, signal });
+  fill(newest,
+    h("h2", {}, "Or ask with a photo of the map"),
+    h("ul", { class: "mosaic" }, images.map((photo) => h("li", {}, h("a", { href: `#/ask/${photo.image_id}`, "aria-label": `Ask with ${photo.original_filename}` }, thumbnail(photo, ""))))));
 }
 
 function askEntry(map, onfile, signal) {

@@ -125,8 +125,8 @@ export async function showPhotos(view, { signal }) {
         location.hash = `#/photo/${photo.image_id}`;
       } });
     }
-    const near = query().near?.split(",").map(Number);
-    if (near) map.circle(near[0], near[1], near[2], "estimate");
+    const { near } = query();
+    if (near) map.circle(...near.split(",").map(Number), "estimate");
     map.fit();
   }
 

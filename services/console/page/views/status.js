@@ -77,7 +77,7 @@ function drawSearches(card, searches) {
     fill(card, h("h2", {}, "Questions"), h("p", { class: "soft" }, "None yet. ", h("a", { href: "#/ask" }, "Ask with a photo"), "."));
     return;
   }
-  const verdict = { true: ["In the map", "own"], false: ["Not in it", "failed"] };
+  const verdict = { true: ["In the map", "own"], false: ["Not in it", "foreign"] };
   fill(card, h("h2", {}, "Newest questions"), h("div", { class: "scroll", tabindex: "0", role: "group", "aria-label": "Newest questions" }, h("table", {},
     h("thead", {}, h("tr", {}, h("th", { scope: "col" }, "Photo"), h("th", { scope: "col" }, "Answer"), h("th", { scope: "col", class: "number" }, "Best"), h("th", { scope: "col", class: "number" }, "Took"), h("th", { scope: "col" }, "When"))),
     h("tbody", {}, searches.map((one) => {
