@@ -112,7 +112,8 @@ class Visitor:
 def context(browser: Browser) -> Iterator[BrowserContext]:
     opened = browser.new_context(viewport={"width": 1280, "height": 860}, reduced_motion="reduce")
     opened.add_init_script(
-        f"localStorage.getItem('placewise-map') ?? localStorage.setItem('placewise-map', '{MAP}')"
+        "if (location.protocol === 'http:' && !localStorage.getItem('placewise-map'))"
+        f" localStorage.setItem('placewise-map', '{MAP}')"
     )
     yield opened
     opened.close()
