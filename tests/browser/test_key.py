@@ -31,7 +31,7 @@ def page(browser: Browser, locked: ServerProcess) -> Iterator[Page]:
 
 
 def give(page: Page, key: str) -> None:
-    page.get_by_label("Key").fill(key)
+    page.get_by_label("Key", exact=True).fill(key)
     page.get_by_role("button", name="Go on").click()
 
 

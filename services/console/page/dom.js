@@ -37,9 +37,13 @@ export function button(label, onclick, kind = "") {
   return element;
 }
 
-/** A field with its label. */
+let hints = 0;
+
+/** A field with its label; the hint is no part of its name. */
 export function field(label, input, hint = null) {
-  return h("label", { class: "field" }, h("span", {}, label), input, hint && h("small", {}, hint));
+  const small = hint && h("small", { id: `hint-${++hints}` }, hint);
+  if (small) input.setAttribute("aria-describedby", small.id);
+  return h("div", { class: "field" }, h("label", {}, h("span", {}, label), input), small);
 }
 
 /** A bar with its meaning in words. `done` of `total`; an unknown total moves. */
