@@ -6,6 +6,7 @@ from fastapi import Depends, FastAPI
 
 from services.gateway import (
     batches,
+    console,
     direct_upload,
     evaluations,
     figures,
@@ -39,6 +40,8 @@ def create_app(gateway: Gateway) -> FastAPI:
         version=health.VERSION,
         description=DESCRIPTION,
         responses=PROBLEM_RESPONSES,
+        docs_url=None,  # console.py has pages that need no other server
+        redoc_url=None,
     )
     app.state.gateway = gateway
     app.state.room = Room(gateway.catalog, gateway.settings)
@@ -70,4 +73,5 @@ def create_app(gateway: Gateway) -> FastAPI:
             dependencies=[Depends(no_unknown_parameters)],
         )
     app.include_router(health.probes)
+    app.include_router(console.console_router(gateway.settings))
     return app

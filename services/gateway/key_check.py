@@ -30,11 +30,11 @@ OPEN_PATHS = frozenset(
         "/livez",
         "/readyz",
         "/docs",
-        "/docs/oauth2-redirect",
         "/redoc",
         "/openapi.json",
     }
 )
+OPEN_FOLDER = "/console/"  # the page's own files, which has a field for the key
 
 # Only describes: `KeyCheck` is what asks for the key, before a route is looked for.
 BEARER = HTTPBearer(
@@ -55,7 +55,7 @@ class KeyCheck:
         self._keys = keys
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http" or scope["path"] in OPEN_PATHS:
+        if scope["type"] != "http" or _is_open(scope["path"]):
             await self._app(scope, receive, send)
             return
         request = Request(scope)
@@ -70,6 +70,10 @@ class KeyCheck:
             await self._app(scope, receive, send)
         finally:
             await self._keys.note_use(caller)
+
+
+def _is_open(path: str) -> bool:
+    return path in OPEN_PATHS or path.startswith(OPEN_FOLDER)
 
 
 def caller_of(request: Request) -> Caller:

@@ -1,0 +1,69 @@
+"""The screenshots that the README and the page's own page show: generated places only."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from playwright.sync_api import Page, expect
+
+from tests.browser.conftest import MAP, Town, Visitor
+
+MOST_BYTES = 300_000
+LOADED = """() => [...document.images].filter((image) =>
+    image.getBoundingClientRect().top < innerHeight && image.src.startsWith("data:image/gif")
+).length"""
+
+
+def take(page: Page, path: Path) -> None:
+    """A picture of what is in sight, once all photos there are loaded."""
+    page.wait_for_load_state("networkidle")
+    while page.evaluate(LOADED):
+        page.wait_for_timeout(100)
+    page.wait_for_timeout(300)
+    page.screenshot(path=path, type="jpeg", quality=82)
+    assert path.stat().st_size < MOST_BYTES
+
+
+def best_known(town: Town) -> Path:
+    """The query of which the map is most certain."""
+
+    def support(photo: Path) -> tuple[bool, float]:
+        found: dict[str, Any] = town.server.client.post(
+            "/api/v1/similarity",
+            params={"map": MAP, "top_k": 12},
+            files={"file": (photo.name, photo.read_bytes())},
+            headers={"Prefer": "wait=60"},
+        ).json()
+        return bool(found["estimate"]["in_map"]), found["similar_images"][0]["similarity_score"]
+
+    return max(town.queries, key=support)
+
+
+def test_pictures_are_taken(visitor: Visitor, town: Town, pictures: Path) -> None:
+    query = best_known(town)
+    data = {"name": "autumn-walk.jpg", "mimeType": "image/jpeg", "buffer": query.read_bytes()}
+    for name, size, scheme in (
+        ("ask", (1280, 860), "light"),
+        ("ask-dark", (1280, 860), "dark"),
+        ("ask-phone", (390, 844), "light"),
+    ):
+        visitor.page.set_viewport_size({"width": size[0], "height": size[1]})
+        visitor.page.emulate_media(color_scheme=scheme)  # type: ignore[arg-type]
+        page = visitor.visit("ask")
+        page.locator("input[data-use=ask]").set_input_files(data)  # type: ignore[arg-type]
+        expect(page.locator(".number-pin").first).to_be_attached()
+        page.evaluate("window.scrollTo(0, 0)")
+        take(page, pictures / f"{name}.jpg")
+    visitor.page.set_viewport_size({"width": 1280, "height": 860})
+    visitor.page.emulate_media(color_scheme="light")
+    page.locator(".match").first.click()
+    expect(page.locator(".overlay")).to_be_visible()
+    take(page, pictures / "compare.jpg")
+    page.keyboard.press("Escape")
+    page = visitor.visit("photos")
+    page.get_by_role("button", name="Show the map").click()
+    expect(page.locator("path.point").first).to_be_attached()
+    take(page, pictures / "photos.jpg")
+    visitor.visit("model")
+    take(page, pictures / "model.jpg")
