@@ -35,6 +35,7 @@ from services.steward.batches.worker import BatchWorker
 from services.steward.evaluate import Evaluator
 from services.steward.loop import Steward
 from services.steward.queue import free_leases
+from services.steward.webhooks.deliver import WebhookSender
 from shared.api_keys import Scope, hash_key, is_loopback, new_local_key
 from shared.catalog.connections import Limits
 from shared.catalog.installation import open_own_store
@@ -123,6 +124,7 @@ def standalone(settings: Settings) -> Iterator[Standalone]:
         extractor = ExtractorWorker(catalog, store, settings, name=name, only_worker=True)
         steward = Steward(catalog, store, hints, settings)
         evaluator = Evaluator(catalog, store, search, settings, name=name)
+        webhooks = WebhookSender(catalog, settings)
         batches = BatchWorker(catalog, store, hints, settings, name=name)
         gateway = Gateway(requests, store, hints, search, settings, keys)
         server = http_server(
@@ -140,6 +142,7 @@ def standalone(settings: Settings) -> Iterator[Standalone]:
                 ("steward", steward.run),
                 ("evaluator", evaluator.run),
                 ("batches", batches.run),
+                ("webhooks", webhooks.run),
             )
         ]
         try:

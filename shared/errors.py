@@ -7,6 +7,7 @@ PlacewiseError
 ├── NotFound 404                photo_not_found, job_not_found, map_not_found, ...
 ├── Conflict 409                not_searchable, coordinates_differ, model_change_running, ...
 ├── Gone 410                    query_expired
+├── LengthRequired 411          length_required
 ├── TooLarge 413                file_too_large, batch_too_large, ...
 ├── UnsupportedMedia 415        unsupported_photo, unsupported_body, unsupported_archive
 ├── Unprocessable 422           invalid_field, undecodable_photo, too_many_pixels, ...
@@ -97,6 +98,11 @@ class Gone(PlacewiseError):
     title = "No longer kept"
 
 
+class LengthRequired(PlacewiseError):
+    status = 411
+    title = "The length must be said"
+
+
 class TooLarge(PlacewiseError):
     status = 413
     title = "Too large"
@@ -155,6 +161,7 @@ _BY_STATUS: dict[int, type[PlacewiseError]] = {
         NotFound,
         Conflict,
         Gone,
+        LengthRequired,
         TooLarge,
         UnsupportedMedia,
         Unprocessable,

@@ -15,6 +15,7 @@ from starlette.exceptions import HTTPException
 
 from shared.catalog.away import as_unavailable
 from shared.errors import InvalidRequest, PlacewiseError, Unprocessable
+from shared.ids import new_id
 
 log = logging.getLogger(__name__)
 
@@ -63,7 +64,7 @@ def install_problem_handlers(app: FastAPI) -> None:
     app.add_exception_handler(RequestValidationError, _on_validation_error)
     app.add_exception_handler(HTTPException, _on_http_exception)
     app.add_exception_handler(SQLAlchemyError, _on_database_error)
-    app.add_exception_handler(Exception, _on_any_error)
+    app.add_exception_handler(Exception, on_any_error)
 
 
 def problem_response(error: PlacewiseError, request: Request) -> JSONResponse:
@@ -134,13 +135,19 @@ async def _on_http_exception(request: Request, error: Exception) -> JSONResponse
 async def _on_database_error(request: Request, error: Exception) -> JSONResponse:
     unavailable = as_unavailable(error)
     if unavailable is None:  # a bug: another try would meet it again
-        return await _on_any_error(request, error)
+        return await on_any_error(request, error)
     return await _on_placewise_error(request, unavailable)
 
 
-async def _on_any_error(request: Request, error: Exception) -> JSONResponse:
-    log.error("%s %s failed", request.method, request.url.path, exc_info=error)
-    return problem_response(
-        PlacewiseError("internal_error", "Something went wrong here; the server's log says what."),
-        request,
+async def on_any_error(request: Request, error: Exception) -> JSONResponse:
+    """What is said of a fault of ours: an id, by which the log tells the rest."""
+    request_id = str(new_id())
+    log.error(
+        "%s %s failed (request %s)", request.method, request.url.path, request_id, exc_info=error
     )
+    problem = PlacewiseError(
+        "internal_error",
+        f"Something went wrong here; the server's log says what, at {request_id}.",
+        request_id=request_id,
+    )
+    return problem_response(problem, request)

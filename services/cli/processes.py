@@ -86,6 +86,7 @@ def steward() -> None:
         from services.steward.batches.worker import BatchWorker
         from services.steward.evaluate import Evaluator
         from services.steward.loop import Steward
+        from services.steward.webhooks.deliver import WebhookSender
 
         stop, died = threading.Event(), threading.Event()
 
@@ -100,10 +101,12 @@ def steward() -> None:
             name = f"steward-{socket.gethostname()}-{os.getpid()}"
             evaluator = Evaluator(catalog, store, search, settings, name)
             batches = BatchWorker(catalog, store, hints, settings, name)
+            webhooks = WebhookSender(catalog, settings)
             duties = Steward(catalog, store, hints, settings)
             parts = [
                 start_part("evaluator", evaluator.run, stop, on_death),
                 start_part("batches", batches.run, stop, on_death),
+                start_part("webhooks", webhooks.run, stop, on_death),
                 start_part("steward", duties.run, stop, on_death),
             ]
             messages.print("Placewise steward is at work")

@@ -13,6 +13,7 @@ from starlette.concurrency import run_in_threadpool
 
 from services.gateway.context import DEFAULT_MAP, Gateway, GatewayDep, JobId, MapName
 from services.gateway.key_check import READ, WRITE, caller_of
+from services.gateway.keys import Caller
 from services.gateway.once import Once, OnceFormDep, Replay
 from services.gateway.receive_batch import (
     ARCHIVE,
@@ -25,7 +26,7 @@ from services.gateway.receive_batch import (
     receive_batch,
     too_many_photos,
 )
-from services.gateway.room import ROOM_FOR_JOBS, Kind, RoomDep
+from services.gateway.room import ROOM_FOR_JOBS, ROOM_FOR_PHOTOS, Kind, RoomDep, max_photos
 from services.gateway.schemas import Answer, JobStarted, job_started, job_url
 from shared.catalog.maps import get_map
 from shared.errors import Conflict, PlacewiseError, Unprocessable, invalid_field
@@ -34,6 +35,7 @@ from shared.jobs import JobKind, JobState
 from shared.jobs.batches import BatchItem, BatchSource, list_batch, list_items, start_batch
 from shared.jobs.table import get_job
 from shared.objects.keys import is_key
+from shared.settings import Settings
 
 router = APIRouter(tags=["batches"])
 
@@ -106,7 +108,7 @@ class BatchItemsAnswer(Answer):
     status_code=202,
     response_model=BatchStarted,
     openapi_extra=BODY,
-    dependencies=[WRITE, ROOM_FOR_JOBS],
+    dependencies=[WRITE, ROOM_FOR_PHOTOS, ROOM_FOR_JOBS],
 )
 async def upload_batch(
     request: Request,
@@ -123,8 +125,8 @@ async def upload_batch(
     """
     with room.receiving(Kind.UPLOAD):
         received = await receive_batch(request, gateway.store, gateway.settings)
-    key_id = caller_of(request).key_id
-    started = await run_in_threadpool(_queue, gateway, map_name, received, key_id, once)
+    whose = _whose(caller_of(request), gateway.settings)
+    started = await run_in_threadpool(_queue, gateway, map_name, received, whose, once)
     response.headers["Location"] = started.status_url
     response.headers["Retry-After"] = "1"
     return started
@@ -167,15 +169,14 @@ def _after(cursor: str | None) -> int:
 
 
 def _queue(
-    gateway: Gateway, map_name: str, received: ReceivedBatch, key_id: UUID | None, once: Once
+    gateway: Gateway, map_name: str, received: ReceivedBatch, whose: dict[str, Any], once: Once
 ) -> BatchStarted:
     try:
         once.begin(received.as_said())
         rows, source, params = _read(gateway, received)
-        if key_id is not None:
-            params["key_id"] = str(key_id)
         with gateway.catalog.write() as session:
-            job = start_batch(session, get_map(session, map_name).id, source, params)
+            map_id = get_map(session, map_name).id
+            job = start_batch(session, map_id, source, {**params, **whose})
             if source != BatchSource.ARCHIVE:
                 list_batch(session, job, rows)
             session.flush()
@@ -189,6 +190,14 @@ def _queue(
         # Only what is certainly refused: after a lost connection the row may be committed.
         discard(gateway.store, received)
         raise
+
+
+def _whose(caller: Caller, settings: Settings) -> dict[str, Any]:
+    """What the steward has to know of the caller, as parameters of the job."""
+    if caller.key_id is None:
+        return {}
+    limited = max_photos(caller, settings)
+    return {"key_id": str(caller.key_id), "max_photos": limited[1] if limited else None}
 
 
 def _read(

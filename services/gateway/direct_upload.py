@@ -35,7 +35,7 @@ from services.gateway.context import (
 from services.gateway.key_check import WRITE, caller_of
 from services.gateway.once import OnceDep, Replay
 from services.gateway.photos import PhotoPatch
-from services.gateway.room import ROOM_FOR_JOBS, Kind, RoomDep
+from services.gateway.room import ROOM_FOR_JOBS, ROOM_FOR_PHOTOS, Kind, RoomDep
 from services.gateway.schemas import Answer, UploadAnswer
 from services.gateway.upload import UPLOAD_ANSWERS, Said, answer_upload
 from shared.catalog.base import db_now_plus
@@ -88,10 +88,14 @@ class PresignAnswer(Answer):
     operation_id="presign_upload",
     status_code=201,
     response_model=PresignAnswer,
-    dependencies=[WRITE, ROOM_FOR_JOBS],
+    dependencies=[WRITE, ROOM_FOR_PHOTOS, ROOM_FOR_JOBS],
 )
 def presign(
-    gateway: GatewayDep, wanted: PresignRequest, once: OnceDep, map_name: MapName = DEFAULT_MAP
+    request: Request,
+    gateway: GatewayDep,
+    wanted: PresignRequest,
+    once: OnceDep,
+    map_name: MapName = DEFAULT_MAP,
 ) -> PresignAnswer:
     """An address to which the photo's bytes can be sent without passing this server.
 
@@ -104,6 +108,7 @@ def presign(
         raise file_too_large(limit)
     said = wanted.said()
     _fields(said)  # what can't be understood is refused now, not after the bytes were sent
+    request.app.state.quotas.take_bytes(caller_of(request), wanted.file_size)
     upload_id = new_id()
     seconds = gateway.settings.presign_seconds
     put = store.presign_put(
@@ -142,7 +147,7 @@ def presign(
     status_code=202,
     response_model=UploadAnswer,
     responses=UPLOAD_ANSWERS,
-    dependencies=[WRITE, ROOM_FOR_JOBS],
+    dependencies=[WRITE, ROOM_FOR_PHOTOS, ROOM_FOR_JOBS],
 )
 async def complete(
     request: Request,

@@ -167,7 +167,7 @@ def image(
             "Content-Length": str(found.size_bytes),
             "Content-Disposition": f"inline; filename*=UTF-8''{quote(found.filename)}",
             "ETag": etag,
-            "X-Content-Type-Options": "nosniff",
+            "Cache-Control": "private, no-cache",  # kept by this browser, and asked for each time
         },
     )
 
@@ -190,7 +190,7 @@ def thumbnail(gateway: GatewayDep, file_id: FileId, map_name: MapName = DEFAULT_
             "thumbnail_not_found",
             "The photo has no thumbnail yet: it is not described.",
         ) from None
-    return Response(data, media_type="image/jpeg", headers={"X-Content-Type-Options": "nosniff"})
+    return Response(data, media_type="image/jpeg")
 
 
 @router.get(

@@ -15,7 +15,7 @@ from services.gateway.context import DEFAULT_MAP, Gateway, GatewayDep, MapName
 from services.gateway.key_check import WRITE, caller_of
 from services.gateway.once import OnceFormDep
 from services.gateway.receive import describe_form, receive_file
-from services.gateway.room import ROOM_FOR_JOBS, Kind, RoomDep
+from services.gateway.room import ROOM_FOR_JOBS, ROOM_FOR_PHOTOS, Kind, RoomDep
 from services.gateway.schemas import UploadAnswer, job_url
 from services.gateway.waiting import preferred_wait, wait_for_job
 from shared.catalog.photos import PhotoRole
@@ -59,7 +59,7 @@ UPLOAD_ANSWERS: dict[int | str, dict[str, Any]] = {
     response_model=UploadAnswer,
     responses=UPLOAD_ANSWERS,
     openapi_extra=FORM,
-    dependencies=[WRITE, ROOM_FOR_JOBS],
+    dependencies=[WRITE, ROOM_FOR_PHOTOS, ROOM_FOR_JOBS],
 )
 async def upload(
     request: Request,

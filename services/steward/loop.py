@@ -17,7 +17,12 @@ from services.steward.count_maps import count_large_maps
 from services.steward.delete_maps import delete_maps
 from services.steward.model_changes import advance_model_changes, fit_maps_that_wait
 from services.steward.queue import free_leases, resend_hints
-from services.steward.retention import forget_old_jobs, forget_old_keys, forget_old_searches
+from services.steward.retention import (
+    forget_old_deliveries,
+    forget_old_jobs,
+    forget_old_keys,
+    forget_old_searches,
+)
 from services.steward.search_workers import remove_dead_workers
 from shared.catalog.away import Outage
 from shared.catalog.session import Catalog
@@ -74,6 +79,11 @@ class Steward:
                 "forget old searches",
                 10.0,
                 lambda: forget_old_searches(catalog, settings.search_history_days),
+            ),
+            Duty(
+                "forget old deliveries",
+                10.0,
+                lambda: forget_old_deliveries(catalog, settings.job_retention_days),
             ),
             Duty("forget old keys", 10.0, lambda: forget_old_keys(catalog)),
             Duty(

@@ -6,61 +6,18 @@ import asyncio
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
-import httpx2
 import pytest
 from sqlalchemy import select, update
 from starlette.datastructures import Headers
-from starlette.testclient import TestClient
 
-from services.gateway.app import create_app
-from services.gateway.context import Gateway
 from services.gateway.keys import CatalogKeys
-from services.search.worker import SearchWorker
 from shared.api_keys import hash_key
 from shared.catalog.keys import ApiKey
-from shared.catalog.maps import ensure_default_map
 from shared.catalog.photos import Photo
-from shared.catalog.session import Catalog
-from shared.jobs import InProcessHints
 from shared.objects import FolderStore
-from shared.settings import Settings
+from tests.integration.door import ADMIN, Door
 from tests.support.photos import photo_bytes
 from tests.support.problems import problem
-
-ADMIN = "the-key-of-the-admin-0123"
-
-
-class Door:
-    """The HTTP API behind keys."""
-
-    def __init__(self, catalog: Catalog, store: FolderStore, settings: Settings) -> None:
-        search = SearchWorker(catalog, store, settings)
-        keys = CatalogKeys(catalog, hash_key(ADMIN))
-        gateway = Gateway(catalog, store, InProcessHints(), search, settings, keys)
-        self.catalog = catalog
-        self._client = TestClient(create_app(gateway), base_url="http://places.example")
-
-    def __call__(self, key: str, method: str, path: str, **options: Any) -> httpx2.Response:
-        headers = {"Authorization": f"Bearer {key}", **options.pop("headers", {})}
-        return self._client.request(method, f"/api/v1{path}", headers=headers, **options)
-
-    def key(self, *scopes: str, **said: Any) -> dict[str, Any]:
-        """A new one, as it was answered."""
-        wanted = {"name": "someone", "scopes": scopes, **said}
-        made = self(ADMIN, "POST", "/keys", json=wanted)
-        assert made.status_code == 201, made.text
-        answer: dict[str, Any] = made.json()
-        return answer
-
-    def put(self, key: str, number: int = 1) -> httpx2.Response:
-        return self(key, "POST", "/upload", files={"file": ("photo.jpg", photo_bytes(number))})
-
-
-@pytest.fixture
-def door(catalog: Catalog, store: FolderStore, settings: Settings) -> Door:
-    with catalog.write() as session:
-        ensure_default_map(session, settings.extractor)
-    return Door(catalog, store, settings)
 
 
 def test_a_key_is_shown_once_and_kept_as_a_hash(door: Door) -> None:
