@@ -32,7 +32,8 @@ class Door:
         keys = CatalogKeys(catalog, hash_key(ADMIN))
         gateway = Gateway(catalog, store, InProcessHints(), search, settings, keys)
         self.catalog, self.store = catalog, store
-        self._client = TestClient(create_app(gateway), base_url="http://places.example")
+        self.app = create_app(gateway)
+        self._client = TestClient(self.app, base_url="http://places.example")
 
     def __call__(self, key: str, method: str, path: str, **options: Any) -> httpx2.Response:
         headers = {"Authorization": f"Bearer {key}", **options.pop("headers", {})}

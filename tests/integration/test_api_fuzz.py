@@ -1,0 +1,131 @@
+"""The API is what its description says, whatever is sent: schemathesis makes the calls.
+
+`make test-api-fuzz` makes many more of them than `make test` does.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import hypothesis
+import pytest
+import schemathesis
+from hypothesis import HealthCheck
+from schemathesis.checks import CHECKS
+
+from shared.catalog.session import Catalog
+from shared.objects import FolderStore
+from shared.settings import Settings
+from tests.integration.door import ADMIN, Door
+
+EXAMPLES = int(os.environ.get("PLACEWISE_FUZZ_EXAMPLES", "3"))  # of calls; a sixth: of sequences
+PROMISED = CHECKS.get_by_names(
+    [
+        "not_a_server_error",
+        "status_code_conformance",
+        "content_type_conformance",
+        "response_headers_conformance",
+        "response_schema_conformance",
+    ]
+)
+KEY = {"Authorization": f"Bearer {ADMIN}"}
+
+
+def settings_of(examples: int, **more: Any) -> hypothesis.settings:
+    return hypothesis.settings(
+        max_examples=examples,
+        deadline=None,
+        database=None,
+        derandomize=EXAMPLES <= 3,
+        suppress_health_check=list(HealthCheck),
+        **more,
+    )
+
+
+@pytest.fixture
+def fuzzed(sqlite_catalog: Catalog, store: FolderStore, settings: Settings) -> Door:
+    """A service with a photo, that waits for nothing."""
+    quick = {"max_wait_seconds": 0, "compare_wait_seconds": 0.0, "search_wait_seconds": 0.1}
+    door = Door(sqlite_catalog, store, settings.model_copy(update=quick))
+    assert door.put(ADMIN).status_code == 202
+    return door
+
+
+def described(door: Door) -> Any:
+    return schemathesis.openapi.from_asgi("/openapi.json", door.app)
+
+
+def each_call(door: Door, check: Callable[[Any], None], examples: int) -> None:
+    """`check` on made-up cases of every call of the description; all that fails is told."""
+    failures: list[str] = []
+    operations = [result.ok() for result in described(door).get_all_operations()]
+    assert len(operations) > 40
+    for operation in operations:
+        run = hypothesis.given(case=operation.as_strategy())(lambda case: check(case))
+        try:
+            settings_of(examples)(run)()
+        except BaseExceptionGroup as group:
+            failures += [str(error) for error in group.exceptions]
+        except schemathesis.FailureGroup as error:
+            failures.append(f"{operation.label}: {error}")
+        except AssertionError as error:
+            failures.append(f"{operation.label}: {error}")
+    assert not failures, "\n\n".join(failures)
+
+
+def test_whoever_has_the_key_gets_what_is_described_and_no_fault(fuzzed: Door) -> None:
+    def check(case: Any) -> None:
+        case.call_and_validate(headers=KEY, checks=PROMISED)
+
+    each_call(fuzzed, check, EXAMPLES)
+
+
+@pytest.mark.parametrize(
+    ("headers", "codes"),
+    [
+        ({}, {"key_missing"}),
+        ({"Authorization": "Bearer pw_guessed"}, {"key_unknown"}),
+        ({"Authorization": "Basic YTpi"}, {"key_missing"}),
+    ],
+)
+def test_without_a_key_nothing_but_what_is_open_is_answered(
+    fuzzed: Door, headers: dict[str, str], codes: Sequence[str]
+) -> None:
+    def check(case: Any) -> None:
+        answer = case.call(headers=headers)
+        case.validate_response(answer, checks=PROMISED)
+        if case.path.startswith("/api/"):
+            assert answer.status_code == 401, case.path
+            assert answer.json()["code"] in codes
+
+    each_call(fuzzed, check, 1)
+
+
+def test_calls_that_follow_from_one_another_get_what_is_described(fuzzed: Door) -> None:
+    machine = described(fuzzed).as_state_machine()
+
+    class Sequences(machine):  # type: ignore[misc, valid-type]
+        def get_call_kwargs(self, case: Any) -> dict[str, Any]:
+            return {"headers": KEY}
+
+        def validate_response(self, response: Any, case: Any, **options: Any) -> None:
+            case.validate_response(response, checks=PROMISED)
+
+    Sequences.run(settings=settings_of(max(1, EXAMPLES // 6), stateful_step_count=12))
+    assert fuzzed.put(ADMIN, 2).status_code == 202, "and the service is still there"
+    assert fuzzed(ADMIN, "GET", "/health").status_code == 200
+
+
+def test_the_fuzz_would_find_a_fault(fuzzed: Door, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*args: Any) -> Any:
+        raise ZeroDivisionError
+
+    monkeypatch.setattr("services.gateway.maps.list_maps", broken, raising=False)
+    operation = described(fuzzed)["/api/v1/maps"]["GET"]
+    run = hypothesis.given(case=operation.as_strategy())(
+        lambda case: case.call_and_validate(headers=KEY, checks=PROMISED)
+    )
+    with pytest.raises(BaseException, match="[Ss]erver error"):
+        settings_of(1)(run)()
