@@ -19,6 +19,8 @@ from shared.errors import PlacewiseError, Unprocessable, invalid_field
 MOST_CHARACTERS = 2000
 PORTS = {"http": 80, "https": 443}
 NAT64 = ipaddress.ip_network("64:ff9b::/96")  # RFC 6052: an IPv4 address in its last 32 bits
+# Of protocols and not of machines (RFC 6890); the standard library calls parts of them global.
+NOT_PUBLIC = tuple(map(ipaddress.ip_network, ("192.0.0.0/24", "192.88.99.0/24", "64:ff9b:1::/48")))
 
 Address = ipaddress.IPv4Address | ipaddress.IPv6Address
 
@@ -92,6 +94,8 @@ def is_public(address: Address) -> bool:
             return is_public(inner)
         if address.scope_id is not None or address.is_site_local:
             return False
+    if any(address in network for network in NOT_PUBLIC):
+        return False
     return address.is_global and not (
         address.is_multicast or address.is_reserved or address.is_unspecified
     )
