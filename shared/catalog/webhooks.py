@@ -127,7 +127,9 @@ def wanted(session: Session, event: EventKind) -> list[UUID]:
     """The webhooks that want the event; they are looked up once in a transaction."""
     webhooks = session.info.get("webhooks")
     if webhooks is None:
-        webhooks = session.execute(select(Webhook.id, Webhook.events)).all()
+        # In the midst of others' changes, which are not to be written before they are whole.
+        with session.no_autoflush:
+            webhooks = session.execute(select(Webhook.id, Webhook.events)).all()
         session.info["webhooks"] = webhooks
     return [webhook_id for webhook_id, events in webhooks if event in events]
 

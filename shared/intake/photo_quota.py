@@ -11,14 +11,14 @@ from shared.catalog.session import Catalog
 from shared.errors import TooManyRequests
 
 LOOK_SECONDS = 10.0
-FULL_LOOK_SECONDS = 1.0  # once the limit seems to be reached
+FULL_LOOK_SECONDS = 1.0  # once the limit is reached
 RETRY_SECONDS = 3600
 KEYS_REMEMBERED = 1000
 
 
 class PhotoQuota:
-    """Counts by looking, and what was taken since: a limit may be passed by what other processes
-    take within LOOK_SECONDS. One for each process, or each thread that has its own."""
+    """Counts by looking, and what was taken since: a limit may be passed by what is being received
+    at that moment, and by what other processes take within LOOK_SECONDS. Thread-safe."""
 
     def __init__(self, catalog: Catalog) -> None:
         self._catalog = catalog
@@ -29,11 +29,11 @@ class PhotoQuota:
         """Room for one more photo. TooManyRequests (`photo_quota_reached`)."""
         looked_at, stored = self._seen.get(key_id, (-LOOK_SECONDS, 0))
         age_seconds = time.monotonic() - looked_at
-        full = stored + self._taken[key_id] >= most
-        if age_seconds >= (FULL_LOOK_SECONDS if full else LOOK_SECONDS):
+        # What was taken may have been refused since, or was there already: full is who looks full.
+        seems_full = stored < most <= stored + self._taken[key_id]
+        if seems_full or age_seconds >= (LOOK_SECONDS if stored < most else FULL_LOOK_SECONDS):
             stored = self._look(key_id, most)
-            full = stored >= most
-        if full:
+        if stored >= most:
             raise TooManyRequests(
                 "photo_quota_reached",
                 f"{most} photos are stored through this key, and no more may be. Delete some, or "

@@ -127,6 +127,9 @@ def test_a_key_stores_so_many_photos_and_a_deleted_one_makes_room(
 ) -> None:
     monkeypatch.setattr(photo_quota, "FULL_LOOK_SECONDS", 0.0)
     key = door.key("write", max_photos=2)["key"]
+    for _ in range(3):  # the same bytes again, and none at all, are no further photos
+        assert door.put(key, 1).status_code in (200, 202)
+        assert door(key, "POST", "/upload", files={"file": b""}).status_code == 400
     stored = [door.put(key, number).json()["file_id"] for number in (1, 2)]
     problem(door.put(key, 3), 429, "photo_quota_reached")
     assert door.put(ADMIN, 4).status_code == 202

@@ -1,4 +1,4 @@
-"""A thumbnail is a picture and nothing else: what a camera wrote beside it stays with the original."""
+"""A thumbnail is a picture and nothing else: what a camera wrote beside it is left out."""
 
 from __future__ import annotations
 

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import logging
 import socket
+import ssl
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -25,6 +27,7 @@ from shared.settings import Settings
 from shared.webhook_address import Target, parse_target
 from tests.integration.door import ADMIN, Door
 from tests.support.archives import zip_of
+from tests.support.certificate import certificate
 from tests.support.photos import photo_bytes
 from tests.support.problems import field_refused, problem
 from tests.support.receiver import Receiver, receiving
@@ -254,6 +257,30 @@ def test_a_receiver_that_drips_is_not_waited_for(
     (delivery,) = told.log(slow)
     assert delivery["state"] == "pending"
     assert delivery["last_status"] is None
+
+
+@pytest.mark.parametrize("name", ["localhost", "elsewhere.example"])
+def test_over_https_only_the_named_host_is_told(
+    told: Told, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    pem = certificate(tmp_path, name)
+    server = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    server.load_cert_chain(pem)
+    trusting = ssl.create_default_context(cafile=str(pem))
+    monkeypatch.setattr(ssl, "create_default_context", lambda: trusting)
+    told.door(ADMIN, "DELETE", f"/webhooks/{told.webhook['id']}")
+    with receiving(server) as secured:
+        told.receiver = secured
+        webhook = told.add("job.succeeded")
+        told.photo()
+        assert told.send() == 1
+        (delivery,) = told.log(webhook)
+        if name == "localhost":
+            assert delivery["state"] == "delivered"
+            assert secured.messages[0].is_signed_with(webhook["secret"])
+        else:
+            assert secured.messages == []
+            assert "certificate verify failed" in delivery["last_error"].lower()
 
 
 def test_a_deleted_webhook_is_told_nothing_more(told: Told) -> None:

@@ -7,6 +7,7 @@ import contextlib
 import hashlib
 import hmac
 import json
+import ssl
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -46,7 +47,7 @@ class Receiver:
 
 
 @contextlib.contextmanager
-def receiving() -> Iterator[Receiver]:
+def receiving(tls: ssl.SSLContext | None = None) -> Iterator[Receiver]:
     """On loopback, on a free port."""
 
     class Handler(BaseHTTPRequestHandler):
@@ -63,7 +64,10 @@ def receiving() -> Iterator[Receiver]:
             pass
 
     with ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
-        receiver = Receiver(f"http://127.0.0.1:{server.server_port}/hook?a=1")
+        if tls is not None:
+            server.socket = tls.wrap_socket(server.socket, server_side=True)
+        scheme, name = ("https", "localhost") if tls else ("http", "127.0.0.1")
+        receiver = Receiver(f"{scheme}://{name}:{server.server_port}/hook?a=1")
         thread = threading.Thread(target=server.serve_forever)
         thread.start()
         try:

@@ -15,7 +15,7 @@ from starlette.datastructures import Headers
 from services.gateway.keys import Caller, CatalogKeys, Keys, NoKeys, read_bearer
 from shared.api_keys import Scope, granted, hash_key, is_loopback, new_key, shown_prefix
 from shared.catalog.session import Catalog
-from shared.errors import Forbidden, Unauthorized
+from shared.errors import Forbidden, Unauthorized, Unavailable
 from shared.home import announced, running_server, write_private
 from shared.settings import Settings
 
@@ -79,6 +79,16 @@ def test_any_of_the_keys_beside_the_catalog_opens_everything(none_stored: Catalo
         assert wrong not in caught.value.detail
     with pytest.raises(Unauthorized):
         check(CatalogKeys(none_stored), authorization=f"Bearer {KEY}")
+
+
+def test_while_the_catalog_is_away_only_the_keys_beside_it_open() -> None:
+    away = Catalog("postgresql+psycopg://nobody@127.0.0.1:9/none")
+    keys = CatalogKeys(away, hash_key(KEY))
+    check(keys, authorization=f"Bearer {KEY}")
+    with pytest.raises(Unavailable) as caught:
+        check(keys, authorization="Bearer pw_of_the_catalog")
+    assert caught.value.code == "catalog_unavailable"
+    away.close()
 
 
 def test_a_key_is_long_random_and_shows_little_of_itself() -> None:
