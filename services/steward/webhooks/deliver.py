@@ -11,6 +11,7 @@ import logging
 import random
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 from uuid import UUID
 
 from sqlalchemy import select, update
@@ -97,7 +98,7 @@ class WebhookSender:
         self._note(delivery.id, delivery.attempts, outcome)
 
     def _note(self, delivery_id: UUID, attempts: int, outcome: Outcome) -> None:
-        values = {"last_status": outcome.status, "last_error": outcome.error}
+        values: dict[str, Any] = {"last_status": outcome.status, "last_error": outcome.error}
         pause = pause_seconds(attempts)
         if outcome.error is None:
             values |= {"state": DeliveryState.DELIVERED, "ended_at": db_now()}
