@@ -11,7 +11,8 @@ from tests.browser.conftest import MAP, Town, Visitor
 
 MOST_BYTES = 300_000
 LOADED = """() => [...document.images].filter((image) =>
-    image.getBoundingClientRect().top < innerHeight && image.src.startsWith("data:image/gif")
+    image.checkVisibility() && image.getBoundingClientRect().top < innerHeight
+    && image.src.startsWith("data:image/gif")
 ).length"""
 
 
