@@ -3,26 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import pytest
 from playwright.sync_api import Page, expect
 
-from tests.browser.conftest import MAP, Town, Visitor
+from tests.browser.conftest import Town, Visitor
 
 TITLES = {True: "In this map", False: "Not in this map", None: "Best guess"}
-
-
-def answer_of(town: Town, photo: Path) -> dict[str, Any]:
-    answer = town.server.client.post(
-        "/api/v1/similarity",
-        params={"map": MAP, "top_k": 12},
-        files={"file": (photo.name, photo.read_bytes())},
-        headers={"Prefer": "wait=60"},
-    )
-    assert answer.status_code == 200, answer.text
-    found: dict[str, Any] = answer.json()
-    return found
 
 
 def ask(visitor: Visitor, photo: Path) -> Page:
@@ -32,12 +19,12 @@ def ask(visitor: Visitor, photo: Path) -> Page:
     return page
 
 
-@pytest.mark.parametrize("number", [0, 1, 2, 3])
+@pytest.mark.parametrize("number", range(4))
 def test_the_page_says_where_a_photo_was_taken_or_that_it_is_not_in_the_map(
     visitor: Visitor, town: Town, number: int
 ) -> None:
     photo = town.queries[number]
-    found = answer_of(town, photo)
+    found = town.ask(photo)
     page = ask(visitor, photo)
     estimate = found["estimate"]
     expect(page.locator(".badge")).to_have_text(TITLES[estimate["in_map"]])

@@ -13,9 +13,9 @@ from tests.support.server import ServerProcess
 
 PLACES = 24
 VIEWS = 2
-QUERIES = 12
+QUERIES = 16
 SEASON = re.compile(r"-([a-z]+)-")
-KEPT_BACK = 4
+KEPT_BACK = 8
 """queries that are no part of the map, to ask with"""
 
 
@@ -36,7 +36,7 @@ def build_town(server: ServerProcess, folder: Path, map_name: str) -> list[Path]
     made = server.client.post("/api/v1/maps", json={"name": map_name})
     assert made.status_code == 201, made.text
     queries = sorted((folder / "queries").glob("*.jpg"))
-    asked, labelled = queries[:KEPT_BACK], queries[KEPT_BACK:]
+    asked, labelled = queries[::2][:KEPT_BACK], queries[1::2]
     _bring_in(server, map_name, sorted((folder / "database").glob("*.jpg")), "database")
     _bring_in(server, map_name, labelled, "query")
     measured = server.client.post("/api/v1/evaluations", params={"map": map_name}, json={})

@@ -155,8 +155,12 @@ function verdict(found) {
     estimate.place && h("p", { class: "place" }, estimate.place),
     estimate.latitude !== null && h("p", { class: estimate.place ? "where" : "place where" }, degrees(estimate.latitude, estimate.longitude), h("span", { class: "radius" }, ` ± ${Math.round(estimate.radius_m)} m`)),
   ];
+  const unsure = {
+    true: ["How sure this is can’t be said yet: ", h("a", { href: "#/add" }, "add labelled queries"), " of another day."],
+    false: ["The photos below are the nearest that the map has."],
+  }[estimate.in_map] ?? ["Whether it is in the map can’t be told yet: ", h("a", { href: "#/model" }, "measure the map"), "."];
   const sure = estimate.confidence === null
-    ? h("p", { class: "soft" }, estimate.in_map === false ? "The photos below are the nearest that the map has." : "How sure this is can’t be said yet: ", estimate.in_map === false ? null : h("a", { href: "#/model" }, "measure the map"))
+    ? h("p", { class: "soft" }, unsure)
     : h("div", { class: "sure" }, h("span", { class: "figure" }, percent(estimate.confidence)), h("span", { class: "soft" }, " sure"), h("meter", { min: 0, max: 1, value: estimate.confidence, "aria-label": "Confidence" }));
   return h("div", { class: `verdict ${kind}` },
     h("p", { class: "badge" }, title),
