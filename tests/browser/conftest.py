@@ -107,6 +107,10 @@ class Visitor:
         self.page.on("console", self._heard)
         self.page.on("request", self._asked)
 
+    def untroubled(self) -> None:
+        """The page has told of no error."""
+        expect(self.page.locator(".note.bad")).to_have_count(0)
+
     def _heard(self, message: Any) -> None:
         # A refusal of the server is shown on the page; the browser writes it down as well.
         if message.type in ("error", "warning") and "Failed to load resource" not in message.text:

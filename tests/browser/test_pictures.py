@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from playwright.sync_api import Page, expect
+from playwright.sync_api import FilePayload, Page, expect
 
 from tests.browser.conftest import MAP, Town, Visitor
 
@@ -28,7 +28,7 @@ def take(page: Page, path: Path) -> None:
 def learn(town: Town) -> None:
     """A vocabulary of the map's own, measured."""
     if town.get(f"/maps/{MAP}")["vocabulary"] != "own":
-        town.work("/vocabularies", clusters=16)
+        town.work("/vocabularies")
     town.work("/evaluations")
 
 
@@ -45,7 +45,11 @@ def best_known(town: Town) -> Path:
 def test_pictures_are_taken(visitor: Visitor, town: Town, pictures: Path) -> None:
     learn(town)
     query = best_known(town)
-    data = {"name": "autumn-walk.jpg", "mimeType": "image/jpeg", "buffer": query.read_bytes()}
+    data: FilePayload = {
+        "name": "a-walk.jpg",
+        "mimeType": "image/jpeg",
+        "buffer": query.read_bytes(),
+    }
     for name, size, scheme in (
         ("ask", (1280, 860), "light"),
         ("ask-dark", (1280, 860), "dark"),
@@ -54,7 +58,7 @@ def test_pictures_are_taken(visitor: Visitor, town: Town, pictures: Path) -> Non
         visitor.page.set_viewport_size({"width": size[0], "height": size[1]})
         visitor.page.emulate_media(color_scheme=scheme)  # type: ignore[arg-type]
         page = visitor.visit("ask")
-        page.locator("input[data-use=ask]").set_input_files(data)  # type: ignore[arg-type]
+        page.locator("input[data-use=ask]").set_input_files(data)
         expect(page.locator(".number-pin").first).to_be_attached()
         page.evaluate("window.scrollTo(0, 0)")
         take(page, pictures / f"{name}.jpg")
@@ -70,6 +74,7 @@ def test_pictures_are_taken(visitor: Visitor, town: Town, pictures: Path) -> Non
     page.get_by_text("More filters").click()
     page.get_by_role("button", name="Show the map").click()
     expect(page.locator("path.point").first).to_be_attached()
+    visitor.untroubled()
     take(page, pictures / "photos.jpg")
     visitor.visit("model")
     take(page, pictures / "model.jpg")
