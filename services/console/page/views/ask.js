@@ -169,6 +169,7 @@ function verdict(found) {
       h("p", {}, estimate.reason),
       h("dl", { class: "facts" },
         h("dt", {}, "Compared"), h("dd", {}, `${count(found.rows_scanned)} rows, ${found.certificate}`),
+        h("dt", {}, "Ranked by"), h("dd", {}, found.word_weights === "applied" ? "similarity of the words that this map trusts" : "similarity"),
         h("dt", {}, "Took"), h("dd", {}, `${found.processing_time_ms.toFixed(0)} ms`),
         h("dt", {}, "Vocabulary"), h("dd", {}, found.vocabulary))),
     found.vocabulary === "foreign" && h("p", { class: "hint" }, "This map uses a vocabulary of elsewhere. ", h("a", { href: "#/model" }, "Fit its own"), " and the right place comes first more often."),
