@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from playwright.sync_api import Page, expect
+from playwright.sync_api import Page, Route, expect
 
 from tests.browser.conftest import Town, Visitor
 
@@ -54,6 +54,22 @@ def test_a_pasted_photo_is_asked_with(visitor: Visitor, town: Town) -> None:
     )
     expect(page.locator(".verdict")).to_be_visible()
     expect(page.locator(".query-photo figcaption")).to_have_text("pasted.jpg")
+
+
+def test_of_two_questions_the_later_one_is_answered(visitor: Visitor, town: Town) -> None:
+    page = visitor.visit("ask")
+    held: list[Route] = []
+    page.route("**/api/v1/similarity?*", held.append, times=1)
+    page.locator("input[data-use=ask]").set_input_files(town.queries[0])
+    expect(page.get_by_role("heading", name="Looking for the place")).to_be_visible()
+    page.locator("input[data-use=ask]").set_input_files(
+        {"name": "later.jpg", "mimeType": "image/jpeg", "buffer": town.queries[1].read_bytes()}
+    )
+    expect(page.locator(".query-photo figcaption")).to_have_text("later.jpg")
+    with page.expect_response("**/api/v1/similarity?*"):
+        held[0].continue_()
+    page.wait_for_load_state("networkidle")
+    expect(page.locator(".query-photo figcaption")).to_have_text("later.jpg")
 
 
 def test_what_is_no_photo_gets_the_reason(visitor: Visitor) -> None:

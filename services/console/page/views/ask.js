@@ -107,7 +107,10 @@ async function findSimilar(path, query, file, onjob, signal) {
   return response.json();
 }
 
+let questions = 0;
+
 async function showAnswer(answer, asked, signal) {
+  const mine = ++questions; // of two that overlap, the later one is shown
   const progress = h("p", { class: "soft" }, "Looking…");
   fill(answer, h("section", { class: "card asking" }, h("figure", {}, asked.picture()), h("div", {}, h("h2", {}, "Looking for the place"), bar("Looking for the place", 0, 0), progress)));
   answer.scrollIntoView({ block: "start" });
@@ -116,9 +119,11 @@ async function showAnswer(answer, asked, signal) {
     found = await asked.find({ top_k: TOP_K }, (job) => fill(progress, `The photo is ${stateInWords(job)}.`));
   } catch (error) {
     if (signal.aborted) throw error;
+    if (mine !== questions) return;
     fill(answer, h("section", { class: "card refused" }, h("figure", {}, asked.picture()), h("div", {}, h("h2", {}, "No answer"), h("p", {}, error.message))));
     return;
   }
+  if (mine !== questions) return;
   const photos = found.similar_images;
   const { openMap } = await import("../map.js");
   const { compare } = await import("./compare.js");
