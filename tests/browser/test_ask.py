@@ -59,7 +59,7 @@ def test_a_pasted_photo_is_asked_with(visitor: Visitor, town: Town) -> None:
 def test_of_two_questions_the_later_one_is_answered(visitor: Visitor, town: Town) -> None:
     page = visitor.visit("ask")
     held: list[Route] = []
-    page.route("**/api/v1/similarity?*", held.append, times=1)
+    page.route("**/api/v1/similarity?*", lambda route: held.append(route), times=1)
     page.locator("input[data-use=ask]").set_input_files(town.queries[0])
     expect(page.get_by_role("heading", name="Looking for the place")).to_be_visible()
     page.locator("input[data-use=ask]").set_input_files(
