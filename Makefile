@@ -18,7 +18,7 @@ INSTALLED := $(VENV)/.installed
 .PHONY: help setup run test test-browser test-api-fuzz pictures lint types bench demo env clean
 
 help: ## list the targets
-	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F':.*## ' '{printf "  make %-12s %s\n", $$1, $$2}'
+	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F':.*## ' '{printf "  make %-13s %s\n", $$1, $$2}'
 
 setup: $(INSTALLED) ## make .venv and install everything into it (TORCH_INDEX= picks another torch build)
 

@@ -13,7 +13,7 @@ from urllib.parse import urlsplit
 import pytest
 from playwright.sync_api import Browser, BrowserContext, Page, expect, sync_playwright
 
-from tests.browser.town import build_town
+from tests.browser.town import build_town, finished
 from tests.support.server import ServerProcess
 
 CHROMIUM = "PLACEWISE_TEST_CHROMIUM"
@@ -76,6 +76,23 @@ class Town:
         assert answer.is_success, answer.text
         return answer.json()
 
+    def ask(self, photo: Path) -> Any:
+        """What the API answers to the photo."""
+        answer = self.server.client.post(
+            "/api/v1/similarity",
+            params={"map": MAP, "top_k": 12},
+            files={"file": (photo.name, photo.read_bytes())},
+            headers={"Prefer": "wait=60"},
+        )
+        assert answer.status_code == 200, answer.text
+        return answer.json()
+
+    def work(self, path: str, **wanted: Any) -> None:
+        """Start the map's job and see it through."""
+        started = self.server.client.post(f"/api/v1{path}", params={"map": MAP}, json=wanted)
+        assert started.status_code == 202, started.text
+        finished(self.server, MAP, started.json()["job_id"])
+
 
 class Visitor:
     """One window; `faults` and `foreign` are what went wrong in it, and who else was asked."""
@@ -89,6 +106,10 @@ class Visitor:
         self.page.on("pageerror", lambda error: self.faults.append(str(error)))
         self.page.on("console", self._heard)
         self.page.on("request", self._asked)
+
+    def untroubled(self) -> None:
+        """The page has told of no error."""
+        expect(self.page.locator(".note.bad")).to_have_count(0)
 
     def _heard(self, message: Any) -> None:
         # A refusal of the server is shown on the page; the browser writes it down as well.

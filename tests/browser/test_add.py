@@ -5,18 +5,21 @@ from __future__ import annotations
 import io
 import zipfile
 from collections.abc import Iterator
-from typing import Any
 
 import pytest
-from playwright.sync_api import Page, expect
+from playwright.sync_api import FilePayload, Page, expect
 
 from tests.browser.conftest import Town, Visitor
 from tests.support.photos import photo_bytes
 
-NO_PHOTO = {"name": "notes.jpg", "mimeType": "image/jpeg", "buffer": b"not a photo at all" * 9}
+NO_PHOTO: FilePayload = {
+    "name": "notes.jpg",
+    "mimeType": "image/jpeg",
+    "buffer": b"not a photo at all" * 9,
+}
 
 
-def photo(number: int) -> dict[str, Any]:
+def photo(number: int) -> FilePayload:
     return {"name": f"{number}.jpg", "mimeType": "image/jpeg", "buffer": photo_bytes(number)}
 
 
@@ -32,7 +35,7 @@ def page(visitor: Visitor, town: Town, request: pytest.FixtureRequest) -> Iterat
     town.server.client.delete(f"/api/v1/maps/{name}")
 
 
-def add(page: Page, *files: dict[str, Any]) -> None:
+def add(page: Page, *files: FilePayload) -> None:
     page.locator("input[data-use=add]").set_input_files(list(files))
 
 

@@ -3,26 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import pytest
-from playwright.sync_api import Page, expect
+from playwright.sync_api import Page, Route, expect
 
-from tests.browser.conftest import MAP, Town, Visitor
+from tests.browser.conftest import Town, Visitor
 
 TITLES = {True: "In this map", False: "Not in this map", None: "Best guess"}
-
-
-def answer_of(town: Town, photo: Path) -> dict[str, Any]:
-    answer = town.server.client.post(
-        "/api/v1/similarity",
-        params={"map": MAP, "top_k": 12},
-        files={"file": (photo.name, photo.read_bytes())},
-        headers={"Prefer": "wait=60"},
-    )
-    assert answer.status_code == 200, answer.text
-    found: dict[str, Any] = answer.json()
-    return found
 
 
 def ask(visitor: Visitor, photo: Path) -> Page:
@@ -32,12 +19,12 @@ def ask(visitor: Visitor, photo: Path) -> Page:
     return page
 
 
-@pytest.mark.parametrize("number", [0, 1, 2, 3])
+@pytest.mark.parametrize("number", range(4))
 def test_the_page_says_where_a_photo_was_taken_or_that_it_is_not_in_the_map(
     visitor: Visitor, town: Town, number: int
 ) -> None:
     photo = town.queries[number]
-    found = answer_of(town, photo)
+    found = town.ask(photo)
     page = ask(visitor, photo)
     estimate = found["estimate"]
     expect(page.locator(".badge")).to_have_text(TITLES[estimate["in_map"]])
@@ -67,6 +54,22 @@ def test_a_pasted_photo_is_asked_with(visitor: Visitor, town: Town) -> None:
     )
     expect(page.locator(".verdict")).to_be_visible()
     expect(page.locator(".query-photo figcaption")).to_have_text("pasted.jpg")
+
+
+def test_of_two_questions_the_later_one_is_answered(visitor: Visitor, town: Town) -> None:
+    page = visitor.visit("ask")
+    held: list[Route] = []
+    page.route("**/api/v1/similarity?*", lambda route: held.append(route), times=1)
+    page.locator("input[data-use=ask]").set_input_files(town.queries[0])
+    expect(page.get_by_role("heading", name="Looking for the place")).to_be_visible()
+    page.locator("input[data-use=ask]").set_input_files(
+        {"name": "later.jpg", "mimeType": "image/jpeg", "buffer": town.queries[1].read_bytes()}
+    )
+    expect(page.locator(".query-photo figcaption")).to_have_text("later.jpg")
+    with page.expect_response("**/api/v1/similarity?*"):
+        held[0].continue_()
+    page.wait_for_load_state("networkidle")
+    expect(page.locator(".query-photo figcaption")).to_have_text("later.jpg")
 
 
 def test_what_is_no_photo_gets_the_reason(visitor: Visitor) -> None:

@@ -47,6 +47,8 @@ def test_photos_are_filtered_by_name_tag_and_place(visitor: Visitor, town: Town)
 
 def test_the_map_shows_where_photos_are_and_takes_a_point(visitor: Visitor) -> None:
     page = visitor.visit("photos")
+    # While the map is being loaded, the photos are asked for anew.
+    page.get_by_label("Tags").fill("spring")
     page.get_by_role("button", name="Show the map").click()
     expect(page.locator("path.point").first).to_be_attached()
     expect(page.locator(".graticule-label").first).to_be_visible()
@@ -54,6 +56,7 @@ def test_the_map_shows_where_photos_are_and_takes_a_point(visitor: Visitor) -> N
     page.keyboard.press("Enter")
     expect(page.get_by_label("Near")).not_to_have_value("")
     expect(page.locator("path.estimate")).to_have_count(1)
+    visitor.untroubled()
 
 
 def test_chosen_photos_are_tagged_and_deleted(visitor: Visitor, town: Town) -> None:

@@ -83,6 +83,8 @@ document.querySelector(".skip").addEventListener("click", (event) => {
   event.preventDefault();
   main.focus();
 });
+// What is dropped beside the field would be opened in the page's place.
+for (const name of ["dragover", "drop"]) document.addEventListener(name, (event) => event.preventDefault());
 window.addEventListener("hashchange", route);
 listMaps().then(route, (error) => {
   noteError(error);

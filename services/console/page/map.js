@@ -4,7 +4,7 @@ import { h } from "./dom.js";
 import { serverSettings } from "./settings.js";
 
 const MOST_ZOOM = 21;
-const LINES = 6; // about so many across the map
+const LINES = 9; // about so many across the map
 const POINTS_DRAWN = 5000;
 
 let loaded = null;
@@ -71,9 +71,12 @@ export async function openMap(element, label, { onpick = null, signal } = {}) {
     preferCanvas: false,
     scrollWheelZoom: false,
     worldCopyJump: true,
+    zoomControl: false,
     zoomSnap: 0.25,
   });
   map.setView([20, 0], 1);
+  // Where no label of the graticule lies.
+  L.control.zoom({ position: "bottomright" }).addTo(map);
   L.control.scale({ imperial: false }).addTo(map);
   if (settings.map_tiles) {
     map.attributionControl.setPrefix("");

@@ -107,7 +107,10 @@ async function findSimilar(path, query, file, onjob, signal) {
   return response.json();
 }
 
+let questions = 0;
+
 async function showAnswer(answer, asked, signal) {
+  const mine = ++questions; // of two that overlap, the later one is shown
   const progress = h("p", { class: "soft" }, "Looking…");
   fill(answer, h("section", { class: "card asking" }, h("figure", {}, asked.picture()), h("div", {}, h("h2", {}, "Looking for the place"), bar("Looking for the place", 0, 0), progress)));
   answer.scrollIntoView({ block: "start" });
@@ -116,9 +119,11 @@ async function showAnswer(answer, asked, signal) {
     found = await asked.find({ top_k: TOP_K }, (job) => fill(progress, `The photo is ${stateInWords(job)}.`));
   } catch (error) {
     if (signal.aborted) throw error;
+    if (mine !== questions) return;
     fill(answer, h("section", { class: "card refused" }, h("figure", {}, asked.picture()), h("div", {}, h("h2", {}, "No answer"), h("p", {}, error.message))));
     return;
   }
+  if (mine !== questions) return;
   const photos = found.similar_images;
   const { openMap } = await import("../map.js");
   const { compare } = await import("./compare.js");
@@ -155,8 +160,12 @@ function verdict(found) {
     estimate.place && h("p", { class: "place" }, estimate.place),
     estimate.latitude !== null && h("p", { class: estimate.place ? "where" : "place where" }, degrees(estimate.latitude, estimate.longitude), h("span", { class: "radius" }, ` ± ${Math.round(estimate.radius_m)} m`)),
   ];
+  const unsure = {
+    true: ["How sure this is can’t be said yet: ", h("a", { href: "#/add" }, "add labelled queries"), " of another day."],
+    false: ["The photos below are the nearest that the map has."],
+  }[estimate.in_map] ?? ["Whether it is in the map can’t be told yet: ", h("a", { href: "#/model" }, "measure the map"), "."];
   const sure = estimate.confidence === null
-    ? h("p", { class: "soft" }, estimate.in_map === false ? "The photos below are the nearest that the map has." : "How sure this is can’t be said yet: ", estimate.in_map === false ? null : h("a", { href: "#/model" }, "measure the map"))
+    ? h("p", { class: "soft" }, unsure)
     : h("div", { class: "sure" }, h("span", { class: "figure" }, percent(estimate.confidence)), h("span", { class: "soft" }, " sure"), h("meter", { min: 0, max: 1, value: estimate.confidence, "aria-label": "Confidence" }));
   return h("div", { class: `verdict ${kind}` },
     h("p", { class: "badge" }, title),
@@ -165,6 +174,7 @@ function verdict(found) {
       h("p", {}, estimate.reason),
       h("dl", { class: "facts" },
         h("dt", {}, "Compared"), h("dd", {}, `${count(found.rows_scanned)} rows, ${found.certificate}`),
+        h("dt", {}, "Ranked by"), h("dd", {}, found.word_weights === "applied" ? "similarity of the words that this map trusts" : "similarity"),
         h("dt", {}, "Took"), h("dd", {}, `${found.processing_time_ms.toFixed(0)} ms`),
         h("dt", {}, "Vocabulary"), h("dd", {}, found.vocabulary))),
     found.vocabulary === "foreign" && h("p", { class: "hint" }, "This map uses a vocabulary of elsewhere. ", h("a", { href: "#/model" }, "Fit its own"), " and the right place comes first more often."),

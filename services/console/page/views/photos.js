@@ -17,7 +17,7 @@ export async function showPhotos(view, { signal }) {
   const more = h("div", { class: "more" });
   const ground = h("div", { class: "ground browse", hidden: true });
   const tools = h("div", { class: "tools", hidden: true });
-  let map = null;
+  let opening = null;
 
   const { form, query, setNear } = filterForm(reload);
   const mapButton = button("Show the map", async () => {
@@ -115,7 +115,8 @@ export async function showPhotos(view, { signal }) {
   }
 
   async function drawMap() {
-    map ??= await openMap(ground, "Where the photos were taken; click to look around a point", { onpick: setNear, signal });
+    opening ??= openMap(ground, "Where the photos were taken; click to look around a point", { onpick: setNear, signal });
+    const map = await opening;
     const page = await get("/search", { query: { ...query(), limit: ON_THE_MAP }, signal });
     map.clear();
     for (const photo of page.images) {
