@@ -15,10 +15,13 @@ from starlette.exceptions import HTTPException
 
 from shared.catalog.away import as_unavailable
 from shared.errors import InvalidRequest, PlacewiseError, Unprocessable
+from shared.telemetry.request_id import HEADER
 
 log = logging.getLogger(__name__)
 
 RETRY_AFTER_SECONDS = 2  # of a 503 that knows no better
+REQUEST_ID = "placewise.request_id"
+"""Of an ASGI scope: the call's id, where the service gives its calls ids."""
 HTTP_CODES = {400: "malformed_body", 404: "path_not_found", 405: "method_not_allowed"}
 
 
@@ -58,6 +61,9 @@ def install_problem_handlers(app: FastAPI) -> None:
 
 def problem_response(error: PlacewiseError, request: Request) -> JSONResponse:
     headers = {}
+    # Where the call's log does not reach: the handler of what nobody foresaw.
+    if (request_id := request.scope.get(REQUEST_ID)) is not None:
+        headers[HEADER] = request_id
     if error.status == 401:
         headers["WWW-Authenticate"] = "Bearer"
     wait = error.extra.get("retry_after_seconds")
@@ -129,7 +135,8 @@ async def _on_database_error(request: Request, error: Exception) -> JSONResponse
 
 
 async def _on_any_error(request: Request, error: Exception) -> JSONResponse:
-    log.error("%s %s failed", request.method, request.url.path, exc_info=error)
+    known = {"request_id": request.scope[REQUEST_ID]} if REQUEST_ID in request.scope else None
+    log.error("%s %s failed", request.method, request.url.path, exc_info=error, extra=known)
     return problem_response(
         PlacewiseError("internal_error", "Something went wrong here; the server's log says what."),
         request,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import sys
 from typing import Annotated
 
@@ -12,6 +11,8 @@ from services.cli.configuration import read_settings
 from services.cli.output import explained, messages
 from shared.admin_key import AdminKey, admin_key_file, is_loopback
 from shared.settings import Settings
+from shared.telemetry.logs import set_up_logs
+from shared.telemetry.traces import set_up_traces
 
 
 def serve(
@@ -30,19 +31,13 @@ def serve(
         settings = read_settings()
         from services.standalone import standalone  # brings torch, as `connect` says
 
-        set_log_levels(settings.debug)
-        with standalone(settings, new_key=new_key) as running:
+        set_up_logs(settings, "embedded")
+        with (
+            set_up_traces(settings, "embedded"),
+            standalone(settings, new_key=new_key) as running,
+        ):
             messages.print(_welcome(running.url, running.key, settings), soft_wrap=True)
             running.serve()
-
-
-def set_log_levels(debug: bool) -> None:
-    """What Placewise itself says, in detail with DEBUG; of others, never each statement."""
-    logging.getLogger().setLevel(logging.INFO)
-    for ours in ("services", "shared"):
-        logging.getLogger(ours).setLevel(logging.DEBUG if debug else logging.INFO)
-    for others in ("alembic", "httpx2", "sqlalchemy"):
-        logging.getLogger(others).setLevel(logging.WARNING)
 
 
 def _welcome(url: str, key: AdminKey | None, settings: Settings) -> str:

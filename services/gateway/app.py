@@ -5,6 +5,7 @@ from __future__ import annotations
 from fastapi import Depends, FastAPI, Security
 from fastapi.security import HTTPBearer
 
+from services.call_log import CallLog
 from services.gateway import (
     batches,
     direct_upload,
@@ -14,6 +15,7 @@ from services.gateway import (
     history,
     jobs,
     maps,
+    metrics,
     model_changes,
     photos,
     similarity,
@@ -23,6 +25,7 @@ from services.gateway import (
 from services.gateway.body_limit import BodyLimit
 from services.gateway.context import API, Gateway
 from services.gateway.key_check import KeyCheck
+from services.gateway.metrics import GatewayMetrics
 from services.gateway.once import Replay, answer_again
 from services.gateway.parameters import no_unknown_parameters
 from services.gateway.room import Room
@@ -49,8 +52,11 @@ def create_app(gateway: Gateway) -> FastAPI:
     )
     app.state.gateway = gateway
     app.state.room = Room(gateway.catalog, gateway.settings)
+    figures_of_calls = GatewayMetrics(gateway, app.state.room)
     app.add_middleware(BodyLimit, streamed={f"{API}{batches.PATH}"})
-    app.add_middleware(KeyCheck, keys=gateway.keys)  # the last one added is the first one asked
+    app.add_middleware(KeyCheck, keys=gateway.keys)
+    # The last one added is the first one asked.
+    app.add_middleware(CallLog, on_begin=figures_of_calls.begun, on_end=figures_of_calls.ended)
     install_problem_handlers(app)
     app.add_exception_handler(Replay, answer_again)
     for module in (
@@ -74,4 +80,5 @@ def create_app(gateway: Gateway) -> FastAPI:
             dependencies=[Security(BEARER), Depends(no_unknown_parameters)],
         )
     app.include_router(health.probes)
+    app.include_router(metrics.router, dependencies=[Security(BEARER)])
     return app
