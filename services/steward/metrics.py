@@ -85,6 +85,6 @@ class _Lag(Collector):
             labels=["duty"],
         )
         now = time.monotonic()
-        for duty, done_at in self._done_at.copy().items():
+        for duty, done_at in dict(self._done_at).items():
             lag.add_metric([duty], now - done_at)
         yield lag

@@ -18,7 +18,7 @@ class DeviceMemory:
 
 def device_memory() -> list[DeviceMemory]:
     """Of each GPU that this process has begun to use: none on a CPU."""
-    if not torch.cuda.is_initialized():
+    if not torch.cuda.is_initialized():  # type: ignore[no-untyped-call]
         return []
     return [
         DeviceMemory(
