@@ -19,6 +19,7 @@ from services.cli.output import explained, messages
 from services.parts import start_part
 from shared.catalog.connections import Limits
 from shared.catalog.installation import ensure_installation, open_own_store
+from shared.catalog.live_processes import signs_of_life
 from shared.catalog.maps import ensure_default_map
 from shared.catalog.open_catalog import open_catalog
 from shared.catalog.schema import migrate as migrate_catalog
@@ -140,7 +141,8 @@ def _service(name: str) -> Iterator[tuple[Settings, Catalog]]:
             catalog = open_catalog(settings, name)
             try:
                 wait_for_schema(catalog, settings.schema_wait_seconds)
-                yield settings, catalog
+                with signs_of_life(catalog, name):
+                    yield settings, catalog
             finally:
                 catalog.close()
 

@@ -17,6 +17,7 @@ import shared.catalog.tables  # noqa: F401  (every table has to be known)
 from shared.catalog.base import Base, UtcDateTime
 from shared.catalog.direct_uploads import DirectUpload
 from shared.catalog.installation import Installation
+from shared.catalog.live_processes import LiveProcess
 from shared.catalog.schema_compatibility import SchemaCompatibility
 from shared.catalog.search_workers import RegisteredWorker
 from shared.errors import Misconfigured
@@ -26,7 +27,8 @@ LEVEL = 1  # of gzip: rows shrink to a fifth, and the disk stays the slower part
 
 # What says nothing elsewhere or later: who is alive now, addresses that expire, the schema's own.
 LEFT_OUT = frozenset(
-    table.__tablename__ for table in (RegisteredWorker, DirectUpload, SchemaCompatibility)
+    table.__tablename__
+    for table in (RegisteredWorker, LiveProcess, DirectUpload, SchemaCompatibility)
 )
 # The target has its own: `shared.backup.restore`.
 NOT_LOADED = frozenset({Installation.__tablename__})

@@ -74,8 +74,8 @@ def named_objects(session: Session) -> Iterator[NamedObject]:
     ):
         # Their hashes are those of the numbers inside.
         found = select(table.id, table.object_key).join(Map, Map.id == table.map_id)
-        for row in session.execute(found.where(Map.deleted_at.is_(None))):
-            yield NamedObject(row.object_key, what, row.id)
+        for one in session.execute(found.where(Map.deleted_at.is_(None))):
+            yield NamedObject(one.object_key, what, one.id)
     batches = select(Job.id, Job.params).where(Job.kind == JobKind.BATCH, Job.state.in_(UNFINISHED))
     for batch in session.execute(batches).all():
         if (key := batch.params.get("object_key")) is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from uuid import UUID
 
 from sqlalchemy import delete, select
@@ -28,7 +29,7 @@ def repair(catalog: Catalog, hints: Hints, report: Report) -> int:
     """
     queued = 0
     for chunk_id in dict.fromkeys(f.chunk_id for f in report.faults if f.chunk_id is not None):
-        queued += catalog.run(lambda session, chunk_id=chunk_id: _give_up(session, chunk_id))
+        queued += catalog.run(partial(_give_up, chunk_id=chunk_id))
     lost = [fault.photo_id for fault in report.faults if fault.photo_id is not None]
     if lost:
         queued += catalog.run(lambda session: _queue(session, lost))

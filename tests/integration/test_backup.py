@@ -91,8 +91,7 @@ def test_a_backup_goes_from_either_database_into_the_other_and_answers_the_same(
     # Work of all kinds under way: queued, held by a worker, a query.
     queued = [service.upload(photo_bytes(number))["job_id"] for number in (5, 6)]
     query = service.ask(photo_bytes(7))
-    with service.catalog.write() as session:
-        held = {str(job.id) for job in take(session, 1)}
+    held = {str(job.id) for job in take(service.catalog, 1)}
     about = backed_up()
     assert (about.missing, about.damaged) == ([], [])
 

@@ -79,16 +79,12 @@ def test_photos_of_a_damaged_chunk_are_described_again(service: Service, damage:
 
 
 def test_rows_that_belong_to_other_photos_are_found(service: Service) -> None:
-    first, second = service.indexed(1, 2)
+    first, _ = service.indexed(1, 2)
     with service.catalog.write() as session:
-        for file_id in (first, second):
-            found = session.scalars(
-                select(Descriptor).where(Descriptor.photo_id == UUID(file_id))
-            ).one()
-            found.row = 1 - found.row
+        session.scalars(select(Descriptor).where(Descriptor.photo_id == UUID(first))).one().row = 5
     report = looked(service)
     assert faults(report) == {("different", "chunk")}
-    assert "2 photos have another row" in report.faults[0].detail
+    assert "1 photos have another row" in report.faults[0].detail
 
 
 def test_photos_without_a_descriptor_are_found_and_described_again(service: Service) -> None:
