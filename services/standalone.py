@@ -22,6 +22,7 @@ from dataclasses import dataclass
 from functools import partial
 
 import uvicorn
+from prometheus_client import CollectorRegistry
 
 from services.extractor.worker import ExtractorWorker
 from services.gateway.app import create_app
@@ -29,11 +30,13 @@ from services.gateway.context import Gateway
 from services.gateway.keys import CatalogKeys, Keys, NoKeys
 from services.http_server import http_server, listening, stopped_by_signals, url_of
 from services.parts import start_part
+from services.search.metrics import SearchMetrics
 from services.search.presence import Presence
 from services.search.worker import SearchWorker
 from services.steward.batches.worker import BatchWorker
 from services.steward.evaluate import Evaluator
 from services.steward.loop import Steward
+from services.steward.metrics import StewardMetrics
 from services.steward.queue import free_leases
 from services.steward.webhooks.deliver import WebhookSender
 from shared.api_keys import Scope, hash_key, is_loopback, new_local_key
@@ -49,6 +52,7 @@ from shared.errors import Misconfigured
 from shared.home import announced, lock_home
 from shared.jobs import InProcessHints
 from shared.settings import Settings
+from shared.telemetry.metrics_server import serving_metrics
 
 log = logging.getLogger(__name__)
 
@@ -118,18 +122,22 @@ def standalone(settings: Settings) -> Iterator[Standalone]:
         url = url_of(host, port)
         held.enter_context(announced(home, url, local_key))
 
+        registry = CollectorRegistry()  # of all parts: one /metrics tells of everything
         search = SearchWorker(catalog, store, settings)
         name = f"embedded-{os.getpid()}"
         presence = Presence(catalog, search, name)
-        extractor = ExtractorWorker(catalog, store, settings, name=name, only_worker=True)
-        steward = Steward(catalog, store, hints, settings)
-        evaluator = Evaluator(catalog, store, search, settings, name=name)
-        webhooks = WebhookSender(catalog, settings)
-        batches = BatchWorker(catalog, store, hints, settings, name=name)
-        gateway = Gateway(requests, store, hints, search, settings, keys)
-        server = http_server(
-            create_app(gateway), access_log=settings.debug, on_stop=gateway.job_watch.end_soon
+        extractor = ExtractorWorker(
+            catalog, store, settings, name=name, only_worker=True, registry=registry
         )
+        stewards = StewardMetrics(registry)
+        steward = Steward(catalog, store, hints, settings, stewards)
+        evaluator = Evaluator(catalog, store, search, settings, name, stewards)
+        webhooks = WebhookSender(catalog, settings)
+        batches = BatchWorker(catalog, store, hints, settings, name, stewards)
+        counted = SearchMetrics(search, registry)
+        gateway = Gateway(requests, store, hints, counted, settings, keys, registry)
+        server = http_server(create_app(gateway), on_stop=gateway.job_watch.end_soon)
+        held.enter_context(serving_metrics(settings, registry))
         running = Standalone(url, server, listener, made_key, local_key, threading.Event())
         stop = threading.Event()
         parts = [

@@ -16,10 +16,13 @@ from starlette.exceptions import HTTPException
 from shared.catalog.away import as_unavailable
 from shared.errors import InvalidRequest, PlacewiseError, Unprocessable
 from shared.ids import new_id
+from shared.telemetry.request_id import HEADER
 
 log = logging.getLogger(__name__)
 
 RETRY_AFTER_SECONDS = 2  # of a 503 that knows no better
+REQUEST_ID = "placewise.request_id"
+"""Of an ASGI scope: the call's id, where the service gives its calls ids."""
 HTTP_CODES = {400: "malformed_body", 404: "path_not_found", 405: "method_not_allowed"}
 
 
@@ -69,6 +72,9 @@ def install_problem_handlers(app: FastAPI) -> None:
 
 def problem_response(error: PlacewiseError, request: Request) -> JSONResponse:
     headers = {}
+    # Where the call's log does not reach: the handler of what nobody foresaw.
+    if (request_id := request.scope.get(REQUEST_ID)) is not None:
+        headers[HEADER] = request_id
     if error.status == 401:
         headers["WWW-Authenticate"] = "Bearer"
     wait = error.extra.get("retry_after_seconds")
@@ -141,9 +147,14 @@ async def _on_database_error(request: Request, error: Exception) -> JSONResponse
 
 async def on_any_error(request: Request, error: Exception) -> JSONResponse:
     """What is said of a fault of ours: an id, by which the log tells the rest."""
-    request_id = str(new_id())
+    request_id = request.scope.get(REQUEST_ID) or str(new_id())
     log.error(
-        "%s %s failed (request %s)", request.method, request.url.path, request_id, exc_info=error
+        "%s %s failed (request %s)",
+        request.method,
+        request.url.path,
+        request_id,
+        exc_info=error,
+        extra={"request_id": request_id},
     )
     problem = PlacewiseError(
         "internal_error",

@@ -131,6 +131,23 @@ class Settings(BaseSettings):
         False, description="log every call and every refusal; answers stay the same"
     )
 
+    # What a running service tells of itself.
+    log_format: Literal["text", "json"] = Field(
+        "text", description="of every line of a service's log; json: one object a line"
+    )
+    metrics_port: int | None = Field(
+        None,
+        ge=0,
+        le=65535,
+        description="where, on HOST, a service answers GET /metrics without a key, for Prometheus; "
+        "unset: nowhere (the gateway and search have theirs beside the API as well)",
+    )
+    otel_exporter_otlp_endpoint: str | None = Field(
+        None,
+        description="where traces are sent by OTLP/HTTP: http://collector:4318; needs the extra "
+        "otel; unset: nothing is traced",
+    )
+
     redis_url: SecretStr | None = Field(
         None, description="Redis that carries hints between services; unset: one process"
     )

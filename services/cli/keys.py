@@ -16,7 +16,6 @@ from rich.table import Table
 
 from services.cli.configuration import read_settings
 from services.cli.output import JsonOption, KeyOption, ServerOption, answers, explained, print_json
-from services.cli.serve import set_log_levels
 from shared.api_keys import Scope
 from shared.catalog.keys import ApiKey, KeyLimits, list_keys, make_key, revoke_key
 from shared.catalog.open_catalog import open_catalog
@@ -24,6 +23,7 @@ from shared.catalog.schema import wait_for_schema
 from shared.catalog.session import Catalog
 from shared.client import Client, Json
 from shared.errors import Conflict, NotFound
+from shared.telemetry.logs import set_up_logs
 
 app = typer.Typer(help="Keys of the HTTP API: who may call, what, and how much.")
 
@@ -138,7 +138,7 @@ def revoke(
 @contextlib.contextmanager
 def _catalog() -> Iterator[Catalog]:
     settings = read_settings()
-    set_log_levels(settings.debug)
+    set_up_logs(settings, "keys")
     catalog = open_catalog(settings, "keys")
     try:
         wait_for_schema(catalog, 0)

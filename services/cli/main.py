@@ -31,6 +31,9 @@ COMMANDS = {
     "models": ("models", "app"),
     "datasets": ("datasets", "app"),
     "storage": ("storage", "app"),
+    "backup": ("backup", "backup"),
+    "restore": ("backup", "restore"),
+    "verify": ("verify", "verify"),
     "bench": ("bench", "app"),
 }
 

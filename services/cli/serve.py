@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import sys
 from typing import TYPE_CHECKING
 
@@ -10,6 +9,8 @@ from services.cli.configuration import read_settings
 from services.cli.output import explained, messages
 from shared.api_keys import is_loopback
 from shared.settings import Settings
+from shared.telemetry.logs import set_up_logs
+from shared.telemetry.traces import set_up_traces
 
 if TYPE_CHECKING:
     from services.standalone import Standalone
@@ -25,19 +26,10 @@ def serve() -> None:
         settings = read_settings()
         from services.standalone import standalone  # brings torch, as `connect` says
 
-        set_log_levels(settings.debug)
-        with standalone(settings) as running:
+        set_up_logs(settings, "embedded")
+        with set_up_traces(settings, "embedded"), standalone(settings) as running:
             messages.print(_welcome(running, settings), soft_wrap=True)
             running.serve()
-
-
-def set_log_levels(debug: bool) -> None:
-    """What Placewise itself says, in detail with DEBUG; of others, never each statement."""
-    logging.getLogger().setLevel(logging.INFO)
-    for ours in ("services", "shared"):
-        logging.getLogger(ours).setLevel(logging.DEBUG if debug else logging.INFO)
-    for others in ("alembic", "httpx2", "sqlalchemy"):
-        logging.getLogger(others).setLevel(logging.WARNING)
 
 
 def _welcome(running: Standalone, settings: Settings) -> str:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections import defaultdict
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 from uuid import UUID
@@ -47,7 +49,14 @@ class Made:
 class LoadedModels:
     """Small LRU caches, shared by the thread that prepares and the one that describes."""
 
-    def __init__(self, store: ObjectStore, settings: Settings) -> None:
+    def __init__(
+        self,
+        store: ObjectStore,
+        settings: Settings,
+        on_load: Callable[[float], object] = lambda seconds: None,
+    ) -> None:
+        """`on_load` is told how many seconds the loading of an extractor took."""
+        self._on_load = on_load
         self._store = store
         self._settings = settings
         self._lock = threading.RLock()
@@ -99,6 +108,7 @@ class LoadedModels:
                     backbone=loaded.backbone,
                     limit=limit,
                 )
+        started = time.perf_counter()
         made = Extractor(
             recipe,
             self._device,
@@ -108,6 +118,7 @@ class LoadedModels:
         )
         if self._device.type == "cuda":
             made.warm_up(self._settings.batch_photos)
+        self._on_load(time.perf_counter() - started)
         return made
 
     def centres(self, vocabulary: Vocabulary) -> Centres:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from fastapi import Depends, FastAPI
 from fastapi.middleware.cors import CORSMiddleware
 
+from services.call_log import CallLog
 from services.gateway import (
     batches,
     console,
@@ -16,6 +17,7 @@ from services.gateway import (
     jobs,
     key_calls,
     maps,
+    metrics,
     model_changes,
     photos,
     similarity,
@@ -26,8 +28,9 @@ from services.gateway import (
 from services.gateway.answer_headers import AnswerHeaders
 from services.gateway.body_limit import BodyLimit
 from services.gateway.context import API, Gateway
-from services.gateway.key_check import KeyCheck, check_scopes
+from services.gateway.key_check import READ, KeyCheck, check_scopes
 from services.gateway.last_resort import LastResort
+from services.gateway.metrics import GatewayMetrics
 from services.gateway.once import Replay, answer_again
 from services.gateway.parameters import no_unknown_parameters
 from services.gateway.quotas import Metered, Quotas
@@ -46,6 +49,7 @@ EXPOSED = (
     "RateLimit",
     "RateLimit-Policy",
     "Retry-After",
+    "X-Request-ID",
 )
 
 
@@ -63,6 +67,7 @@ def create_app(gateway: Gateway) -> FastAPI:
     app.state.room = Room(gateway.catalog, gateway.settings)
     app.state.quotas = Quotas(gateway.settings)
     app.state.photo_quota = PhotoQuota(gateway.catalog)
+    figures_of_calls = GatewayMetrics(gateway, app.state.room)
     # The last one added is the first one asked.
     app.add_middleware(BodyLimit, streamed={f"{API}{batches.PATH}"})
     app.add_middleware(Metered, quotas=app.state.quotas)
@@ -77,6 +82,7 @@ def create_app(gateway: Gateway) -> FastAPI:
             expose_headers=EXPOSED,
         )
     app.add_middleware(AnswerHeaders, settings=gateway.settings)
+    app.add_middleware(CallLog, on_begin=figures_of_calls.begun, on_end=figures_of_calls.ended)
     install_problem_handlers(app)
     app.add_exception_handler(Replay, answer_again)
     for module in (
@@ -104,5 +110,6 @@ def create_app(gateway: Gateway) -> FastAPI:
             dependencies=[Depends(no_unknown_parameters)],
         )
     app.include_router(health.probes)
+    app.include_router(metrics.router, responses=KEY_RESPONSES, dependencies=[READ])
     app.include_router(console.console_router(gateway.settings))
     return app

@@ -8,6 +8,7 @@ from shared.catalog.generations import Generation
 from shared.catalog.idempotency import KeyedCall
 from shared.catalog.installation import Installation
 from shared.catalog.keys import ApiKey
+from shared.catalog.live_processes import LiveProcess
 from shared.catalog.maps import Map
 from shared.catalog.models import Model
 from shared.catalog.photos import Photo
@@ -32,6 +33,7 @@ __all__ = [
     "Installation",
     "Job",
     "KeyedCall",
+    "LiveProcess",
     "Map",
     "MapFigures",
     "Model",
