@@ -114,10 +114,8 @@ def test_the_kubernetes_component_watches_every_pod_that_works() -> None:
         check=False,
     )
     assert done.returncode == 0, done.stderr
-    monitor, policy = sorted(yaml.safe_load_all(done.stdout), key=lambda one: str(one["kind"]))[
-        ::-1
-    ]
-    assert monitor["kind"] == "PodMonitor"
+    made = {one["kind"]: one for one in yaml.safe_load_all(done.stdout)}
+    monitor, policy = made["PodMonitor"], made["NetworkPolicy"]
     base = yaml.safe_load((ROOT / "deploy/k8s/base/kustomization.yaml").read_text())
     literals = base["configMapGenerator"][0]["literals"]
     (endpoint,) = monitor["spec"]["podMetricsEndpoints"]
