@@ -48,7 +48,8 @@ def postgres_check(settings: Settings) -> str:
     except SQLAlchemyError as error:
         raise as_unavailable(error) or Misconfigured(
             "catalog_unreadable",
-            f"PostgreSQL refuses ({type(error).__name__}): check DATABASE_URL and its user's rights.",
+            f"PostgreSQL refuses ({type(error).__name__}): check DATABASE_URL, and what its user "
+            "may do.",
         ) from error
     finally:
         catalog.close()

@@ -44,6 +44,7 @@ CALLS = {
     f"GET {API}/health",
     "GET /",
     "GET /livez",
+    "GET /metrics",
     "GET /readyz",
 }
 FIGURES = {

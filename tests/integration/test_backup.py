@@ -97,8 +97,6 @@ def test_a_backup_goes_from_either_database_into_the_other_and_answers_the_same(
 
     done = restored(tmp_path / "backup", other_catalog, other_store)
     assert done.cancelled_jobs == 1
-    other = Service(other_catalog, other_store, settings, make_worker)
-    assert answers(other, known) == answers(service, known)
     with service.catalog.read() as here, other_catalog.read() as there:
         for table in tables():
             if table.name in ("installation", "jobs"):
@@ -107,6 +105,8 @@ def test_a_backup_goes_from_either_database_into_the_other_and_answers_the_same(
             ours = [tuple(row) for row in here.execute(select(table).order_by(*order))]
             theirs = [tuple(row) for row in there.execute(select(table).order_by(*order))]
             assert ours == theirs, table.name
+    other = Service(other_catalog, other_store, settings, make_worker)
+    assert answers(other, known) == answers(service, known)
     assert read_job(other_catalog, UUID(query)).state == JobState.CANCELLED
     for job_id in [*queued, *held]:
         job = read_job(other_catalog, UUID(job_id))
