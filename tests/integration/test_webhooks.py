@@ -21,16 +21,19 @@ from services.steward.webhooks.deliver import PAUSES_SECONDS, WebhookSender, pau
 from shared.catalog.base import db_now
 from shared.catalog.session import Catalog
 from shared.catalog.webhooks import Delivery, Webhook
-from shared.jobs import InProcessHints, Job
+from shared.jobs import InProcessHints, Job, JobState
 from shared.objects import FolderStore
 from shared.settings import Settings
 from shared.webhook_address import Target, parse_target
 from tests.integration.door import ADMIN, Door
+from tests.integration.workplace import Workplace
 from tests.support.archives import zip_of
 from tests.support.certificate import certificate
 from tests.support.photos import photo_bytes
 from tests.support.problems import field_refused, problem
 from tests.support.receiver import Receiver, receiving
+
+PHOTOS = 6
 
 
 @pytest.fixture
@@ -281,6 +284,24 @@ def test_over_https_only_the_named_host_is_told(
         else:
             assert secured.messages == []
             assert "certificate verify failed" in delivery["last_error"].lower()
+
+
+def test_a_switched_generation_is_told_of_and_its_photos_are_not(
+    told: Told, vlads: Workplace
+) -> None:
+    vlads.upload(*range(PHOTOS))
+    assert vlads.fit().state == JobState.SUCCEEDED
+    told.door(ADMIN, "DELETE", f"/webhooks/{told.webhook['id']}")
+    told.add("generation.switched", "job.succeeded")
+    before = vlads.active().id
+    assert vlads.fit().state == JobState.SUCCEEDED
+    while told.send():
+        pass
+    said = {message.json()["type"]: message.json()["data"] for message in told.receiver.messages}
+    assert len(told.receiver.messages) == 2, "one fit, one switch, and no reindex job"
+    assert said["job.succeeded"]["kind"] == "fit"
+    assert said["generation.switched"]["generation_id"] == str(vlads.active().id)
+    assert said["generation.switched"]["replaced_generation_id"] == str(before)
 
 
 def test_a_deleted_webhook_is_told_nothing_more(told: Told) -> None:
