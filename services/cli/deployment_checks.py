@@ -75,13 +75,16 @@ def redis_check(settings: Settings) -> str:
     ) as redis:
         try:
             said = redis.info("server")
-            found = redis.config_get("maxmemory-policy")
         except (RedisError, OSError) as error:
             raise Unavailable(
                 "redis_unavailable",
                 f"Redis (REDIS_URL) does not answer: {error}. Start it, or correct the address or "
                 "the password. Until then jobs are found by the workers' own looks.",
             ) from error
+        try:
+            found = redis.config_get("maxmemory-policy")
+        except RedisError:  # some providers let nobody look at it
+            found = {}
     version = str(said["redis_version"])
     if tuple(int(part) for part in version.split(".")[:2]) < LEAST_REDIS:
         raise Misconfigured("redis_too_old", f"Redis is {version}, and 6.2 or newer is needed.")
@@ -91,7 +94,8 @@ def redis_check(settings: Settings) -> str:
             "redis_evicts",
             f"Redis throws keys away when it is full (maxmemory-policy {policy}). Set noeviction.",
         )
-    return f"Redis {version} answers, and evicts nothing"
+    said_of = "evicts nothing" if policy == "noeviction" else "does not tell whether it evicts"
+    return f"Redis {version} answers, and {said_of}"
 
 
 def objects_check(settings: Settings) -> str:

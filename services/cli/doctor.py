@@ -57,7 +57,9 @@ def doctor(server: ServerOption = None, key: KeyOption = None, as_json: JsonOpti
         _report([Finding("settings", False, error.detail)], as_json)
         raise typer.Exit(1) from None
     checks: list[tuple[str, Callable[[Settings], str]]] = [("python", _python)]
-    checks += [("settings", _settings), ("folder", _folder)]
+    checks.append(("settings", _settings))
+    if settings.s3_endpoint is None or settings.database_url is None:
+        checks.append(("folder", _folder))  # else a service may have none that it can write to
     if settings.s3_endpoint is None:
         checks.append(("uploads", _uploads))
     else:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -90,15 +92,18 @@ def test_who_lives_is_known_and_who_was_killed_soon_is_not(deployed: Catalog) ->
     settings = Settings()
     assert refused(processes_check, settings, "extractor").code == "nobody_there"
     with signs_of_life(deployed, "extractor"):
-        for _ in range(1000):
+        deadline = time.monotonic() + 30
+        while True:
             with deployed.read() as session:
                 if living(session):
                     break
+            assert time.monotonic() < deadline, "it gave no sign"
+            time.sleep(0.01)
         assert processes_check(settings, "extractor").startswith("1 of release ")
         with deployed.write() as session:
             session.execute(update(LiveProcess).values(seen_at=db_now_plus(-60)))
         gone = refused(processes_check, settings, "extractor")
-        assert "The last sign of one is 60 s old" in gone.detail
+        assert re.search(r"The last sign of one is \d+ s old", gone.detail)
     with deployed.read() as session:
         assert living(session) == [], "it has signed off"
 
