@@ -91,3 +91,10 @@ def test_every_line_of_the_log_is_json_and_the_id_of_an_upload_is_in_several(
     assert len(lines) > len(text) / 2
     loggers = {line["logger"] for line in lines if "an-id-of-mine" in json.dumps(line)}
     assert loggers >= {"services.call_log", "services.extractor.publish"}
+
+
+def test_what_is_not_there_can_neither_be_backed_up_nor_verified(tmp_path: Path) -> None:
+    for command in (["backup", tmp_path / "out"], ["verify"]):
+        assert run(tmp_path / "home", *command, code=1)["code"] == "nothing_stored"
+    assert not (tmp_path / "out").exists()
+    assert run(tmp_path / "home", "restore", tmp_path / "out", code=1)["code"] == "no_backup"
