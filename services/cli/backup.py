@@ -14,13 +14,14 @@ from rich.markup import escape
 
 from services.cli.configuration import read_settings
 from services.cli.output import JsonOption, answers, explained, messages, print_json, progress_bar
+from services.cli.stored import what_is_stored
 from shared.backup.folder import open_backup
 from shared.backup.make import make_backup
 from shared.backup.restore import restore_backup
 from shared.backup.rows import Progress
 from shared.catalog.installation import ensure_installation, open_own_store
 from shared.catalog.open_catalog import open_catalog
-from shared.catalog.schema import check_schema, migrate
+from shared.catalog.schema import migrate
 from shared.home import lock_home
 
 SHOWN = 10
@@ -34,17 +35,12 @@ def backup(
     that the catalog names is missing or damaged; all the rest is there then."""
     with explained(as_json), told() as progress:
         settings = read_settings()
-        catalog = open_catalog(settings, "backup")
-        try:
-            check_schema(catalog)
-            store = open_own_store(catalog, settings, alone=False)
+        with what_is_stored(settings, "backup") as (catalog, store):
             with catalog.write() as session:
                 installation_id = ensure_installation(session).id
             about = make_backup(
                 catalog, store, installation_id, out, settings.import_prefix, progress
             )
-        finally:
-            catalog.close()
     if as_json:
         print_json(asdict(about))
     else:

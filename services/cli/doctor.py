@@ -17,17 +17,15 @@ from sqlalchemy import func, select
 from sqlalchemy.exc import SQLAlchemyError
 
 from services.cli.configuration import read_settings
-from services.cli.deployment_checks import (
+from services.cli.extractor_checks import device_check, extractor_check, memory_check
+from services.cli.output import JsonOption, KeyOption, ServerOption, answers, print_json
+from services.cli.server_checks import objects_check, postgres_check, redis_check
+from services.cli.service_checks import (
     gateway_check,
-    objects_check,
-    postgres_check,
     processes_check,
-    redis_check,
     search_check,
     steward_check,
 )
-from services.cli.extractor_checks import device_check, extractor_check, memory_check
-from services.cli.output import JsonOption, KeyOption, ServerOption, answers, print_json
 from shared.catalog.open_catalog import open_catalog
 from shared.catalog.photos import Photo
 from shared.client import Client
@@ -57,7 +55,9 @@ def doctor(server: ServerOption = None, key: KeyOption = None, as_json: JsonOpti
         _report([Finding("settings", False, error.detail)], as_json)
         raise typer.Exit(1) from None
     checks: list[tuple[str, Callable[[Settings], str]]] = [("python", _python)]
-    checks += [("settings", _settings), ("folder", _folder)]
+    checks.append(("settings", _settings))
+    if settings.s3_endpoint is None or settings.database_url is None:
+        checks.append(("folder", _folder))  # else a service may have none that it can write to
     if settings.s3_endpoint is None:
         checks.append(("uploads", _uploads))
     else:
@@ -110,13 +110,20 @@ def _python(_settings: Settings) -> str:
 
 def _settings(settings: Settings) -> str:
     """They were read, or nothing else would be looked at."""
-    if settings.otel_exporter_otlp_endpoint is not None and find_spec("opentelemetry.sdk") is None:
+    if settings.otel_exporter_otlp_endpoint is not None and not _is_installed("opentelemetry.sdk"):
         raise Misconfigured(
             "otel_missing",
             "OTEL_EXPORTER_OTLP_ENDPOINT is set, and the extra otel is not installed: uv pip "
             "install '.[otel]', or unset it.",
         )
     return f"{len(settings.model_fields_set)} are set (placewise config prints all)"
+
+
+def _is_installed(package: str) -> bool:
+    try:
+        return find_spec(package) is not None
+    except ModuleNotFoundError:  # not even what it is a part of
+        return False
 
 
 def _folder(settings: Settings) -> str:

@@ -11,10 +11,7 @@ from rich.markup import escape
 from services.cli.backup import told
 from services.cli.configuration import read_settings
 from services.cli.output import JsonOption, answers, explained, messages, print_json
-from shared.catalog.connections import Limits
-from shared.catalog.installation import open_own_store
-from shared.catalog.open_catalog import open_catalog
-from shared.catalog.schema import check_schema
+from services.cli.stored import what_is_stored
 from shared.integrity.check import check
 from shared.integrity.repair import repair
 from shared.integrity.report import Report, Wrong
@@ -49,10 +46,7 @@ def verify(
         from services.steward.collect import orphans
 
         settings = read_settings()
-        catalog = open_catalog(settings, "verify", Limits(statement_seconds=0))
-        try:
-            check_schema(catalog)
-            store = open_own_store(catalog, settings, alone=False)
+        with what_is_stored(settings, "verify") as (catalog, store):
             report = check(catalog, store, originals=originals, progress=progress)
             for info in orphans(catalog, store, age_seconds=0.0):
                 report.orphans += 1
@@ -60,8 +54,6 @@ def verify(
                 progress("objects that no row knows", report.orphans, report.orphans)
             # Workers look every second, and the steward sends hints.
             queued = repair(catalog, InProcessHints(), report) if mend else None
-        finally:
-            catalog.close()
     if as_json:
         print_json(_as_dict(report, queued))
     else:

@@ -7,7 +7,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from sqlalchemy import and_, case, func, select
+from sqlalchemy import and_, case, func, literal_column, select
 from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.orm import Session
 
@@ -59,7 +59,7 @@ class QueueLook:
 def count_jobs(session: Session) -> list[Group]:
     """Of all maps. The index of a map's jobs by state serves it: those that succeeded, by far the
     most, are not looked at."""
-    state = case((Job.waiting_for.is_not(None), "waiting"), else_=Job.state)
+    state = case((Job.waiting_for.is_not(None), literal_column("'waiting'")), else_=Job.state)
     found = session.execute(
         select(Job.kind, state, func.count(), func.min(Job.created_at), db_now())
         .join_from(Map, Job, and_(Job.map_id == Map.id, Job.state.in_(COUNTED)))

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from shared.backup.folder import BackupFolder, Kept
 from shared.objects import ObjectStore
 from shared.objects.folder import MARK
-from shared.objects.keys import FEATURES, INCOMING, QUERIES, WORK
+from shared.objects.keys import FEATURES, INCOMING, ORIGINALS, QUERIES, WORK, is_original_key
 from shared.objects.port import ObjectInfo
 
 PIECE_BYTES = 1024 * 1024
@@ -18,10 +18,12 @@ LEFT_OUT = (INCOMING, QUERIES, FEATURES, WORK)
 
 def objects_to_keep(store: ObjectStore, import_prefix: str) -> Iterator[ObjectInfo]:
     """What belongs into a backup of the store, whether rows name it or not (thumbnails, codes).
-    What lies under `import_prefix` is its owner's, not Placewise's."""
+    What lies under `import_prefix`, or was put into UPLOAD_DIR by hand, is its owner's."""
     for info in store.list(""):
-        if info.key != MARK and not info.key.startswith((*LEFT_OUT, import_prefix)):
-            yield info
+        others = info.key.startswith(ORIGINALS) and not is_original_key(info.key)
+        if info.key == MARK or others or info.key.startswith((*LEFT_OUT, import_prefix)):
+            continue
+        yield info
 
 
 def has(folder: BackupFolder, info: ObjectInfo) -> bool:

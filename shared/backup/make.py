@@ -14,14 +14,13 @@ from shared.backup.copy_objects import has, objects_to_keep, take
 from shared.backup.folder import About, BackupFolder
 from shared.backup.rows import Progress, dump_rows
 from shared.catalog.base import db_now
-from shared.catalog.connections import Limits
+from shared.catalog.connections import UNLIMITED
 from shared.catalog.session import Catalog
 from shared.errors import Misconfigured, NotFound, Unavailable
 from shared.integrity.named_objects import NamedObject, named_objects
 from shared.objects import ObjectStore
 
 ROUNDS = 5  # of reading the catalog anew because something it named went away meanwhile
-NO_LIMITS = Limits(statement_seconds=0, lock_seconds=60)
 
 
 def make_backup(
@@ -50,7 +49,7 @@ def make_backup(
                 f"{path} holds a backup of another Placewise. Give each a folder of its own.",
             )
         seen = _copy_all(store, folder, import_prefix, progress)
-        unlimited = catalog.limited(NO_LIMITS)
+        unlimited = catalog.limited(UNLIMITED)
         for _ in range(ROUNDS):
             with unlimited.read() as session:
                 # The first statement fixes what is seen.

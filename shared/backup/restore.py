@@ -15,8 +15,8 @@ from sqlalchemy.orm import Session
 
 from shared.backup.copy_objects import copy, objects_to_keep, sha256_of
 from shared.backup.folder import About, BackupFolder
-from shared.backup.make import NO_LIMITS
 from shared.backup.rows import NOT_LOADED, Progress, load_rows, tables
+from shared.catalog.connections import UNLIMITED
 from shared.catalog.installation import ensure_installation
 from shared.catalog.maps import DEFAULT_MAP, Map
 from shared.catalog.search_workers import RegisteredWorker
@@ -54,7 +54,7 @@ def restore_backup(
     (`target_not_empty`) where something else lies, and Misconfigured: `backup_of_another_release`,
     `backup_damaged` (the target then stays without rows).
     """
-    unlimited = catalog.limited(NO_LIMITS)
+    unlimited = catalog.limited(UNLIMITED)
     with unlimited.write() as session:
         _check_schema(session, about)
         _check_catalog_empty(session)

@@ -51,7 +51,9 @@ def test_a_damaged_chunk_of_a_running_server_is_found_and_described_again(
     server: ServerProcess,
 ) -> None:
     chunk = next((server.home / "objects/chunks").rglob("*.npy"))
-    chunk.write_bytes(chunk.read_bytes()[:-1] + b"x")
+    damaged = chunk.with_suffix(".other")
+    damaged.write_bytes(chunk.read_bytes()[:-1] + b"x")
+    damaged.rename(chunk)  # the server may have mapped the file that was there
     found = run(server.home, "verify", code=1)
     assert [fault["wrong"] for fault in found["faults"]] == ["damaged"]
     mended = run(server.home, "verify", "--repair", code=1)
@@ -89,3 +91,10 @@ def test_every_line_of_the_log_is_json_and_the_id_of_an_upload_is_in_several(
     assert len(lines) > len(text) / 2
     loggers = {line["logger"] for line in lines if "an-id-of-mine" in json.dumps(line)}
     assert loggers >= {"services.call_log", "services.extractor.publish"}
+
+
+def test_what_is_not_there_can_neither_be_backed_up_nor_verified(tmp_path: Path) -> None:
+    for command in (["backup", tmp_path / "out"], ["verify"]):
+        assert run(tmp_path / "home", *command, code=1)["code"] == "nothing_stored"
+    assert not (tmp_path / "out").exists()
+    assert run(tmp_path / "home", "restore", tmp_path / "out", code=1)["code"] == "no_backup"

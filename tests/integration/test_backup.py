@@ -13,7 +13,7 @@ import pytest
 from sqlalchemy import select
 
 from services.extractor.worker import ExtractorWorker
-from shared.backup import make
+from shared.backup import copy_objects, make, rows
 from shared.backup.folder import BackupFolder, open_backup
 from shared.backup.make import make_backup
 from shared.backup.restore import Restored, restore_backup
@@ -122,13 +122,12 @@ def test_a_backup_taken_again_copies_only_what_is_new_and_forgets_what_is_gone(
     first, _ = service.indexed(1, 2)
     backed_up()
     taken: list[str] = []
-    copy = make.take
 
     def noted(store: FolderStore, folder: BackupFolder, info: Any) -> int:
         taken.append(info.key)
-        return copy(store, folder, info)
+        return copy_objects.take(store, folder, info)
 
-    monkeypatch.setattr(make, "take", noted)
+    monkeypatch.setattr("shared.backup.make.take", noted)
     assert backed_up().objects
     assert taken == []
     with service.catalog.read() as session:
@@ -149,10 +148,10 @@ def test_what_comes_or_goes_while_a_backup_is_taken_is_in_it_or_not_named_by_it(
     service: Service, backed_up: Callable[[], Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     service.indexed(1, 2)
-    dump, rounds = make.dump_rows, []
+    rounds: list[int] = []
 
     def meanwhile(*arguments: Any) -> Any:
-        counts = dump(*arguments)
+        counts = rows.dump_rows(*arguments)
         rounds.append(1)
         return counts
 
@@ -172,7 +171,7 @@ def test_what_comes_or_goes_while_a_backup_is_taken_is_in_it_or_not_named_by_it(
         return copy_rest(*arguments)
 
     copy_all, copy_rest = make._copy_all, make._copy_rest
-    monkeypatch.setattr(make, "dump_rows", meanwhile)
+    monkeypatch.setattr("shared.backup.make.dump_rows", meanwhile)
     monkeypatch.setattr(make, "_copy_all", before)
     monkeypatch.setattr(make, "_copy_rest", after)
     about = backed_up()

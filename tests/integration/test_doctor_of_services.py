@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
+import re
+import time
 from collections.abc import Iterator
 from typing import Any
 
 import pytest
 from sqlalchemy import update
 
-from services.cli import deployment_checks
-from services.cli.deployment_checks import (
+from services.cli import server_checks
+from services.cli.server_checks import objects_check, postgres_check, redis_check
+from services.cli.service_checks import (
     gateway_check,
-    objects_check,
-    postgres_check,
     processes_check,
-    redis_check,
     search_check,
     steward_check,
 )
@@ -51,11 +51,11 @@ def test_postgres_tells_its_version_tables_and_clock(
     deployed: Catalog, postgres: PostgresServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert "tables up to date" in postgres_check(Settings())
-    monkeypatch.setattr(deployment_checks, "MOST_SKEW_SECONDS", -1.0)
+    monkeypatch.setattr(server_checks, "MOST_SKEW_SECONDS", -1.0)
     assert refused(postgres_check, Settings()).code == "clocks_differ"
-    monkeypatch.setattr(deployment_checks, "LEAST_POSTGRES", 10**9)
+    monkeypatch.setattr(server_checks, "LEAST_POSTGRES", 10**9)
     assert refused(postgres_check, Settings()).code == "postgres_too_old"
-    monkeypatch.setattr(deployment_checks, "LEAST_POSTGRES", 0)
+    monkeypatch.setattr(server_checks, "LEAST_POSTGRES", 0)
     monkeypatch.setenv("DATABASE_URL", postgres.new_database())
     assert refused(postgres_check, Settings()).code == "schema_outdated"
     monkeypatch.setenv("DATABASE_URL", "postgresql+psycopg://nobody:x@127.0.0.1:1/none")
@@ -68,7 +68,7 @@ def test_redis_tells_its_version_and_has_to_keep_what_it_is_given(
     assert refused(redis_check, Settings()).code == "redis_missing"
     monkeypatch.setenv("REDIS_URL", redis.url)
     assert "answers" in redis_check(Settings())
-    monkeypatch.setattr(deployment_checks, "LEAST_REDIS", (999, 0))
+    monkeypatch.setattr(server_checks, "LEAST_REDIS", (999, 0))
     assert refused(redis_check, Settings()).code == "redis_too_old"
     monkeypatch.setenv("REDIS_URL", "redis://127.0.0.1:1/0")
     gone = refused(redis_check, Settings())
@@ -90,15 +90,18 @@ def test_who_lives_is_known_and_who_was_killed_soon_is_not(deployed: Catalog) ->
     settings = Settings()
     assert refused(processes_check, settings, "extractor").code == "nobody_there"
     with signs_of_life(deployed, "extractor"):
-        for _ in range(1000):
+        deadline = time.monotonic() + 30
+        while True:
             with deployed.read() as session:
                 if living(session):
                     break
+            assert time.monotonic() < deadline, "it gave no sign"
+            time.sleep(0.01)
         assert processes_check(settings, "extractor").startswith("1 of release ")
         with deployed.write() as session:
             session.execute(update(LiveProcess).values(seen_at=db_now_plus(-60)))
         gone = refused(processes_check, settings, "extractor")
-        assert "The last sign of one is 60 s old" in gone.detail
+        assert re.search(r"The last sign of one is \d+ s old", gone.detail)
     with deployed.read() as session:
         assert living(session) == [], "it has signed off"
 

@@ -5,9 +5,7 @@ from __future__ import annotations
 
 import json
 import re
-import threading
 import urllib.request
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -70,7 +68,7 @@ def expressions() -> list[tuple[str, str]]:
 
 
 def test_alerts_and_dashboards_name_only_what_the_services_export(
-    whole: CollectorRegistry, workplace_of: Callable[[str], Workplace]
+    whole: CollectorRegistry,
 ) -> None:
     there = exported(whole)
     # Samples that exist only while there is something to tell.
@@ -206,4 +204,3 @@ def test_figures_are_answered_on_a_port_of_their_own(
         monkeypatch.setenv("METRICS_PORT", str(port))
         with pytest.raises(Misconfigured, match="METRICS_PORT"), serving_metrics(Settings(), whole):
             pass
-    assert "metrics" not in {thread.name for thread in threading.enumerate()}

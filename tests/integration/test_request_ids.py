@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import sys
 import threading
 from collections.abc import Iterator
 from uuid import UUID
@@ -82,7 +83,6 @@ def test_an_unforeseen_error_answers_with_the_id_and_logs_it(
     service: Service, lines: list[logging.LogRecord], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("services.gateway.jobs.list_jobs", lambda *_: 1 / 0)
-    service._client.app.middleware_stack = None  # type: ignore[attr-defined]
     with pytest.raises(ZeroDivisionError):  # TestClient raises it once more
         service("GET", "/jobs", headers={"X-Request-ID": ID})
     failed = [line for line in lines if line.getMessage() == "GET /api/v1/jobs: 500"]
@@ -126,10 +126,8 @@ def test_a_trace_leads_from_the_call_to_the_transaction_that_makes_it_searchable
 
 def test_traces_without_their_packages_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("OTEL_EXPORTER_OTLP_ENDPOINT", "http://127.0.0.1:4318")
-    monkeypatch.setitem(__import__("sys").modules, "opentelemetry", None)
-    monkeypatch.delitem(
-        __import__("sys").modules, "shared.telemetry.opentelemetry_tracer", raising=False
-    )
+    monkeypatch.setitem(sys.modules, "opentelemetry", None)
+    monkeypatch.delitem(sys.modules, "shared.telemetry.opentelemetry_tracer", raising=False)
     with pytest.raises(Misconfigured, match="extra `otel`") as caught:
         set_up_traces(Settings(), "gateway")
     assert caught.value.code == "otel_missing"
