@@ -8,8 +8,14 @@ from typing import Any
 import httpx2
 import psutil
 
-from tests.support.hostile import Hostile, corpus
-from tests.support.hostile.file import MAX_ARCHIVE_BYTES, MAX_BYTES, MAX_MEMBERS, MAX_PIXELS
+from tests.support.hostile import corpus
+from tests.support.hostile.file import (
+    MAX_ARCHIVE_BYTES,
+    MAX_BYTES,
+    MAX_MEMBERS,
+    MAX_PIXELS,
+    Hostile,
+)
 from tests.support.photos import near_copy, photo_bytes
 from tests.support.server import ServerProcess
 
