@@ -21,8 +21,11 @@ from urllib.parse import urlsplit
 import numpy as np
 from PIL import Image
 
+from tests.support.server import SERVICES_KEY
+
 BOUNDARY = "placewise-bench"
 CONTENT_TYPE = {"Content-Type": f"multipart/form-data; boundary={BOUNDARY}"}
+KEY = {"Authorization": f"Bearer {SERVICES_KEY}"}
 TIMEOUT_SECONDS = 60.0
 SHARPEST, ROUGHEST = 95, 5  # JPEG qualities
 
@@ -74,7 +77,7 @@ class Caller:
             self._own.connection = connection
             self._connections.append(connection)
         try:
-            connection.request(method, path, body, headers)
+            connection.request(method, path, body, KEY | headers)
             answer = connection.getresponse()
             return Answer(answer.status, dict(answer.getheaders()), answer.read())
         except (OSError, HTTPException):

@@ -30,16 +30,14 @@ class Server(uvicorn.Server):
         await super().shutdown(sockets)
 
 
-def http_server(
-    app: FastAPI, *, access_log: bool, on_stop: Callable[[], object] = lambda: None
-) -> Server:
+def http_server(app: FastAPI, *, on_stop: Callable[[], object] = lambda: None) -> Server:
     """A server of the application, not started yet. `on_stop` is called on its event loop when it
     takes no more requests; it answers those that it has for GRACEFUL_SECONDS."""
     server = Server(
         uvicorn.Config(
             app,
             log_config=None,
-            access_log=access_log,
+            access_log=False,  # `call_log` writes them
             timeout_keep_alive=KEEP_ALIVE_SECONDS,
             timeout_graceful_shutdown=GRACEFUL_SECONDS,
         )

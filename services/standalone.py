@@ -22,30 +22,37 @@ from dataclasses import dataclass
 from functools import partial
 
 import uvicorn
+from prometheus_client import CollectorRegistry
 
 from services.extractor.worker import ExtractorWorker
 from services.gateway.app import create_app
 from services.gateway.context import Gateway
-from services.gateway.keys import Keys, KnownKeys, NoKeys
+from services.gateway.keys import CatalogKeys, Keys, NoKeys
 from services.http_server import http_server, listening, stopped_by_signals, url_of
 from services.parts import start_part
+from services.search.metrics import SearchMetrics
 from services.search.presence import Presence
 from services.search.worker import SearchWorker
 from services.steward.batches.worker import BatchWorker
 from services.steward.evaluate import Evaluator
 from services.steward.loop import Steward
+from services.steward.metrics import StewardMetrics
 from services.steward.queue import free_leases
-from shared.admin_key import AdminKey, admin_key, hash_key, is_loopback, new_local_key
+from services.steward.webhooks.deliver import WebhookSender
+from shared.api_keys import Scope, hash_key, is_loopback, new_local_key
 from shared.catalog.connections import Limits
 from shared.catalog.installation import open_own_store
+from shared.catalog.keys import has_admin_key, make_key
 from shared.catalog.maps import ensure_default_map
 from shared.catalog.open_catalog import open_catalog
 from shared.catalog.schema import migrate
 from shared.catalog.search_workers import forget_dead_workers
+from shared.catalog.session import Catalog
 from shared.errors import Misconfigured
 from shared.home import announced, lock_home
 from shared.jobs import InProcessHints
 from shared.settings import Settings
+from shared.telemetry.metrics_server import serving_metrics
 
 log = logging.getLogger(__name__)
 
@@ -58,10 +65,10 @@ class Standalone:
     """An address of it that this machine reaches."""
     server: uvicorn.Server
     listener: socket.socket
-    key: AdminKey | None
-    """What every call needs; None on loopback, where none is needed unless ADMIN_KEY is set."""
+    made_key: str | None
+    """The first admin key, where this start has made it: to be shown now or never."""
     local_key: str | None
-    """Another one, for the commands of this user."""
+    """A key for the commands of this user; None on loopback without ADMIN_KEY: none is needed."""
     failed: threading.Event
     """Set when one of the parts has died: the process should end and say so."""
 
@@ -79,14 +86,13 @@ class Standalone:
 
 
 @contextlib.contextmanager
-def standalone(settings: Settings, *, new_key: bool = False) -> Iterator[Standalone]:
+def standalone(settings: Settings) -> Iterator[Standalone]:
     """Lock the folder, recover what a killed process left, and start every part.
 
-    Beyond loopback, or with an ADMIN_KEY, every call needs a key; `new_key` replaces the one that
-    an earlier start has made. Raises Misconfigured: `home_in_use` for a folder that another server
-    has, `address_in_use`, `separate_services` where SEARCH_URLS is set, `no_key_needed` for a new
-    key on loopback, and those of `admin_key` and `open_own_store`; Unavailable for a bucket that
-    can't be used.
+    Beyond loopback, or with an ADMIN_KEY, every call needs a key; where there is no admin's yet,
+    the first one is made. Raises Misconfigured: `home_in_use` for a folder that another server has,
+    `address_in_use`, `separate_services` where SEARCH_URLS is set, and those of `open_own_store`;
+    Unavailable for a bucket that can't be used.
     """
     if settings.search_addresses:
         raise Misconfigured(
@@ -111,23 +117,28 @@ def standalone(settings: Settings, *, new_key: bool = False) -> Iterator[Standal
 
         # After all that can be refused: a key that no start gets to show would be lost.
         host, port = listener.getsockname()[:2]
-        keys, key, local_key = _make_keys(settings, host, new_key)
+        requests = catalog.limited(Limits.of_requests(settings))
+        keys, made_key, local_key = _make_keys(settings, host, requests)
         url = url_of(host, port)
         held.enter_context(announced(home, url, local_key))
 
+        registry = CollectorRegistry()  # of all parts: one /metrics tells of everything
         search = SearchWorker(catalog, store, settings)
         name = f"embedded-{os.getpid()}"
         presence = Presence(catalog, search, name)
-        extractor = ExtractorWorker(catalog, store, settings, name=name, only_worker=True)
-        steward = Steward(catalog, store, hints, settings)
-        evaluator = Evaluator(catalog, store, search, settings, name=name)
-        batches = BatchWorker(catalog, store, hints, settings, name=name)
-        requests = catalog.limited(Limits.of_requests(settings))
-        gateway = Gateway(requests, store, hints, search, settings, keys)
-        server = http_server(
-            create_app(gateway), access_log=settings.debug, on_stop=gateway.job_watch.end_soon
+        extractor = ExtractorWorker(
+            catalog, store, settings, name=name, only_worker=True, registry=registry
         )
-        running = Standalone(url, server, listener, key, local_key, threading.Event())
+        stewards = StewardMetrics(registry)
+        steward = Steward(catalog, store, hints, settings, stewards)
+        evaluator = Evaluator(catalog, store, search, settings, name, stewards)
+        webhooks = WebhookSender(catalog, settings)
+        batches = BatchWorker(catalog, store, hints, settings, name, stewards)
+        counted = SearchMetrics(search, registry)
+        gateway = Gateway(requests, store, hints, counted, settings, keys, registry)
+        server = http_server(create_app(gateway), on_stop=gateway.job_watch.end_soon)
+        held.enter_context(serving_metrics(settings, registry))
+        running = Standalone(url, server, listener, made_key, local_key, threading.Event())
         stop = threading.Event()
         parts = [
             start_part(name, part, stop, running.end)
@@ -139,6 +150,7 @@ def standalone(settings: Settings, *, new_key: bool = False) -> Iterator[Standal
                 ("steward", steward.run),
                 ("evaluator", evaluator.run),
                 ("batches", batches.run),
+                ("webhooks", webhooks.run),
             )
         ]
         try:
@@ -153,18 +165,19 @@ def standalone(settings: Settings, *, new_key: bool = False) -> Iterator[Standal
 
 
 def _make_keys(
-    settings: Settings, host: str, new_key: bool
-) -> tuple[Keys, AdminKey | None, str | None]:
-    """What the gateway asks, the admin key, and a key for this user's commands."""
+    settings: Settings, host: str, catalog: Catalog
+) -> tuple[Keys, str | None, str | None]:
+    """What the gateway asks, the first admin key if it is made now, and a key for this user's
+    commands."""
     # The name as well as what it means today: what a name leads to can change.
-    if settings.admin_key or not (is_loopback(settings.host) and is_loopback(host)):
-        key = admin_key(settings.placewise_home, settings.admin_key, new_key)
-        local_key = new_local_key()
-        return KnownKeys(key.sha256, hash_key(local_key)), key, local_key
-    if new_key:
-        raise Misconfigured(
-            "no_key_needed",
-            f"On {settings.host} no key is needed, because only this machine reaches it. "
-            "Give --new-key with the HOST that needs one.",
-        )
-    return NoKeys(), None, None
+    if settings.admin_key is None and is_loopback(settings.host) and is_loopback(host):
+        return NoKeys(settings.trusted_origins), None, None
+    local_key, made_key = new_local_key(), None
+    admins = [hash_key(local_key)]
+    if settings.admin_key is not None:
+        admins.append(hash_key(settings.admin_key.get_secret_value()))
+    else:
+        with catalog.write() as session:
+            if not has_admin_key(session):
+                _, made_key = make_key(session, "made at the first start", [Scope.ADMIN])
+    return CatalogKeys(catalog, *admins), made_key, local_key

@@ -141,7 +141,8 @@ def corrupt(object_key: str) -> Unavailable:
     return Unavailable(
         "chunk_corrupt",
         f"The chunk {object_key} is not what was written (its hash differs). "
-        "Restore the object from a backup, or describe its photos again.",
+        "Restore the object from a backup, or describe its photos again: placewise verify "
+        "--repair.",
         object_key=object_key,
     )
 

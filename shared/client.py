@@ -366,6 +366,19 @@ class Client:
     def stats(self) -> Json:
         return self._call("GET", "/database/stats")
 
+    def keys(self) -> list[Json]:
+        """Every key of the server, for an admin; the keys themselves are shown to nobody."""
+        found: Any = self._call("GET", "/keys")
+        return list(found)
+
+    def create_key(self, name: str, scopes: Sequence[str], **limits: Any) -> Json:
+        """A new key: `key` of the answer is shown this once. `limits` are those of POST /keys."""
+        wanted = {"name": name, "scopes": list(scopes), **_given(**limits)}
+        return self._call("POST", "/keys", json=wanted)
+
+    def revoke_key(self, key_id: str) -> Json:
+        return self._call("DELETE", f"/keys/{key_id}")
+
     def _send_file(self, path: str, file: Path, called: str | None = None, **options: Any) -> Json:
         with _opened(file) as opened:
             files = {"file": (called or _name_of(file), opened)}

@@ -2,14 +2,16 @@
 
 PlacewiseError
 ├── InvalidRequest 400          no_file, empty_file, malformed_body, bad_manifest, ...
-├── Unauthorized 401            key_missing, key_unknown
+├── Unauthorized 401            key_missing, key_unknown, key_revoked, key_expired
+├── Forbidden 403               scope_missing, foreign_page
 ├── NotFound 404                photo_not_found, job_not_found, map_not_found, ...
 ├── Conflict 409                not_searchable, coordinates_differ, model_change_running, ...
 ├── Gone 410                    query_expired
+├── LengthRequired 411          length_required
 ├── TooLarge 413                file_too_large, batch_too_large, ...
 ├── UnsupportedMedia 415        unsupported_photo, unsupported_body, unsupported_archive
 ├── Unprocessable 422           invalid_field, undecodable_photo, too_many_pixels, ...
-├── TooManyRequests 429         queue_full, too_many_uploads (come again after `Retry-After`)
+├── TooManyRequests 429         queue_full, too_many_requests, ... (come again after `Retry-After`)
 ├── Unavailable 503             search_behind, codes_being_made, ... (may be tried again)
 │   │                       object_store_unavailable, bucket_not_found, ...
 │   └── StorageFull 507         disk_full, object_store_full
@@ -96,6 +98,11 @@ class Gone(PlacewiseError):
     title = "No longer kept"
 
 
+class LengthRequired(PlacewiseError):
+    status = 411
+    title = "The length must be said"
+
+
 class TooLarge(PlacewiseError):
     status = 413
     title = "Too large"
@@ -150,9 +157,11 @@ _BY_STATUS: dict[int, type[PlacewiseError]] = {
     for kind in (
         InvalidRequest,
         Unauthorized,
+        Forbidden,
         NotFound,
         Conflict,
         Gone,
+        LengthRequired,
         TooLarge,
         UnsupportedMedia,
         Unprocessable,

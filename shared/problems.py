@@ -15,10 +15,14 @@ from starlette.exceptions import HTTPException
 
 from shared.catalog.away import as_unavailable
 from shared.errors import InvalidRequest, PlacewiseError, Unprocessable
+from shared.ids import new_id
+from shared.telemetry.request_id import HEADER
 
 log = logging.getLogger(__name__)
 
 RETRY_AFTER_SECONDS = 2  # of a 503 that knows no better
+REQUEST_ID = "placewise.request_id"
+"""Of an ASGI scope: the call's id, where the service gives its calls ids."""
 HTTP_CODES = {400: "malformed_body", 404: "path_not_found", 405: "method_not_allowed"}
 
 
@@ -46,6 +50,16 @@ PROBLEM_RESPONSES: dict[int | str, dict[str, Any]] = {
     },
 }
 
+# The same for whoever calls without a key, with too little of one, or too often.
+KEY_RESPONSES: dict[int | str, dict[str, Any]] = {
+    401: {**PROBLEM_RESPONSES["4XX"], "description": "No key, or one that is no longer good."},
+    403: {**PROBLEM_RESPONSES["4XX"], "description": "The key lacks the scope of this call."},
+    429: {
+        **PROBLEM_RESPONSES["4XX"],
+        "description": "Too much at once; again after `Retry-After` seconds.",
+    },
+}
+
 
 def install_problem_handlers(app: FastAPI) -> None:
     """Turn whatever is raised in a route into a problem document."""
@@ -53,11 +67,14 @@ def install_problem_handlers(app: FastAPI) -> None:
     app.add_exception_handler(RequestValidationError, _on_validation_error)
     app.add_exception_handler(HTTPException, _on_http_exception)
     app.add_exception_handler(SQLAlchemyError, _on_database_error)
-    app.add_exception_handler(Exception, _on_any_error)
+    app.add_exception_handler(Exception, on_any_error)
 
 
 def problem_response(error: PlacewiseError, request: Request) -> JSONResponse:
     headers = {}
+    # Where the call's log does not reach: the handler of what nobody foresaw.
+    if (request_id := request.scope.get(REQUEST_ID)) is not None:
+        headers[HEADER] = request_id
     if error.status == 401:
         headers["WWW-Authenticate"] = "Bearer"
     wait = error.extra.get("retry_after_seconds")
@@ -124,13 +141,24 @@ async def _on_http_exception(request: Request, error: Exception) -> JSONResponse
 async def _on_database_error(request: Request, error: Exception) -> JSONResponse:
     unavailable = as_unavailable(error)
     if unavailable is None:  # a bug: another try would meet it again
-        return await _on_any_error(request, error)
+        return await on_any_error(request, error)
     return await _on_placewise_error(request, unavailable)
 
 
-async def _on_any_error(request: Request, error: Exception) -> JSONResponse:
-    log.error("%s %s failed", request.method, request.url.path, exc_info=error)
-    return problem_response(
-        PlacewiseError("internal_error", "Something went wrong here; the server's log says what."),
-        request,
+async def on_any_error(request: Request, error: Exception) -> JSONResponse:
+    """What is said of a fault of ours: an id, by which the log tells the rest."""
+    request_id = request.scope.get(REQUEST_ID) or str(new_id())
+    log.error(
+        "%s %s failed (request %s)",
+        request.method,
+        request.url.path,
+        request_id,
+        exc_info=error,
+        extra={"request_id": request_id},
     )
+    problem = PlacewiseError(
+        "internal_error",
+        f"Something went wrong here; the server's log says what, at {request_id}.",
+        request_id=request_id,
+    )
+    return problem_response(problem, request)

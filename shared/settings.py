@@ -39,8 +39,36 @@ class Settings(BaseSettings):
     port: int = Field(8000, ge=0, le=65535, description="0 takes a free one")
     admin_key: SecretStr | None = Field(
         None,
-        description="the key that every call needs; unset: made and shown at the first start "
-        "beyond loopback, and none is needed on loopback",
+        description="a key that may do everything, beside those of `placewise keys`; unset: the "
+        "embedded Placewise needs none on loopback, and makes one at its first start beyond",
+    )
+    cors_origins: str | None = Field(
+        None,
+        description="pages of elsewhere whose scripts may call, by their origins, separated by "
+        "commas: https://maps.example.com; unset: none",
+    )
+    hsts_seconds: int = Field(
+        0,
+        ge=0,
+        description="how long browsers shall use HTTPS alone (Strict-Transport-Security); 0: not "
+        "said. For servers that are reached over HTTPS only",
+    )
+
+    # What a key may do, unless it has limits of its own; ADMIN_KEY has none.
+    key_requests_per_minute: int | None = Field(
+        None, ge=1, description="calls of one key; unset: any number"
+    )
+    key_upload_bytes_per_day: int | None = Field(
+        None, ge=1, description="bytes that one key sends; unset: any number"
+    )
+    key_max_photos: int | None = Field(
+        None, ge=1, description="photos that are stored through one key; unset: any number"
+    )
+
+    webhook_private_addresses: bool = Field(
+        False,
+        description="lets webhooks lead to private addresses and over plain HTTP: whoever makes "
+        "one then reaches what the steward reaches",
     )
     placewise_home: Path = Field(
         Path("./var"), description="folder of the embedded catalog and object store"
@@ -103,8 +131,35 @@ class Settings(BaseSettings):
         False, description="log every call and every refusal; answers stay the same"
     )
 
+    # What a running service tells of itself.
+    log_format: Literal["text", "json"] = Field(
+        "text", description="of every line of a service's log; json: one object a line"
+    )
+    metrics_port: int | None = Field(
+        None,
+        ge=0,
+        le=65535,
+        description="where, on HOST, a service answers GET /metrics without a key, for Prometheus; "
+        "unset: nowhere (the gateway and search have theirs beside the API as well)",
+    )
+    otel_exporter_otlp_endpoint: str | None = Field(
+        None,
+        description="where traces are sent by OTLP/HTTP: http://collector:4318; needs the extra "
+        "otel; unset: nothing is traced",
+    )
+
     redis_url: SecretStr | None = Field(
         None, description="Redis that carries hints between services; unset: one process"
+    )
+
+    map_tiles: str | None = Field(
+        None,
+        description="address of the page's map tiles: "
+        "https://tile.openstreetmap.org/{z}/{x}/{y}.png; unset: a plain graticule, and the page "
+        "loads nothing from elsewhere",
+    )
+    map_attribution: str | None = Field(
+        None, description="whose MAP_TILES are, as their licence wants it shown"
     )
 
     heartbeat_file: Path | None = Field(
@@ -324,6 +379,17 @@ class Settings(BaseSettings):
             )
         return value
 
+    @field_validator("cors_origins")
+    @classmethod
+    def _are_origins(cls, value: str | None) -> str | None:
+        for origin in _split(value):
+            if not re.fullmatch(r"https?://([a-z0-9.-]+|\[[0-9a-f:]+\])(:\d+)?", origin):
+                raise ValueError(
+                    f"{origin!r} is no origin: scheme, name and port in small letters, without a "
+                    "path: https://maps.example.com"
+                )
+        return value
+
     @field_validator("search_shard")
     @classmethod
     def _names_a_shard(cls, value: str) -> str:
@@ -373,6 +439,20 @@ class Settings(BaseSettings):
             )
         return value
 
+    @field_validator("map_tiles")
+    @classmethod
+    def _a_pattern_of_tiles(cls, value: str | None) -> str | None:
+        # Its host goes into the page's Content-Security-Policy: nothing else may follow it there.
+        if value is not None and not (
+            re.fullmatch(r"https?://[A-Za-z0-9.-]+(:\d+)?/[^\s]+", value)
+            and all(part in value for part in ("{z}", "{x}", "{y}"))
+        ):
+            raise ValueError(
+                f"{value!r} is no address of tiles with {{z}}, {{x}} and {{y}}, such as "
+                "https://tile.openstreetmap.org/{z}/{x}/{y}.png"
+            )
+        return value
+
     @field_validator("s3_public_endpoint")
     @classmethod
     def _an_address_without_a_path(cls, value: str | None) -> str | None:
@@ -400,6 +480,15 @@ class Settings(BaseSettings):
             raise ValueError(
                 "With S3_ENDPOINT the photos lie in S3_BUCKET, and UPLOAD_DIR names a folder for "
                 "them. Unset one of the two"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _tiles_say_whose_they_are(self) -> Self:
+        if self.map_tiles is not None and self.map_attribution is None:
+            raise ValueError(
+                "MAP_TILES needs MAP_ATTRIBUTION, which stands in the corner of the map: "
+                "© OpenStreetMap contributors"
             )
         return self
 
@@ -496,6 +585,11 @@ class Settings(BaseSettings):
     def search_addresses(self) -> tuple[str, ...]:
         """The search workers' addresses, each once; () when search is in this process."""
         return tuple(dict.fromkeys(url.rstrip("/") for url in _split(self.search_urls)))
+
+    @property
+    def trusted_origins(self) -> tuple[str, ...]:
+        """Whose pages may call; () for our own alone."""
+        return tuple(dict.fromkeys(_split(self.cors_origins)))
 
     def catalog_url(self) -> str:
         """The SQLAlchemy URL of the catalog."""

@@ -16,6 +16,7 @@ from uuid import UUID
 import httpx2
 
 from tests.support.photos import photo_bytes
+from tests.support.server import SERVICES_KEY
 
 UPLOADERS = 4
 CALL_SECONDS = 60.0
@@ -34,7 +35,10 @@ class Traffic:
     def __init__(self, urls: Sequence[str], seed: int) -> None:
         self._urls = urls
         self._random = random.Random(seed)
-        self._clients = [httpx2.Client(base_url=url, timeout=CALL_SECONDS) for url in urls]
+        headers = {"Authorization": f"Bearer {SERVICES_KEY}"}
+        self._clients = [
+            httpx2.Client(base_url=url, headers=headers, timeout=CALL_SECONDS) for url in urls
+        ]
         self._lock = threading.Lock()
         self._released = 0
         self._next = 0

@@ -17,7 +17,7 @@ from shared.catalog.session import Catalog
 from shared.objects import ObjectStore
 from shared.objects.s3 import S3Store
 from tests.support.processes import PLACEWISE
-from tests.support.server import environment
+from tests.support.server import SERVICES_KEY, environment
 from tests.support.servers.daemon import free_ports
 
 S3_TIMEOUT_SECONDS = 2.0  # so that a silent store is noticed within a fault
@@ -69,6 +69,7 @@ class Fleet:
         self._settings = {
             "database_url": database_url,
             "redis_url": redis_url,
+            "admin_key": SERVICES_KEY,
             "search_urls": ",".join(self.search_urls),
             **s3.variables(bucket.name),
             "s3_timeout_seconds": S3_TIMEOUT_SECONDS,

@@ -8,6 +8,8 @@ import shutil
 import sys
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from functools import partial
+from importlib.util import find_spec
 
 import typer
 from rich.markup import escape
@@ -16,7 +18,14 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from services.cli.configuration import read_settings
 from services.cli.extractor_checks import device_check, extractor_check, memory_check
-from services.cli.output import JsonOption, answers, print_json
+from services.cli.output import JsonOption, KeyOption, ServerOption, answers, print_json
+from services.cli.server_checks import objects_check, postgres_check, redis_check
+from services.cli.service_checks import (
+    gateway_check,
+    processes_check,
+    search_check,
+    steward_check,
+)
 from shared.catalog.open_catalog import open_catalog
 from shared.catalog.photos import Photo
 from shared.client import Client
@@ -34,23 +43,39 @@ class Finding:
     detail: str
 
 
-def doctor(as_json: JsonOption = False) -> None:
-    """Check this installation; exit code 1 when something needs attention."""
+def doctor(server: ServerOption = None, key: KeyOption = None, as_json: JsonOption = False) -> None:
+    """Check this installation part by part; exit code 1 when something needs attention.
+
+    With DATABASE_URL: of separate services, who lives and what each part says of itself. Run it
+    with the settings of a service, where that one runs; --server names the gateway.
+    """
     try:
         settings = read_settings()
     except Misconfigured as error:
         _report([Finding("settings", False, error.detail)], as_json)
         raise typer.Exit(1) from None
-    checks: list[tuple[str, Callable[[Settings], str]]] = [
-        ("python", _python),
-        ("folder", _folder),
-        ("uploads", _uploads),
-        ("server", _server),
-        ("vocabulary", _vocabulary),
-        ("device", device_check),
-        ("memory", memory_check),
-        ("extractor", extractor_check),
-    ]
+    checks: list[tuple[str, Callable[[Settings], str]]] = [("python", _python)]
+    checks.append(("settings", _settings))
+    if settings.s3_endpoint is None or settings.database_url is None:
+        checks.append(("folder", _folder))  # else a service may have none that it can write to
+    if settings.s3_endpoint is None:
+        checks.append(("uploads", _uploads))
+    else:
+        checks.append(("objects", objects_check))
+    if settings.database_url is None:
+        checks += [("server", _server), ("vocabulary", _vocabulary)]
+    else:
+        checks += [
+            ("postgresql", postgres_check),
+            ("redis", redis_check),
+            ("search", search_check),
+            ("gateways", partial(processes_check, role="gateway")),
+            ("extractors", partial(processes_check, role="extractor")),
+            ("stewards", steward_check),
+        ]
+    if server is not None:
+        checks.append(("gateway", lambda _: gateway_check(server, key)))
+    checks += [("device", device_check), ("memory", memory_check), ("extractor", extractor_check)]
     findings = [_look(part, check, settings) for part, check in checks]
     _report(findings, as_json)
     if not all(finding.ok for finding in findings):
@@ -72,12 +97,33 @@ def _look(part: str, check: Callable[[Settings], str], settings: Settings) -> Fi
         return Finding(part, True, check(settings))
     except PlacewiseError as error:
         return Finding(part, False, error.detail)
+    except ModuleNotFoundError as error:
+        # Each image has its service's packages only.
+        return Finding(part, True, f"not looked at: {error.name} is not installed here")
     except OSError as error:
         return Finding(part, False, f"{error.filename or ''}: {error.strerror}. Check permissions.")
 
 
 def _python(_settings: Settings) -> str:
     return f"Python {sys.version.split()[0]}"
+
+
+def _settings(settings: Settings) -> str:
+    """They were read, or nothing else would be looked at."""
+    if settings.otel_exporter_otlp_endpoint is not None and not _is_installed("opentelemetry.sdk"):
+        raise Misconfigured(
+            "otel_missing",
+            "OTEL_EXPORTER_OTLP_ENDPOINT is set, and the extra otel is not installed: uv pip "
+            "install '.[otel]', or unset it.",
+        )
+    return f"{len(settings.model_fields_set)} are set (placewise config prints all)"
+
+
+def _is_installed(package: str) -> bool:
+    try:
+        return find_spec(package) is not None
+    except ModuleNotFoundError:  # not even what it is a part of
+        return False
 
 
 def _folder(settings: Settings) -> str:
@@ -93,11 +139,6 @@ def _folder(settings: Settings) -> str:
 
 
 def _uploads(settings: Settings) -> str:
-    if settings.s3_endpoint is not None:
-        from shared.objects.open_store import open_store  # the minio client takes its time
-
-        open_store(settings).check()
-        return f"S3_BUCKET {settings.s3_bucket} at {settings.s3_endpoint} is writable"
     folder = settings.upload_dir
     if folder is None:
         return "originals lie under PLACEWISE_HOME"

@@ -25,6 +25,7 @@ COMMANDS = {
     "compare": ("compare", "compare"),
     "config": ("configuration", "config"),
     "doctor": ("doctor", "doctor"),
+    "keys": ("keys", "app"),
     "maps": ("maps", "app"),
     "vocabulary": ("vocabulary", "app"),
     "pca": ("pca", "app"),
@@ -33,6 +34,9 @@ COMMANDS = {
     "train": ("train", "train"),
     "grid": ("grid", "grid"),
     "storage": ("storage", "app"),
+    "backup": ("backup", "backup"),
+    "restore": ("backup", "restore"),
+    "verify": ("verify", "verify"),
     "bench": ("bench", "app"),
 }
 

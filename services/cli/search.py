@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from services.cli.configuration import read_settings
 from services.cli.output import explained, messages
-from services.cli.serve import set_log_levels
+from shared.telemetry.logs import set_up_logs
+from shared.telemetry.traces import set_up_traces
 
 
 def search() -> None:
@@ -21,12 +22,15 @@ def search() -> None:
         from shared.catalog.open_catalog import open_catalog
         from shared.catalog.schema import wait_for_schema
 
-        set_log_levels(settings.debug)
+        set_up_logs(settings, "search")
         catalog = open_catalog(settings, "search")
         try:
             wait_for_schema(catalog, settings.schema_wait_seconds)
             store = open_own_store(catalog, settings, alone=False)  # others write there meanwhile
-            with search_service(settings, catalog, store) as running:
+            with (
+                set_up_traces(settings, "search"),
+                search_service(settings, catalog, store) as running,
+            ):
                 messages.print(
                     f"Placewise search serves shard {settings.shard} on {running.url}\n"
                     f"  look:     {running.url}/readyz   {running.url}/metrics",

@@ -106,7 +106,7 @@ class Comparisons:
             mine = held(session, token_of(job), [job])
             for own in mine:
                 succeed(own, {"candidates": len(result.candidates)})
-        return Published(succeeded=len(mine))
+        return Published(succeeded=len(mine), lost=1 - len(mine))
 
     def _read_query(self, job: Job, asked: Comparison) -> bytes:
         if asked.query_photo_id is None:

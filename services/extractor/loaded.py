@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -53,8 +54,16 @@ class Made:
 class LoadedModels:
     """Small LRU caches, shared by the thread that prepares and the one that describes."""
 
-    def __init__(self, store: ObjectStore, settings: Settings, load_added: LoadAdded) -> None:
-        """`load_added` is that of AddedModels."""
+    def __init__(
+        self,
+        store: ObjectStore,
+        settings: Settings,
+        load_added: LoadAdded,
+        on_load: Callable[[float], object] = lambda seconds: None,
+    ) -> None:
+        """`load_added` is that of AddedModels; `on_load` is told how many seconds the loading of an
+        extractor took."""
+        self._on_load = on_load
         self._store = store
         self._load_added = load_added
         self._settings = settings
@@ -108,6 +117,7 @@ class LoadedModels:
                     limit=limit,
                 )
         added = recipe.trained.registered if recipe.trained else None
+        started = time.perf_counter()
         made = Extractor(
             recipe,
             self._device,
@@ -118,6 +128,7 @@ class LoadedModels:
         )
         if self._device.type == "cuda":
             made.warm_up(self._settings.batch_photos)
+        self._on_load(time.perf_counter() - started)
         return made
 
     def centres(self, vocabulary: Vocabulary) -> Centres:

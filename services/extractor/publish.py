@@ -6,6 +6,7 @@ over, or that was cancelled, is passed over: its row stays in the chunk as a dea
 
 from __future__ import annotations
 
+import logging
 import time
 from dataclasses import dataclass
 from uuid import UUID
@@ -25,14 +26,19 @@ from shared.ids import new_id
 from shared.jobs import JobKind
 from shared.jobs.finish import cancel, fail, release, succeed
 from shared.jobs.leases import held
+from shared.jobs.on_behalf import request_ids
 from shared.objects import ObjectStore
 from shared.objects.keys import query_vector_key
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(slots=True)
 class Published:
     succeeded: int = 0
     failed: int = 0
+    lost: int = 0
+    """Taken over by another worker, or cancelled, while they were computed."""
 
 
 def publish(
@@ -42,16 +48,30 @@ def publish(
     started = time.perf_counter()
     rows = batch.refuse_not_finite(rows)
     if batch.kind == JobKind.DESCRIBE:
-        outcome = _publish_queries(catalog, store, batch, rows)
+        outcome, chunk = _publish_queries(catalog, store, batch, rows), None
     else:
-        outcome = _publish_photos(catalog, store, batch, rows, slot_rows)
+        outcome, chunk = _publish_photos(catalog, store, batch, rows, slot_rows)
     batch.seconds["publish"] = time.perf_counter() - started
+    log.info(
+        "published: %d succeeded, %d failed",
+        outcome.succeeded,
+        outcome.failed,
+        extra={
+            "kind": str(batch.kind),
+            "map_id": str(batch.jobs[0].map_id),
+            "generation_id": str(batch.target.generation.id),
+            "job_ids": [str(job.id) for job in batch.jobs],
+            "request_ids": request_ids(batch.jobs),
+            "chunk": chunk,
+        },
+    )
     return outcome
 
 
 def _publish_photos(
     catalog: Catalog, store: ObjectStore, batch: Batch, rows: Rows, slot_rows: int
-) -> Published:
+) -> tuple[Published, str | None]:
+    """What it has come to, and the key of the chunk."""
     generation_id = batch.target.generation.id
     chunk_id = new_id()
     written = None
@@ -70,6 +90,7 @@ def _publish_photos(
         lock_map(session, batch.jobs[0].map_id)
         generation = lock_generation(session, generation_id)
         mine = {job.id: job for job in held(session, batch.token, batch.jobs)}
+        outcome.lost = len(batch.jobs) - len(mine)
         if generation.state not in _wanted_states(batch.kind):
             # A model change was switched in (or given up) while the batch was computed.
             for job in mine.values():
@@ -114,7 +135,7 @@ def _publish_photos(
             bump_version(session, generation.map_id)
         return outcome
 
-    return catalog.run(commit)
+    return catalog.run(commit), written.object_key if written else None
 
 
 def _publish_queries(catalog: Catalog, store: ObjectStore, batch: Batch, rows: Rows) -> Published:
@@ -124,6 +145,7 @@ def _publish_queries(catalog: Catalog, store: ObjectStore, batch: Batch, rows: R
     def commit(session: Session) -> Published:
         outcome = Published()
         mine = {job.id: job for job in held(session, batch.token, batch.jobs)}
+        outcome.lost = len(batch.jobs) - len(mine)
         for stale, error in batch.failed:
             if stale.id in mine:
                 fail(mine[stale.id], error.as_problem())

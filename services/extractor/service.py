@@ -14,6 +14,7 @@ from collections.abc import Callable
 from typing import Any
 
 from celery import signals
+from prometheus_client import CollectorRegistry
 from sqlalchemy.exc import SQLAlchemyError
 
 from services.extractor.drain_result import DrainResult
@@ -27,6 +28,7 @@ from shared.jobs.celery_hints import CeleryHints
 from shared.jobs.hints import Lane
 from shared.objects import ObjectStore
 from shared.settings import Settings
+from shared.telemetry.metrics_server import serving_metrics
 
 log = logging.getLogger(__name__)
 
@@ -44,7 +46,8 @@ def serve_extractor(
     app = make_celery(settings)
     hints = CeleryHints(app, settings)
     name = f"extractor-{socket.gethostname()}-{os.getpid()}"
-    worker = ExtractorWorker(catalog, store, settings, name)
+    registry = CollectorRegistry()
+    worker = ExtractorWorker(catalog, store, settings, name, registry=registry)
     heartbeat = Heartbeat(settings.heartbeat_file)
     stop = threading.Event()
 
@@ -76,27 +79,33 @@ def serve_extractor(
     def on_heartbeat(**_: object) -> None:
         heartbeat.beat()
 
+    def leave_logs_alone(**_: object) -> None:
+        pass
+
     signals.worker_shutting_down.connect(on_shutdown, weak=False)
     signals.worker_ready.connect(on_worker_ready, weak=False)
     # Sent every two seconds from the loop that takes hints, while it is connected to Redis.
     signals.heartbeat_sent.connect(on_heartbeat, weak=False)
+    # Celery would set up handlers and formats of its own. (`--loglevel` has no effect then.)
+    signals.setup_logging.connect(leave_logs_alone, weak=False)
     try:
-        worker.warm_up()
-        for lane in Lane:
-            hints.send(lane)  # what was queued before this worker came
-        app.worker_main(
-            [
-                "worker",
-                "--pool=solo",
-                "--concurrency=1",
-                f"--hostname={name}@%h",
-                f"--queues={','.join(Lane)}",
-                "--loglevel=INFO" if settings.debug else "--loglevel=WARNING",
-                "--without-gossip",
-                "--without-mingle",
-            ]
-        )
+        with serving_metrics(settings, registry):
+            worker.warm_up()
+            for lane in Lane:
+                hints.send(lane)  # what was queued before this worker came
+            app.worker_main(
+                [
+                    "worker",
+                    "--pool=solo",
+                    "--concurrency=1",
+                    f"--hostname={name}@%h",
+                    f"--queues={','.join(Lane)}",
+                    "--without-gossip",
+                    "--without-mingle",
+                ]
+            )
     finally:
+        signals.setup_logging.disconnect(leave_logs_alone)
         signals.worker_shutting_down.disconnect(on_shutdown)
         signals.worker_ready.disconnect(on_worker_ready)
         signals.heartbeat_sent.disconnect(on_heartbeat)

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from sqlalchemy.exc import SQLAlchemyError
 
 from services.extractor.drain_result import DrainResult
+from services.extractor.metrics import ExtractorMetrics
 from shared.catalog.generations import active_generation
 from shared.catalog.maps import lock_map
 from shared.catalog.session import Catalog
@@ -30,26 +31,32 @@ OPERATOR_SECONDS = 15.0  # pause of photos that need an operator first (weights 
 class Setbacks:
     """Writes them to the jobs of a batch: `jobs` were claimed together, under one token."""
 
-    def __init__(self, catalog: Catalog, max_attempts: int) -> None:
+    def __init__(self, catalog: Catalog, max_attempts: int, metrics: ExtractorMetrics) -> None:
         """`max_attempts`: so many falls of a worker over a job alone, and it fails."""
+        self._metrics = metrics
         self._catalog = catalog
         self._max_attempts = max_attempts
 
     @contextlib.contextmanager
     def answered(self, jobs: list[Job], result: DrainResult) -> Iterator[None]:
         """What goes wrong in the block is written to the jobs, and failed ones are counted."""
+        kind = JobKind(jobs[0].kind)
         try:
             yield
         except (Unavailable, OSError, SQLAlchemyError) as error:
+            self._metrics.ended(kind, "paused", len(jobs))
             self._pause(jobs, error)
         except PlacewiseError as error:
+            self._metrics.ended(kind, "refused", len(jobs))
             result.failed += self._refuse(jobs, error)
         except Exception as error:
             log.exception("a batch of %d jobs crashed", len(jobs))
+            self._metrics.ended(kind, "crashed", len(jobs))
             self._crashed(jobs, error)
 
     def wait_for_vocabulary(self, jobs: list[Job]) -> None:
         """Photos wait until the map has one; a query is told at once."""
+        self._metrics.ended(JobKind(jobs[0].kind), "waiting", len(jobs))
         with self._catalog.write() as session:
             lock_map(session, jobs[0].map_id)
             there = active_generation(session, jobs[0].map_id) is not None
@@ -61,6 +68,7 @@ class Setbacks:
 
     def give_back(self, jobs: list[Job]) -> None:
         """Stopping: what was taken ahead goes to another worker, unharmed."""
+        self._metrics.ended(JobKind(jobs[0].kind), "given_back", len(jobs))
         with self._catalog.write() as session:
             for job in held(session, token_of(jobs[0]), jobs):
                 release(job)

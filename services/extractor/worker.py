@@ -27,6 +27,7 @@ from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
 from uuid import UUID
 
+from prometheus_client import CollectorRegistry
 from sqlalchemy.exc import SQLAlchemyError
 
 from services.extractor.added_models import AddedModels
@@ -35,9 +36,10 @@ from services.extractor.decoding import DecoderPool
 from services.extractor.describe import describe
 from services.extractor.drain_result import DrainResult
 from services.extractor.loaded import LoadedModels
+from services.extractor.metrics import ExtractorMetrics
 from services.extractor.model_change import ModelChanges
 from services.extractor.prepare import Batch, prepare
-from services.extractor.publish import publish
+from services.extractor.publish import Published, publish
 from services.extractor.renew import renew_outdated_generations
 from services.extractor.setbacks import AWAY_SECONDS, Setbacks
 from services.extractor.target import find_target
@@ -49,6 +51,7 @@ from shared.heartbeat import Heartbeat
 from shared.jobs import InProcessHints, Job, Priority, begin, claim, hold_lease
 from shared.jobs.claim import any_claimable
 from shared.jobs.leases import token_of
+from shared.jobs.on_behalf import on_behalf_of
 from shared.jobs.table import EXTRACTOR_JOBS, MODEL_CHANGES, JobKind
 from shared.objects import ObjectStore
 from shared.settings import Settings
@@ -85,19 +88,23 @@ class ExtractorWorker:
         name: str,
         *,
         only_worker: bool = False,
+        registry: CollectorRegistry | None = None,
     ) -> None:
-        """`only_worker`: no other can be of another release, so this one renews what is old."""
+        """`only_worker`: no other can be of another release, so this one renews what is old.
+        `registry`: of the process's figures."""
+        self._metrics = ExtractorMetrics(registry or CollectorRegistry())
         self._catalog = catalog
         self._store = store
         self._settings = settings
         self._heartbeat = Heartbeat(settings.heartbeat_file)
         self._name = name
         self._only_worker = only_worker
-        self._models = LoadedModels(store, settings, AddedModels(catalog, store, settings).load)
+        added = AddedModels(catalog, store, settings)
+        self._models = LoadedModels(store, settings, added.load, self._metrics.loaded)
         self._decoders = DecoderPool(settings)
         self._changes = ModelChanges(catalog, store, self._models, self._decoders, settings)
         self._comparisons = Comparisons(catalog, store, self._models, self._decoders, settings)
-        self._setbacks = Setbacks(catalog, settings.max_attempts)
+        self._setbacks = Setbacks(catalog, settings.max_attempts, self._metrics)
         # Two: a query's photo does not wait until those of the next batch are read.
         self._ahead = ThreadPoolExecutor(max_workers=2, thread_name_prefix="prepare")
         self._beside = ThreadPoolExecutor(max_workers=1, thread_name_prefix="queries")
@@ -141,9 +148,15 @@ class ExtractorWorker:
     def drain(self, stop: threading.Event, seconds: float = math.inf) -> DrainResult:
         """Work until nothing is claimable, `stop` is set, or `seconds` have passed."""
         result = DrainResult()
-        until = time.monotonic() + seconds
-        work: Work | None = None
         ahead = self._take(result)
+        if ahead is not None:
+            with self._metrics.draining():
+                self._drain(ahead, stop, time.monotonic() + seconds, result)
+        return result
+
+    def _drain(self, first: Work, stop: threading.Event, until: float, result: DrainResult) -> None:
+        work: Work | None = None
+        ahead: Work | None = first
         try:
             while ahead is not None:
                 if stop.is_set() or time.monotonic() > until:
@@ -168,7 +181,6 @@ class ExtractorWorker:
                 if unfinished is not None:
                     unfinished.lease.close()
             self._await_published(result)
-        return result
 
     def _go_on_with(self, work: Work, result: DrainResult, stop: threading.Event) -> None:
         if _has_to_be_alone(work):
@@ -224,6 +236,7 @@ class ExtractorWorker:
             )
         if not jobs:
             return None
+        self._metrics.claimed(JobKind(jobs[0].kind), len(jobs))
         result.claimed += len(jobs)
         result.maps.add(str(jobs[0].map_id))
         work = Work(jobs, contextlib.ExitStack(), None)
@@ -235,10 +248,11 @@ class ExtractorWorker:
         return work
 
     def _prepare(self, jobs: list[Job]) -> Batch | None:
-        target = find_target(self._catalog, self._store, self._models, jobs[0])
-        if target is None:
-            return None
-        return prepare(self._catalog, self._store, self._decoders, jobs, target)
+        with on_behalf_of(jobs, "prepare"):
+            target = find_target(self._catalog, self._store, self._models, jobs[0])
+            if target is None:
+                return None
+            return prepare(self._catalog, self._store, self._decoders, jobs, target)
 
     def _do(
         self, work: Work, result: DrainResult, company: int = 0, *, behind: bool = False
@@ -259,12 +273,14 @@ class ExtractorWorker:
 
     def _describe(self, work: Work, result: DrainResult, company: int) -> Rows | None:
         """A row for each of the batch's `ready`; None where there is nothing to publish."""
-        with self._setbacks.answered(work.jobs, result):
+        with on_behalf_of(work.jobs, "describe"), self._setbacks.answered(work.jobs, result):
             if work.batch is None:
                 started = time.perf_counter()
                 self._begin(work)
                 self._changes.slice(work.jobs[0])
-                result.seconds["model change"] += time.perf_counter() - started
+                took = time.perf_counter() - started
+                result.seconds["model change"] += took
+                self._metrics.stage("model change", took)
                 return None
             batch = work.batch.result()
             if batch is None:
@@ -272,17 +288,23 @@ class ExtractorWorker:
                 return None
             self._begin(work, company)
             if isinstance(batch, Prepared):
-                result.count(self._comparisons.finish(batch), batch.seconds)
+                self._count(work, result, self._comparisons.finish(batch), batch.seconds)
                 return None
             return describe(batch)
         return None  # what went wrong has been answered
 
     def _publish(self, work: Work, rows: Rows, result: DrainResult) -> None:
-        with self._setbacks.answered(work.jobs, result):
+        with on_behalf_of(work.jobs, "publish"), self._setbacks.answered(work.jobs, result):
             batch = work.batch.result() if work.batch else None
             assert isinstance(batch, Batch), "it was described"
             outcome = publish(self._catalog, self._store, batch, rows, self._settings.slot_rows)
-            result.count(outcome, batch.seconds)
+            self._count(work, result, outcome, batch.seconds)
+
+    def _count(
+        self, work: Work, result: DrainResult, outcome: Published, seconds: dict[str, float]
+    ) -> None:
+        result.count(outcome, seconds)
+        self._metrics.published(JobKind(work.jobs[0].kind), outcome, seconds)
 
     def _publish_behind(self, work: Work, rows: Rows) -> DrainResult:
         result = DrainResult()

@@ -12,6 +12,8 @@ from pydantic import Field
 from starlette.concurrency import run_in_threadpool
 
 from services.gateway.context import DEFAULT_MAP, Gateway, GatewayDep, JobId, MapName
+from services.gateway.key_check import READ, WRITE, caller_of
+from services.gateway.keys import Caller
 from services.gateway.once import Once, OnceFormDep, Replay
 from services.gateway.receive_batch import (
     ARCHIVE,
@@ -24,7 +26,7 @@ from services.gateway.receive_batch import (
     receive_batch,
     too_many_photos,
 )
-from services.gateway.room import ROOM_FOR_JOBS, Kind, RoomDep
+from services.gateway.room import ROOM_FOR_JOBS, ROOM_FOR_PHOTOS, Kind, RoomDep, max_photos
 from services.gateway.schemas import Answer, JobStarted, job_started, job_url
 from shared.catalog.maps import get_map
 from shared.errors import Conflict, PlacewiseError, Unprocessable, invalid_field
@@ -33,6 +35,7 @@ from shared.jobs import JobKind, JobState
 from shared.jobs.batches import BatchItem, BatchSource, list_batch, list_items, start_batch
 from shared.jobs.table import get_job
 from shared.objects.keys import is_key
+from shared.settings import Settings
 
 router = APIRouter(tags=["batches"])
 
@@ -105,7 +108,7 @@ class BatchItemsAnswer(Answer):
     status_code=202,
     response_model=BatchStarted,
     openapi_extra=BODY,
-    dependencies=[ROOM_FOR_JOBS],
+    dependencies=[WRITE, ROOM_FOR_PHOTOS, ROOM_FOR_JOBS],
 )
 async def upload_batch(
     request: Request,
@@ -122,14 +125,18 @@ async def upload_batch(
     """
     with room.receiving(Kind.UPLOAD):
         received = await receive_batch(request, gateway.store, gateway.settings)
-    started = await run_in_threadpool(_queue, gateway, map_name, received, once)
+    whose = _whose(caller_of(request), gateway.settings)
+    started = await run_in_threadpool(_queue, gateway, map_name, received, whose, once)
     response.headers["Location"] = started.status_url
     response.headers["Retry-After"] = "1"
     return started
 
 
 @router.get(
-    "/jobs/{job_id}/items", operation_id="list_batch_items", response_model=BatchItemsAnswer
+    "/jobs/{job_id}/items",
+    operation_id="list_batch_items",
+    response_model=BatchItemsAnswer,
+    dependencies=[READ],
 )
 def items(
     gateway: GatewayDep,
@@ -161,12 +168,15 @@ def _after(cursor: str | None) -> int:
     return int(cursor)
 
 
-def _queue(gateway: Gateway, map_name: str, received: ReceivedBatch, once: Once) -> BatchStarted:
+def _queue(
+    gateway: Gateway, map_name: str, received: ReceivedBatch, whose: dict[str, Any], once: Once
+) -> BatchStarted:
     try:
         once.begin(received.as_said())
         rows, source, params = _read(gateway, received)
         with gateway.catalog.write() as session:
-            job = start_batch(session, get_map(session, map_name).id, source, params)
+            map_id = get_map(session, map_name).id
+            job = start_batch(session, map_id, source, {**params, **whose})
             if source != BatchSource.ARCHIVE:
                 list_batch(session, job, rows)
             session.flush()
@@ -180,6 +190,14 @@ def _queue(gateway: Gateway, map_name: str, received: ReceivedBatch, once: Once)
         # Only what is certainly refused: after a lost connection the row may be committed.
         discard(gateway.store, received)
         raise
+
+
+def _whose(caller: Caller, settings: Settings) -> dict[str, Any]:
+    """What the steward has to know of the caller, as parameters of the job."""
+    if caller.key_id is None:
+        return {}
+    limited = max_photos(caller, settings)
+    return {"key_id": str(caller.key_id), "max_photos": limited[1] if limited else None}
 
 
 def _read(

@@ -8,6 +8,7 @@ from typing import Annotated
 from uuid import UUID
 
 from fastapi import Depends, Query, Request
+from prometheus_client import CollectorRegistry
 from pydantic import BeforeValidator
 
 from services.gateway.job_watch import JobWatch
@@ -34,6 +35,8 @@ class Gateway:
     search: SearchPort
     settings: Settings
     keys: Keys
+    registry: CollectorRegistry = field(default_factory=CollectorRegistry)
+    """Of the process's figures: in the embedded Placewise, of all of its parts."""
     started: float = field(default_factory=time.monotonic)
     job_watch: JobWatch = field(init=False)
 
@@ -80,6 +83,8 @@ FileId = Annotated[UUID, _known_shape("photo")]
 UploadId = Annotated[UUID, _known_shape("upload")]
 JobId = Annotated[UUID, _known_shape("job")]
 GenerationId = Annotated[UUID, _known_shape("generation")]
+KeyId = Annotated[UUID, _known_shape("key")]
+WebhookId = Annotated[UUID, _known_shape("webhook")]
 
 __all__ = [
     "API",
@@ -90,7 +95,9 @@ __all__ = [
     "GatewayDep",
     "GenerationId",
     "JobId",
+    "KeyId",
     "MapName",
     "UploadId",
+    "WebhookId",
     "read_cursor",
 ]

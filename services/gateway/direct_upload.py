@@ -32,9 +32,10 @@ from services.gateway.context import (
     MapName,
     UploadId,
 )
+from services.gateway.key_check import WRITE, caller_of
 from services.gateway.once import OnceDep, Replay
 from services.gateway.photos import PhotoPatch
-from services.gateway.room import ROOM_FOR_JOBS, Kind, RoomDep
+from services.gateway.room import ROOM_FOR_JOBS, ROOM_FOR_PHOTOS, Kind, RoomDep
 from services.gateway.schemas import Answer, UploadAnswer
 from services.gateway.upload import UPLOAD_ANSWERS, Said, answer_upload
 from shared.catalog.base import db_now_plus
@@ -87,10 +88,14 @@ class PresignAnswer(Answer):
     operation_id="presign_upload",
     status_code=201,
     response_model=PresignAnswer,
-    dependencies=[ROOM_FOR_JOBS],
+    dependencies=[WRITE, ROOM_FOR_PHOTOS, ROOM_FOR_JOBS],
 )
 def presign(
-    gateway: GatewayDep, wanted: PresignRequest, once: OnceDep, map_name: MapName = DEFAULT_MAP
+    request: Request,
+    gateway: GatewayDep,
+    wanted: PresignRequest,
+    once: OnceDep,
+    map_name: MapName = DEFAULT_MAP,
 ) -> PresignAnswer:
     """An address to which the photo's bytes can be sent without passing this server.
 
@@ -103,6 +108,7 @@ def presign(
         raise file_too_large(limit)
     said = wanted.said()
     _fields(said)  # what can't be understood is refused now, not after the bytes were sent
+    request.app.state.quotas.take_bytes(caller_of(request), wanted.file_size)
     upload_id = new_id()
     seconds = gateway.settings.presign_seconds
     put = store.presign_put(
@@ -141,7 +147,7 @@ def presign(
     status_code=202,
     response_model=UploadAnswer,
     responses=UPLOAD_ANSWERS,
-    dependencies=[ROOM_FOR_JOBS],
+    dependencies=[WRITE, ROOM_FOR_PHOTOS, ROOM_FOR_JOBS],
 )
 async def complete(
     request: Request,
@@ -155,7 +161,8 @@ async def complete(
     again, it answers the same again."""
     key = new_original_key()
     with room.receiving(Kind.UPLOAD):
-        stored = await run_in_threadpool(_complete, gateway, map_name, upload_id, key)
+        key_id = caller_of(request).key_id
+        stored = await run_in_threadpool(_complete, gateway, map_name, upload_id, key, key_id)
 
     def replace(said: Said) -> None:
         with gateway.catalog.write() as session:
@@ -166,7 +173,9 @@ async def complete(
     return await answer_upload(request, response, gateway, stored, key, replace)
 
 
-def _complete(gateway: Gateway, map_name: str, upload_id: UUID, key: str) -> Stored:
+def _complete(
+    gateway: Gateway, map_name: str, upload_id: UUID, key: str, key_id: UUID | None
+) -> Stored:
     """The photo, whose bytes lie under `key` unless the map had them. Raises Replay for an upload
     that was completed before."""
     store = _direct_store(gateway)
@@ -196,7 +205,7 @@ def _complete(gateway: Gateway, map_name: str, upload_id: UUID, key: str) -> Sto
         media_type = check_photo_begin(received.begin)
         with store.open(key) as file:
             header = read_photo_header(file, gateway.settings.max_image_pixels)
-        incoming = Incoming(received, media_type, header, _fields(upload.said))
+        incoming = Incoming(received, media_type, header, _fields(upload.said), key_id)
         stored = store_photo(gateway.catalog, gateway.hints, map_name, incoming, keep)
     except (PlacewiseError, Replay):
         store.delete(key)

@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from sqlalchemy.orm import Session
 
 from services.gateway.context import DEFAULT_MAP, GatewayDep, MapName, read_cursor
+from services.gateway.key_check import READ, WRITE
 from services.gateway.once import Once, OnceDep
 from services.gateway.room import ROOM_FOR_JOBS
 from services.gateway.schemas import Answer, JobStarted, started_job
@@ -72,7 +73,7 @@ class EvaluationsAnswer(Answer):
     operation_id="evaluate",
     status_code=202,
     response_model=JobStarted,
-    dependencies=[ROOM_FOR_JOBS],
+    dependencies=[WRITE, ROOM_FOR_JOBS],
 )
 def evaluate(
     gateway: GatewayDep,
@@ -93,7 +94,12 @@ def evaluate(
     return started_job(response, job)
 
 
-@router.get("/evaluations", operation_id="list_evaluations", response_model=EvaluationsAnswer)
+@router.get(
+    "/evaluations",
+    operation_id="list_evaluations",
+    response_model=EvaluationsAnswer,
+    dependencies=[READ],
+)
 def evaluations(
     gateway: GatewayDep,
     limit: Annotated[int, Query(ge=1, le=1000)] = 50,

@@ -9,6 +9,7 @@ from pydantic import Field
 from sqlalchemy import func, select
 
 from services.gateway.context import DEFAULT_MAP, GatewayDep, MapName
+from services.gateway.key_check import READ
 from services.gateway.schemas import Answer
 from shared.catalog.chunks import Chunk
 from shared.catalog.figures import figures_of
@@ -40,7 +41,12 @@ class StatsAnswer(Answer):
     counted_at: datetime = Field(description="when the figures were counted")
 
 
-@router.get("/database/stats", operation_id="database_stats", response_model=StatsAnswer)
+@router.get(
+    "/database/stats",
+    operation_id="database_stats",
+    response_model=StatsAnswer,
+    dependencies=[READ],
+)
 def stats(gateway: GatewayDep, map_name: MapName = DEFAULT_MAP) -> StatsAnswer:
     """Figures of one map; search times are those of the last seven days. Those of a map with more
     than 10,000 photos, jobs or searches may be as old as `counted_at` says."""

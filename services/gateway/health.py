@@ -11,6 +11,7 @@ from sqlalchemy import select
 from sqlalchemy.exc import SQLAlchemyError
 
 from services.gateway.context import Gateway, GatewayDep
+from services.gateway.key_check import READ
 from services.gateway.room import Kind, Room, RoomDep
 from services.gateway.schemas import Answer
 from shared.catalog.maps import Map
@@ -68,8 +69,6 @@ class HealthAnswer(Answer):
     load: LoadAnswer | None = Field(description="null while the catalog is away")
 
 
-@probes.head("/", include_in_schema=False)
-@probes.get("/", operation_id="service", response_model=ServiceAnswer)
 def service() -> ServiceAnswer:
     """What this is and where to look."""
     return ServiceAnswer(
@@ -101,8 +100,8 @@ def readyz(gateway: GatewayDep, response: Response) -> ProbeAnswer:
     return ProbeAnswer(status="ready" if ready else "not ready")
 
 
-@router.head("/health", include_in_schema=False)
-@router.get("/health", operation_id="health", response_model=HealthAnswer)
+@router.head("/health", include_in_schema=False, dependencies=[READ])
+@router.get("/health", operation_id="health", response_model=HealthAnswer, dependencies=[READ])
 def health(gateway: GatewayDep, room: RoomDep, response: Response) -> HealthAnswer:
     """The state of each part; 503 when one is away, or `degraded`: a part of it is away."""
     parts = _parts(gateway)

@@ -10,6 +10,7 @@ from fastapi import APIRouter, Query
 from pydantic import Field
 
 from services.gateway.context import DEFAULT_MAP, GatewayDep, MapName, read_cursor
+from services.gateway.key_check import READ
 from services.gateway.schemas import Answer
 from shared.catalog.maps import get_map
 from shared.catalog.searches import Search, list_searches
@@ -50,7 +51,9 @@ class SearchesAnswer(Answer):
     next_cursor: str | None
 
 
-@router.get("/searches", operation_id="list_searches", response_model=SearchesAnswer)
+@router.get(
+    "/searches", operation_id="list_searches", response_model=SearchesAnswer, dependencies=[READ]
+)
 def searches(
     gateway: GatewayDep,
     limit: Annotated[int, Query(ge=1, le=1000)] = 50,

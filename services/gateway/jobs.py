@@ -15,6 +15,7 @@ from sqlalchemy.orm import Session
 from starlette.concurrency import run_in_threadpool
 
 from services.gateway.context import DEFAULT_MAP, Gateway, GatewayDep, JobId, MapName, read_cursor
+from services.gateway.key_check import READ, WRITE
 from services.gateway.once import OnceDep
 from services.gateway.room import ROOM_FOR_JOBS
 from services.gateway.schemas import JobAnswer, JobsAnswer
@@ -36,7 +37,7 @@ AWAY_SECONDS = 1.0  # between two looks while the catalog is away
 HEARTBEAT_SECONDS = 15.0  # a comment line, so that proxies keep a silent stream open
 
 
-@router.get("/jobs", operation_id="list_jobs", response_model=JobsAnswer)
+@router.get("/jobs", operation_id="list_jobs", response_model=JobsAnswer, dependencies=[READ])
 def jobs(
     gateway: GatewayDep,
     state: Annotated[list[JobState] | None, Query()] = None,
@@ -57,7 +58,7 @@ def jobs(
     )
 
 
-@router.get("/jobs/{job_id}", operation_id="get_job", response_model=JobAnswer)
+@router.get("/jobs/{job_id}", operation_id="get_job", response_model=JobAnswer, dependencies=[READ])
 async def job(
     gateway: GatewayDep,
     job_id: JobId,
@@ -77,6 +78,7 @@ async def job(
     operation_id="job_events",
     response_class=StreamingResponse,
     responses={200: {"content": {"text/event-stream": {}}, "description": "`progress` events"}},
+    dependencies=[READ],
 )
 async def job_events(
     request: Request,
@@ -93,7 +95,12 @@ async def job_events(
     )
 
 
-@router.post("/jobs/{job_id}/cancel", operation_id="cancel_job", response_model=JobAnswer)
+@router.post(
+    "/jobs/{job_id}/cancel",
+    operation_id="cancel_job",
+    response_model=JobAnswer,
+    dependencies=[WRITE],
+)
 def cancel_job(
     gateway: GatewayDep, job_id: JobId, once: OnceDep, map_name: MapName = DEFAULT_MAP
 ) -> JobAnswer:
@@ -120,7 +127,7 @@ def cancel_job(
     "/jobs/{job_id}/retry",
     operation_id="retry_job",
     response_model=JobAnswer,
-    dependencies=[ROOM_FOR_JOBS],
+    dependencies=[WRITE, ROOM_FOR_JOBS],
 )
 def retry_job(
     gateway: GatewayDep, job_id: JobId, once: OnceDep, map_name: MapName = DEFAULT_MAP

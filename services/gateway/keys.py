@@ -1,30 +1,59 @@
-"""Who may call: by the key in `Authorization`, or, where there is none, from this machine."""
+"""Who calls, and what they may do: by the key in `Authorization`, or, embedded on loopback without
+keys, whoever is on this machine."""
 
 from __future__ import annotations
 
 import hmac
+import logging
 import re
+import time
+from collections.abc import Container
+from dataclasses import dataclass, field
 from typing import Protocol
 from urllib.parse import urlsplit
+from uuid import UUID
 
+from sqlalchemy.exc import SQLAlchemyError
+from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import Headers
 
-from shared.admin_key import hash_key, is_loopback
-from shared.errors import Forbidden, Misconfigured, Unauthorized
-from shared.settings import Settings
+from shared.api_keys import EVERYTHING, Scope, granted, hash_key, is_loopback
+from shared.catalog.away import as_unavailable
+from shared.catalog.keys import USE_NOTED_SECONDS, KeyLimits, find_key, note_use
+from shared.catalog.session import Catalog
+from shared.errors import Forbidden, Unauthorized
+
+log = logging.getLogger(__name__)
 
 # RFC 6750 in one line; a scheme's name is written in any case (RFC 9110).
 BEARER = re.compile(r"bearer +(?P<key>[!-~]+) *", re.IGNORECASE)
 HOW = "send the header `Authorization: Bearer KEY` (the commands: PLACEWISE_KEY=KEY)"
+USES_REMEMBERED = 10_000  # keys whose last use this process knows; above that it forgets all
+
+
+@dataclass(frozen=True, slots=True)
+class Caller:
+    """Whoever makes a call."""
+
+    who: str
+    """The same for the same key, and no secret."""
+    scopes: frozenset[Scope]
+    key_id: UUID | None = None
+    """None for keys that are no row of the catalog: ADMIN_KEY, and that of this user's commands."""
+    limits: KeyLimits = field(default=KeyLimits())
 
 
 class Keys(Protocol):
-    """Decides about every call before it reaches a route. Asked on the event loop: no waiting."""
+    """Decides about every call before it reaches a route."""
 
-    def check(self, headers: Headers) -> None:
-        """Raise Unauthorized (`key_missing`, `key_unknown`) unless `Authorization` holds a key, and
-        Forbidden (`foreign_page`) where none is asked for and a browser's page of elsewhere calls.
+    async def check(self, headers: Headers) -> Caller:
+        """Raise Unauthorized (`key_missing`, `key_unknown`, `key_revoked`, `key_expired`) unless
+        `Authorization` holds a key, Forbidden (`foreign_page`) where none is asked for and a
+        browser's page of elsewhere calls, and Unavailable while the catalog can't be asked.
         """
+
+    async def note_use(self, caller: Caller) -> None:
+        """Called once the call has been answered."""
 
 
 class NoKeys:
@@ -34,15 +63,24 @@ class NoKeys:
     to this machine, that name is in `Host`.
     """
 
-    def check(self, headers: Headers) -> None:
+    def __init__(self, trusted_origins: Container[str] = ()) -> None:
+        """`trusted_origins` (CORS_ORIGINS) name pages of elsewhere that may call."""
+        self._trusted = trusted_origins
+
+    async def check(self, headers: Headers) -> Caller:
         host = headers.get("host", "")
         origin = headers.get("origin", f"http://{host}")
-        if not is_loopback(_name(host)) or origin.partition("://")[2] != host:
+        ours = origin.partition("://")[2] == host or origin in self._trusted
+        if not is_loopback(_name(host)) or not ours:
             raise Forbidden(
                 "foreign_page",
                 "Without a key only calls to localhost are answered, and no page of elsewhere may "
                 "make them in a browser. Set ADMIN_KEY to let others in.",
             )
+        return Caller("this machine", EVERYTHING)
+
+    async def note_use(self, caller: Caller) -> None:
+        pass
 
 
 def _name(host: str) -> str:
@@ -53,18 +91,60 @@ def _name(host: str) -> str:
         return ""
 
 
-class KnownKeys:
-    """A few keys, each of which may do everything. Only their hashes are held."""
+class CatalogKeys:
+    """The catalog's keys, and a few beside them that may do everything (ADMIN_KEY).
 
-    def __init__(self, *sha256: str) -> None:
-        """`sha256` in hexadecimal, as `hash_key` makes it."""
-        self._known = sha256
+    The catalog is asked at each call: a revoked key opens nothing from that commit on, whichever
+    gateway is asked. Those beside it open also while the catalog is away.
+    """
 
-    def check(self, headers: Headers) -> None:
+    def __init__(self, catalog: Catalog, *admin_sha256: str) -> None:
+        """`admin_sha256` in hexadecimal, as `hash_key` makes it."""
+        self._catalog = catalog
+        self._admins = admin_sha256
+        self._noted: dict[UUID, float] = {}
+
+    async def check(self, headers: Headers) -> Caller:
         shown = hash_key(read_bearer(headers.get("authorization")))
         # In constant time: how long a refusal takes says nothing of how near a guess was.
-        if not any(hmac.compare_digest(shown, known) for known in self._known):
-            raise Unauthorized("key_unknown", f"This is not a key of this server: {HOW}.")
+        if any(hmac.compare_digest(shown, known) for known in self._admins):
+            return Caller("admin", EVERYTHING)
+        return await run_in_threadpool(self._find, shown)
+
+    def _find(self, sha256: str) -> Caller:
+        try:
+            with self._catalog.read() as session:
+                key = find_key(session, sha256)
+        except Unauthorized as error:
+            raise Unauthorized(error.code, f"{error.detail} To call: {HOW}.") from None
+        except SQLAlchemyError as error:
+            unavailable = as_unavailable(error)
+            if unavailable is None:
+                raise
+            raise unavailable from error
+        return Caller(
+            who=f"key {key.id}",
+            scopes=granted([Scope(scope) for scope in key.scopes]),
+            key_id=key.id,
+            limits=KeyLimits(key.requests_per_minute, key.upload_bytes_per_day, key.max_photos),
+        )
+
+    async def note_use(self, caller: Caller) -> None:
+        """`last_used_at`, at most once a minute for a key; no reason to fail a call."""
+        key_id, now = caller.key_id, time.monotonic()
+        if key_id is None or now - self._noted.get(key_id, -USE_NOTED_SECONDS) < USE_NOTED_SECONDS:
+            return
+        if len(self._noted) >= USES_REMEMBERED:
+            self._noted.clear()
+        self._noted[key_id] = now
+        try:
+            await run_in_threadpool(self._note, key_id)
+        except SQLAlchemyError as error:
+            log.warning("the use of the key %s was not noted: %s", key_id, error.__class__.__name__)
+
+    def _note(self, key_id: UUID) -> None:
+        with self._catalog.write() as session:
+            note_use(session, key_id)
 
 
 def read_bearer(authorization: str | None) -> str:
@@ -73,19 +153,3 @@ def read_bearer(authorization: str | None) -> str:
     if found is None:
         raise Unauthorized("key_missing", f"This server wants its key: {HOW}.")
     return found["key"]
-
-
-def keys_of(settings: Settings) -> Keys:
-    """The keys of a gateway that keeps nothing: ADMIN_KEY, or none on loopback.
-
-    Raises Misconfigured (`admin_key_missing`) beyond loopback without one.
-    """
-    if settings.admin_key is not None:
-        return KnownKeys(hash_key(settings.admin_key.get_secret_value()))
-    if is_loopback(settings.host):
-        return NoKeys()
-    raise Misconfigured(
-        "admin_key_missing",
-        f"HOST is {settings.host}: others can reach this address, and every call needs a key. Set "
-        "ADMIN_KEY; this makes one: openssl rand -hex 24",
-    )

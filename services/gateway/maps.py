@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 from sqlalchemy.orm import Session
 
 from services.gateway.context import DEFAULT_MAP, NO_NUL, GatewayDep
+from services.gateway.key_check import READ, WRITE
 from services.gateway.once import OnceDep
 from services.gateway.schemas import Answer
 from shared.catalog.added_models import check_model
@@ -79,14 +80,20 @@ class MapDeleted(Answer):
     deleted_map: str
 
 
-@router.get("/maps", operation_id="list_maps", response_model=list[MapAnswer])
+@router.get("/maps", operation_id="list_maps", response_model=list[MapAnswer], dependencies=[READ])
 def maps(gateway: GatewayDep) -> list[MapAnswer]:
     """Every map, by name."""
     with gateway.catalog.read() as session:
         return [_answer(session, map_) for map_ in list_maps(session)]
 
 
-@router.post("/maps", operation_id="create_map", status_code=201, response_model=MapAnswer)
+@router.post(
+    "/maps",
+    operation_id="create_map",
+    status_code=201,
+    response_model=MapAnswer,
+    dependencies=[WRITE],
+)
 def new_map(gateway: GatewayDep, wanted: NewMap, once: OnceDep) -> MapAnswer:
     """Make an empty map; 409 when the name is taken."""
     settings = gateway.settings
@@ -101,14 +108,16 @@ def new_map(gateway: GatewayDep, wanted: NewMap, once: OnceDep) -> MapAnswer:
     return answer
 
 
-@router.get("/maps/{name}", operation_id="get_map", response_model=MapAnswer)
+@router.get("/maps/{name}", operation_id="get_map", response_model=MapAnswer, dependencies=[READ])
 def one_map(gateway: GatewayDep, name: MapPath) -> MapAnswer:
     """One map."""
     with gateway.catalog.read() as session:
         return _answer(session, get_map(session, name))
 
 
-@router.delete("/maps/{name}", operation_id="delete_map", response_model=MapDeleted)
+@router.delete(
+    "/maps/{name}", operation_id="delete_map", response_model=MapDeleted, dependencies=[WRITE]
+)
 def delete_map(gateway: GatewayDep, name: MapPath) -> MapDeleted:
     """Gone with all its photos at once; its bytes follow. `default` is made anew, empty."""
 

@@ -11,6 +11,7 @@ from sqlalchemy.orm import Session
 from starlette.concurrency import run_in_threadpool
 
 from services.gateway.context import DEFAULT_MAP, NO_NUL, Gateway, GatewayDep, MapName
+from services.gateway.key_check import READ, WRITE
 from services.gateway.once import Once, OnceDep, OnceFormDep
 from services.gateway.receive import describe_form, receive_file
 from services.gateway.room import ROOM_FOR_JOBS, Kind, RoomDep
@@ -85,7 +86,7 @@ class SwitchRequest(BaseModel):
     operation_id="fit_vocabulary",
     status_code=202,
     response_model=JobStarted,
-    dependencies=[ROOM_FOR_JOBS],
+    dependencies=[WRITE, ROOM_FOR_JOBS],
 )
 def fit_vocabulary(
     gateway: GatewayDep,
@@ -118,7 +119,7 @@ def fit_vocabulary(
         "a `.npz` file of `placewise vocabulary fit DIR`, or a `.npy` file of "
         "(clusters, dimension) floats"
     ),
-    dependencies=[ROOM_FOR_JOBS],
+    dependencies=[WRITE, ROOM_FOR_JOBS],
 )
 async def import_vocabulary(
     request: Request,
@@ -150,6 +151,7 @@ async def import_vocabulary(
     "/vocabularies",
     operation_id="list_vocabularies",
     response_model=list[VocabularyAnswer],
+    dependencies=[READ],
 )
 def vocabularies(gateway: GatewayDep, map_name: MapName = DEFAULT_MAP) -> list[VocabularyAnswer]:
     """The map's vocabularies, newest first, with their provenance."""
@@ -170,6 +172,7 @@ def vocabularies(gateway: GatewayDep, map_name: MapName = DEFAULT_MAP) -> list[V
             }
         }
     },
+    dependencies=[READ],
 )
 def vocabulary_file(
     gateway: GatewayDep,
@@ -195,6 +198,7 @@ def vocabulary_file(
     "/generations",
     operation_id="list_generations",
     response_model=list[GenerationAnswer],
+    dependencies=[READ],
 )
 def generations(gateway: GatewayDep, map_name: MapName = DEFAULT_MAP) -> list[GenerationAnswer]:
     """The map's generations, newest first."""
@@ -210,7 +214,7 @@ def generations(gateway: GatewayDep, map_name: MapName = DEFAULT_MAP) -> list[Ge
     operation_id="start_generation",
     status_code=202,
     response_model=JobStarted,
-    dependencies=[ROOM_FOR_JOBS],
+    dependencies=[WRITE, ROOM_FOR_JOBS],
 )
 def start_generation(
     gateway: GatewayDep,

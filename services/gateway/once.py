@@ -30,6 +30,7 @@ from sqlalchemy.orm import Session
 from starlette.concurrency import run_in_threadpool
 
 from services.gateway.context import DEFAULT_MAP, Gateway, GatewayDep
+from services.gateway.key_check import caller_of
 from services.gateway.schemas import job_started
 from shared.catalog.idempotency import (
     CallMade,
@@ -198,8 +199,8 @@ async def once_of_body(request: Request, once: Annotated[Once, Depends(once_of_f
 
 
 def _scope(request: Request) -> str:
-    """Whose key it is: the caller's, in one map. Hashed, for the caller is known by a secret."""
-    whose = [request.headers.get("authorization"), request.query_params.get("map", DEFAULT_MAP)]
+    """Whose key it is: the caller's, in one map."""
+    whose = [caller_of(request).who, request.query_params.get("map", DEFAULT_MAP)]
     return hashlib.sha256(json.dumps(whose).encode()).hexdigest()
 
 

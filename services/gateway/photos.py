@@ -18,6 +18,7 @@ from sqlalchemy.orm import Session
 
 from services.gateway.context import DEFAULT_MAP, NO_NUL, FileId, GatewayDep, MapName
 from services.gateway.filters import FilterDep
+from services.gateway.key_check import READ, WRITE
 from services.gateway.schemas import (
     DeleteAnswer,
     MetadataAnswer,
@@ -48,7 +49,12 @@ PICTURE: dict[int | str, dict[str, Any]] = {
 }
 
 
-@router.get("/uploads/{file_id}", operation_id="get_photo", response_model=OnePhotoAnswer)
+@router.get(
+    "/uploads/{file_id}",
+    operation_id="get_photo",
+    response_model=OnePhotoAnswer,
+    dependencies=[READ],
+)
 def photo(gateway: GatewayDep, file_id: FileId, map_name: MapName = DEFAULT_MAP) -> OnePhotoAnswer:
     """What is known of one photo."""
     with gateway.catalog.read() as session:
@@ -88,7 +94,12 @@ class PhotoPatch(BaseModel):
         return said
 
 
-@router.patch("/uploads/{file_id}", operation_id="patch_photo", response_model=OnePhotoAnswer)
+@router.patch(
+    "/uploads/{file_id}",
+    operation_id="patch_photo",
+    response_model=OnePhotoAnswer,
+    dependencies=[WRITE],
+)
 def patch_photo(
     gateway: GatewayDep,
     file_id: FileId,
@@ -108,7 +119,12 @@ def patch_photo(
         return _one(session, found)
 
 
-@router.delete("/uploads/{file_id}", operation_id="delete_photo", response_model=DeleteAnswer)
+@router.delete(
+    "/uploads/{file_id}",
+    operation_id="delete_photo",
+    response_model=DeleteAnswer,
+    dependencies=[WRITE],
+)
 def delete_photo(
     gateway: GatewayDep, file_id: FileId, map_name: MapName = DEFAULT_MAP
 ) -> DeleteAnswer:
@@ -130,6 +146,7 @@ def delete_photo(
     operation_id="get_image",
     response_class=Response,
     responses=PICTURE,
+    dependencies=[READ],
 )
 def image(
     request: Request,
@@ -150,7 +167,7 @@ def image(
             "Content-Length": str(found.size_bytes),
             "Content-Disposition": f"inline; filename*=UTF-8''{quote(found.filename)}",
             "ETag": etag,
-            "X-Content-Type-Options": "nosniff",
+            "Cache-Control": "private, no-cache",  # kept by this browser, and asked for each time
         },
     )
 
@@ -160,6 +177,7 @@ def image(
     operation_id="get_thumbnail",
     response_class=Response,
     responses=PICTURE,
+    dependencies=[READ],
 )
 def thumbnail(gateway: GatewayDep, file_id: FileId, map_name: MapName = DEFAULT_MAP) -> Response:
     """A small JPEG without any metadata; it is there once the photo has been described."""
@@ -172,10 +190,12 @@ def thumbnail(gateway: GatewayDep, file_id: FileId, map_name: MapName = DEFAULT_
             "thumbnail_not_found",
             "The photo has no thumbnail yet: it is not described.",
         ) from None
-    return Response(data, media_type="image/jpeg", headers={"X-Content-Type-Options": "nosniff"})
+    return Response(data, media_type="image/jpeg")
 
 
-@router.get("/search", operation_id="search_metadata", response_model=MetadataAnswer)
+@router.get(
+    "/search", operation_id="search_metadata", response_model=MetadataAnswer, dependencies=[READ]
+)
 def search(
     gateway: GatewayDep,
     photos: FilterDep,

@@ -20,10 +20,13 @@ from collections.abc import Iterator
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
+from uuid import UUID
 
 from fastapi import Depends, Request
 
-from services.gateway.context import DEFAULT_MAP, MapName
+from services.gateway.context import DEFAULT_MAP, GatewayDep, MapName
+from services.gateway.key_check import caller_of
+from services.gateway.keys import Caller
 from shared.catalog.session import Catalog
 from shared.errors import StorageFull, TooManyRequests
 from shared.jobs.waiting import Waiting, look_at_queue
@@ -161,6 +164,19 @@ def _room_for_queries(room: RoomDep) -> None:
     room.take_query()
 
 
+def _room_for_photos(request: Request, gateway: GatewayDep) -> None:
+    limited = max_photos(caller_of(request), gateway.settings)
+    if limited is not None:
+        request.app.state.photo_quota.take(*limited)
+
+
+def max_photos(caller: Caller, settings: Settings) -> tuple[UUID, int] | None:
+    """The caller's key, and how many photos may be stored through it; None for any number."""
+    most = caller.limits.max_photos or settings.key_max_photos
+    return None if caller.key_id is None or most is None else (caller.key_id, most)
+
+
+ROOM_FOR_PHOTOS = Depends(_room_for_photos)
 ROOM_FOR_JOBS = Depends(_room_for_jobs)
 ROOM_FOR_QUERIES = Depends(_room_for_queries)
 

@@ -209,6 +209,9 @@ class JobAnswer(Answer):
     finished_at: datetime | None
     status_url: str
     result_url: str | None
+    request_id: str | None = Field(
+        description="`X-Request-ID` of the call that made it; logs of every service carry it"
+    )
 
     @classmethod
     def of(cls, job: Job) -> JobAnswer:
@@ -234,6 +237,7 @@ class JobAnswer(Answer):
             finished_at=job.finished_at,
             status_url=job_url(job.id),
             result_url=f"{job_url(job.id)}/result" if query else None,
+            request_id=job.request_id,
         )
 
 

@@ -26,6 +26,7 @@ from services.gateway.context import (
     MapName,
 )
 from services.gateway.find_similar import find_similar, query_by_job, query_by_photo
+from services.gateway.key_check import READ
 from services.gateway.once import Once, OnceFormDep
 from services.gateway.receive import describe_form, receive_file
 from services.gateway.room import ROOM_FOR_QUERIES, Kind, RoomDep
@@ -64,6 +65,7 @@ OF_STATUS = {kind.status: kind for kind in (NotFound, Conflict, Gone)}
     operation_id="similar_to_stored",
     response_model=SimilarityAnswer,
     responses=BEING_COMPARED,
+    dependencies=[READ],
 )
 async def similar_to_stored(
     request: Request,
@@ -104,7 +106,7 @@ async def similar_to_stored(
     response_model=SimilarityAnswer,
     responses={202: {"model": JobStarted, "description": "Being described; poll, then fetch."}},
     openapi_extra=describe_form("the photo to ask with"),
-    dependencies=[ROOM_FOR_QUERIES],
+    dependencies=[READ, ROOM_FOR_QUERIES],
 )
 async def similar_to_upload(
     request: Request,
@@ -142,6 +144,7 @@ async def similar_to_upload(
     operation_id="similarity_result",
     response_model=SimilarityAnswer,
     responses=BEING_COMPARED,
+    dependencies=[READ],
 )
 async def similarity_result(
     response: Response, gateway: GatewayDep, job_id: JobId, map_name: MapName = DEFAULT_MAP

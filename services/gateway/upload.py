@@ -5,15 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
+from uuid import UUID
 
 from fastapi import APIRouter, Request, Response
 from sqlalchemy.orm import Session
 from starlette.concurrency import run_in_threadpool
 
 from services.gateway.context import DEFAULT_MAP, Gateway, GatewayDep, MapName
+from services.gateway.key_check import WRITE, caller_of
 from services.gateway.once import OnceFormDep
 from services.gateway.receive import describe_form, receive_file
-from services.gateway.room import ROOM_FOR_JOBS, Kind, RoomDep
+from services.gateway.room import ROOM_FOR_JOBS, ROOM_FOR_PHOTOS, Kind, RoomDep
 from services.gateway.schemas import UploadAnswer, job_url
 from services.gateway.waiting import preferred_wait, wait_for_job
 from shared.catalog.photos import PhotoRole
@@ -57,7 +59,7 @@ UPLOAD_ANSWERS: dict[int | str, dict[str, Any]] = {
     response_model=UploadAnswer,
     responses=UPLOAD_ANSWERS,
     openapi_extra=FORM,
-    dependencies=[ROOM_FOR_JOBS],
+    dependencies=[WRITE, ROOM_FOR_PHOTOS, ROOM_FOR_JOBS],
 )
 async def upload(
     request: Request,
@@ -87,7 +89,8 @@ async def upload(
         once.keep(session, said.status, said.answer, said.headers)
         return stored
 
-    stored = await run_in_threadpool(_store, gateway, map_name, received, keep)
+    key_id = caller_of(request).key_id
+    stored = await run_in_threadpool(_store, gateway, map_name, received, key_id, keep)
 
     def replace(said: Said) -> None:
         once.replace(said.status, said.answer, said.headers)
@@ -151,10 +154,12 @@ async def answer_upload(
     return said.answer
 
 
-def _store(gateway: Gateway, map_name: str, received: Received, keep: Keep) -> Stored:
+def _store(
+    gateway: Gateway, map_name: str, received: Received, key_id: UUID | None, keep: Keep
+) -> Stored:
     """Check what came and acknowledge it; whatever is not kept leaves no bytes behind."""
     try:
-        incoming = examine(gateway.store, received, gateway.settings.max_image_pixels)
+        incoming = examine(gateway.store, received, gateway.settings.max_image_pixels, key_id)
         stored = store_photo(gateway.catalog, gateway.hints, map_name, incoming, keep)
     except PlacewiseError:
         # Only what is certainly refused: after a lost connection the row may be committed.

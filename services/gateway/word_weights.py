@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from services.gateway.context import DEFAULT_MAP, GatewayDep, GenerationId, MapName
 from services.gateway.evaluations import queue_asking
+from services.gateway.key_check import READ, WRITE
 from services.gateway.once import OnceDep
 from services.gateway.room import ROOM_FOR_JOBS
 from services.gateway.schemas import Answer, JobStarted, started_job
@@ -67,7 +68,7 @@ GenerationInPath = Annotated[GenerationId, PathParameter(description="of the map
     operation_id="learn_word_weights",
     status_code=202,
     response_model=JobStarted,
-    dependencies=[ROOM_FOR_JOBS],
+    dependencies=[WRITE, ROOM_FOR_JOBS],
 )
 def learn_word_weights(
     gateway: GatewayDep,
@@ -100,6 +101,7 @@ def learn_word_weights(
     "/generations/{generation_id}/word-weights",
     operation_id="read_word_weights",
     response_model=WordWeightsAnswer,
+    dependencies=[READ],
 )
 def read_word_weights(
     gateway: GatewayDep, generation_id: GenerationInPath, map_name: MapName = DEFAULT_MAP

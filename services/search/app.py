@@ -6,17 +6,18 @@ where only they can reach it.
 
 from __future__ import annotations
 
-import time
 from uuid import UUID
 
 from fastapi import FastAPI, Response
+from prometheus_client import CollectorRegistry
 from pydantic import BaseModel
 
+from services.call_log import CallLog
 from services.search.metrics import SearchMetrics
 from services.search.worker import SearchWorker
-from shared.errors import PlacewiseError
 from shared.problems import PROBLEM_RESPONSES, install_problem_handlers
 from shared.search_protocol import Lag, SearchRequest, SearchResponse, SearchStatus
+from shared.telemetry.metrics_server import CONTENT_TYPE
 
 # Several looks at the catalog were missed, or loading takes that long.
 READY_LAG_SECONDS = 5.0
@@ -32,7 +33,7 @@ class Readiness(BaseModel):
     missing: list[str]
 
 
-def create_app(worker: SearchWorker) -> FastAPI:
+def create_app(worker: SearchWorker, registry: CollectorRegistry | None = None) -> FastAPI:
     """The HTTP form of one worker, which someone else makes follow the catalog."""
     app = FastAPI(
         title="Placewise search",
@@ -40,20 +41,14 @@ def create_app(worker: SearchWorker) -> FastAPI:
         responses=PROBLEM_RESPONSES,
     )
     install_problem_handlers(app)
-    metrics = SearchMetrics(worker)
+    metrics = SearchMetrics(worker, registry)
+    app.add_middleware(CallLog, quiet=True)
 
     @app.post("/search", operation_id="search", response_model=SearchResponse)
     def search(request: SearchRequest) -> Response:
         """The rows of this shard that are most similar to the one that is referred to."""
-        started = time.perf_counter()
-        try:
-            answer = worker.search(request)
-        except PlacewiseError as error:
-            metrics.refused(error.code)
-            raise
-        metrics.answered(answer, time.perf_counter() - started)
         # Written here: the framework would check again what was built a moment ago.
-        return Response(answer.as_json(), media_type="application/json")
+        return Response(metrics.search(request).as_json(), media_type="application/json")
 
     # On the event loop, as the probes are: it has to answer while every thread is searching.
     @app.get("/status", operation_id="status", response_model=SearchStatus)
@@ -76,7 +71,7 @@ def create_app(worker: SearchWorker) -> FastAPI:
     @app.get("/metrics", operation_id="metrics", response_class=Response)
     async def read_metrics() -> Response:
         """Prometheus' text format."""
-        return Response(metrics.text(), media_type="text/plain; version=0.0.4; charset=utf-8")
+        return Response(metrics.text(), media_type=CONTENT_TYPE)
 
     return app
 

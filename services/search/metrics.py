@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterable
 
 from prometheus_client import CollectorRegistry, Counter, Histogram, generate_latest
@@ -10,7 +11,9 @@ from prometheus_client.metrics_core import Metric
 from prometheus_client.registry import Collector
 
 from services.search.worker import SearchWorker
-from shared.search_protocol import SearchResponse
+from shared.errors import PlacewiseError
+from shared.search_protocol import SearchRequest, SearchResponse, SearchStatus
+from shared.telemetry.traces import span
 
 # From a small map in memory to a scan of a full shard, and to the longest wait for a version.
 SECONDS = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0)
@@ -20,10 +23,14 @@ DEVIATIONS = (1.0, 2.0, 3.0, 4.0, 5.0, 5.5)
 
 
 class SearchMetrics:
-    """One worker's figures, in a registry of their own: tests run several workers at once."""
+    """One worker's figures, and the search port on which they are counted.
 
-    def __init__(self, worker: SearchWorker) -> None:
-        self._registry = CollectorRegistry()
+    Unless `registry` is given, they are in one of their own: tests run several workers at once.
+    """
+
+    def __init__(self, worker: SearchWorker, registry: CollectorRegistry | None = None) -> None:
+        self._worker = worker
+        self._registry = registry or CollectorRegistry()
         self._searches = Counter(
             "placewise_search_searches",
             "Searches by what became of them: answered, or the code of the refusal.",
@@ -60,7 +67,22 @@ class SearchMetrics:
         )
         self._registry.register(_Snapshots(worker))
 
-    def answered(self, response: SearchResponse, seconds: float) -> None:
+    def search(self, request: SearchRequest) -> SearchResponse:
+        """The worker's answer, counted."""
+        started = time.perf_counter()
+        try:
+            with span("search", shard=str(self._worker.shard), k=request.k):
+                response = self._worker.search(request)
+        except PlacewiseError as error:
+            self._searches.labels(error.code).inc()
+            raise
+        self._count(response, time.perf_counter() - started)
+        return response
+
+    def status(self) -> SearchStatus:
+        return self._worker.status()
+
+    def _count(self, response: SearchResponse, seconds: float) -> None:
         self._searches.labels("answered").inc()
         self._seconds.observe(seconds)
         self._rows.inc(response.rows_scanned)
@@ -68,9 +90,6 @@ class SearchMetrics:
         self._certificates.labels(response.certificate).inc()
         if response.max_z is not None:
             self._deviations.observe(response.max_z)
-
-    def refused(self, code: str) -> None:
-        self._searches.labels(code).inc()
 
     def text(self) -> bytes:
         """Prometheus' text format."""

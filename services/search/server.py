@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import uvicorn
+from prometheus_client import CollectorRegistry
 
 from services.http_server import http_server, listening, stopped_by_signals, url_of
 from services.parts import start_part
@@ -19,6 +20,7 @@ from shared.catalog.session import Catalog
 from shared.errors import Misconfigured
 from shared.objects import ObjectStore
 from shared.settings import Settings
+from shared.telemetry.metrics_server import serving_metrics
 
 
 @dataclass(slots=True)
@@ -52,10 +54,11 @@ def search_service(
     register. Raises Misconfigured (`address_in_use`)."""
     with listening(settings.host, settings.port) as listener:
         host, port = listener.getsockname()[:2]
+        registry = CollectorRegistry()
         worker = SearchWorker(catalog, store, settings, settings.shard)
         url = url_of(host, port)
         presence = Presence(catalog, worker, f"{socket.gethostname()}:{port}", url)
-        server = http_server(create_app(worker), access_log=settings.debug)
+        server = http_server(create_app(worker, registry))
         running = SearchService(url, worker, server, listener, threading.Event())
         stop = threading.Event()
         parts = [
@@ -67,7 +70,8 @@ def search_service(
             )
         ]
         try:
-            yield running
+            with serving_metrics(settings, registry):
+                yield running
         finally:
             stop.set()
             for part in parts:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from datetime import timedelta
 from uuid import UUID
 
@@ -48,6 +48,7 @@ from shared.objects.keys import (
     local_features_prefix,
     thumbnail_key,
 )
+from shared.objects.port import ObjectInfo
 from shared.settings import Settings
 
 log = logging.getLogger(__name__)
@@ -257,24 +258,28 @@ def collect_brought(catalog: Catalog, store: ObjectStore, prefix: str, kind: Job
 
 
 def collect_orphans(catalog: Catalog, store: ObjectStore, age_seconds: float) -> int:
+    """Remove objects older than `age_seconds` that no row knows; how many."""
+    removed = 0
+    for info in orphans(catalog, store, age_seconds):
+        store.delete(info.key)
+        removed += 1
+    if removed:
+        log.info("%d orphaned objects removed", removed)
+    return removed
+
+
+def orphans(catalog: Catalog, store: ObjectStore, age_seconds: float) -> Iterator[ObjectInfo]:
     """Objects older than `age_seconds` that no row knows: crashes between object and commit."""
     with catalog.read() as session:
         now = session.execute(select(db_now())).scalar_one()
     before = now - timedelta(seconds=age_seconds)
-    removed = 0
     for prefix, referenced in REFERENCED.items():
-        old = [info.key for info in store.list(prefix) if info.modified_at < before]
+        old = [info for info in store.list(prefix) if info.modified_at < before]
         for begin in range(0, len(old), AT_ONCE):
-            keys = old[begin : begin + AT_ONCE]
+            some = old[begin : begin + AT_ONCE]
             with catalog.read() as session:
-                known = set(referenced(session, keys))
-            for key in keys:
-                if key not in known:
-                    store.delete(key)
-                    removed += 1
-    if removed:
-        log.info("%d orphaned objects removed", removed)
-    return removed
+                known = set(referenced(session, [info.key for info in some]))
+            yield from (info for info in some if info.key not in known)
 
 
 def collect(catalog: Catalog, store: ObjectStore, settings: Settings) -> None:

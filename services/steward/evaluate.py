@@ -11,10 +11,12 @@ import threading
 from typing import Any
 from uuid import UUID
 
+from prometheus_client import CollectorRegistry
 from sqlalchemy.orm import Session
 
 from services.steward.asked import Asked
 from services.steward.measure import Measure
+from services.steward.metrics import StewardMetrics
 from services.steward.take import Taker
 from services.steward.word_weights import LearnWords
 from shared.catalog.chunks import count_searchable
@@ -44,13 +46,15 @@ class Evaluator:
         search: SearchPort,
         settings: Settings,
         name: str,
+        metrics: StewardMetrics | None = None,
     ) -> None:
         self._catalog = catalog
         self._store = store
         self._search = search
         self._settings = settings
         kinds = (JobKind.EVALUATE, JobKind.WORD_WEIGHTS)
-        self._taker = Taker(catalog, settings, name, kinds)
+        counted = metrics or StewardMetrics(CollectorRegistry())
+        self._taker = Taker(catalog, settings, name, kinds, counted)
 
     def run(self, stop: threading.Event) -> None:
         """Take jobs until `stop` is set."""

@@ -8,16 +8,24 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+from prometheus_client import CollectorRegistry
 from sqlalchemy.exc import SQLAlchemyError
 
 from services.steward.auto_evaluate import evaluate_changed_maps
 from services.steward.collect import collect, collect_orphans
 from services.steward.compact import compact
 from services.steward.count_maps import count_large_maps
+from services.steward.counted_store import CountedStore
 from services.steward.delete_maps import delete_maps
+from services.steward.metrics import StewardMetrics
 from services.steward.model_changes import advance_model_changes, fit_maps_that_wait
 from services.steward.queue import free_leases, resend_hints
-from services.steward.retention import forget_old_jobs, forget_old_keys, forget_old_searches
+from services.steward.retention import (
+    forget_old_deliveries,
+    forget_old_jobs,
+    forget_old_keys,
+    forget_old_searches,
+)
 from services.steward.search_workers import remove_dead_workers
 from shared.catalog.away import Outage
 from shared.catalog.session import Catalog
@@ -43,13 +51,29 @@ class Steward:
     """Does each duty when it is due. A duty that fails is logged and tried again next time."""
 
     def __init__(
-        self, catalog: Catalog, store: ObjectStore, hints: Hints, settings: Settings
+        self,
+        catalog: Catalog,
+        store: ObjectStore,
+        hints: Hints,
+        settings: Settings,
+        metrics: StewardMetrics | None = None,
     ) -> None:
+        self._metrics = metrics = metrics or StewardMetrics(CollectorRegistry())
         self._outage = Outage("steward")
         self._heartbeat = Heartbeat(settings.heartbeat_file)
+
+        def counted(duty: str) -> CountedStore:
+            return CountedStore(store, metrics.objects_deleted.labels(duty).inc)
+
         self.duties = [
-            Duty("free leases", 1.0, lambda: free_leases(catalog, settings.max_attempts)),
-            Duty("resend hints", 2.0, lambda: resend_hints(catalog, hints)),
+            Duty(
+                "free leases",
+                1.0,
+                lambda: metrics.leases_expired.inc(free_leases(catalog, settings.max_attempts)),
+            ),
+            Duty(
+                "resend hints", 2.0, lambda: metrics.hints_resent.inc(resend_hints(catalog, hints))
+            ),
             Duty(
                 "advance model changes",
                 0.5,
@@ -62,9 +86,13 @@ class Steward:
                 lambda: fit_maps_that_wait(catalog, hints, settings.auto_fit_photos),
             ),
             Duty("count large maps", 10.0, lambda: count_large_maps(catalog)),
-            Duty("compact", 5.0, lambda: compact(catalog, store, settings.compact_chunks)),
-            Duty("delete maps", 1.0, lambda: delete_maps(catalog, store)),
-            Duty("collect", 10.0, lambda: collect(catalog, store, settings)),
+            Duty(
+                "compact",
+                5.0,
+                lambda: metrics.slots_merged.inc(compact(catalog, store, settings.compact_chunks)),
+            ),
+            Duty("delete maps", 1.0, lambda: delete_maps(catalog, counted("delete_maps"))),
+            Duty("collect", 10.0, lambda: collect(catalog, counted("collect"), settings)),
             Duty(
                 "forget old jobs",
                 10.0,
@@ -74,6 +102,11 @@ class Steward:
                 "forget old searches",
                 10.0,
                 lambda: forget_old_searches(catalog, settings.search_history_days),
+            ),
+            Duty(
+                "forget old deliveries",
+                10.0,
+                lambda: forget_old_deliveries(catalog, settings.job_retention_days),
             ),
             Duty("forget old keys", 10.0, lambda: forget_old_keys(catalog)),
             Duty(
@@ -86,7 +119,9 @@ class Steward:
             Duty(
                 "collect orphans",
                 3600.0,
-                lambda: collect_orphans(catalog, store, settings.orphan_age_seconds),
+                lambda: collect_orphans(
+                    catalog, counted("collect_orphans"), settings.orphan_age_seconds
+                ),
             ),
         ]
 
@@ -100,15 +135,19 @@ class Steward:
             stop.wait(TICK_SECONDS)
 
     def _do(self, duty: Duty) -> None:
+        started, outcome = time.monotonic(), "done"
         try:
             duty.do()
             self._outage.over()
         except SQLAlchemyError as error:
+            outcome = "catalog_away"
             self._outage.met(error)
         except Exception:  # one duty's trouble must not end the others
+            outcome = "failed"
             log.exception(
                 "the steward could not %s; next try in %g s",
                 duty.name,
                 duty.every_seconds,
             )
+        self._metrics.duty(duty.name, outcome, time.monotonic() - started)
         duty.due = time.monotonic() + duty.every_seconds

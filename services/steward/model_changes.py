@@ -26,6 +26,7 @@ from shared.catalog.generations import (
 from shared.catalog.maps import Map, bump_version, list_maps, lock_map
 from shared.catalog.photos import Photo, PhotoRole
 from shared.catalog.session import Catalog
+from shared.catalog.webhooks import EventKind, announce
 from shared.catalog.whitenings import StoredWhitening
 from shared.errors import Conflict
 from shared.ids import new_id
@@ -191,7 +192,18 @@ def _switch(session: Session, generation: Generation) -> None:
     session.flush()  # one generation of a map may be active at a time, also inside a transaction
     generation.state = GenerationState.ACTIVE
     generation.activated_at = db_now()
-    session.get_one(Map, generation.map_id).extractor = generation.extractor
+    map_ = session.get_one(Map, generation.map_id)
+    map_.extractor = generation.extractor
+    announce(
+        session,
+        EventKind.GENERATION_SWITCHED,
+        {
+            "map": map_.name,
+            "generation_id": str(generation.id),
+            "replaced_generation_id": str(active.id),
+            "extractor": generation.extractor,
+        },
+    )
     reindex = (Job.kind == JobKind.REINDEX) & (Job.generation_id == generation.id)
     # A photo that could not be described anew says so through its own job from now on.
     failed = select(Job.photo_id, Job.id).where(reindex, Job.state == JobState.FAILED)

@@ -23,8 +23,10 @@ def free_leases(catalog: Catalog, max_attempts: int, *, everyone: bool = False) 
     return freed
 
 
-def resend_hints(catalog: Catalog, hints: Hints) -> None:
-    """Wake a worker when there is work: the hint that was sent with it may be lost."""
+def resend_hints(catalog: Catalog, hints: Hints) -> int:
+    """Wake a worker when there is work: the hint that was sent with it may be lost. Returns how
+    many hints were sent."""
+    sent = 0
     with catalog.read() as session:
         for lane, condition in (
             (Lane.QUERY, Job.priority >= Priority.QUERY),
@@ -32,3 +34,5 @@ def resend_hints(catalog: Catalog, hints: Hints) -> None:
         ):
             if session.scalar(select(exists(select(Job.id).where(claimable(), condition)))):
                 hints.send(lane)
+                sent += 1
+    return sent

@@ -1,4 +1,5 @@
-"""What is kept for a while only: finished jobs, the history of searches, idempotency keys."""
+"""What is kept for a while only: finished jobs, the history of searches, the
+log of webhooks, idempotency keys."""
 
 from __future__ import annotations
 
@@ -9,6 +10,7 @@ from shared.catalog.idempotency import KeyedCall
 from shared.catalog.photos import Photo
 from shared.catalog.searches import Search
 from shared.catalog.session import Catalog
+from shared.catalog.webhooks import Delivery
 from shared.jobs.table import Job, JobState
 
 AT_ONCE = 1000  # rows removed in one transaction
@@ -41,6 +43,17 @@ def forget_old_searches(catalog: Catalog, history_days: float) -> None:
     )
     with catalog.write() as session:
         session.execute(delete(Search).where(Search.id.in_(session.scalars(old).all())))
+
+
+def forget_old_deliveries(catalog: Catalog, retention_days: float) -> None:
+    """The log of what was sent to webhooks. Nothing waits as long as that."""
+    old = (
+        select(Delivery.id)
+        .where(Delivery.created_at < db_now_plus(-retention_days * DAY_SECONDS))
+        .limit(AT_ONCE)
+    )
+    with catalog.write() as session:
+        session.execute(delete(Delivery).where(Delivery.id.in_(session.scalars(old).all())))
 
 
 def forget_old_keys(catalog: Catalog) -> None:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 from sqlalchemy.exc import SQLAlchemyError
 
+from services.steward.metrics import StewardMetrics
 from shared.catalog.away import Outage
 from shared.catalog.session import Catalog
 from shared.errors import PlacewiseError, Unavailable
@@ -16,6 +17,7 @@ from shared.jobs import Job, JobKind, claim, hold_lease
 from shared.jobs.cancel_batch import cancel_items
 from shared.jobs.finish import fail, release
 from shared.jobs.leases import fallen, held, token_of
+from shared.jobs.on_behalf import on_behalf_of
 from shared.settings import Settings
 
 log = logging.getLogger(__name__)
@@ -36,6 +38,7 @@ class Taker:
     settings: Settings
     name: str
     kinds: tuple[JobKind, ...]
+    metrics: StewardMetrics
 
     def run(self, stop: threading.Event, do: Callable[[Job], None]) -> None:
         """Take jobs until `stop` is set."""
@@ -60,19 +63,29 @@ class Taker:
         if not jobs:
             return False
         job = jobs[0]
-        with hold_lease(self.catalog, token_of(job), lease_seconds):
+        outcome = "done"
+        with (
+            hold_lease(self.catalog, token_of(job), lease_seconds),
+            on_behalf_of(jobs, job.kind),
+        ):
             try:
                 do(job)
             except Stopped:
+                outcome = "stopped"
                 self._end(job, release)
             except (Unavailable, OSError, SQLAlchemyError) as error:
+                outcome = "paused"
                 log.warning("the job %s (%s) pauses: %s", job.id, job.kind, error)
                 self._end(job, lambda mine: release(mine, after_seconds=AWAY_SECONDS))
             except PlacewiseError as error:
+                outcome = "failed"
                 self._fail(job, error)
             except Exception as error:
+                outcome = "crashed"
                 log.exception("the job %s (%s) crashed", job.id, job.kind)
                 self._crashed(job, error)
+            log.info("a step of %s: %s", job.kind, outcome, extra={"job_id": str(job.id)})
+        self.metrics.job(job.kind, outcome)
         return True
 
     def _end(self, job: Job, how: Callable[[Job], None]) -> None:

@@ -63,6 +63,10 @@ class Limits:
         )
 
 
+# Of a walk over everything.
+UNLIMITED = Limits(statement_seconds=0)
+
+
 @dataclass(frozen=True, slots=True)
 class Pool:
     """A process's connections to PostgreSQL. Durations in seconds."""

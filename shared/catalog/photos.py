@@ -78,6 +78,7 @@ class Photo(Base):
     uploaded_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())
     deleted_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
     changed_version: Mapped[int] = mapped_column(BigInteger, default=0)
+    key_id: Mapped[UUID | None] = mapped_column(Uuid)  # that it came in with, if there was one
 
     __table_args__ = (
         CheckConstraint(
@@ -95,6 +96,9 @@ class Photo(Base):
         Index("ix_photos_map_changed", "map_id", "changed_version"),
         Index("ix_photos_map_position", "map_id", "latitude", "longitude"),
         Index("ix_photos_object_key", "object_key"),
+        partial_index(
+            "ix_photos_key", "key_id", only=and_(deleted_at.is_(None), key_id.is_not(None))
+        ),
         partial_index("ix_photos_map_size", "map_id", "size_bytes", only=deleted_at.is_(None)),
         partial_index(
             "ix_photos_map_captured",

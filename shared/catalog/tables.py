@@ -7,6 +7,8 @@ from shared.catalog.figures import MapFigures
 from shared.catalog.generations import Generation
 from shared.catalog.idempotency import KeyedCall
 from shared.catalog.installation import Installation
+from shared.catalog.keys import ApiKey
+from shared.catalog.live_processes import LiveProcess
 from shared.catalog.maps import Map
 from shared.catalog.models import Model
 from shared.catalog.photos import Photo
@@ -14,13 +16,16 @@ from shared.catalog.schema_compatibility import SchemaCompatibility
 from shared.catalog.search_workers import RegisteredWorker
 from shared.catalog.searches import Search
 from shared.catalog.vocabularies import Vocabulary
+from shared.catalog.webhooks import Delivery, Webhook
 from shared.catalog.whitenings import StoredWhitening
 from shared.jobs.batches import BatchItem
 from shared.jobs.table import Job
 
 __all__ = [
+    "ApiKey",
     "BatchItem",
     "Chunk",
+    "Delivery",
     "Descriptor",
     "DirectUpload",
     "Evaluation",
@@ -28,6 +33,7 @@ __all__ = [
     "Installation",
     "Job",
     "KeyedCall",
+    "LiveProcess",
     "Map",
     "MapFigures",
     "Model",
@@ -37,4 +43,5 @@ __all__ = [
     "Search",
     "StoredWhitening",
     "Vocabulary",
+    "Webhook",
 ]

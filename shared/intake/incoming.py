@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from uuid import UUID
 
 from shared.intake.photo_fields import PhotoFields, read_form_fields
 from shared.intake.photo_header import PhotoHeader, read_photo_header
@@ -18,9 +19,13 @@ class Incoming:
     media_type: str
     header: PhotoHeader
     fields: PhotoFields
+    key_id: UUID | None = None
+    """That it came in with."""
 
 
-def examine(store: ObjectStore, received: Received, max_pixels: int) -> Incoming:
+def examine(
+    store: ObjectStore, received: Received, max_pixels: int, key_id: UUID | None = None
+) -> Incoming:
     """What the photo is and what is said of it.
 
     Raises UnsupportedMedia (`unsupported_photo`) and Unprocessable (`invalid_field`,
@@ -30,4 +35,4 @@ def examine(store: ObjectStore, received: Received, max_pixels: int) -> Incoming
     fields = read_form_fields(received.fields)
     with received.open(store) as file:
         header = read_photo_header(file, max_pixels)
-    return Incoming(received, media_type, header, fields)
+    return Incoming(received, media_type, header, fields, key_id)

@@ -97,6 +97,7 @@ def put_photo(
         tags=fields.tags or [],
         attributes=fields.metadata or {},
         role=fields.role or PhotoRole.DATABASE,
+        key_id=incoming.key_id,
     )
     session.add(photo)
     session.flush()

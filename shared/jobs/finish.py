@@ -5,10 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 from sqlalchemy import select, update
-from sqlalchemy.orm import Session
+from sqlalchemy.orm import Session, object_session
 
 from shared.catalog.base import Condition, db_now, db_now_plus
+from shared.catalog.maps import Map
 from shared.catalog.photos import Photo
+from shared.catalog.webhooks import EventKind, announce, wanted
 from shared.errors import Conflict
 from shared.jobs.table import (
     MODEL_CHANGES,
@@ -41,6 +43,7 @@ def succeed(job: Job, result: dict[str, Any] | None = None) -> None:
     job.progress_done = job.progress_total - job.progress_failed
     job.finished_at = db_now()
     _drop_lease(job)
+    _announce(job, EventKind.JOB_SUCCEEDED)
 
 
 def fail(job: Job, problem: dict[str, Any]) -> None:
@@ -52,6 +55,32 @@ def fail(job: Job, problem: dict[str, Any]) -> None:
         job.progress_failed = 1
     job.finished_at = db_now()
     _drop_lease(job)
+    _announce(job, EventKind.JOB_FAILED)
+
+
+def _announce(job: Job, event: EventKind) -> None:
+    """Tell the webhooks of it; not of each photo of a model change, which is told of as a whole."""
+    session = object_session(job)
+    assert session is not None, "a job ends in a transaction"
+    events = [event] if job.kind != JobKind.REINDEX else []
+    if job.kind == JobKind.BATCH:
+        events.append(EventKind.BATCH_FINISHED)
+    for one in events:
+        if wanted(session, one):
+            announce(session, one, _said_of(session, job))
+
+
+def _said_of(session: Session, job: Job) -> dict[str, Any]:
+    map_ = session.get(Map, job.map_id)
+    return {
+        "job_id": str(job.id),
+        "kind": job.kind,
+        "map": map_.name if map_ else None,
+        "state": job.state,
+        "file_id": str(job.photo_id) if job.photo_id else None,
+        "result": job.result,
+        "error": job.error,
+    }
 
 
 def release(job: Job, *, after_seconds: float = 0.0, waiting_for: WaitingFor | None = None) -> None:

@@ -53,6 +53,8 @@ from shared.catalog.base import (
 )
 from shared.errors import NotFound
 from shared.ids import new_id
+from shared.telemetry.request_id import MOST_CHARACTERS, current_request_id
+from shared.telemetry.traces import current_traceparent
 
 
 class JobState(StrEnum):
@@ -158,6 +160,11 @@ class Job(Base):
     created_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())
     started_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
     finished_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
+    # Of the request that made it, or of the job that did: logs and traces follow them.
+    request_id: Mapped[str | None] = mapped_column(
+        String(MOST_CHARACTERS), default=current_request_id
+    )
+    traceparent: Mapped[str | None] = mapped_column(String(55), default=current_traceparent)
 
     __table_args__ = (
         # Claiming: whatever goes first, then the rest of its batch.

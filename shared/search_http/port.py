@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
+from contextvars import copy_context
 from types import TracebackType
 from typing import Self
 
@@ -76,7 +77,10 @@ class HttpSearch:
             self._workers.look()
             layout = self._workers.layout(request.generation_id, request.min_version)
         calls = {
-            shard: self._calls.submit(self._ask_shard, shard, urls, request, deadline)
+            # In the request's context: its id and its trace go along.
+            shard: self._calls.submit(
+                copy_context().run, self._ask_shard, shard, urls, request, deadline
+            )
             for shard, urls in layout.items()
         }
         wait(calls.values(), timeout=deadline + LATE_SECONDS - time.monotonic())

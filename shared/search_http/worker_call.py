@@ -9,6 +9,9 @@ from pydantic import BaseModel, ValidationError
 
 from shared.errors import PlacewiseError, refusal
 from shared.search_protocol import SearchRequest, SearchResponse, SearchStatus
+from shared.telemetry.request_id import HEADER as REQUEST_HEADER
+from shared.telemetry.request_id import current_request_id
+from shared.telemetry.traces import current_traceparent
 
 CONNECT_SECONDS = 1.0  # inside one network: who takes longer is away
 
@@ -35,7 +38,6 @@ def ask(
         f"{url}/search",
         timeout_seconds,
         content=request.as_json(),
-        headers={"Content-Type": "application/json"},
     )
     return _read(SearchResponse, url, body)
 
@@ -53,11 +55,22 @@ def _read(kind: type[Message], url: str, body: bytes) -> Message:
 
 
 def _call(
-    http: httpx2.Client, method: str, url: str, timeout_seconds: float, **options: object
+    http: httpx2.Client,
+    method: str,
+    url: str,
+    timeout_seconds: float,
+    content: str | None = None,
 ) -> bytes:
+    headers = {"Content-Type": "application/json"} if content is not None else {}
+    request_id = current_request_id()
+    if request_id is not None:
+        headers[REQUEST_HEADER] = request_id
+    traceparent = current_traceparent()
+    if traceparent is not None:
+        headers["traceparent"] = traceparent
     timeout = httpx2.Timeout(timeout_seconds, connect=min(CONNECT_SECONDS, timeout_seconds))
     try:
-        answer = http.request(method, url, timeout=timeout, **options)  # type: ignore[arg-type]
+        answer = http.request(method, url, timeout=timeout, content=content, headers=headers)
     except httpx2.TransportError as error:
         silent = isinstance(error, httpx2.ReadTimeout)
         raise WorkerAway(url, type(error).__name__, silent=silent) from error

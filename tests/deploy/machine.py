@@ -141,6 +141,8 @@ class Machine:
         for port in ("PORT", "FLOWER_PORT"):
             if port in read:
                 read[port] = str(self._ports[service])
+        if "METRICS_PORT" in read:
+            read["METRICS_PORT"] = "0"  # of all of them on one machine
         path = f"{self._programs}:{Path(sys.executable).parent}:{os.environ['PATH']}"
         home = {"PLACEWISE_HOME": str(self.folder(service))}
         return {**base, **home, **read, "PATH": path, "REDISCLI_PORT": str(self._ports["redis"])}

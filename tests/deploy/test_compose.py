@@ -29,6 +29,7 @@ BOTH = pytest.mark.parametrize("file", [SERVICES, EMBEDDED], ids=lambda file: fi
 REQUIRED = {
     "ADMIN_KEY",
     "FLOWER_PASSWORD",
+    "GRAFANA_PASSWORD",
     "POSTGRES_PASSWORD",
     "REDIS_PASSWORD",
     "S3_ACCESS_KEY",
@@ -78,6 +79,7 @@ def test_each_choice_of_profiles_is_read_and_has_what_it_says(
         "gpu": {"extractor-gpu"},
         "seaweedfs": {"objects", "own-objects"},
         "flower": {"flower"},
+        "monitoring": {"prometheus", "grafana"},
     }
     assert set(more) == set(PROFILES)
     without = {**values, "COMPOSE_PROFILES": ""}
@@ -157,7 +159,7 @@ def test_every_service_has_a_health_check_or_is_done_once(
 
 def test_every_image_has_a_fixed_version(all_services: dict[str, Json]) -> None:
     for name, service in all_services.items():
-        assert re.search(r":\d+\.\d+", service["image"]), name
+        assert re.search(r":v?\d+\.\d+", service["image"]), name
     for base in re.findall(r"^FROM (\S+)", (ROOT / "deploy/Dockerfile").read_text(), re.MULTILINE):
         assert re.search(r":\d+\.\d+\.\d+-", base), base
 
@@ -197,18 +199,18 @@ def test_services_wait_until_the_tables_and_the_bucket_are_made(
     }
 
 
-def test_only_the_gateway_and_flower_listen_to_the_machine_and_only_on_loopback(
+def test_only_the_gateway_flower_and_grafana_listen_to_the_machine_and_only_on_loopback(
     all_services: dict[str, Json],
 ) -> None:
     open_to = {name: s["ports"] for name, s in all_services.items() if s.get("ports")}
-    assert set(open_to) == {"gateway", "flower", "placewise"}
+    assert set(open_to) == {"gateway", "flower", "grafana", "placewise"}
     for ports in open_to.values():
         assert {port["host_ip"] for port in ports} == {"127.0.0.1"}
 
 
 def test_the_servers_are_on_a_network_that_leads_nowhere(everything: dict[str, Json]) -> None:
     assert yaml.safe_load(SERVICES.read_text())["networks"]["inside"]["internal"]
-    servers = {"postgres", "redis", "objects"}
+    servers = {"postgres", "redis", "objects", "prometheus"}
     assert {n for n, s in everything.items() if set(s.get("networks", {})) == {"inside"}} >= servers
     # S3_ENDPOINT may be elsewhere.
     for name in (*OURS, "create-bucket"):

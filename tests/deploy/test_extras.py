@@ -21,7 +21,11 @@ EXTRAS = {
     "flower": ["flower", "celery"],
     "gateway": ["services.gateway.app", "services.gateway.keys", "services.http_server"],
     "search": ["services.search.server"],
-    "steward": ["services.steward.loop", "services.steward.evaluate"],
+    "steward": [
+        "services.steward.loop",
+        "services.steward.evaluate",
+        "services.steward.webhooks.deliver",
+    ],
 }
 # What every image's command imports, whatever service it runs.
 COMMAND = ["services.cli.main", "shared.catalog.installation", "shared.heartbeat"]

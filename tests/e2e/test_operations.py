@@ -42,8 +42,16 @@ CALLS = {
     f"POST {API}/generations",
     f"GET {API}/database/stats",
     f"GET {API}/health",
+    f"GET {API}/keys",
+    f"POST {API}/keys",
+    f"DELETE {API}/keys/{{key_id}}",
+    f"GET {API}/webhooks",
+    f"POST {API}/webhooks",
+    f"DELETE {API}/webhooks/{{webhook_id}}",
+    f"GET {API}/webhooks/{{webhook_id}}/deliveries",
     "GET /",
     "GET /livez",
+    "GET /metrics",
     "GET /readyz",
 }
 FIGURES = {

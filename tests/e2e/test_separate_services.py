@@ -16,7 +16,7 @@ import pytest
 from tests.support.checkpoints import some_checkpoint
 from tests.support.photos import photo_bytes
 from tests.support.processes import PLACEWISE, Process, start
-from tests.support.server import environment, run_command
+from tests.support.server import SERVICES_KEY, environment, run_command
 from tests.support.servers import PostgresServer, RedisServer, S3Server, start_redis
 
 SECONDS = 90.0
@@ -33,6 +33,7 @@ class Deployment:
             "redis_url": redis_url,
             "lease_seconds": 5,
             "search_urls": "",
+            "admin_key": SERVICES_KEY,
         }
         self._processes: list[Process] = []
 
@@ -105,7 +106,9 @@ def test_services_in_processes_of_their_own_do_what_the_embedded_one_does(
     deployment.start("gateway")
     extractors = [deployment.start("extractor") for _ in range(2)]
     stewards = [deployment.start("steward") for _ in range(2)]
-    with httpx2.Client(base_url=deployment.address("gateway", 2), timeout=60) as client:
+    headers = {"Authorization": f"Bearer {SERVICES_KEY}"}
+    url = deployment.address("gateway", 2)
+    with httpx2.Client(base_url=url, headers=headers, timeout=60) as client:
         until(lambda: client.get("/readyz").is_success)
 
         def put(number: int) -> dict[str, Any]:
@@ -221,7 +224,7 @@ def test_an_extractor_that_has_never_seen_a_model_fetches_it(
         ("extractor", {"redis_url": ""}, "redis_missing"),
         (
             "gateway",
-            {"search_urls": "http://127.0.0.1:9", "host": "0.0.0.0"},
+            {"search_urls": "http://127.0.0.1:9"},
             "admin_key_missing",
         ),
     ],

@@ -17,6 +17,7 @@ from shared.ids import new_id
 from shared.jobs import Job, JobKind
 from tests.e2e.test_separate_services import Deployment, until
 from tests.support.photos import near_copy
+from tests.support.server import SERVICES_KEY
 from tests.support.servers import PostgresServer, RedisServer
 
 CALLS = 12
@@ -44,7 +45,11 @@ def ask(addresses: list[str], photo: bytes) -> UUID:
     """
     deadline = time.monotonic() + SECONDS
     files = {"file": ("query.jpg", photo)}
-    headers = {"Idempotency-Key": str(new_id()), "Prefer": "wait=60"}
+    headers = {
+        "Authorization": f"Bearer {SERVICES_KEY}",
+        "Idempotency-Key": str(new_id()),
+        "Prefer": "wait=60",
+    }
     while True:
         for address in addresses:
             assert time.monotonic() < deadline, "the call was never answered"

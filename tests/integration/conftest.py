@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from uuid import UUID
 
 import pytest
@@ -18,6 +20,7 @@ from shared.objects import FolderStore
 from shared.settings import Settings
 from shared.vision.decode import Decoded
 from shared.vision.preprocessing import Preprocessing
+from tests.integration.door import Door
 from tests.integration.gateway import Service
 from tests.integration.workplace import Workplace
 from tests.support.catalog_rows import add_map
@@ -89,6 +92,20 @@ def service(
     with catalog.write() as session:
         ensure_default_map(session, settings.extractor)
     return Service(catalog, store, settings, make_worker)
+
+
+@pytest.fixture
+def sqlite_catalog(migrated_sqlite: Path, tmp_path: Path) -> Iterator[Catalog]:
+    """An empty catalog for tests of what is the same whatever the database."""
+    opened = Catalog(f"sqlite:///{shutil.copy(migrated_sqlite, tmp_path)}")
+    yield opened
+    opened.close()
+
+
+@pytest.fixture
+def door(catalog: Catalog, store: FolderStore, settings: Settings) -> Door:
+    """The HTTP API behind keys, on an empty catalog with the map `default`."""
+    return Door(catalog, store, settings)
 
 
 @pytest.fixture

@@ -45,7 +45,7 @@ class SearchServer:
         listener = held.enter_context(listening("127.0.0.1", self._port))
         self._port = listener.getsockname()[1]
         self.url = url_of("127.0.0.1", self._port)
-        server = http_server(create_app(self.worker), access_log=False)
+        server = http_server(create_app(self.worker))
         thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
         thread.start()
         self._running = server, thread, held

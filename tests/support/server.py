@@ -19,6 +19,7 @@ import psutil
 from shared.home import address_file
 from tests.support.processes import INHERITED, PLACEWISE, Process, start
 
+SERVICES_KEY = "the-admin-key-of-the-tests"  # separate services want one, on loopback too
 START_SECONDS = 150.0  # seconds of work, of which a busy machine makes minutes
 COMMAND_SECONDS = 120.0
 

@@ -1,17 +1,21 @@
-"""Keys: what a header has to look like, which key is in force, and what is left on the disk."""
+"""Keys: what a header has to look like, what a key may do, and when none is needed."""
 
 from __future__ import annotations
 
+import asyncio
+import re
 import stat
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from pydantic import SecretStr, ValidationError
 from starlette.datastructures import Headers
 
-from services.gateway.keys import KnownKeys, NoKeys, read_bearer
-from shared.admin_key import admin_key, admin_key_file, hash_key, is_loopback
-from shared.errors import Forbidden, Misconfigured, Unauthorized
+from services.gateway.keys import Caller, CatalogKeys, Keys, NoKeys, read_bearer
+from shared.api_keys import Scope, granted, hash_key, is_loopback, new_key, shown_prefix
+from shared.catalog.session import Catalog
+from shared.errors import Forbidden, Unauthorized, Unavailable
 from shared.home import announced, running_server, write_private
 from shared.settings import Settings
 
@@ -52,17 +56,53 @@ def test_a_header_without_a_bearer_key_holds_none(header: str | None) -> None:
     assert "Authorization: Bearer KEY" in caught.value.detail
 
 
-def test_any_of_the_known_keys_opens_and_no_other() -> None:
-    keys = KnownKeys(hash_key(KEY), hash_key("another"))
-    keys.check(Headers({"authorization": f"Bearer {KEY}"}))
-    keys.check(Headers({"authorization": "Bearer another", "origin": "https://elsewhere.example"}))
+@pytest.fixture
+def none_stored(migrated_sqlite: Path) -> Iterator[Catalog]:
+    """A catalog without keys."""
+    opened = Catalog(f"sqlite:///{migrated_sqlite}")
+    yield opened
+    opened.close()
+
+
+def check(keys: Keys, **headers: str) -> Caller:
+    return asyncio.run(keys.check(Headers(headers)))
+
+
+def test_any_of_the_keys_beside_the_catalog_opens_everything(none_stored: Catalog) -> None:
+    keys = CatalogKeys(none_stored, hash_key(KEY), hash_key("another"))
+    assert check(keys, authorization=f"Bearer {KEY}").scopes == set(Scope)
+    check(keys, authorization="Bearer another", origin="https://elsewhere.example")
     for wrong in (KEY[:-1], KEY + "x", KEY.upper(), hash_key(KEY)):
         with pytest.raises(Unauthorized) as caught:
-            keys.check(Headers({"authorization": f"Bearer {wrong}"}))
+            check(keys, authorization=f"Bearer {wrong}")
         assert caught.value.code == "key_unknown"
         assert wrong not in caught.value.detail
     with pytest.raises(Unauthorized):
-        KnownKeys().check(Headers({"authorization": f"Bearer {KEY}"}))
+        check(CatalogKeys(none_stored), authorization=f"Bearer {KEY}")
+
+
+def test_while_the_catalog_is_away_only_the_keys_beside_it_open() -> None:
+    away = Catalog("postgresql+psycopg://nobody@127.0.0.1:9/none")
+    keys = CatalogKeys(away, hash_key(KEY))
+    check(keys, authorization=f"Bearer {KEY}")
+    with pytest.raises(Unavailable) as caught:
+        check(keys, authorization="Bearer pw_of_the_catalog")
+    assert caught.value.code == "catalog_unavailable"
+    away.close()
+
+
+def test_a_key_is_long_random_and_shows_little_of_itself() -> None:
+    made = {new_key() for _ in range(100)}
+    assert len({shown_prefix(key) for key in made}) == 100
+    for key in made:
+        assert re.fullmatch(r"pw_[\w-]{43}", key)
+        assert len(key) - len(shown_prefix(key)) > 32
+
+
+def test_an_admin_may_everything_and_no_other_scope_implies_one() -> None:
+    assert granted([Scope.ADMIN]) == set(Scope)
+    assert granted([Scope.WRITE]) == {Scope.WRITE}
+    assert granted([Scope.READ, Scope.WRITE]) == {Scope.READ, Scope.WRITE}
 
 
 LOCAL = [
@@ -77,9 +117,9 @@ LOCAL = [
 
 @pytest.mark.parametrize("host", LOCAL)
 def test_without_keys_whoever_calls_this_machine_may(host: str) -> None:
-    NoKeys().check(Headers({"host": host}))
-    NoKeys().check(Headers({"host": host, "authorization": "Bearer whatever"}))
-    NoKeys().check(Headers({"host": host, "origin": f"http://{host}"}))
+    check(NoKeys(), host=host)
+    check(NoKeys(), host=host, authorization="Bearer whatever")
+    check(NoKeys(), host=host, origin=f"http://{host}")
 
 
 @pytest.mark.parametrize(
@@ -100,50 +140,19 @@ def test_without_keys_whoever_calls_this_machine_may(host: str) -> None:
 )
 def test_without_keys_no_page_of_elsewhere_may_call(said: dict[str, str]) -> None:
     with pytest.raises(Forbidden) as caught:
-        NoKeys().check(Headers(said))
+        check(NoKeys(), **said)
     assert caught.value.code == "foreign_page"
 
 
-# --- the key in force ------------------------------------------------------------------------
+def test_without_keys_a_page_that_is_trusted_may_call_this_machine() -> None:
+    keys = NoKeys(["https://maps.example"])
+    check(keys, host="localhost:8000", origin="https://maps.example")
+    for said in ({"origin": "https://maps.example.evil"}, {"host": "maps.example"}):
+        with pytest.raises(Forbidden):
+            check(keys, **{"host": "localhost", "origin": "https://maps.example", **said})
 
 
-def test_a_made_key_is_shown_once_and_kept_as_a_hash(tmp_path: Path) -> None:
-    first = admin_key(tmp_path, None, new=False)
-    assert first.made is not None
-    assert first.made.startswith("pw_")
-    assert len(first.made) > 40
-    assert first.made not in repr(first)
-    assert admin_key_file(tmp_path).read_text() == f"{hash_key(first.made)}\n"
-    assert stat.S_IMODE(admin_key_file(tmp_path).stat().st_mode) == 0o600
-    again = admin_key(tmp_path, None, new=False)
-    assert (again.sha256, again.made) == (first.sha256, None)
-
-
-def test_a_new_key_takes_the_place_of_the_old_one(tmp_path: Path) -> None:
-    first = admin_key(tmp_path, None, new=False)
-    second = admin_key(tmp_path, None, new=True)
-    assert second.made
-    assert second.sha256 != first.sha256
-    assert admin_key(tmp_path, None, new=False).sha256 == second.sha256
-
-
-def test_a_chosen_key_is_used_and_not_stored(tmp_path: Path) -> None:
-    made = admin_key(tmp_path, None, new=False)
-    chosen = admin_key(tmp_path, SecretStr(KEY), new=False)
-    assert (chosen.sha256, chosen.made) == (hash_key(KEY), None)
-    assert admin_key_file(tmp_path).read_text() == f"{made.sha256}\n"
-    with pytest.raises(Misconfigured) as caught:
-        admin_key(tmp_path, SecretStr(KEY), new=True)
-    assert caught.value.code == "admin_key_chosen"
-
-
-@pytest.mark.parametrize("text", ["", "not a hash", "ab" * 31, "G" * 64, "ab" * 33])
-def test_a_broken_hash_file_is_named_and_never_opens(tmp_path: Path, text: str) -> None:
-    admin_key_file(tmp_path).write_text(text)
-    with pytest.raises(Misconfigured) as caught:
-        admin_key(tmp_path, None, new=False)
-    assert caught.value.code == "admin_key_unreadable"
-    assert str(admin_key_file(tmp_path)) in caught.value.detail
+# --- ADMIN_KEY ----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("value", ["short", "x" * 15, "with a blank in it all", "schlüssel" * 4])

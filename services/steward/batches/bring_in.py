@@ -19,6 +19,7 @@ from services.steward.take import Stopped
 from shared.catalog.session import Catalog
 from shared.errors import InvalidRequest, PlacewiseError, Unavailable
 from shared.intake.incoming import Incoming, examine
+from shared.intake.photo_quota import PhotoQuota
 from shared.intake.received import PassingFile, Received, base_name, check_photo_begin
 from shared.intake.store_photo import Stored, put_photo, try_again_once
 from shared.jobs import Hints, Job, JobState, Priority
@@ -43,6 +44,7 @@ class BringIn:
         self._store = store
         self._hints = hints
         self._settings = settings
+        self._quota = PhotoQuota(catalog)
         self._archives: OrderedDict[UUID, Archive] = OrderedDict()
 
     def archive_of(self, job: Job) -> Archive:
@@ -69,7 +71,9 @@ class BringIn:
         key = item.object_key if uploaded and item.object_key else new_original_key()
         try:
             received = self._uploaded(item) if uploaded else self._copy(job, item, key)
-            incoming = examine(self._store, received, self._settings.max_image_pixels)
+            incoming = examine(
+                self._store, received, self._settings.max_image_pixels, self._take_for(job)
+            )
             stored = try_again_once(lambda: self._commit(job, item, incoming))
         except Unavailable:
             raise
@@ -86,6 +90,15 @@ class BringIn:
             self._hints.send()
         if stored.photo.object_key != key:
             self._store.delete(key)
+
+    def _take_for(self, job: Job) -> UUID | None:
+        """The key that the batch came in with. TooManyRequests (`photo_quota_reached`)."""
+        if "key_id" not in job.params:
+            return None
+        key_id = UUID(job.params["key_id"])
+        if job.params["max_photos"] is not None:
+            self._quota.take(key_id, job.params["max_photos"])
+        return key_id
 
     def _uploaded(self, item: BatchItem) -> Received:
         """The file that the gateway has stored."""

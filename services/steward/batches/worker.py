@@ -10,11 +10,13 @@ import logging
 import threading
 import time
 
+from prometheus_client import CollectorRegistry
 from sqlalchemy import exists, select
 from sqlalchemy.orm import Session
 
 from services.steward.batches.bring_in import BringIn
 from services.steward.batches.list_archive import list_archive
+from services.steward.metrics import StewardMetrics
 from services.steward.take import Stopped, Taker
 from shared.catalog.session import Catalog
 from shared.errors import PlacewiseError
@@ -48,12 +50,19 @@ class BatchWorker:
     """Does batch jobs; `run` until stopped."""
 
     def __init__(
-        self, catalog: Catalog, store: ObjectStore, hints: Hints, settings: Settings, name: str
+        self,
+        catalog: Catalog,
+        store: ObjectStore,
+        hints: Hints,
+        settings: Settings,
+        name: str,
+        metrics: StewardMetrics | None = None,
     ) -> None:
         self._catalog = catalog
         self._settings = settings
         self._bring_in = BringIn(catalog, store, hints, settings)
-        self._taker = Taker(catalog, settings, name, (JobKind.BATCH,))
+        counted = metrics or StewardMetrics(CollectorRegistry())
+        self._taker = Taker(catalog, settings, name, (JobKind.BATCH,), counted)
 
     def run(self, stop: threading.Event) -> None:
         """Take batches until `stop` is set."""

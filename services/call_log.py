@@ -1,0 +1,111 @@
+"""Every HTTP call of a service: its id, its line in the log, its span, its place in the figures."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from shared.problems import REQUEST_ID
+from shared.telemetry.request_id import HEADER, accept_request_id, under_request_id
+from shared.telemetry.traces import span
+
+log = logging.getLogger(__name__)
+
+NO_ROUTE = "none"  # of a call that no route takes: its path is anyone's choice
+METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"})
+READS = frozenset({"GET", "HEAD", "OPTIONS"})
+
+
+@dataclass(slots=True)
+class Call:
+    """One call. `method` and `route` are of a few: they may become labels."""
+
+    method: str
+    route: str = NO_ROUTE
+    """The route's template: /api/v1/jobs/{job_id}."""
+    status: int = 500
+    """What is answered when no answer has begun: the error handler's."""
+    received_bytes: int = 0
+    begun_seconds: float | None = None
+    """Until the answer's first byte; None while there is none."""
+
+
+class CallLog:
+    """The outermost middleware. A call's id is the caller's `X-Request-ID`, or a fresh one; the
+    answer carries it. `on_begin` and `on_end` are for the service's figures.
+
+    Calls that may change something and those that fail have their line at INFO, all others at
+    DEBUG; where `quiet`, all that do not fail.
+    """
+
+    def __init__(
+        self,
+        app: ASGIApp,
+        *,
+        quiet: bool = False,
+        on_begin: Callable[[], object] = lambda: None,
+        on_end: Callable[[Call], object] = lambda call: None,
+    ) -> None:
+        self._app = app
+        self._quiet = quiet
+        self._on_begin = on_begin
+        self._on_end = on_end
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        headers = Headers(scope=scope)
+        method = scope["method"] if scope["method"] in METHODS else "OTHER"
+        call, started = Call(method), time.perf_counter()
+        request_id = accept_request_id(headers.get(HEADER))
+        # For the handler of unforeseen errors, which stands outside of every middleware.
+        scope[REQUEST_ID] = request_id
+
+        async def counted() -> Message:
+            message = await receive()
+            call.received_bytes += len(message.get("body", b""))
+            return message
+
+        async def marked(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                call.status = message["status"]
+                call.begun_seconds = time.perf_counter() - started
+                MutableHeaders(scope=message)[HEADER] = request_id
+            await send(message)
+
+        self._on_begin()
+        with (
+            under_request_id(request_id),
+            span(method, [headers.get("traceparent")], request_id=request_id) as describe,
+        ):
+            try:
+                await self._app(scope, counted, marked)
+            finally:
+                call.route = getattr(scope.get("route"), "path", NO_ROUTE)
+                describe(f"{method} {call.route}", status=call.status)
+                self._on_end(call)
+                self._write(call, scope, time.perf_counter() - started)
+
+    def _write(self, call: Call, scope: Scope, seconds: float) -> None:
+        worth = call.status >= 500 or not (self._quiet or call.method in READS)
+        facts: dict[str, Any] = {
+            "route": call.route,
+            "status": call.status,
+            "seconds": round(seconds, 4),
+            "received_bytes": call.received_bytes,
+        }
+        log.log(
+            logging.INFO if worth else logging.DEBUG,
+            "%s %s: %d",
+            call.method,
+            scope["path"],
+            call.status,
+            extra=facts,
+        )

@@ -1,0 +1,100 @@
+"""`placewise verify`: every chunk against its hash and the catalog."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Annotated, Any
+
+import typer
+from rich.markup import escape
+
+from services.cli.backup import told
+from services.cli.configuration import read_settings
+from services.cli.output import JsonOption, answers, explained, messages, print_json
+from services.cli.stored import what_is_stored
+from shared.integrity.check import check
+from shared.integrity.repair import repair
+from shared.integrity.report import Report, Wrong
+from shared.jobs import InProcessHints
+
+SHOWN = 20
+WHAT_TO_DO = {
+    "chunk": "placewise verify --repair describes their photos again",
+    "manifest": "placewise verify --repair describes the photos of their chunks again",
+    "photo": "placewise verify --repair describes them again",
+    "original": "restore the object from a backup, or delete the photo and upload it again",
+    "vocabulary": "restore the object from a backup, or fit a new vocabulary",
+    "whitening": "restore the object from a backup, or start a model change",
+    "archive": "its batch fails: send it again",
+    "file": "its batch fails: send it again",
+}
+
+
+def verify(
+    originals: Annotated[
+        bool, typer.Option("--originals", help="Read every photo against its hash, too.")
+    ] = False,
+    mend: Annotated[
+        bool, typer.Option("--repair", help="Queue the photos of damaged chunks again.")
+    ] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Read every chunk against its hash and the catalog, while the service runs; exit code 1 when
+    something is wrong, also when it was repaired."""
+    with explained(as_json), told() as progress:
+        # Imported only here: it is the steward's.
+        from services.steward.collect import orphans
+
+        settings = read_settings()
+        with what_is_stored(settings, "verify") as (catalog, store):
+            report = check(catalog, store, originals=originals, progress=progress)
+            for info in orphans(catalog, store, age_seconds=0.0):
+                report.orphans += 1
+                report.orphan_bytes += info.size_bytes
+                progress("objects that no row knows", report.orphans, report.orphans)
+            # Workers look every second, and the steward sends hints.
+            queued = repair(catalog, InProcessHints(), report) if mend else None
+    if as_json:
+        print_json(_as_dict(report, queued))
+    else:
+        _print(report, queued)
+    if report.faults:
+        raise typer.Exit(1)
+
+
+def _as_dict(report: Report, queued: int | None) -> dict[str, Any]:
+    faults = [
+        {name: str(value) for name, value in asdict(fault).items() if value is not None}
+        for fault in report.faults
+    ]
+    return {**asdict(report), "faults": faults, "queued_photos": queued}
+
+
+def _print(report: Report, queued: int | None) -> None:
+    looked = ", ".join(f"{count} {what}s" for what, count in sorted(report.checked.items()))
+    answers.print(
+        f"{looked or 'nothing'} looked at, {report.read_bytes / 1e6:.1f} MB read: "
+        f"{len(report.faults)} faults",
+        soft_wrap=True,
+    )
+    if report.orphans:
+        answers.print(
+            f"{report.orphans} objects ({report.orphan_bytes / 1e6:.1f} MB) are known to no row: "
+            "just coming in, or left by a crash; the steward removes old ones",
+            soft_wrap=True,
+        )
+    for fault in report.faults[:SHOWN]:
+        answers.print(
+            f"[red]{fault.wrong}[/red] {fault.what} {escape(fault.name)}: {escape(fault.detail)}",
+            soft_wrap=True,
+        )
+    if len(report.faults) > SHOWN:
+        answers.print(f"and {len(report.faults) - SHOWN} more: --json names them all")
+    mended = {"chunk", "manifest", "photo"} if queued is not None else set()
+    for what in dict.fromkeys(fault.what for fault in report.faults):
+        if what not in mended:
+            messages.print(f"{what}s: {WHAT_TO_DO[what]}", soft_wrap=True)
+    if queued is not None:
+        answers.print(f"{queued} photos are queued again")
+    if any(f.wrong == Wrong.MISSING and f.what == "original" for f in report.faults):
+        messages.print("Lost originals can't be described again.")

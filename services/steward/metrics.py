@@ -1,0 +1,90 @@
+"""What Prometheus reads of a steward: its rounds, what it mended, what it threw away."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Mapping
+
+from prometheus_client import CollectorRegistry, Counter, Histogram
+from prometheus_client.core import GaugeMetricFamily
+from prometheus_client.metrics_core import Metric
+from prometheus_client.registry import Collector
+
+PREFIX = "placewise_steward"
+# From a look that finds nothing to a walk over a whole bucket.
+SECONDS = (0.005, 0.01, 0.05, 0.1, 0.5, 1.0, 5.0, 10.0, 60.0, 300.0, 900.0)
+
+
+class StewardMetrics:
+    """One steward's figures; several stewards' add up."""
+
+    def __init__(self, registry: CollectorRegistry) -> None:
+        self._duties = Counter(
+            f"{PREFIX}_duties",
+            "Rounds of each duty by what became of them: done, failed, or catalog_away.",
+            ["duty", "outcome"],
+            registry=registry,
+        )
+        self._duty_seconds = Histogram(
+            f"{PREFIX}_duty_seconds",
+            "Seconds that a round of a duty took.",
+            ["duty"],
+            buckets=SECONDS,
+            registry=registry,
+        )
+        self.leases_expired = Counter(
+            f"{PREFIX}_leases_expired",
+            "Jobs that were taken back from workers that fell silent.",
+            registry=registry,
+        )
+        self.hints_resent = Counter(
+            f"{PREFIX}_hints_resent",
+            "Hints for work that was found waiting.",
+            registry=registry,
+        )
+        self.slots_merged = Counter(
+            f"{PREFIX}_slots_merged", "Slots whose chunks became one.", registry=registry
+        )
+        self.objects_deleted = Counter(
+            f"{PREFIX}_objects_deleted",
+            "Objects that nothing refers to any more.",
+            ["duty"],
+            registry=registry,
+        )
+        self._jobs = Counter(
+            f"{PREFIX}_jobs",
+            "The steward's own jobs, slice by slice, by what became of each: done, stopped, "
+            "paused, failed, crashed.",
+            ["kind", "outcome"],
+            registry=registry,
+        )
+        self._done_at: dict[str, float] = {}
+        registry.register(_Lag(self._done_at))
+
+    def duty(self, name: str, outcome: str, seconds: float) -> None:
+        """A round of the duty has ended."""
+        duty = name.replace(" ", "_")
+        self._duties.labels(duty, outcome).inc()
+        self._duty_seconds.labels(duty).observe(seconds)
+        if outcome == "done":
+            self._done_at[duty] = time.monotonic()
+
+    def job(self, kind: str, outcome: str) -> None:
+        """A slice of one of its jobs has ended."""
+        self._jobs.labels(kind, outcome).inc()
+
+
+class _Lag(Collector):
+    def __init__(self, done_at: Mapping[str, float]) -> None:
+        self._done_at = done_at
+
+    def collect(self) -> Iterable[Metric]:
+        lag = GaugeMetricFamily(
+            f"{PREFIX}_duty_lag_seconds",
+            "Seconds since a round of the duty was last done.",
+            labels=["duty"],
+        )
+        now = time.monotonic()
+        for duty, done_at in dict(self._done_at).items():
+            lag.add_metric([duty], now - done_at)
+        yield lag

@@ -1,0 +1,70 @@
+"""Copying one object from store to store, hashed on the way."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator
+
+from shared.backup.folder import BackupFolder, Kept
+from shared.objects import ObjectStore
+from shared.objects.folder import MARK
+from shared.objects.keys import FEATURES, INCOMING, ORIGINALS, QUERIES, WORK, is_original_key
+from shared.objects.port import ObjectInfo
+
+PIECE_BYTES = 1024 * 1024
+# Made again when they are wanted, or of calls that have ended by the time of a restore.
+LEFT_OUT = (INCOMING, QUERIES, FEATURES, WORK)
+
+
+def objects_to_keep(store: ObjectStore, import_prefix: str) -> Iterator[ObjectInfo]:
+    """What belongs into a backup of the store, whether rows name it or not (thumbnails, codes).
+    What lies under `import_prefix`, or was put into UPLOAD_DIR by hand, is its owner's."""
+    for info in store.list(""):
+        others = info.key.startswith(ORIGINALS) and not is_original_key(info.key)
+        if info.key == MARK or others or info.key.startswith((*LEFT_OUT, import_prefix)):
+            continue
+        yield info
+
+
+def has(folder: BackupFolder, info: ObjectInfo) -> bool:
+    """Whether the backup has the object as it is now."""
+    kept = folder.index.get(info.key)
+    return (
+        kept is not None
+        and kept.size_bytes == info.size_bytes
+        and kept.modified == info.modified_at.isoformat()
+        and folder.objects.path(info.key).is_file()
+    )
+
+
+def take(store: ObjectStore, folder: BackupFolder, info: ObjectInfo) -> int:
+    """Copy the object into the backup; its bytes. NotFound when it is gone."""
+    size, sha256 = copy(store, folder.objects, info.key)
+    folder.note(Kept(info.key, size, sha256, info.modified_at.isoformat()))
+    return size
+
+
+def copy(source: ObjectStore, target: ObjectStore, key: str) -> tuple[int, str]:
+    """Copy the object; its size in bytes and its SHA-256. NotFound where there is none."""
+    digest, size = hashlib.sha256(), 0
+    with source.open(key) as file:
+        writer = target.writer(key)
+        try:
+            while piece := file.read(PIECE_BYTES):
+                digest.update(piece)
+                writer.write(piece)
+                size += len(piece)
+            writer.commit()
+        finally:
+            writer.abort()
+    return size, digest.hexdigest()
+
+
+def sha256_of(store: ObjectStore, key: str) -> tuple[int, str]:
+    """The object's size in bytes and its SHA-256. NotFound where there is none."""
+    digest, size = hashlib.sha256(), 0
+    with store.open(key) as file:
+        while piece := file.read(PIECE_BYTES):
+            digest.update(piece)
+            size += len(piece)
+    return size, digest.hexdigest()

@@ -1,0 +1,149 @@
+"""Making an empty Placewise what a backup holds.
+
+Objects come first, then all rows in one transaction: a restore that is interrupted has no row yet,
+and goes on with the objects that it lacks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from uuid import UUID
+
+from sqlalchemy import delete, select, text
+from sqlalchemy.orm import Session
+
+from shared.backup.copy_objects import copy, objects_to_keep, sha256_of
+from shared.backup.folder import About, BackupFolder
+from shared.backup.rows import NOT_LOADED, Progress, load_rows, tables
+from shared.catalog.connections import UNLIMITED
+from shared.catalog.installation import ensure_installation
+from shared.catalog.maps import DEFAULT_MAP, Map
+from shared.catalog.search_workers import RegisteredWorker
+from shared.catalog.session import Catalog
+from shared.errors import Conflict, Misconfigured, NotFound
+from shared.jobs.finish import cancel, release
+from shared.jobs.model_changes import cancel_model_change
+from shared.jobs.table import MODEL_CHANGES, QUERY_JOBS, UNFINISHED, Job
+from shared.objects import ObjectStore
+
+NAMED_IN_ERROR = 5
+
+
+@dataclass(frozen=True, slots=True)
+class Restored:
+    rows: int
+    objects: int
+    copied_objects: int
+    """The others were there already: of a restore that was interrupted, or in the same bucket."""
+    cancelled_jobs: int
+    """Queries, and fits whose half-done work a backup does not hold."""
+
+
+def restore_backup(
+    folder: BackupFolder,
+    about: About,
+    catalog: Catalog,
+    open_store: Callable[[], ObjectStore],
+    import_prefix: str,
+    progress: Progress = lambda what, done, total: None,
+) -> Restored:
+    """The catalog, its schema up to date, and the store become what the backup holds.
+
+    `open_store` is called once the catalog has the backup's installation id. Raises Conflict
+    (`target_not_empty`) where something else lies, and Misconfigured: `backup_of_another_release`,
+    `backup_damaged` (the target then stays without rows).
+    """
+    unlimited = catalog.limited(UNLIMITED)
+    with unlimited.write() as session:
+        _check_schema(session, about)
+        _check_catalog_empty(session)
+        installation = ensure_installation(session)
+        if installation.bucket is None:  # no bucket carries its mark: it may become the other
+            installation.id = UUID(about.installation_id)
+    store = open_store()
+    strange = next(
+        (i.key for i in objects_to_keep(store, import_prefix) if i.key not in folder.index), None
+    )
+    if strange is not None:
+        raise _not_empty(f"the object store has {strange!r}, which the backup does not know")
+    copied = _copy_objects(folder, store, progress)
+    with unlimited.write() as session:
+        _check_catalog_empty(session)
+        session.execute(delete(RegisteredWorker))
+        session.execute(delete(Map))
+        load_rows(session, folder.path / about.catalog, about.rows, progress)
+        session.flush()
+        cancelled = _settle(session)
+    rows = sum(count for name, count in about.rows.items() if name not in NOT_LOADED)
+    return Restored(rows, len(folder.index), copied, cancelled)
+
+
+def _check_schema(session: Session, about: About) -> None:
+    present = str(session.scalar(text("SELECT version_num FROM alembic_version")))
+    if present != about.schema:
+        raise Misconfigured(
+            "backup_of_another_release",
+            f"The backup's schema is {about.schema}, this release's is {present}. Restore it with "
+            f"the release that made it ({about.release}), then upgrade.",
+        )
+
+
+def _check_catalog_empty(session: Session) -> None:
+    """Empty: as `placewise migrate`, or a first start, has left it."""
+    for table in tables():
+        if table.name in (*NOT_LOADED, Map.__tablename__):
+            continue
+        if session.execute(select(table).limit(1)).first() is not None:
+            raise _not_empty(f"its table {table.name} has rows")
+    if any(name != DEFAULT_MAP for name in session.scalars(select(Map.name))):
+        raise _not_empty("it has maps")
+
+
+def _not_empty(why: str) -> Conflict:
+    return Conflict(
+        "target_not_empty",
+        f"A backup is restored into an empty Placewise only, and this one is not: {why}. Give "
+        "another PLACEWISE_HOME, or a new database (DATABASE_URL) and an empty bucket (S3_BUCKET).",
+    )
+
+
+def _copy_objects(folder: BackupFolder, store: ObjectStore, progress: Progress) -> int:
+    """Every object that is not there yet, checked against its hash; how many those were."""
+    source, copied, bad = folder.objects, 0, []
+    for done, kept in enumerate(folder.index.values(), start=1):
+        there = store.head(kept.key)
+        if there is None or there.size_bytes != kept.size_bytes:
+            try:
+                if sha256_of(source, kept.key) != (kept.size_bytes, kept.sha256):
+                    bad.append(kept.key)
+                else:
+                    copy(source, store, kept.key)
+                    copied += 1
+            except NotFound:
+                bad.append(kept.key)
+        progress("objects", done, len(folder.index))
+    if bad:
+        named = ", ".join(bad[:NAMED_IN_ERROR]) + (" ..." if len(bad) > NAMED_IN_ERROR else "")
+        raise Misconfigured(
+            "backup_damaged",
+            f"{len(bad)} objects of the backup are gone or changed: {named}. Take another backup. "
+            "To restore the rest without them: delete their lines from objects.jsonl, and run "
+            "`placewise verify --repair` afterwards.",
+        )
+    return copied
+
+
+def _settle(session: Session) -> int:
+    """Nobody works on anything here yet. What can't go on is cancelled; how many jobs."""
+    for job in session.scalars(select(Job).where(Job.lease_token.is_not(None))).all():
+        release(job)
+    lost = session.scalars(
+        select(Job).where(
+            Job.state.in_(UNFINISHED),
+            Job.kind.in_(QUERY_JOBS) | (Job.kind.in_(MODEL_CHANGES) & Job.generation_id.is_(None)),
+        )
+    ).all()
+    for job in lost:
+        cancel(job) if job.kind in QUERY_JOBS else cancel_model_change(session, job)
+    return len(lost)

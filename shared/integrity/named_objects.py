@@ -1,0 +1,87 @@
+"""Which objects the catalog's rows name, and what it knows of them: what a backup must hold, and
+what `placewise verify` looks for."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from enum import StrEnum
+from uuid import UUID
+
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from shared.catalog.chunks import Chunk
+from shared.catalog.generations import Generation, GenerationState
+from shared.catalog.maps import Map
+from shared.catalog.photos import Photo
+from shared.catalog.vocabularies import Vocabulary
+from shared.catalog.whitenings import StoredWhitening
+from shared.chunks import manifest_key
+from shared.jobs.batches import BatchItem
+from shared.jobs.table import UNFINISHED, Job, JobKind, JobState
+from shared.objects.keys import ORIGINALS
+
+ROWS_AT_ONCE = 1000
+
+
+class What(StrEnum):
+    ORIGINAL = "original"
+    CHUNK = "chunk"
+    MANIFEST = "manifest"
+    VOCABULARY = "vocabulary"
+    WHITENING = "whitening"
+    ARCHIVE = "archive"  # of a batch that is not finished
+    FILE = "file"  # of such a batch, not a photo yet
+
+
+@dataclass(frozen=True, slots=True)
+class NamedObject:
+    key: str
+    what: What
+    row_id: UUID
+    """Of the photo, chunk, vocabulary, whitening or batch's job."""
+    size_bytes: int | None = None
+    """None: not known."""
+    sha256: str | None = None
+    """Of the object's bytes, hexadecimal; None: not known."""
+
+
+def named_objects(session: Session) -> Iterator[NamedObject]:
+    """Those of live photos and of what answers or is being built, of maps that are not deleted."""
+    photos = select(Photo.id, Photo.object_key, Photo.size_bytes, Photo.sha256).join(
+        Map, Map.id == Photo.map_id
+    )
+    photos = photos.where(Photo.deleted_at.is_(None), Map.deleted_at.is_(None))
+    for row in session.execute(photos.execution_options(yield_per=ROWS_AT_ONCE)):
+        yield NamedObject(row.object_key, What.ORIGINAL, row.id, row.size_bytes, row.sha256)
+    chunks = (
+        select(Chunk.id, Chunk.object_key, Chunk.size_bytes, Chunk.sha256)
+        .join(Generation, Generation.id == Chunk.generation_id)
+        .join(Map, Map.id == Generation.map_id)
+        .where(
+            Chunk.superseded_at.is_(None),
+            Generation.state.in_((GenerationState.ACTIVE, GenerationState.BUILDING)),
+            Map.deleted_at.is_(None),
+        )
+    )
+    for row in session.execute(chunks.execution_options(yield_per=ROWS_AT_ONCE)):
+        yield NamedObject(row.object_key, What.CHUNK, row.id, row.size_bytes, row.sha256)
+        yield NamedObject(manifest_key(row.object_key), What.MANIFEST, row.id)
+    for table, what in (
+        (Vocabulary, What.VOCABULARY),
+        (StoredWhitening, What.WHITENING),
+    ):
+        # Their hashes are those of the numbers inside.
+        found = select(table.id, table.object_key).join(Map, Map.id == table.map_id)
+        for one in session.execute(found.where(Map.deleted_at.is_(None))):
+            yield NamedObject(one.object_key, what, one.id)
+    batches = select(Job.id, Job.params).where(Job.kind == JobKind.BATCH, Job.state.in_(UNFINISHED))
+    for batch in session.execute(batches).all():
+        if (key := batch.params.get("object_key")) is not None:
+            yield NamedObject(key, What.ARCHIVE, batch.id)
+    files = select(BatchItem.object_key, BatchItem.job_id).where(
+        BatchItem.state == JobState.QUEUED, BatchItem.object_key.startswith(ORIGINALS)
+    )
+    for item in session.execute(files.execution_options(yield_per=ROWS_AT_ONCE)):
+        yield NamedObject(item.object_key, What.FILE, item.job_id)

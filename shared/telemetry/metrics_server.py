@@ -1,0 +1,43 @@
+"""`GET /metrics` on METRICS_PORT: for services that answer no HTTP, and without a key for all."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+from collections.abc import Iterator
+
+from prometheus_client import CollectorRegistry, start_http_server
+
+from shared.errors import Misconfigured
+from shared.settings import Settings
+
+log = logging.getLogger(__name__)
+
+CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
+"""Of Prometheus' text format."""
+
+
+@contextlib.contextmanager
+def serving_metrics(settings: Settings, registry: CollectorRegistry) -> Iterator[int | None]:
+    """While the block runs, the registry's figures are answered on HOST and METRICS_PORT, from a
+    thread; gives the port, None where none is set. Misconfigured: `address_in_use`."""
+    if settings.metrics_port is None:
+        yield None
+        return
+    try:
+        server, thread = start_http_server(
+            settings.metrics_port, addr=settings.host, registry=registry
+        )
+    except OSError as error:
+        raise Misconfigured(
+            "address_in_use",
+            f"Can't listen on {settings.host}:{settings.metrics_port} (METRICS_PORT): "
+            f"{error.strerror or error}. Choose another one.",
+        ) from error
+    log.info("metrics on port %d", server.server_port)
+    try:
+        yield server.server_port
+    finally:
+        server.shutdown()
+        server.server_close()
+        thread.join()

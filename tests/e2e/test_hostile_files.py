@@ -1,0 +1,107 @@
+"""Two hundred and more files that mean harm, through the real upload of a real server."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import httpx2
+import psutil
+
+from tests.support.hostile import corpus
+from tests.support.hostile.file import (
+    MAX_ARCHIVE_BYTES,
+    MAX_BYTES,
+    MAX_MEMBERS,
+    MAX_PIXELS,
+    Hostile,
+)
+from tests.support.photos import near_copy, photo_bytes
+from tests.support.server import ServerProcess
+
+SETTINGS = {
+    "max_file_size": MAX_BYTES,
+    "max_image_pixels": MAX_PIXELS,
+    "max_archive_size": MAX_ARCHIVE_BYTES,
+    "max_batch_photos": MAX_MEMBERS,
+}
+SECONDS = 240.0
+MOST_GROWTH_BYTES = 300_000_000  # of the server with its decoders; the bombs unpack to gigabytes
+
+
+def memory_of(server: ServerProcess) -> int:
+    """Bytes of RAM that the server and its decoding processes have."""
+    process = psutil.Process(server.process.pid)
+    total = process.memory_info().rss
+    for child in process.children(recursive=True):
+        try:
+            total += child.memory_info().rss
+        except psutil.NoSuchProcess:
+            continue
+    return total
+
+
+def put(server: ServerProcess, one: Hostile) -> httpx2.Response:
+    if one.archive:
+        return server.client.post(
+            "/api/v1/upload/batch", files={"archive": (one.filename, one.data)}
+        )
+    return server.client.post(
+        "/api/v1/upload", files={"file": (one.filename, one.data)}, data=one.fields
+    )
+
+
+def what_became(server: ServerProcess, one: Hostile, answer: httpx2.Response) -> set[str]:
+    """The codes that it was refused with, and "succeeded"; of an archive, of each item too."""
+    body = answer.json()
+    if 400 <= answer.status_code < 500:
+        assert answer.headers["content-type"] == "application/problem+json"
+        return {body["code"]}
+    assert answer.status_code in (200, 202), f"{one.what}: {answer.status_code} {answer.text}"
+    job: dict[str, Any] = server.finished(body["job_id"], SECONDS)
+    became = {job["error"]["code"] if job["state"] == "failed" else job["state"]}
+    if one.archive:
+        items = server.client.get(f"/api/v1/jobs/{body['job_id']}/items").json()["items"]
+        became |= {item["error"]["code"] if item["error"] else item["state"] for item in items}
+    return became
+
+
+def test_each_hostile_file_is_refused_or_handled_and_the_service_goes_on(
+    server: ServerProcess,
+) -> None:
+    files = corpus()
+    assert len(files) >= 200
+    assert len({one.what for one in files}) == len(files)
+    around = {path.name for path in server.home.parent.iterdir()}
+    before = most = memory_of(server)
+    answers = []
+    for one in files:
+        answers.append(put(server, one))
+        most = max(most, memory_of(server))
+    deadline = time.monotonic() + SECONDS
+    while True:  # everything that was taken comes to an end
+        open_jobs = server.client.get(
+            "/api/v1/jobs", params={"state": ["queued", "running"]}
+        ).json()["jobs"]
+        most = max(most, memory_of(server))
+        if not open_jobs:
+            break
+        assert time.monotonic() < deadline, open_jobs
+        time.sleep(0.1)
+    wrong = {
+        one.what: sorted(became - one.may)
+        for one, answer in zip(files, answers, strict=True)
+        if (became := what_became(server, one, answer)) - one.may
+    }
+    assert wrong == {}
+
+    growth = most - before
+    print(f"{len(files)} files; at most {growth / 1e6:.0f} MB more than the {before / 1e6:.0f} MB")
+    assert growth < MOST_GROWTH_BYTES
+    assert {path.name for path in server.home.parent.iterdir()} == around, "nothing lies beside it"
+    assert server.process.poll() is None
+    assert server.client.get("/readyz").status_code == 200
+    good = server.indexed(photo_bytes(5), "good.jpg")
+    asked = server.ask(near_copy(5)).json()
+    assert asked["similar_images"][0]["image_id"] == good
+    assert "Traceback" not in server.log_path.read_text(errors="replace")

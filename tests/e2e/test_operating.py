@@ -1,0 +1,100 @@
+"""Backup, restore, verify, figures and logs of a server that runs."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from tests.support.metrics import read
+from tests.support.photos import photo_bytes
+from tests.support.server import ServerProcess, environment, run_command
+
+SETTINGS = {"log_format": "json"}
+
+
+def run(server_or_home: Path, *arguments: str | Path, code: int = 0) -> Any:
+    done = run_command(
+        *arguments, "--json", env=environment(server_or_home), cwd=server_or_home.parent
+    )
+    assert done.returncode == code, done.stdout + done.stderr
+    return json.loads(done.stdout)
+
+
+def test_a_running_server_is_backed_up_and_another_one_answers_as_it_did(
+    server: ServerProcess, tmp_path: Path
+) -> None:
+    for number in range(1, 4):
+        server.indexed(
+            photo_bytes(number), f"{number}.jpg", latitude=45 + number / 100, longitude=7
+        )
+    out = tmp_path / "backup"
+    about = run(server.home, "backup", out)
+    assert about["rows"]["photos"] == 4
+    assert about["missing"] == about["damaged"] == []
+    query = photo_bytes(2)
+    before = server.ask(query, top_k=3).json()["similar_images"]
+
+    refused = run(server.home, "restore", out, code=1)
+    assert refused["code"] == "home_in_use"
+    home = tmp_path / "other"
+    restored = run(home, "restore", out)
+    assert restored["objects"] == about["objects"]
+    again = run(home, "restore", out, code=1)
+    assert again["code"] == "target_not_empty"
+    with ServerProcess(home) as other:
+        assert other.ask(query, top_k=3).json()["similar_images"] == before
+        assert run(home, "verify", "--originals")["faults"] == []
+
+
+def test_a_damaged_chunk_of_a_running_server_is_found_and_described_again(
+    server: ServerProcess,
+) -> None:
+    chunk = next((server.home / "objects/chunks").rglob("*.npy"))
+    damaged = chunk.with_suffix(".other")
+    damaged.write_bytes(chunk.read_bytes()[:-1] + b"x")
+    damaged.rename(chunk)  # the server may have mapped the file that was there
+    found = run(server.home, "verify", code=1)
+    assert [fault["wrong"] for fault in found["faults"]] == ["damaged"]
+    mended = run(server.home, "verify", "--repair", code=1)
+    assert mended["queued_photos"] >= 1
+    for job in server.client.get("/api/v1/jobs").json()["jobs"]:
+        if job["kind"] == "index":
+            server.finished(job["job_id"])
+    assert run(server.home, "verify")["faults"] == []
+
+
+def test_one_scrape_of_the_embedded_server_tells_of_all_its_parts(server: ServerProcess) -> None:
+    server.indexed(photo_bytes(20))
+    assert server.ask(photo_bytes(21)).is_success
+    told = read(server.client.get("/metrics").text)
+    assert told["placewise_extractor_jobs_total"][(("kind", "index"), ("outcome", "succeeded"))] > 0
+    assert told["placewise_search_searches_total"][(("outcome", "answered"),)] > 0
+    assert told["placewise_search_rows"][()] > 0
+    assert told["placewise_steward_duties_total"][(("duty", "free_leases"), ("outcome", "done"))]
+    assert told["placewise_gateway_catalog_up"][()] == 1
+
+
+def test_every_line_of_the_log_is_json_and_the_id_of_an_upload_is_in_several(
+    server: ServerProcess,
+) -> None:
+    answer = server.client.post(
+        "/api/v1/upload",
+        files={"file": ("photo.jpg", photo_bytes(30))},
+        headers={"X-Request-ID": "an-id-of-mine"},
+    )
+    job = server.finished(answer.json()["job_id"])
+    assert job["request_id"] == "an-id-of-mine"
+    text = server.log_path.read_text().splitlines()
+    lines = [json.loads(line) for line in text if line.startswith("{")]
+    # What `placewise serve` says to its user at the start is no log.
+    assert len(lines) > len(text) / 2
+    loggers = {line["logger"] for line in lines if "an-id-of-mine" in json.dumps(line)}
+    assert loggers >= {"services.call_log", "services.extractor.publish"}
+
+
+def test_what_is_not_there_can_neither_be_backed_up_nor_verified(tmp_path: Path) -> None:
+    for command in (["backup", tmp_path / "out"], ["verify"]):
+        assert run(tmp_path / "home", *command, code=1)["code"] == "nothing_stored"
+    assert not (tmp_path / "out").exists()
+    assert run(tmp_path / "home", "restore", tmp_path / "out", code=1)["code"] == "no_backup"

@@ -1,0 +1,51 @@
+"""The HTTP API in this process, behind keys."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import httpx2
+from starlette.testclient import TestClient
+
+from services.gateway.app import create_app
+from services.gateway.context import Gateway
+from services.gateway.keys import CatalogKeys
+from services.search.worker import SearchWorker
+from shared.api_keys import hash_key
+from shared.catalog.maps import ensure_default_map
+from shared.catalog.session import Catalog
+from shared.jobs import InProcessHints
+from shared.objects import FolderStore
+from shared.settings import Settings
+from tests.support.photos import photo_bytes
+
+ADMIN = "the-key-of-the-admin-0123"
+
+
+class Door:
+    """The HTTP API behind keys."""
+
+    def __init__(self, catalog: Catalog, store: FolderStore, settings: Settings) -> None:
+        with catalog.write() as session:
+            ensure_default_map(session, settings.extractor)
+        search = SearchWorker(catalog, store, settings)
+        keys = CatalogKeys(catalog, hash_key(ADMIN))
+        gateway = Gateway(catalog, store, InProcessHints(), search, settings, keys)
+        self.catalog, self.store = catalog, store
+        self.app = create_app(gateway)
+        self._client = TestClient(self.app, base_url="http://places.example")
+
+    def __call__(self, key: str, method: str, path: str, **options: Any) -> httpx2.Response:
+        headers = {"Authorization": f"Bearer {key}", **options.pop("headers", {})}
+        return self._client.request(method, f"/api/v1{path}", headers=headers, **options)
+
+    def key(self, *scopes: str, **said: Any) -> dict[str, Any]:
+        """A new one, as it was answered."""
+        wanted = {"name": "someone", "scopes": scopes, **said}
+        made = self(ADMIN, "POST", "/keys", json=wanted)
+        assert made.status_code == 201, made.text
+        answer: dict[str, Any] = made.json()
+        return answer
+
+    def put(self, key: str, number: int = 1) -> httpx2.Response:
+        return self(key, "POST", "/upload", files={"file": ("photo.jpg", photo_bytes(number))})

@@ -1,0 +1,141 @@
+"""The doctor's look at separate services: what is well, and what to do about what is not."""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from sqlalchemy import update
+
+from services.cli import server_checks
+from services.cli.server_checks import objects_check, postgres_check, redis_check
+from services.cli.service_checks import (
+    gateway_check,
+    processes_check,
+    search_check,
+    steward_check,
+)
+from shared.catalog.base import db_now_plus
+from shared.catalog.live_processes import LiveProcess, living, signs_of_life
+from shared.catalog.session import Catalog
+from shared.errors import Misconfigured, PlacewiseError, Unavailable
+from shared.objects import FolderStore
+from shared.settings import Settings
+from shared.shards import Shard
+from tests.support.catalog_rows import add_job, add_map, set_columns, take
+from tests.support.search_tier import SearchServer
+from tests.support.servers import PostgresServer, RedisServer
+
+
+@pytest.fixture
+def deployed(
+    postgres: PostgresServer, migrated_postgres: str, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[Catalog]:
+    url = postgres.new_database(migrated_postgres)
+    monkeypatch.setenv("DATABASE_URL", url)
+    opened = Catalog(url)
+    yield opened
+    opened.close()
+
+
+def refused(check: Any, *arguments: Any) -> PlacewiseError:
+    with pytest.raises(PlacewiseError) as caught:
+        check(*arguments)
+    return caught.value
+
+
+def test_postgres_tells_its_version_tables_and_clock(
+    deployed: Catalog, postgres: PostgresServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert "tables up to date" in postgres_check(Settings())
+    monkeypatch.setattr(server_checks, "MOST_SKEW_SECONDS", -1.0)
+    assert refused(postgres_check, Settings()).code == "clocks_differ"
+    monkeypatch.setattr(server_checks, "LEAST_POSTGRES", 10**9)
+    assert refused(postgres_check, Settings()).code == "postgres_too_old"
+    monkeypatch.setattr(server_checks, "LEAST_POSTGRES", 0)
+    monkeypatch.setenv("DATABASE_URL", postgres.new_database())
+    assert refused(postgres_check, Settings()).code == "schema_outdated"
+    monkeypatch.setenv("DATABASE_URL", "postgresql+psycopg://nobody:x@127.0.0.1:1/none")
+    assert refused(postgres_check, Settings()).code == "catalog_unavailable"
+
+
+def test_redis_tells_its_version_and_has_to_keep_what_it_is_given(
+    redis: RedisServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert refused(redis_check, Settings()).code == "redis_missing"
+    monkeypatch.setenv("REDIS_URL", redis.url)
+    assert "answers" in redis_check(Settings())
+    monkeypatch.setattr(server_checks, "LEAST_REDIS", (999, 0))
+    assert refused(redis_check, Settings()).code == "redis_too_old"
+    monkeypatch.setenv("REDIS_URL", "redis://127.0.0.1:1/0")
+    gone = refused(redis_check, Settings())
+    assert isinstance(gone, Unavailable)
+    assert "Start it" in gone.detail
+
+
+def test_objects_are_written_read_and_deleted(monkeypatch: pytest.MonkeyPatch) -> None:
+    said = objects_check(Settings())
+    assert "written, read, listed and deleted" in said
+    store = FolderStore(Settings().placewise_home / "objects", alone=False)
+    assert list(store.list("")) == []
+    monkeypatch.setattr(FolderStore, "read_range", lambda *_: b"all of it")
+    assert refused(objects_check, Settings()).code == "object_store_unfit"
+    assert list(store.list("")) == []
+
+
+def test_who_lives_is_known_and_who_was_killed_soon_is_not(deployed: Catalog) -> None:
+    settings = Settings()
+    assert refused(processes_check, settings, "extractor").code == "nobody_there"
+    with signs_of_life(deployed, "extractor"):
+        deadline = time.monotonic() + 30
+        while True:
+            with deployed.read() as session:
+                if living(session):
+                    break
+            assert time.monotonic() < deadline, "it gave no sign"
+            time.sleep(0.01)
+        assert processes_check(settings, "extractor").startswith("1 of release ")
+        with deployed.write() as session:
+            session.execute(update(LiveProcess).values(seen_at=db_now_plus(-60)))
+        gone = refused(processes_check, settings, "extractor")
+        assert re.search(r"The last sign of one is \d+ s old", gone.detail)
+    with deployed.read() as session:
+        assert living(session) == [], "it has signed off"
+
+
+def test_a_steward_that_lives_and_frees_no_lease_is_found_out(deployed: Catalog) -> None:
+    with deployed.write() as session:
+        session.add(LiveProcess(role="steward", name="one", release="1"))
+        add_job(session, add_map(session).id)
+    assert "no lease is overdue" in steward_check(Settings())
+    job = take(deployed, 1)[0]
+    set_columns(deployed, job.id, lease_until=db_now_plus(-60))
+    assert refused(steward_check, Settings()).code == "leases_overdue"
+
+
+def test_every_shard_has_to_be_answered_for(
+    deployed: Catalog, store: FolderStore, settings: Settings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert refused(search_check, settings).code == "search_missing"
+    first = SearchServer(deployed, store, settings, Shard(0, 2))
+    second = SearchServer(deployed, store, settings, Shard(1, 2))
+    try:
+        monkeypatch.setenv("SEARCH_URLS", f"{first.url},{second.url}")
+        assert search_check(Settings()).startswith("2 shards, 2 workers, 0 rows")
+        second.stop()
+        ill = refused(search_check, Settings())
+        assert ill.code == "search_ill"
+        assert "nobody answers for shard 1/2" in ill.detail
+    finally:
+        first.stop()
+        second.stop()
+
+
+def test_a_gateway_that_is_not_there_is_named() -> None:
+    gone = refused(gateway_check, "http://127.0.0.1:1", None)
+    assert isinstance(gone, Unavailable)
+    assert not isinstance(gone, Misconfigured)
+    assert "http://127.0.0.1:1 does not answer" in gone.detail
