@@ -88,7 +88,7 @@ class CallLog:
             try:
                 await self._app(scope, counted, marked)
             finally:
-                call.route = getattr(scope.get("route"), "path", NO_ROUTE)
+                call.route = _template(scope)
                 describe(f"{method} {call.route}", status=call.status)
                 self._on_end(call)
                 self._write(call, scope, time.perf_counter() - started)
@@ -109,3 +109,14 @@ class CallLog:
             call.status,
             extra=facts,
         )
+
+
+def _template(scope: Scope) -> str:
+    """The path of the route that took the call, with its router's prefix: that is not in the route,
+    and is the same in every path."""
+    template: str | None = getattr(scope.get("route"), "path", None)
+    if template is None:
+        return NO_ROUTE
+    parts = scope["path"].split("/")
+    prefix = parts[: len(parts) - template.count("/")]
+    return "/".join(prefix) + template

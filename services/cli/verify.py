@@ -67,7 +67,14 @@ def _as_dict(report: Report, queued: int | None) -> dict[str, Any]:
         {name: str(value) for name, value in asdict(fault).items() if value is not None}
         for fault in report.faults
     ]
-    return {**asdict(report), "faults": faults, "queued_photos": queued}
+    return {
+        "checked": dict(report.checked),
+        "read_bytes": report.read_bytes,
+        "faults": faults,
+        "orphans": report.orphans,
+        "orphan_bytes": report.orphan_bytes,
+        "queued_photos": queued,
+    }
 
 
 def _print(report: Report, queued: int | None) -> None:

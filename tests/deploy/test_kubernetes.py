@@ -100,8 +100,8 @@ def test_every_service_is_watched_and_has_time_to_end(build: str) -> None:
 
 
 def test_checks_and_commands_are_those_of_the_compose_file(tmp_path: Path) -> None:
-    secrets = ("POSTGRES_PASSWORD", "REDIS_PASSWORD", "FLOWER_PASSWORD", "GRAFANA_PASSWORD")
-    secrets += ("ADMIN_KEY",)
+    passwords = (f"{name}_PASSWORD" for name in ("POSTGRES", "REDIS", "FLOWER", "GRAFANA"))
+    secrets = (*passwords, "ADMIN_KEY")
     values = dict.fromkeys((*secrets, "S3_ACCESS_KEY", "S3_SECRET_KEY"), "x")
     compose = services(SERVICES, tmp_path, values)
     for name, workload in of_kind("base", *WORKLOADS).items():

@@ -29,13 +29,13 @@ ID = "from-the-proxy-17"
 
 
 @pytest.fixture
-def lines(caplog: pytest.LogCaptureFixture) -> Iterator[list[logging.LogRecord]]:
+def log(caplog: pytest.LogCaptureFixture) -> Iterator[pytest.LogCaptureFixture]:
     with caplog.at_level(logging.DEBUG, "services"):
-        yield caplog.records
+        yield caplog
 
 
 def test_the_id_of_an_upload_is_found_in_the_answer_the_job_and_both_logs(
-    service: Service, lines: list[logging.LogRecord]
+    service: Service, log: pytest.LogCaptureFixture
 ) -> None:
     answer = service(
         "POST",
@@ -49,10 +49,10 @@ def test_the_id_of_an_upload_is_found_in_the_answer_the_job_and_both_logs(
     service.drain()
     assert service.json("GET", f"/jobs/{job_id}")["request_id"] == ID
 
-    (call,) = [line for line in lines if line.getMessage() == "POST /api/v1/upload: 202"][:1]
+    (call,) = [line for line in log.records if line.getMessage() == "POST /api/v1/upload: 202"][:1]
     assert call.__dict__["route"] == "/api/v1/upload"
     assert call.__dict__["received_bytes"] > len(photo_bytes(1))
-    (published,) = [line for line in lines if line.name == "services.extractor.publish"]
+    (published,) = [line for line in log.records if line.name == "services.extractor.publish"]
     assert ID in published.__dict__["request_ids"]
     assert len(published.__dict__["request_ids"]) == 2, "the other call has an id of its own"
     assert job_id in published.__dict__["job_ids"]
@@ -66,7 +66,7 @@ def test_photos_of_a_batch_carry_the_id_of_its_call(service: Service) -> None:
         "POST",
         "/upload/batch",
         202,
-        files={"file": ("photos.zip", archive)},
+        files={"archive": ("photos.zip", archive)},
         headers={"X-Request-ID": ID},
     )
     worker = BatchWorker(
@@ -80,12 +80,12 @@ def test_photos_of_a_batch_carry_the_id_of_its_call(service: Service) -> None:
 
 
 def test_an_unforeseen_error_answers_with_the_id_and_logs_it(
-    service: Service, lines: list[logging.LogRecord], monkeypatch: pytest.MonkeyPatch
+    service: Service, log: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("services.gateway.jobs.list_jobs", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):  # TestClient raises it once more
         service("GET", "/jobs", headers={"X-Request-ID": ID})
-    failed = [line for line in lines if line.getMessage() == "GET /api/v1/jobs: 500"]
+    failed = [line for line in log.records if line.getMessage() == "GET /api/v1/jobs: 500"]
     assert [line.levelno for line in failed] == [logging.INFO]
 
 
