@@ -16,6 +16,7 @@ from sqlalchemy.orm import Session
 from starlette.concurrency import run_in_threadpool
 
 from services.gateway.context import DEFAULT_MAP, NO_NUL, Gateway, GatewayDep, MapName
+from services.gateway.key_check import ADMIN, READ
 from services.gateway.once import Once, OnceFormDep
 from services.gateway.receive import describe_form, receive_file
 from services.gateway.room import ROOM_FOR_JOBS, Kind, RoomDep
@@ -109,7 +110,7 @@ class ModelRemoved(Answer):
         ["name"],
         **FIELDS,
     ),
-    dependencies=[ROOM_FOR_JOBS],
+    dependencies=[ADMIN, ROOM_FOR_JOBS],
 )
 async def add_model(
     request: Request,
@@ -153,7 +154,7 @@ async def add_model(
     return answer
 
 
-@router.get("/models", operation_id="list_models", response_model=ModelsAnswer)
+@router.get("/models", operation_id="list_models", response_model=ModelsAnswer, dependencies=[READ])
 def models(gateway: GatewayDep) -> ModelsAnswer:
     """Every model that was added, by name."""
     with gateway.catalog.read() as session:
@@ -161,14 +162,21 @@ def models(gateway: GatewayDep) -> ModelsAnswer:
     return ModelsAnswer(models=found)
 
 
-@router.get("/models/{name}", operation_id="get_model", response_model=ModelAnswer)
+@router.get(
+    "/models/{name}", operation_id="get_model", response_model=ModelAnswer, dependencies=[READ]
+)
 def one_model(gateway: GatewayDep, name: ModelPath) -> ModelAnswer:
     """One model."""
     with gateway.catalog.read() as session:
         return ModelAnswer.of(session, get_model(session, name))
 
 
-@router.delete("/models/{name}", operation_id="remove_model", response_model=ModelRemoved)
+@router.delete(
+    "/models/{name}",
+    operation_id="remove_model",
+    response_model=ModelRemoved,
+    dependencies=[ADMIN],
+)
 def delete_model(gateway: GatewayDep, name: ModelPath) -> ModelRemoved:
     """Remove a model; 409 (`model_in_use`) while a map is described with it.
 

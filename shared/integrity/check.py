@@ -77,8 +77,8 @@ def _look(
             store, chunk.id, chunk.object_key, chunk.sha256, chunk.rows, rows, report
         )
         return
-    if one.what == What.ORIGINAL and originals:
-        yield from _read_original(store, one, report)
+    if one.what == What.MODEL or (one.what == What.ORIGINAL and originals):
+        yield from _read_whole(store, one, report)
         return
     info = store.head(one.key)
     if info is None:
@@ -92,7 +92,7 @@ def _look(
         yield from _read_vocabulary(catalog, store, one, report)
 
 
-def _read_original(store: ObjectStore, one: NamedObject, report: Report) -> Iterator[Fault]:
+def _read_whole(store: ObjectStore, one: NamedObject, report: Report) -> Iterator[Fault]:
     digest = hashlib.sha256()
     try:
         with store.open(one.key) as file:
@@ -104,7 +104,7 @@ def _read_original(store: ObjectStore, one: NamedObject, report: Report) -> Iter
         return
     report.checked[one.what] += 1
     if digest.hexdigest() != one.sha256:
-        yield Fault(Wrong.DAMAGED, one.what, one.key, f"of photo {one.row_id}: its hash differs")
+        yield Fault(Wrong.DAMAGED, one.what, one.key, f"{one.what} {one.row_id}: its hash differs")
 
 
 def _read_vocabulary(

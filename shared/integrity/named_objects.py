@@ -14,6 +14,7 @@ from sqlalchemy.orm import Session
 from shared.catalog.chunks import Chunk
 from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.maps import Map
+from shared.catalog.models import Model
 from shared.catalog.photos import Photo
 from shared.catalog.vocabularies import Vocabulary
 from shared.catalog.whitenings import StoredWhitening
@@ -31,8 +32,14 @@ class What(StrEnum):
     MANIFEST = "manifest"
     VOCABULARY = "vocabulary"
     WHITENING = "whitening"
+    MODEL = "model"
+    CHECKPOINT = "checkpoint"  # of a model that is being added
     ARCHIVE = "archive"  # of a batch that is not finished
     FILE = "file"  # of such a batch, not a photo yet
+
+
+BROUGHT = {JobKind.BATCH: What.ARCHIVE, JobKind.ADD_MODEL: What.CHECKPOINT}
+"""What came with a job, and goes when it ends."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +47,7 @@ class NamedObject:
     key: str
     what: What
     row_id: UUID
-    """Of the photo, chunk, vocabulary, whitening or batch's job."""
+    """Of the photo, chunk, vocabulary, whitening, model or job."""
     size_bytes: int | None = None
     """None: not known."""
     sha256: str | None = None
@@ -76,10 +83,14 @@ def named_objects(session: Session) -> Iterator[NamedObject]:
         found = select(table.id, table.object_key).join(Map, Map.id == table.map_id)
         for one in session.execute(found.where(Map.deleted_at.is_(None))):
             yield NamedObject(one.object_key, what, one.id)
-    batches = select(Job.id, Job.params).where(Job.kind == JobKind.BATCH, Job.state.in_(UNFINISHED))
-    for batch in session.execute(batches).all():
-        if (key := batch.params.get("object_key")) is not None:
-            yield NamedObject(key, What.ARCHIVE, batch.id)
+    models = select(Model.id, Model.object_key, Model.size_bytes, Model.sha256)
+    for model in session.execute(models.where(Model.object_key.is_not(None))):
+        yield NamedObject(model.object_key, What.MODEL, model.id, model.size_bytes, model.sha256)
+    for kind, what in BROUGHT.items():
+        jobs = select(Job.id, Job.params).where(Job.kind == kind, Job.state.in_(UNFINISHED))
+        for job in session.execute(jobs).all():
+            if (key := job.params.get("object_key")) is not None:
+                yield NamedObject(key, what, job.id)
     files = select(BatchItem.object_key, BatchItem.job_id).where(
         BatchItem.state == JobState.QUEUED, BatchItem.object_key.startswith(ORIGINALS)
     )
