@@ -15,10 +15,10 @@ UV_VERSION := 0.13.8
 INSTALLED := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help setup run test lint types bench demo env clean
+.PHONY: help setup run test test-browser pictures lint types bench demo env clean
 
 help: ## list the targets
-	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | awk -F':.*## ' '{printf "  make %-8s %s\n", $$1, $$2}'
+	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F':.*## ' '{printf "  make %-13s %s\n", $$1, $$2}'
 
 setup: $(INSTALLED) ## make .venv and install everything into it (TORCH_INDEX= picks another torch build)
 
@@ -43,6 +43,12 @@ run: $(INSTALLED) ## serve the embedded Placewise on http://HOST:PORT, data unde
 
 test: $(INSTALLED) ## every test (PLACEWISE_TEST_DATA=FOLDER adds those on real photos)
 	$(BIN)/python -m pytest tests --numprocesses auto --dist loadfile --no-loadscope-reorder
+
+test-browser: $(INSTALLED) ## the page in a real Chromium (apt-get install chromium)
+	PLACEWISE_TEST_BROWSER=1 $(BIN)/python -m pytest tests/browser
+
+pictures: $(INSTALLED) ## the same, and the screenshots in docs/pictures anew
+	PLACEWISE_TEST_BROWSER=1 PLACEWISE_PICTURES=docs/pictures $(BIN)/python -m pytest tests/browser
 
 lint: $(INSTALLED) ## ruff, formatting and the import contracts
 	$(BIN)/ruff check .

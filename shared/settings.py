@@ -107,6 +107,16 @@ class Settings(BaseSettings):
         None, description="Redis that carries hints between services; unset: one process"
     )
 
+    map_tiles: str | None = Field(
+        None,
+        description="address of the page's map tiles: "
+        "https://tile.openstreetmap.org/{z}/{x}/{y}.png; unset: a plain graticule, and the page "
+        "loads nothing from elsewhere",
+    )
+    map_attribution: str | None = Field(
+        None, description="whose MAP_TILES are, as their licence wants it shown"
+    )
+
     heartbeat_file: Path | None = Field(
         None,
         description="file that an extractor or steward of its own touches while it works, for "
@@ -359,6 +369,20 @@ class Settings(BaseSettings):
             )
         return value
 
+    @field_validator("map_tiles")
+    @classmethod
+    def _a_pattern_of_tiles(cls, value: str | None) -> str | None:
+        # Its host goes into the page's Content-Security-Policy: nothing else may follow it there.
+        if value is not None and not (
+            re.fullmatch(r"https?://[A-Za-z0-9.-]+(:\d+)?/[^\s]+", value)
+            and all(part in value for part in ("{z}", "{x}", "{y}"))
+        ):
+            raise ValueError(
+                f"{value!r} is no address of tiles with {{z}}, {{x}} and {{y}}, such as "
+                "https://tile.openstreetmap.org/{z}/{x}/{y}.png"
+            )
+        return value
+
     @field_validator("s3_public_endpoint")
     @classmethod
     def _an_address_without_a_path(cls, value: str | None) -> str | None:
@@ -386,6 +410,15 @@ class Settings(BaseSettings):
             raise ValueError(
                 "With S3_ENDPOINT the photos lie in S3_BUCKET, and UPLOAD_DIR names a folder for "
                 "them. Unset one of the two"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _tiles_say_whose_they_are(self) -> Self:
+        if self.map_tiles is not None and self.map_attribution is None:
+            raise ValueError(
+                "MAP_TILES needs MAP_ATTRIBUTION, which stands in the corner of the map: "
+                "© OpenStreetMap contributors"
             )
         return self
 

@@ -24,6 +24,7 @@ from tests.support.servers import (
 )
 
 REAL_PHOTOS = "PLACEWISE_TEST_DATA"
+BROWSER = "PLACEWISE_TEST_BROWSER"
 TESTS = Path(__file__).parent
 # A long test that begins last is waited for alone.
 LONGEST_FIRST = ("faults", "deploy", "e2e", "integration", "contract", "unit")
@@ -34,14 +35,23 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """What waits most comes first, beside what calculates. Without the real photos, the tests that
-    need them are deselected, and one line says so."""
+    need them are deselected, and so are those in a browser where none is asked for; one line says
+    so."""
     kinds = {kind: place for place, kind in enumerate(LONGEST_FIRST)}
-    items.sort(key=lambda item: kinds.get(item.path.relative_to(TESTS).parts[0], len(kinds)))
-    if os.environ.get(REAL_PHOTOS):
-        return
-    without = [item for item in items if item.get_closest_marker("real_photos")]
-    config.hook.pytest_deselected(items=without)
-    items[:] = [item for item in items if item not in without]
+    items.sort(key=lambda item: kinds.get(_kind(item), len(kinds)))
+    without = [
+        item
+        for item in items
+        if (item.get_closest_marker("real_photos") and not os.environ.get(REAL_PHOTOS))
+        or (_kind(item) == "browser" and not os.environ.get(BROWSER))
+    ]
+    if without:
+        config.hook.pytest_deselected(items=without)
+        items[:] = [item for item in items if item not in without]
+
+
+def _kind(item: pytest.Item) -> str:
+    return item.path.relative_to(TESTS).parts[0]
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
@@ -49,6 +59,10 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
         terminalreporter.write_line(
             f"The tests on real photos were left out: set {REAL_PHOTOS} to a folder with "
             "toy-places/ and anyloc-vocabularies/ to run them."
+        )
+    if not os.environ.get(BROWSER):
+        terminalreporter.write_line(
+            "The tests in a browser were left out: make test-browser runs them."
         )
 
 

@@ -51,7 +51,7 @@ def _welcome(url: str, key: AdminKey | None, settings: Settings) -> str:
     lines = [
         f"Placewise serves {settings.placewise_home} on {url}",
         *_about_the_key(key, settings, command),
-        f"  look:     {url}/docs   (the API)   {url}/api/v1/health",
+        f"  look:     {url}   (the page)   {url}/docs   (the API)",
         (
             f"  put in:   curl {header}-F file=@PHOTO.jpg -F latitude=45.07 -F longitude=7.69 "
             f"{url}/api/v1/upload"

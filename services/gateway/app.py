@@ -7,6 +7,7 @@ from fastapi.security import HTTPBearer
 
 from services.gateway import (
     batches,
+    console,
     direct_upload,
     evaluations,
     figures,
@@ -46,6 +47,8 @@ def create_app(gateway: Gateway) -> FastAPI:
         version=health.VERSION,
         description=DESCRIPTION,
         responses=PROBLEM_RESPONSES,
+        docs_url=None,  # console.py has pages that need no other server
+        redoc_url=None,
     )
     app.state.gateway = gateway
     app.state.room = Room(gateway.catalog, gateway.settings)
@@ -74,4 +77,5 @@ def create_app(gateway: Gateway) -> FastAPI:
             dependencies=[Security(BEARER), Depends(no_unknown_parameters)],
         )
     app.include_router(health.probes)
+    app.include_router(console.console_router(gateway.settings))
     return app

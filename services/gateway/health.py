@@ -68,8 +68,6 @@ class HealthAnswer(Answer):
     load: LoadAnswer | None = Field(description="null while the catalog is away")
 
 
-@probes.head("/", include_in_schema=False)
-@probes.get("/", operation_id="service", response_model=ServiceAnswer)
 def service() -> ServiceAnswer:
     """What this is and where to look."""
     return ServiceAnswer(

@@ -20,11 +20,11 @@ OPEN_PATHS = frozenset(
         "/livez",
         "/readyz",
         "/docs",
-        "/docs/oauth2-redirect",
         "/redoc",
         "/openapi.json",
     }
 )
+OPEN_FOLDER = "/console/"  # the page's own files, which has a field for the key
 
 
 class KeyCheck:
@@ -37,7 +37,7 @@ class KeyCheck:
         self._keys = keys
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] == "http" and scope["path"] not in OPEN_PATHS:
+        if scope["type"] == "http" and not _is_open(scope["path"]):
             request = Request(scope)
             try:
                 self._keys.check(request.headers)
@@ -46,3 +46,7 @@ class KeyCheck:
                 await problem_response(error, request)(scope, receive, send)
                 return
         await self._app(scope, receive, send)
+
+
+def _is_open(path: str) -> bool:
+    return path in OPEN_PATHS or path.startswith(OPEN_FOLDER)

@@ -56,8 +56,11 @@ def objects(server: ServerProcess) -> set[Path]:
 
 
 def test_probes_and_descriptions_are_open(stranger: httpx2.Client) -> None:
-    for path in ("/", "/livez", "/readyz", "/docs", "/redoc", "/openapi.json"):
+    for path in ("/", "/livez", "/readyz", "/docs", "/redoc", "/openapi.json", "/console/app.js"):
         assert stranger.get(path).status_code == 200, path
+    # No way out of the page's folder, and no other folder that begins alike.
+    for path in ("/console/../api/v1/maps", "/console/%2e%2e/api/v1/maps", "/console"):
+        assert stranger.get(path).status_code in (401, 404), path
 
 
 def test_every_described_call_needs_the_key(stranger: httpx2.Client, key: str) -> None:

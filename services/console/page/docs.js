@@ -1,0 +1,10 @@
+// Swagger UI on the server's own description.
+const target = document.getElementById("description");
+SwaggerUIBundle({
+  url: target.dataset.url,
+  domNode: target,
+  deepLinking: true,
+  validatorUrl: null, // the public validator would be asked otherwise
+  presets: [SwaggerUIBundle.presets.apis],
+  layout: "BaseLayout",
+});

@@ -1,0 +1,100 @@
+// Elements without a framework: h("p", { class: "soft" }, "text", child).
+
+/** An element. `on...` are listeners, true and false are attributes with no value; a null is left out. */
+export function h(name, attributes = {}, ...children) {
+  const element = document.createElement(name);
+  for (const [key, value] of Object.entries(attributes)) {
+    if (value === null || value === undefined || value === false) continue;
+    if (key.startsWith("on")) element.addEventListener(key.slice(2), value);
+    else if (key === "value") element.value = value;
+    else element.setAttribute(key, value === true ? "" : value);
+  }
+  element.append(...children.flat().filter((child) => child !== null && child !== undefined && child !== false));
+  return element;
+}
+
+/** Put these in the place of all that is in the element. */
+export function fill(element, ...children) {
+  element.replaceChildren(...children.flat().filter((child) => child !== null && child !== undefined && child !== false));
+  return element;
+}
+
+/** A button; `onclick` may take its time, and the button can't be pressed again meanwhile. */
+export function button(label, onclick, kind = "") {
+  const element = h("button", { type: "button", class: kind }, label);
+  element.addEventListener("click", async () => {
+    // Not `disabled`: that would take the keyboard's place away.
+    if (element.getAttribute("aria-disabled") === "true") return;
+    element.setAttribute("aria-disabled", "true");
+    try {
+      await onclick();
+    } catch (error) {
+      noteError(error);
+    } finally {
+      element.removeAttribute("aria-disabled");
+    }
+  });
+  return element;
+}
+
+let hints = 0;
+
+/** A field with its label; the hint is no part of its name. */
+export function field(label, input, hint = null) {
+  const small = hint && h("small", { id: `hint-${++hints}` }, hint);
+  if (small) input.setAttribute("aria-describedby", small.id);
+  return h("div", { class: "field" }, h("label", {}, h("span", {}, label), input), small);
+}
+
+/** A bar with its meaning in words. `done` of `total`; an unknown total moves. */
+export function bar(label, done, total) {
+  const known = total > 0;
+  return h("progress", { "aria-label": label, max: known ? total : null, value: known ? done : null });
+}
+
+/** A short message at the lower edge; read out by screen readers. */
+export function note(text, kind = "") {
+  const line = h("p", { class: `note ${kind}` }, text, h("button", { type: "button", class: "bare", "aria-label": "Close this message", onclick: () => line.remove() }, "×"));
+  document.getElementById("notes").append(line);
+  setTimeout(() => line.remove(), kind === "bad" ? 12000 : 5000);
+}
+
+/** Have screen readers say what the eye sees anyway. */
+export function say(text) {
+  document.getElementById("said").textContent = text;
+}
+
+/** What went wrong, unless the view was only left. */
+export function noteError(error) {
+  if (error.name !== "AbortError") note(error.message, "bad");
+}
+
+/** A dialog with the keyboard's focus in it; resolves with what closed it. */
+export function openDialog(title, ...content) {
+  const heading = h("h2", { id: "dialog-title", tabindex: "-1" }, title);
+  const close = h("button", { type: "button", class: "bare close", "aria-label": "Close" }, "×");
+  const dialog = h("dialog", { "aria-labelledby": "dialog-title" }, h("header", {}, heading, close), ...content);
+  close.addEventListener("click", () => dialog.close());
+  dialog.addEventListener("click", (event) => event.target === dialog && dialog.close());
+  document.body.append(dialog);
+  dialog.showModal();
+  const closed = new Promise((resolve) => {
+    dialog.addEventListener("close", () => {
+      dialog.remove();
+      resolve(dialog.returnValue);
+    });
+  });
+  return { dialog, heading, closed };
+}
+
+/** Ask before something that can't be undone; true when it is wanted. */
+export async function confirmed(title, text, action) {
+  const { dialog, closed } = openDialog(
+    title,
+    h("p", {}, text),
+    h("div", { class: "row end" },
+      h("button", { type: "button", onclick: () => dialog.close("") }, "Keep"),
+      h("button", { type: "button", class: "danger", onclick: () => dialog.close("yes") }, action)),
+  );
+  return (await closed) === "yes";
+}

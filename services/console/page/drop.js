@@ -1,0 +1,50 @@
+// Files from a drop, a folder of a drop, or the clipboard.
+
+/** Every file of a drop, folders opened; each with its path from there as `path`. */
+export async function droppedFiles(transfer) {
+  const entries = Array.from(transfer.items, (item) => item.webkitGetAsEntry?.()).filter(Boolean);
+  if (!entries.length) return Array.from(transfer.files, (file) => ({ file, path: file.name }));
+  const found = [];
+  for (const entry of entries) await walk(entry, "", found);
+  return found;
+}
+
+async function walk(entry, folder, found) {
+  const path = folder + entry.name;
+  if (entry.isFile) {
+    const file = await new Promise((resolve, reject) => entry.file(resolve, reject));
+    if (!entry.name.startsWith(".")) found.push({ file, path });
+    return;
+  }
+  const reader = entry.createReader();
+  while (true) {
+    // A hundred at a time, until none is left.
+    const some = await new Promise((resolve, reject) => reader.readEntries(resolve, reject));
+    if (!some.length) return;
+    for (const one of some) await walk(one, `${path}/`, found);
+  }
+}
+
+/** Let files be dropped on the element; `onfiles` gets them as [{file, path}]. */
+export function takesDrops(element, onfiles) {
+  element.addEventListener("dragover", (event) => {
+    event.preventDefault();
+    element.classList.add("over");
+  });
+  element.addEventListener("dragleave", (event) => {
+    if (!element.contains(event.relatedTarget)) element.classList.remove("over");
+  });
+  element.addEventListener("drop", async (event) => {
+    event.preventDefault();
+    element.classList.remove("over");
+    onfiles(await droppedFiles(event.dataTransfer));
+  });
+}
+
+/** The clipboard's picture, wherever it is pasted, until the view is left. */
+export function takesPastes(onfiles, signal) {
+  document.addEventListener("paste", (event) => {
+    const files = Array.from(event.clipboardData?.files ?? []);
+    if (files.length) onfiles(files.map((file) => ({ file, path: file.name })));
+  }, { signal });
+}

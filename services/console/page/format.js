@@ -1,0 +1,33 @@
+// Figures as people read them.
+
+export const count = (number) => number.toLocaleString("en");
+export const plural = (number, noun) => `${count(number)} ${noun}${number === 1 ? "" : "s"}`;
+export const percent = (share) => (share === null || share === undefined ? "–" : `${(100 * share).toFixed(1)} %`);
+export const score = (cosine) => cosine.toFixed(3);
+
+export function bytes(number) {
+  const units = ["B", "kB", "MB", "GB", "TB"];
+  const power = number < 1000 ? 0 : Math.min(units.length - 1, Math.floor(Math.log10(number) / 3));
+  return `${(number / 1000 ** power).toFixed(power && number / 1000 ** power < 100 ? 1 : 0)} ${units[power]}`;
+}
+
+/** Degrees to the decimetre or so. */
+export const degrees = (latitude, longitude) => `${latitude.toFixed(5)}, ${longitude.toFixed(5)}`;
+
+/** Local time, short. */
+export function when(text) {
+  return new Date(text).toLocaleString("en-GB", { year: "numeric", month: "short", day: "numeric", hour: "2-digit", minute: "2-digit" });
+}
+
+export function duration(seconds) {
+  if (seconds < 90) return `${Math.round(seconds)} s`;
+  if (seconds < 5400) return `${Math.round(seconds / 60)} min`;
+  return seconds < 129600 ? `${Math.round(seconds / 3600)} h` : `${Math.round(seconds / 86400)} days`;
+}
+
+/** What a photo says of where it was taken. */
+export function whereabouts(photo) {
+  const place = photo.place ? [photo.place] : [];
+  if (photo.latitude !== null) place.push(degrees(photo.latitude, photo.longitude));
+  return place.join(" · ") || "no place";
+}

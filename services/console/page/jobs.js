@@ -1,0 +1,69 @@
+// A job until it ends: server-sent events, or polling where a proxy keeps those back.
+
+import { ask, get } from "./api.js";
+
+const ENDED = ["succeeded", "failed", "cancelled"];
+const SILENCE_MS = 40_000; // the server says something every 15 s
+const POLL_SECONDS = 10;
+
+export const hasEnded = (job) => ENDED.includes(job.state);
+
+/** Tells `onChange` of every change; resolves with the job as it ended. `query` may name its map. */
+export async function watchJob(id, onChange, signal, query = {}) {
+  try {
+    for await (const job of events(id, signal, query)) {
+      onChange(job);
+      if (hasEnded(job)) return job;
+    }
+  } catch (error) {
+    if (signal?.aborted) throw error;
+  }
+  while (true) {
+    const job = await get(`/jobs/${id}`, { query: { ...query, wait: POLL_SECONDS }, signal });
+    onChange(job);
+    if (hasEnded(job)) return job;
+  }
+}
+
+// Not EventSource: it can't send a key.
+async function* events(id, signal, query) {
+  const silence = new AbortController();
+  let timer;
+  const spoken = () => {
+    clearTimeout(timer);
+    timer = setTimeout(() => silence.abort(), SILENCE_MS);
+  };
+  const leave = () => silence.abort();
+  signal?.addEventListener("abort", leave);
+  try {
+    spoken();
+    const response = await ask(`/jobs/${id}/events`, { query, signal: silence.signal });
+    const reader = response.body.pipeThrough(new TextDecoderStream()).getReader();
+    let text = "";
+    while (true) {
+      const { done, value } = await reader.read();
+      if (done) return;
+      spoken();
+      text += value;
+      const whole = text.split("\n\n");
+      text = whole.pop();
+      for (const event of whole) {
+        const data = event.split("\n").filter((line) => line.startsWith("data:")).map((line) => line.slice(5)).join("\n");
+        if (data) yield JSON.parse(data);
+      }
+    }
+  } finally {
+    clearTimeout(timer);
+    signal?.removeEventListener("abort", leave);
+    silence.abort();
+  }
+}
+
+/** What a job is at, in words. */
+export function stateInWords(job) {
+  if (job.state === "queued" && job.waiting_for === "vocabulary") return "waits for a vocabulary";
+  if (job.state === "queued" && job.waiting_for) return `waits for ${job.waiting_for}`;
+  const stage = { sample: "looking at photos", cluster: "finding centres", describe: "describing", load: "loading into search", list: "listing", store: "storing" }[job.stage];
+  if (job.state === "running") return stage ?? "being described";
+  return { queued: "waiting", succeeded: "done", failed: "failed", cancelled: "cancelled" }[job.state];
+}

@@ -1,0 +1,156 @@
+// The map: Leaflet, with the tiles of MAP_TILES or else a graticule.
+
+import { h } from "./dom.js";
+import { serverSettings } from "./settings.js";
+
+const MOST_ZOOM = 21;
+const LINES = 9; // about so many across the map
+const POINTS_DRAWN = 5000;
+
+let loaded = null;
+
+/** Leaflet and what the server says of tiles; loaded when the first map is wanted. */
+function load() {
+  loaded ??= Promise.all([
+    new Promise((resolve, reject) => {
+      // Before the page's own style sheet, which has the last word.
+      document.head.prepend(h("link", { rel: "stylesheet", href: "/console/leaflet/leaflet.css", onload: resolve, onerror: reject }));
+    }),
+    new Promise((resolve, reject) => {
+      document.head.append(h("script", { src: "/console/leaflet/leaflet.js", onload: resolve, onerror: reject }));
+    }),
+    serverSettings(),
+  ]).then(([, , settings]) => settings);
+  return loaded;
+}
+
+/** Degrees between two lines, so that about LINES of them are seen: 1, 2 or 5 times a power of ten. */
+function stepOf(extent) {
+  const rough = extent / LINES;
+  const power = 10 ** Math.floor(Math.log10(rough));
+  return [1, 2, 5, 10].map((factor) => factor * power).find((step) => step >= rough);
+}
+
+function drawGraticule(map, layer) {
+  layer.clearLayers();
+  const bounds = map.getBounds().pad(0.1);
+  const step = stepOf(Math.max(bounds.getNorth() - bounds.getSouth(), bounds.getEast() - bounds.getWest()));
+  const digits = Math.max(0, -Math.floor(Math.log10(step) + 1e-9));
+  const line = (from, to, text, at) => {
+    L.polyline([from, to], { className: "graticule", interactive: false }).addTo(layer);
+    L.marker(at, { interactive: false, keyboard: false, icon: L.divIcon({ className: "graticule-label", html: text, iconSize: null }) }).addTo(layer);
+  };
+  const { x: width, y: height } = map.getSize();
+  const corner = map.containerPointToLatLng([4, height - 6]);
+  for (let lat = Math.ceil(bounds.getSouth() / step) * step; lat < bounds.getNorth(); lat += step) {
+    if (Math.abs(lat) > 85) continue;
+    line([lat, bounds.getWest()], [lat, bounds.getEast()], `${lat.toFixed(digits)}°`, [lat, corner.lng]);
+  }
+  const top = map.containerPointToLatLng([width, 4]);
+  for (let lng = Math.ceil(bounds.getWest() / step) * step; lng < bounds.getEast(); lng += step) {
+    line([bounds.getSouth(), lng], [bounds.getNorth(), lng], `${lng.toFixed(digits)}°`, [top.lat, lng]);
+  }
+}
+
+/** A map in the element, with its name for screen readers. `onpick(latitude, longitude)` makes it a
+ * field: a click, or Enter at the middle, chooses a point. */
+export async function openMap(element, label, { onpick = null, signal } = {}) {
+  const settings = await load();
+  signal?.throwIfAborted();
+  element.setAttribute("role", "group");
+  element.setAttribute("aria-label", label);
+  const still = matchMedia("(prefers-reduced-motion: reduce)").matches;
+  const map = L.map(element, {
+    attributionControl: Boolean(settings.map_tiles),
+    fadeAnimation: !still,
+    zoomAnimation: !still,
+    markerZoomAnimation: !still,
+    inertia: !still,
+    maxZoom: MOST_ZOOM,
+    minZoom: 1,
+    preferCanvas: false,
+    scrollWheelZoom: false,
+    worldCopyJump: true,
+    zoomControl: false,
+    zoomSnap: 0.25,
+  });
+  map.setView([20, 0], 1);
+  // Where no label of the graticule lies.
+  L.control.zoom({ position: "bottomright" }).addTo(map);
+  L.control.scale({ imperial: false }).addTo(map);
+  if (settings.map_tiles) {
+    map.attributionControl.setPrefix("");
+    L.tileLayer(settings.map_tiles, { attribution: escaped(settings.map_attribution), maxZoom: MOST_ZOOM, maxNativeZoom: 19 }).addTo(map);
+  } else {
+    const lines = L.layerGroup().addTo(map);
+    map.on("moveend resize", () => drawGraticule(map, lines));
+  }
+  // The wheel scrolls the page until the map was asked for.
+  map.on("focus click", () => map.scrollWheelZoom.enable());
+  map.on("blur mouseout", () => map.scrollWheelZoom.disable());
+  const things = L.layerGroup().addTo(map);
+  const resized = new ResizeObserver(() => map.invalidateSize({ pan: false }));
+  resized.observe(element);
+  signal?.addEventListener("abort", () => {
+    resized.disconnect();
+    map.remove();
+  });
+  if (onpick) {
+    element.classList.add("picks");
+    map.on("click", ({ latlng }) => onpick(latlng.lat, latlng.wrap().lng));
+    element.addEventListener("keydown", (event) => {
+      if (event.key !== "Enter" || event.target !== element) return;
+      const middle = map.getCenter().wrap();
+      onpick(middle.lat, middle.lng);
+    });
+  }
+  return new PlaceMap(map, things);
+}
+
+class PlaceMap {
+  constructor(map, things) {
+    this.map = map;
+    this.things = things;
+    this.bounds = [];
+  }
+
+  clear() {
+    this.things.clearLayers();
+    this.bounds = [];
+  }
+
+  /** A photo's point. `kind` is a class of the style sheet. */
+  point(latitude, longitude, { kind = "", text = "", radius = 6, onclick = null } = {}) {
+    if (this.bounds.length >= POINTS_DRAWN) return null;
+    const drawn = L.circleMarker([latitude, longitude], { radius, className: `point ${kind}` }).addTo(this.things);
+    if (text) drawn.bindTooltip(escaped(text));
+    if (onclick) drawn.on("click", onclick);
+    this.bounds.push([latitude, longitude]);
+    return drawn;
+  }
+
+  /** A point with its number, for the list beside the map. */
+  numbered(latitude, longitude, number, text, onclick) {
+    const icon = L.divIcon({ className: `number-pin ${number === 1 ? "first" : ""}`, html: String(number), iconSize: [24, 24] });
+    L.marker([latitude, longitude], { icon, title: text, alt: text, zIndexOffset: -number }).on("click", onclick).addTo(this.things);
+    this.bounds.push([latitude, longitude]);
+  }
+
+  /** A circle of so many metres. */
+  circle(latitude, longitude, radiusM, kind) {
+    const drawn = L.circle([latitude, longitude], { radius: radiusM, className: kind, interactive: false }).addTo(this.things);
+    const box = L.latLng(latitude, longitude).toBounds(2 * radiusM);
+    this.bounds.push(box.getSouthWest(), box.getNorthEast());
+    return drawn;
+  }
+
+  /** Show all that was drawn. */
+  fit() {
+    this.map.invalidateSize({ pan: false });
+    if (this.bounds.length) this.map.fitBounds(this.bounds, { padding: [36, 36], maxZoom: 19, animate: false });
+  }
+}
+
+function escaped(text) {
+  return text.replace(/[&<>"']/g, (letter) => `&#${letter.charCodeAt(0)};`);
+}

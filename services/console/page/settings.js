@@ -1,0 +1,8 @@
+// What the server says of itself to everyone: map_tiles, map_attribution, max_file_size (bytes).
+
+let read = null;
+
+export function serverSettings() {
+  read ??= fetch("/console/settings.json").then((response) => response.json());
+  return read;
+}

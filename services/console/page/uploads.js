@@ -1,0 +1,249 @@
+// What is being added: a few uploads at a time, each with its job, many photos as batches.
+
+import { Problem, currentMap, get, idempotencyKey, post, send } from "./api.js";
+import { count, plural } from "./format.js";
+import { stateInWords, watchJob } from "./jobs.js";
+
+const AT_ONCE = 3; // browsers keep six connections to a server, and each job's events take one
+const ONE_BY_ONE = 24; // more than these go as batches
+const BATCH_PHOTOS = 60;
+const BATCH_BYTES = 120_000_000;
+const ERRORS_SHOWN = 100;
+const BUSY_TRIES = 20;
+const ARCHIVE = /\.(zip|tar|tgz|tar\.gz)$/i;
+const PHOTO = /\.(jpe?g|png|webp|bmp|tiff?|heic|heif)$/i;
+
+/** One row of the list: a photo, a batch of photos, or an archive. */
+class Entry {
+  constructor(queue, name, total) {
+    this.queue = queue;
+    this.name = name;
+    this.total = total;
+    this.map = currentMap(); // also when another one is looked at meanwhile
+    this.picture = null;
+    this.begin();
+  }
+
+  begin() {
+    this.key = idempotencyKey();
+    /** waiting, sending, working, done, failed */
+    this.phase = "waiting";
+    this.sent = 0;
+    this.done = 0;
+    this.failed = 0;
+    this.job = null;
+    this.errors = [];
+    this.hold = null;
+    this.again = false;
+  }
+
+  set(changes) {
+    Object.assign(this, changes);
+    this.queue.changed();
+  }
+
+  /** Sent again while the server has no room for it. */
+  async sendForm(path, form) {
+    for (let turn = 1; ; turn++) {
+      try {
+        this.set({ phase: "sending", sent: 0, hold: null });
+        return await send(path, form, { query: { map: this.map }, key: this.key, onSent: (sent) => this.set({ sent }) });
+      } catch (error) {
+        if (!(error instanceof Problem) || error.retryAfter === null || turn === BUSY_TRIES) throw error;
+        this.set({ hold: error.retryAfter });
+        await new Promise((resolve) => setTimeout(resolve, error.retryAfter * 1000));
+      }
+    }
+  }
+
+  async run() {
+    try {
+      await this.work();
+    } catch (error) {
+      this.set({ phase: "failed", failed: this.total - this.done, errors: [...this.errors, { name: "", detail: error.message }] });
+    }
+  }
+
+  watch(id) {
+    return watchJob(id, (job) => this.set({ job, phase: "working", done: job.progress.done, failed: job.progress.failed, total: Math.max(job.progress.total, this.total) }), undefined, { map: this.map });
+  }
+
+  canRetry() {
+    return this.phase === "failed";
+  }
+
+  async retry() {
+    this.begin();
+    this.queue.start();
+  }
+
+  words() {
+    if (this.hold !== null) return `The server is busy: sent again after ${this.hold} s`;
+    switch (this.phase) {
+      case "waiting": return "Waiting for its turn";
+      case "sending": return this.sent < 1 ? `Being sent, ${Math.floor(100 * this.sent)} %` : "Being stored";
+      case "working": return this.total > 1 ? `${count(this.done)} of ${count(this.total)} searchable` : `Stored, ${this.job ? stateInWords(this.job) : "waiting"}`;
+      case "failed": return this.total > 1 ? `${count(this.done)} added, ${count(this.failed)} failed` : "Failed";
+      default: return this.total > 1 ? `${plural(this.done, "photo")} added` : this.already ? "Searchable; the map had it already" : "Searchable";
+    }
+  }
+}
+
+class PhotoEntry extends Entry {
+  constructor(queue, { file, path }, fields) {
+    super(queue, path, 1);
+    this.picture = file;
+    this.fields = fields;
+  }
+
+  async work() {
+    const form = new FormData();
+    // Fields first: the server reads the form as it comes.
+    for (const [name, value] of Object.entries(this.fields)) form.append(name, Array.isArray(value) ? value.join(",") : value);
+    form.append("file", this.picture, this.picture.name);
+    const stored = await this.sendForm("/upload", form);
+    this.already = stored.already_there;
+    if (stored.job_id && stored.status !== "succeeded") {
+      this.set({ phase: "working" });
+      const job = await this.watch(stored.job_id);
+      if (job.state !== "succeeded") throw new Error(job.error?.detail ?? `The job is ${job.state}.`);
+    }
+    this.set({ phase: "done", done: 1, failed: 0 });
+  }
+}
+
+class BatchEntry extends Entry {
+  constructor(queue, name, files, fields) {
+    super(queue, name, files.length);
+    this.files = files;
+    this.fields = fields;
+  }
+
+  form() {
+    const form = new FormData();
+    const said = Object.keys(this.fields).length > 0;
+    if (said) form.append("manifest", this.files.map(({ path }) => JSON.stringify({ filename: path, ...this.fields })).join("\n"));
+    for (const { file, path } of this.files) form.append("file", file, path);
+    return form;
+  }
+
+  async work() {
+    if (!this.again) this.batch = (await this.sendForm("/upload/batch", this.form())).job_id;
+    this.set({ phase: "working" });
+    const job = await this.watch(this.batch);
+    const { done, failed, total } = job.progress;
+    const errors = failed ? await this.#failedItems() : [];
+    if (job.state !== "succeeded" && job.error && !errors.length) errors.push({ name: "", detail: job.error.detail });
+    this.set({ phase: failed || job.state !== "succeeded" ? "failed" : "done", done, failed: job.state === "succeeded" ? failed : Math.max(total, this.total) - done, errors });
+  }
+
+  async #failedItems() {
+    const { items } = await get(`/jobs/${this.batch}/items`, { query: { map: this.map, state: "failed", limit: ERRORS_SHOWN } });
+    return items.map((item) => ({ name: item.name, detail: item.error?.detail ?? "not known why" }));
+  }
+
+  /** The server has the bytes of what it took: only what has failed is done again. */
+  async retry() {
+    const { batch } = this;
+    this.begin();
+    if (batch) {
+      try {
+        await post(`/jobs/${batch}/retry`, { query: { map: this.map } });
+        this.again = true;
+      } catch (error) {
+        if (error.code !== "job_not_retryable") throw error;
+      }
+    }
+    this.queue.start();
+  }
+}
+
+class ArchiveEntry extends BatchEntry {
+  constructor(queue, { file, path }) {
+    super(queue, path, [{ file, path }], {});
+  }
+
+  form() {
+    const form = new FormData();
+    form.append("archive", this.files[0].file, this.files[0].file.name);
+    return form;
+  }
+}
+
+/** Runs AT_ONCE entries at a time, in their order. */
+export class UploadQueue {
+  constructor() {
+    this.entries = [];
+    this.running = 0;
+    this.onchange = () => {};
+    this.drawing = false;
+  }
+
+  /** `files` as [{file, path}]; `fields` are those of POST /upload, and hold for all of them. How many
+   * were left out, because they are neither photos nor archives. */
+  add(files, fields) {
+    const archives = files.filter(({ path }) => ARCHIVE.test(path));
+    const photos = files.filter(({ file, path }) => !ARCHIVE.test(path) && (file.type.startsWith("image/") || PHOTO.test(path) || files.length === 1));
+    this.entries.push(...archives.map((one) => new ArchiveEntry(this, one)));
+    if (photos.length <= ONE_BY_ONE) this.entries.push(...photos.map((one) => new PhotoEntry(this, one, fields)));
+    else this.entries.push(...this.#batches(photos, fields));
+    this.start();
+    return files.length - archives.length - photos.length;
+  }
+
+  #batches(photos, fields) {
+    const batches = [[]];
+    let size = 0;
+    for (const photo of photos) {
+      if (batches.at(-1).length === BATCH_PHOTOS || (size && size + photo.file.size > BATCH_BYTES)) {
+        batches.push([]);
+        size = 0;
+      }
+      batches.at(-1).push(photo);
+      size += photo.file.size;
+    }
+    return batches.map((some) => new BatchEntry(this, `${some[0].path} … ${some.at(-1).path}`, some, fields));
+  }
+
+  start() {
+    while (this.running < AT_ONCE) {
+      const next = this.entries.find((entry) => entry.phase === "waiting");
+      if (!next) break;
+      this.running += 1;
+      next.phase = "sending";
+      next.run().finally(() => {
+        this.running -= 1;
+        this.start();
+      });
+    }
+    this.changed();
+  }
+
+  /** At most one drawing for each of the screen's. */
+  changed() {
+    if (this.drawing) return;
+    this.drawing = true;
+    requestAnimationFrame(() => {
+      this.drawing = false;
+      this.onchange();
+    });
+  }
+
+  figures() {
+    const sum = (name) => this.entries.reduce((all, entry) => all + entry[name], 0);
+    return { total: sum("total"), done: sum("done"), failed: sum("failed"), sending: this.entries.some((entry) => ["waiting", "sending"].includes(entry.phase)) };
+  }
+
+  retryable() {
+    return this.entries.filter((entry) => entry.canRetry());
+  }
+
+  async retryAll() {
+    for (const entry of this.retryable()) await entry.retry();
+  }
+
+  clear() {
+    this.entries = [];
+    this.changed();
+  }
+}

@@ -1,0 +1,145 @@
+// Add photos: a few one by one, many in batches, archives as they are.
+
+import { bar, button, field, fill, h, note, noteError } from "../dom.js";
+import { takesDrops, takesPastes } from "../drop.js";
+import { bytes, count, plural } from "../format.js";
+import { serverSettings } from "../settings.js";
+import { UploadQueue } from "../uploads.js";
+import { readTags } from "./photos.js";
+
+// The queue goes on while another view is looked at, as long as the page is open.
+const queue = new UploadQueue();
+
+export async function showAdd(view, { signal }) {
+  const settings = await serverSettings();
+  const said = saidForm();
+  const list = h("ul", { class: "queue" });
+  const summary = h("div", { class: "summary" });
+  const take = (files) => {
+    const leftOut = queue.add(files, said.read());
+    if (leftOut) note(`${plural(leftOut, "file")} left out: neither photos nor archives.`);
+  };
+  const zone = addZone(settings, take);
+  takesPastes(take, signal);
+  fill(view, zone, said.element, summary, list);
+
+  const rows = new Map();
+  const draw = () => {
+    if (signal.aborted) return;
+    for (const entry of queue.entries) {
+      let row = rows.get(entry);
+      if (!row) {
+        row = new QueueRow(entry);
+        rows.set(entry, row);
+        list.prepend(row.element);
+      }
+      row.draw();
+    }
+    drawSummary(summary);
+  };
+  queue.onchange = draw;
+  draw();
+}
+
+function addZone(settings, take) {
+  const chooser = (attributes) => {
+    const input = h("input", { type: "file", multiple: true, class: "hidden", tabindex: "-1", "aria-hidden": "true", ...attributes });
+    input.addEventListener("change", () => {
+      take(Array.from(input.files, (file) => ({ file, path: file.webkitRelativePath || file.name })));
+      input.value = "";
+    });
+    return input;
+  };
+  const files = chooser({ "data-use": "add", accept: "image/*,.zip,.tar,.tgz,.gz" });
+  const folder = chooser({ webkitdirectory: true });
+  const zone = h("section", { class: "drop", "aria-label": "Add photos" },
+    h("div", { class: "drop-words" },
+      h("h1", {}, "Add photos"),
+      h("p", { class: "lead" }, "Drop photos, a folder, or a zip. Coordinates and times are read from each photo."),
+      h("div", { class: "row" }, button("Choose photos", () => files.click(), "primary"), button("Choose a folder", () => folder.click(), "not-touch"), files, folder),
+      h("p", { class: "soft small" }, `JPEG, PNG, WebP, BMP or TIFF, up to ${bytes(settings.max_file_size)} each`)));
+  takesDrops(zone, take);
+  return zone;
+}
+
+/** What is true of all photos that are added next. */
+function saidForm() {
+  const latitude = h("input", { type: "number", min: -90, max: 90, step: "any" });
+  const longitude = h("input", { type: "number", min: -180, max: 180, step: "any" });
+  const place = h("input", { maxlength: 500, autocomplete: "off" });
+  const tags = h("input", { autocomplete: "off" });
+  const role = h("select", {}, h("option", { value: "" }, "Can be found"), h("option", { value: "query" }, "Labelled queries"));
+  const element = h("details", { class: "card said" }, h("summary", {}, "Say more of the next photos"),
+    h("p", { class: "soft" }, "It holds for every photo that you add from here on. What is left empty is read from the photo."),
+    h("div", { class: "filters-more" },
+      field("Place", place, "A label, such as a room"), field("Tags", tags, "Separated by commas"),
+      field("Latitude", latitude), field("Longitude", longitude),
+      field("Role", role, "Labelled queries are never found: the map is measured with them")));
+  return {
+    element,
+    read: () => {
+      const fields = { place: place.value.trim(), tags: readTags(tags.value), role: role.value };
+      for (const [name, input] of Object.entries({ latitude, longitude })) fields[name] = input.value === "" ? "" : Number(input.value);
+      return Object.fromEntries(Object.entries(fields).filter(([, value]) => value !== "" && value.length !== 0));
+    },
+  };
+}
+
+function drawSummary(summary) {
+  const { total, done, failed, sending } = queue.figures();
+  if (!total) {
+    fill(summary);
+    return;
+  }
+  const open = total - done - failed;
+  const words = open ? `${count(done)} of ${plural(total, "photo")} searchable` : failed ? `${count(done)} of ${plural(total, "photo")} added` : `${plural(total, "photo")} added`;
+  fill(summary,
+    h("div", { class: "summary-words" },
+      h("h2", { role: "status" }, words),
+      failed > 0 && h("p", { class: "bad" }, `${count(failed)} failed`),
+      sending && open ? h("p", { class: "soft" }, "Keep this page open while photos are sent.") : null,
+      h("div", { class: "row" },
+        failed > 0 && queue.retryable().length > 0 && button("Try all failed again", () => queue.retryAll()),
+        !open && h("a", { class: "button", href: "#/photos" }, "See the photos"),
+        !open && button("Clear the list", () => {
+          queue.clear();
+          fill(document.querySelector(".queue"));
+        }))),
+    bar("Photos that are done", done + failed, total));
+}
+
+class QueueRow {
+  constructor(entry) {
+    this.entry = entry;
+    this.state = h("p", { class: "state" });
+    this.errors = h("ul", { class: "errors" });
+    this.progress = h("div", { class: "row-progress" });
+    this.retry = button("Try again", () => entry.retry().catch(noteError));
+    this.element = h("li", { class: "queue-row" },
+      entry.picture ? this.#preview(entry.picture) : h("span", { class: "pile", "aria-hidden": "true" }, entry.total > 1 ? count(entry.total) : "zip"),
+      h("div", { class: "queue-words" }, h("p", { class: "queue-name" }, entry.name), this.state, this.progress, this.errors), this.retry);
+  }
+
+  #preview(file) {
+    const url = URL.createObjectURL(file);
+    const image = h("img", { src: url, alt: "", width: "72", height: "54" });
+    const release = () => URL.revokeObjectURL(url);
+    image.addEventListener("load", release);
+    image.addEventListener("error", release);
+    return image;
+  }
+
+  draw() {
+    const { entry } = this;
+    this.element.className = `queue-row ${entry.phase}`;
+    fill(this.state, entry.words());
+    const busy = entry.phase === "sending" || entry.phase === "working";
+    const [done, total] = entry.phase === "sending" ? [entry.sent, 1] : [entry.done + entry.failed, entry.total > 1 ? entry.total : 0];
+    const known = this.progress.firstElementChild;
+    if (!busy) fill(this.progress);
+    else if (known && total) Object.assign(known, { max: total, value: done });
+    else if (!known || known.hasAttribute("value")) fill(this.progress, bar(`${entry.name}: ${entry.words()}`, done, total));
+    fill(this.errors, entry.errors.map(({ name, detail }) => h("li", {}, name && h("strong", {}, name), name && ": ", detail)));
+    this.retry.hidden = !entry.canRetry();
+  }
+}

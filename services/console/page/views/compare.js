@@ -1,0 +1,56 @@
+// Two photos side by side, and what makes them similar.
+
+import { Problem } from "../api.js";
+import { fill, h, openDialog } from "../dom.js";
+import { score, whereabouts } from "../format.js";
+import { original } from "../photo.js";
+
+/** Open the dialog at one of the matches; the arrow keys lead to the others. */
+export function compare(asked, photos, index, signal) {
+  const body = h("div", { class: "compare" });
+  const { dialog, heading } = openDialog("", body);
+  dialog.classList.add("wide");
+  signal.addEventListener("abort", () => dialog.close());
+  let shown = 0;
+
+  async function show(next) {
+    index = (next + photos.length) % photos.length;
+    const mine = ++shown;
+    const photo = photos[index];
+    fill(heading, `Match ${index + 1} of ${photos.length}`);
+    const overlay = h("img", { class: "overlay", alt: "", hidden: true });
+    const strength = h("input", { type: "range", min: 0, max: 100, value: 70, "aria-label": "Strength of the overlay" });
+    strength.addEventListener("input", () => (overlay.style.opacity = strength.value / 100));
+    overlay.style.opacity = 0.7;
+    const why = h("div", { class: "why" }, h("p", { class: "soft" }, "Asking what makes them similar…"));
+    fill(body,
+      h("figure", {}, h("div", { class: "frame" }, asked.picture(), overlay), h("figcaption", {}, asked.name)),
+      h("figure", {}, h("div", { class: "frame" }, original(photo)), h("figcaption", {}, h("a", { href: `#/photo/${photo.image_id}` }, photo.original_filename), h("span", { class: "soft" }, ` ${whereabouts(photo)}`))),
+      h("div", { class: "compare-words" },
+        h("p", {}, h("span", { class: "figure large" }, score(photo.similarity_score)), h("span", { class: "soft" }, " cosine similarity")),
+        why,
+        h("div", { class: "row end" },
+          h("button", { type: "button", onclick: () => show(index - 1) }, "← Previous"),
+          h("button", { type: "button", onclick: () => show(index + 1) }, "Next →"))));
+    try {
+      const found = await asked.find({ top_k: 1, ids: photo.image_id, explain: true }, () => {});
+      const explanation = found.similar_images[0]?.explanation;
+      if (mine !== shown || !explanation) return;
+      overlay.src = explanation.overlay;
+      overlay.hidden = false;
+      fill(why,
+        h("p", { class: "legend" }, h("span", { class: "swatch for" }), "speaks for this match ", h("span", { class: "swatch against" }), "speaks against it"),
+        h("label", { class: "field inline" }, h("span", {}, "Overlay"), strength));
+    } catch (error) {
+      if (mine !== shown || signal.aborted) return;
+      fill(why, h("p", { class: "soft" }, error instanceof Problem ? error.message : "What makes them similar can’t be told now."));
+    }
+  }
+
+  dialog.addEventListener("keydown", (event) => {
+    if (event.target instanceof HTMLInputElement) return;
+    if (event.key === "ArrowLeft") show(index - 1);
+    if (event.key === "ArrowRight") show(index + 1);
+  });
+  show(index);
+}

@@ -1,0 +1,161 @@
+// What the map's answers are made with: its vocabulary, its generations, and how good they are.
+
+import { ask, currentMap, get, post } from "../api.js";
+import { bar, button, field, fill, h, note, noteError, openDialog } from "../dom.js";
+import { count, percent, plural, when } from "../format.js";
+import { stateInWords, watchJob } from "../jobs.js";
+
+const CHANGES = ["fit", "import_vocabulary", "switch", "pca"];
+const RECALLS = ["R@1", "R@5", "R@10"];
+
+const STANDING = {
+  own: ["Its own", "The vocabulary was learnt on this map’s photos. Fit it again when many photos have come since."],
+  foreign: ["Foreign", "The vocabulary was learnt on photos of elsewhere. One of the map’s own finds the right place more often: it is the one thing that counts most."],
+  none: ["None", "This extractor uses no vocabulary."],
+};
+
+export async function showModel(view, { signal }) {
+  const path = `/maps/${encodeURIComponent(currentMap())}`;
+  const [map, generations, vocabularies, { evaluations }, { jobs }] = await Promise.all([
+    get(path, { signal }), get("/generations", { signal }), get("/vocabularies", { signal }),
+    get("/evaluations", { query: { limit: 50 }, signal }),
+    get("/jobs", { query: { kind: [...CHANGES, "evaluate"], state: ["queued", "running"] }, signal }),
+  ]);
+  const again = () => showModel(view, { signal });
+  const work = h("div", { class: "work" });
+  const follow = (job, words) => followJob(work, job, words, again, signal);
+  const [standing, meaning] = STANDING[map.vocabulary] ?? ["Not yet", "The map has no descriptors yet. Photos that wait for a vocabulary are described once one is fitted."];
+  const fits = map.vocabulary !== "none";
+  fill(view,
+    h("header", { class: "head" }, h("h1", {}, "Model")),
+    h("section", { class: "card standing" },
+      h("div", {}, h("h2", {}, "What answers now"),
+        h("dl", { class: "facts" },
+          h("dt", {}, "Extractor"), h("dd", {}, map.extractor),
+          h("dt", {}, "Dimension"), h("dd", {}, map.dimension ? count(map.dimension) : "–"),
+          h("dt", {}, "Photos"), h("dd", {}, `${count(map.searchable)} of ${count(map.photos)} searchable`),
+          h("dt", {}, "Vocabulary"), h("dd", {}, h("span", { class: `chip ${map.vocabulary ?? ""}` }, standing)))),
+      h("div", { class: "standing-words" },
+        h("p", {}, map.photos ? meaning : "This map has no photos yet: there is nothing to learn from."),
+        map.photos ? fits && button(map.vocabulary === "own" ? "Fit it again…" : "Fit a vocabulary…", () => fitVocabulary(follow), "primary") : h("a", { class: "button primary", href: "#/add" }, "Add photos")),
+      work),
+    comparison(evaluations, generations, vocabularies, () => measure(follow)),
+    generationsTable(generations, vocabularies),
+    vocabulariesTable(vocabularies, generations, follow));
+  for (const job of jobs.filter((one) => one.kind !== "evaluate").slice(0, 1)) follow(job, `A model change (${job.kind})`);
+}
+
+/** The bar of a job that changes the model; `again` draws the view anew when it has ended. */
+async function followJob(work, started, words, again, signal) {
+  const state = h("p", { class: "soft" });
+  const progress = h("div", {});
+  const cancel = button("Cancel", () => post(`/jobs/${started.job_id}/cancel`));
+  fill(work, h("div", { class: "job" }, h("p", { role: "status" }, h("strong", {}, words)), progress, h("div", { class: "row" }, state, cancel)));
+  const draw = (job) => {
+    fill(progress, bar(words, job.progress.done, job.progress.total));
+    fill(state, stateInWords(job), job.progress.total ? `: ${count(job.progress.done)} of ${count(job.progress.total)}` : "");
+  };
+  try {
+    const job = await watchJob(started.job_id, draw, signal);
+    if (job.state === "failed") note(job.error?.detail ?? `${words} has failed.`, "bad");
+    else note(`${words}: ${stateInWords(job)}.`);
+    await again();
+  } catch (error) {
+    if (!signal.aborted) noteError(error);
+  }
+}
+
+async function fitVocabulary(follow) {
+  const clusters = h("input", { type: "number", min: 1, max: 4096, placeholder: "as the extractor says" });
+  const sample = h("input", { type: "number", min: 1, value: "1000" });
+  const { dialog, closed } = openDialog("Fit a vocabulary", h("form", { method: "dialog" },
+    h("p", {}, "Centres are found in this map’s own photos, and every photo is described again with them. Answers go on meanwhile; the new descriptors take over when all are ready."),
+    h("div", { class: "pair" }, field("Clusters", clusters), field("Photos to learn from, at most", sample)),
+    h("div", { class: "row end" }, h("button", { type: "button", onclick: () => dialog.close() }, "Cancel"), h("button", { class: "primary", value: "yes" }, "Fit it"))));
+  if ((await closed) !== "yes") return;
+  const wanted = { sample: Number(sample.value) || 1000, clusters: Number(clusters.value) || null };
+  follow(await post("/vocabularies", { json: wanted }), "Fitting a vocabulary");
+}
+
+async function measure(follow) {
+  follow(await post("/evaluations", { json: {} }), "Measuring the map");
+}
+
+/** The newest measurement of each of the two newest generations that have one, side by side. */
+function comparison(evaluations, generations, vocabularies, onmeasure) {
+  const measured = [];
+  for (const evaluation of evaluations) {
+    if (measured.length < 2 && !measured.some((one) => one.generation_id === evaluation.generation_id)) measured.push(evaluation);
+  }
+  const [after, before] = measured;
+  const head = h("header", { class: "head" }, h("h2", {}, before ? "Before and after" : "How good the answers are"), button("Measure now", onmeasure));
+  if (!after) {
+    return h("section", { class: "card" }, head, h("p", {}, "Not measured yet. Placewise asks the map about its own photos, each left out once: how often does another photo of the same place come first? It does so by itself once 20 photos have coordinates or a place."));
+  }
+  const nameOf = (evaluation) => nameGeneration(generations.find((one) => one.generation_id === evaluation.generation_id), vocabularies);
+  const sets = [["labelled_queries", "Labelled queries"], ["leave_one_out", "The map’s own photos, each left out once"]];
+  return h("section", { class: "card" }, head,
+    h("p", { class: "soft" }, `Right means within ${after.figures.radius_m} m, or the same place label. R@k: the share of queries with a right photo among the first k.`),
+    h("div", { class: "comparisons" }, sets.filter(([set]) => after.figures[set]?.queries).map(([set, title]) =>
+      h("table", { class: "recalls" },
+        h("caption", {}, `${title} (${count(after.figures[set].queries)})`),
+        h("thead", {}, h("tr", {}, h("th", { scope: "col" }, ""), before && h("th", { scope: "col" }, "Before", h("small", {}, nameOf(before))), h("th", { scope: "col" }, before ? "After" : "Now", h("small", {}, nameOf(after))), before && h("th", { scope: "col" }, "Points"))),
+        h("tbody", {}, RECALLS.map((recall) => {
+          const [was, is] = [before?.figures[set]?.[recall], after.figures[set][recall]];
+          return h("tr", {}, h("th", { scope: "row" }, recall), before && h("td", {}, share(was)), h("td", {}, share(is)), before && h("td", { class: "figure" }, gain(was, is)));
+        }))))));
+}
+
+function share(value) {
+  if (value === null || value === undefined) return "–";
+  return h("div", { class: "share" }, h("span", { class: "figure" }, percent(value)), h("meter", { min: 0, max: 1, value, "aria-hidden": "true" }));
+}
+
+function gain(was, is) {
+  if (was === undefined || was === null || is === null) return "–";
+  const points = 100 * (is - was);
+  return h("span", { class: points > 0 ? "good" : points < 0 ? "bad" : "" }, `${points > 0 ? "+" : points < 0 ? "−" : "±"}${Math.abs(points).toFixed(1)}`);
+}
+
+function nameGeneration(generation, vocabularies) {
+  if (!generation) return "a generation that is gone";
+  const vocabulary = vocabularies.find((one) => one.vocabulary_id === generation.vocabulary_id);
+  const name = vocabulary ? nameVocabulary(vocabulary) : "no vocabulary";
+  return generation.pca_from ? `${name}, PCA ${count(generation.dimension)}` : name;
+}
+
+const nameVocabulary = (vocabulary) => ({ fitted: "fitted here" })[vocabulary.origin] ?? vocabulary.origin;
+
+function generationsTable(generations, vocabularies) {
+  if (!generations.length) return null;
+  const tone = { active: "succeeded", building: "running" };
+  return h("section", { class: "card" }, h("h2", {}, "Generations"),
+    h("div", { class: "scroll", tabindex: "0", role: "group", "aria-label": "Generations" }, h("table", {},
+      h("thead", {}, h("tr", {}, ["State", "Vocabulary", "Dimension", "Photos", "Begun"].map((name) => h("th", { scope: "col", class: ["Dimension", "Photos"].includes(name) ? "number" : "" }, name)))),
+      h("tbody", {}, generations.map((one) => h("tr", {},
+        h("td", {}, h("span", { class: `chip ${tone[one.state] ?? ""}` }, one.state)),
+        h("td", {}, nameGeneration(one, vocabularies)),
+        h("td", { class: "number" }, count(one.dimension)), h("td", { class: "number" }, count(one.photos)), h("td", {}, when(one.created_at))))))));
+}
+
+function vocabulariesTable(vocabularies, generations, follow) {
+  if (!vocabularies.length) return null;
+  const active = generations.find((one) => one.state === "active");
+  return h("section", { class: "card" }, h("h2", {}, "Vocabularies"),
+    h("div", { class: "scroll", tabindex: "0", role: "group", "aria-label": "Vocabularies" }, h("table", {},
+      h("thead", {}, h("tr", {}, h("th", { scope: "col" }, "Origin"), h("th", { scope: "col", class: "number" }, "Clusters"), h("th", { scope: "col" }, "Learnt from"), h("th", { scope: "col" }, "Made"), h("th", { scope: "col" }, h("span", { class: "heard" }, "What can be done")))),
+      h("tbody", {}, vocabularies.map((one) => h("tr", {},
+        h("td", {}, nameVocabulary(one)), h("td", { class: "number" }, count(one.clusters)),
+        h("td", {}, one.provenance.photos ? plural(Number(one.provenance.photos), "photo") : "–"), h("td", {}, when(one.created_at)),
+        h("td", { class: "row end" },
+          button("Download", () => download(one)),
+          active?.vocabulary_id === one.vocabulary_id && !active.pca_from ? h("span", { class: "chip own" }, "answers") : button("Switch to it", async () => follow(await post("/generations", { json: { vocabulary_id: one.vocabulary_id } }), "Switching the vocabulary")))))))));
+}
+
+async function download(vocabulary) {
+  const response = await ask(`/vocabularies/${vocabulary.vocabulary_id}/file`);
+  const url = URL.createObjectURL(await response.blob());
+  const name = /filename="(.+)"/.exec(response.headers.get("Content-Disposition") ?? "")?.[1] ?? "vocabulary.npz";
+  h("a", { href: url, download: name }).click();
+  setTimeout(() => URL.revokeObjectURL(url), 10_000);
+}

@@ -1,0 +1,91 @@
+// Is it well, how full is it, what is it doing, what was asked.
+
+import { get, post } from "../api.js";
+import { button, fill, h } from "../dom.js";
+import { bytes, count, duration, score, when } from "../format.js";
+import { stateInWords } from "../jobs.js";
+
+const LOOK_SECONDS = 5;
+
+export async function showStatus(view, { signal }) {
+  const drawn = { health: h("section", { class: "card" }), figures: h("section", { class: "card" }), jobs: h("section", { class: "card" }), searches: h("section", { class: "card" }) };
+  const look = async () => {
+    const [health, stats, { jobs }, { searches }] = await Promise.all([
+      // 503 with the same answer, where a part is away.
+      get("/health", { signal, also: [503] }), get("/database/stats", { signal }),
+      get("/jobs", { query: { limit: 12 }, signal }), get("/searches", { query: { limit: 12 }, signal }),
+    ]);
+    drawHealth(drawn.health, health);
+    drawFigures(drawn.figures, stats);
+    drawJobs(drawn.jobs, jobs, look);
+    drawSearches(drawn.searches, searches);
+  };
+  await look();
+  fill(view, h("header", { class: "head" }, h("h1", {}, "Status"), h("p", { class: "row" }, h("a", { class: "button", href: "/docs" }, "The API"))), h("div", { class: "status-grid" }, Object.values(drawn)));
+  const timer = setInterval(() => {
+    // Not while someone is at a button of what would be drawn anew.
+    if (!document.hidden && !drawn.jobs.contains(document.activeElement)) look().catch(() => {});
+  }, LOOK_SECONDS * 1000);
+  signal.addEventListener("abort", () => clearInterval(timer));
+}
+
+const PARTS = { catalog: "Catalog", object_store: "Object store", search: "Search" };
+
+function drawHealth(card, health) {
+  const { load } = health;
+  fill(card,
+    h("h2", {}, "Health ", h("span", { class: `chip ${health.status}` }, health.status)),
+    h("ul", { class: "parts" }, Object.entries(health.parts).map(([name, part]) => h("li", {}, h("span", { class: `light ${part.status}`, "aria-hidden": "true" }), h("strong", {}, PARTS[name] ?? name), h("span", { class: "soft" }, part.detail ?? part.status)))),
+    load && h("dl", { class: "facts" },
+      h("dt", {}, "Jobs that wait"), h("dd", {}, `${count(load.waiting_jobs)} of at most ${count(load.max_queued_jobs)}`),
+      h("dt", {}, "Photos described"), h("dd", {}, `${load.finished_per_second.toFixed(1)} a second`),
+      h("dt", {}, "Uploads now"), h("dd", {}, `${count(load.receiving_uploads)} of at most ${count(load.max_concurrent_uploads)}`),
+      load.free_bytes !== null && [h("dt", {}, "Disk free"), h("dd", {}, bytes(load.free_bytes))]),
+    h("p", { class: "soft small" }, `Placewise ${health.version}, up for ${duration(health.uptime_seconds)}`));
+}
+
+function drawFigures(card, stats) {
+  const tile = (figure, name) => h("div", { class: "tile" }, h("span", { class: "figure" }, figure), h("span", { class: "soft" }, name));
+  fill(card, h("h2", {}, `The map “${stats.map}”`),
+    h("div", { class: "tiles" },
+      tile(count(stats.total_images), "photos"), tile(count(stats.searchable_images), "searchable"),
+      tile(count(stats.labelled_queries), "labelled queries"), tile(bytes(stats.total_storage_bytes), "stored"),
+      tile(count(stats.total_searches), "searches"), tile(stats.avg_processing_time_ms === null ? "–" : `${stats.avg_processing_time_ms.toFixed(0)} ms`, "a search, on average")));
+}
+
+const KINDS = { index: "Photo", batch: "Batch", describe: "Question", compare: "Comparison", fit: "Vocabulary fit", import_vocabulary: "Vocabulary import", switch: "Switch", pca: "PCA", evaluate: "Evaluation", reindex: "Describe again", word_weights: "Word weights" };
+
+function drawJobs(card, jobs, look) {
+  if (!jobs.length) {
+    fill(card, h("h2", {}, "Jobs"), h("p", { class: "soft" }, "None yet: each photo that you add makes one."));
+    return;
+  }
+  fill(card, h("h2", {}, "Newest jobs"), h("div", { class: "scroll", tabindex: "0", role: "group", "aria-label": "Newest jobs" }, h("table", {},
+    h("thead", {}, h("tr", {}, h("th", { scope: "col" }, "Job"), h("th", { scope: "col" }, "State"), h("th", { scope: "col", class: "number" }, "Done"), h("th", { scope: "col" }, "Begun"), h("th", { scope: "col" }, h("span", { class: "heard" }, "What can be done")))),
+    h("tbody", {}, jobs.map((job) => h("tr", {},
+      h("td", {}, KINDS[job.kind] ?? job.kind),
+      h("td", {}, h("span", { class: `chip ${job.state}` }, stateInWords(job)), job.error && h("p", { class: "bad small" }, job.error.detail)),
+      h("td", { class: "number" }, job.progress.total ? `${count(job.progress.done)} / ${count(job.progress.total)}` : "–"),
+      h("td", {}, when(job.created_at)),
+      h("td", { class: "row end" },
+        job.state === "failed" && button("Try again", () => post(`/jobs/${job.job_id}/retry`).then(look)),
+        ["queued", "running"].includes(job.state) && button("Cancel", () => post(`/jobs/${job.job_id}/cancel`).then(look)))))))));
+}
+
+function drawSearches(card, searches) {
+  if (!searches.length) {
+    fill(card, h("h2", {}, "Questions"), h("p", { class: "soft" }, "None yet. ", h("a", { href: "#/ask" }, "Ask with a photo"), "."));
+    return;
+  }
+  const verdict = { true: ["In the map", "own"], false: ["Not in it", "foreign"] };
+  fill(card, h("h2", {}, "Newest questions"), h("div", { class: "scroll", tabindex: "0", role: "group", "aria-label": "Newest questions" }, h("table", {},
+    h("thead", {}, h("tr", {}, h("th", { scope: "col" }, "Photo"), h("th", { scope: "col" }, "Answer"), h("th", { scope: "col", class: "number" }, "Best"), h("th", { scope: "col", class: "number" }, "Took"), h("th", { scope: "col" }, "When"))),
+    h("tbody", {}, searches.map((one) => {
+      const [words, tone] = verdict[one.in_map] ?? ["Open", ""];
+      return h("tr", {},
+        h("td", { class: "name" }, one.query_file_id ? h("a", { href: `#/ask/${one.query_file_id}` }, one.query_filename) : one.query_filename),
+        h("td", {}, h("span", { class: `chip ${tone}` }, words)),
+        h("td", { class: "number" }, one.best_score === null ? "–" : score(one.best_score)),
+        h("td", { class: "number" }, `${one.processing_time_ms.toFixed(0)} ms`), h("td", {}, when(one.searched_at)));
+    })))));
+}

@@ -1,0 +1,110 @@
+"""The page on `/`, the descriptions of the API on `/docs` and `/redoc`, and what they load.
+
+Everything comes from this server: Leaflet, Swagger UI and ReDoc are files of installed packages.
+The one foreign address that a page may load from is that of MAP_TILES.
+"""
+
+from __future__ import annotations
+
+import json
+from importlib.resources import files
+from pathlib import Path
+from urllib.parse import urlsplit
+
+from fastapi import APIRouter, Request
+from fastapi.responses import Response
+
+from services.console import PAGE
+from services.gateway.assets import Asset, read_assets
+from services.gateway.health import ServiceAnswer, service
+from shared.errors import NotFound
+from shared.settings import Settings
+
+PREFIX = "/console/"
+PAGES = ("index.html", "docs.html", "redoc.html")
+# From packages: the folder's name on this server, the package, the folder in it, and its files.
+LIBRARIES = (
+    ("leaflet", "xstatic.pkg.leaflet", "data", ("leaflet.js", "leaflet.css")),
+    (
+        "api",
+        "fastapi_offline",
+        "static",
+        ("swagger-ui-bundle.js", "swagger-ui.css", "redoc.standalone.js"),
+    ),
+)
+# Swagger UI and ReDoc write style elements and run their search in a worker of a blob.
+OF_DESCRIPTIONS = "; style-src 'self' 'unsafe-inline'; worker-src blob:"
+
+
+def console_router(settings: Settings) -> APIRouter:
+    """The routes of the page; its files are read here, once."""
+    assets = dict(read_assets(PAGE))
+    for folder, package, inner, names in LIBRARIES:
+        there = Path(str(files(package))) / inner
+        for name in names:
+            assets[f"{folder}/{name}"] = Asset.of(Path(name).suffix, (there / name).read_bytes())
+    pages = {name: assets.pop(name) for name in PAGES}
+    assets["settings.json"] = Asset.of(".json", json.dumps(_said_to_the_page(settings)).encode())
+
+    of_page = _headers(settings)
+    policy = of_page["Content-Security-Policy"]
+    of_descriptions = {**of_page, "Content-Security-Policy": policy + OF_DESCRIPTIONS}
+    router = APIRouter()
+
+    @router.head("/", include_in_schema=False)
+    @router.get("/", operation_id="service", response_model=ServiceAnswer, tags=["operations"])
+    def first(request: Request) -> Response:
+        """What this is and where to look; to browsers, which ask for HTML, the page."""
+        if "text/html" in request.headers.get("accept", ""):
+            answer = pages["index.html"].answer(request, of_page)
+        else:
+            answer = Response(service().model_dump_json(), media_type="application/json")
+        answer.headers["Vary"] = "Accept, Accept-Encoding"
+        return answer
+
+    @router.api_route("/docs", methods=["GET", "HEAD"], include_in_schema=False)
+    def docs(request: Request) -> Response:
+        return pages["docs.html"].answer(request, of_descriptions)
+
+    @router.api_route("/redoc", methods=["GET", "HEAD"], include_in_schema=False)
+    def redoc(request: Request) -> Response:
+        return pages["redoc.html"].answer(request, of_descriptions)
+
+    @router.api_route(PREFIX + "{path:path}", methods=["GET", "HEAD"], include_in_schema=False)
+    def asset(request: Request, path: str) -> Response:
+        found = assets.get(path)
+        if found is None:
+            raise NotFound("path_not_found", f"There is no {PREFIX}{path}.")
+        return found.answer(request, {"X-Content-Type-Options": "nosniff"})
+
+    return router
+
+
+def _said_to_the_page(settings: Settings) -> dict[str, str | int | None]:
+    """Open to everyone, before any key: nothing of what is stored."""
+    return {
+        "map_tiles": settings.map_tiles,
+        "map_attribution": settings.map_attribution,
+        "max_file_size": settings.max_file_size,
+    }
+
+
+def _headers(settings: Settings) -> dict[str, str]:
+    pictures = ["'self'", "blob:", "data:"]
+    if settings.map_tiles is not None:
+        tiles = urlsplit(settings.map_tiles)
+        pictures.append(f"{tiles.scheme}://{tiles.netloc}")
+    policy = {
+        "default-src": "'self'",
+        "img-src": " ".join(pictures),
+        "base-uri": "'none'",
+        "form-action": "'self'",
+        "frame-ancestors": "'none'",
+        "object-src": "'none'",
+    }
+    return {
+        "Content-Security-Policy": "; ".join(f"{name} {value}" for name, value in policy.items()),
+        # Tile servers want to know whose map it is, not which photo it shows.
+        "Referrer-Policy": "strict-origin-when-cross-origin",
+        "X-Content-Type-Options": "nosniff",
+    }

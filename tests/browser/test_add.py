@@ -1,0 +1,105 @@
+"""Photos in: one by one, in batches, refused ones named, and watched without events."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from collections.abc import Iterator
+
+import pytest
+from playwright.sync_api import FilePayload, Page, expect
+
+from tests.browser.conftest import Town, Visitor
+from tests.support.photos import photo_bytes
+
+NO_PHOTO: FilePayload = {
+    "name": "notes.jpg",
+    "mimeType": "image/jpeg",
+    "buffer": b"not a photo at all" * 9,
+}
+
+
+def photo(number: int) -> FilePayload:
+    return {"name": f"{number}.jpg", "mimeType": "image/jpeg", "buffer": photo_bytes(number)}
+
+
+@pytest.fixture
+def page(visitor: Visitor, town: Town, request: pytest.FixtureRequest) -> Iterator[Page]:
+    """The view on a map of the test's own, with an extractor that takes no time."""
+    name = f"add-{abs(hash(request.node.name)) % 10**9}"
+    made = {"name": name, "extractor": "test-tiny-avg"}
+    assert town.server.client.post("/api/v1/maps", json=made).status_code == 201
+    visitor.page.goto(town.url)
+    visitor.page.evaluate("name => localStorage.setItem('placewise-map', name)", name)
+    yield visitor.visit("add")
+    town.server.client.delete(f"/api/v1/maps/{name}")
+
+
+def add(page: Page, *files: FilePayload) -> None:
+    page.locator("input[data-use=add]").set_input_files(list(files))
+
+
+def searchable(page: Page, town: Town) -> int:
+    name = page.evaluate("localStorage.getItem('placewise-map')")
+    answer = town.server.client.get(f"/api/v1/maps/{name}").json()
+    return int(answer["searchable"])
+
+
+def test_each_photo_is_watched_until_it_can_be_found(page: Page, town: Town) -> None:
+    add(page, photo(1), photo(2))
+    expect(page.locator(".queue-row.done .state")).to_have_text(["Searchable", "Searchable"])
+    expect(page.locator(".summary h2")).to_have_text("2 photos added")
+    assert searchable(page, town) == 2
+    add(page, photo(2))
+    expect(page.locator(".queue-row.done")).to_have_count(3)
+    expect(page.get_by_text("the map had it already")).to_be_visible()
+
+
+def test_a_refused_file_is_named_with_the_reason_and_the_others_go_on(
+    page: Page, town: Town
+) -> None:
+    add(page, photo(1), NO_PHOTO)
+    refused = page.locator(".queue-row.failed")
+    expect(refused.locator(".queue-name")).to_have_text("notes.jpg")
+    expect(refused.locator(".errors")).to_contain_text("JPEG")
+    expect(page.locator(".queue-row.done")).to_have_count(1)
+    expect(page.locator(".summary .bad")).to_have_text("1 failed")
+    refused.get_by_role("button", name="Try again").click()
+    expect(refused.locator(".errors li")).to_have_count(1)
+
+
+def test_many_photos_go_as_a_batch_with_counters_and_named_errors(page: Page, town: Town) -> None:
+    page.get_by_text("Say more of the next photos").click()
+    page.get_by_label("Tags").fill("north, wing")
+    add(page, *[photo(number) for number in range(30)], NO_PHOTO)
+    expect(page.locator(".queue-row.failed .state")).to_have_text("30 added, 1 failed")
+    expect(page.locator(".errors li strong")).to_have_text("notes.jpg")
+    assert searchable(page, town) == 30
+    name = page.evaluate("localStorage.getItem('placewise-map')")
+    found = town.get("/search", map=name, tags="north,wing")
+    assert found["total_found"] == 30
+
+
+def test_an_archive_goes_as_it_is(page: Page, town: Town) -> None:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        for number in range(3):
+            archive.writestr(f"hall/{number}.jpg", photo_bytes(number))
+    add(page, {"name": "h.zip", "mimeType": "application/zip", "buffer": buffer.getvalue()})
+    expect(page.locator(".queue-row.done .state")).to_have_text("3 photos added")
+    assert searchable(page, town) == 3
+
+
+def test_a_job_is_polled_where_events_do_not_arrive(page: Page, town: Town) -> None:
+    page.route("**/events*", lambda route: route.abort())
+    add(page, photo(1))
+    expect(page.locator(".queue-row.done .state")).to_have_text("Searchable")
+
+
+def test_a_lost_connection_is_said_and_the_photo_sent_again(page: Page, town: Town) -> None:
+    page.route("**/api/v1/upload?*", lambda route: route.abort())
+    add(page, photo(1))
+    expect(page.locator(".queue-row.failed .errors")).to_contain_text("connection")
+    page.unroute("**/api/v1/upload?*")
+    page.get_by_role("button", name="Try again").click()
+    expect(page.locator(".queue-row.done .state")).to_have_text("Searchable")

@@ -1,0 +1,90 @@
+"""The page for everyone: by keyboard, with a screen reader, on a narrow phone, in the dark."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from axe_core_python.sync_playwright import Axe
+from playwright.sync_api import Page, expect
+
+from tests.browser.conftest import Town, Visitor
+
+VIEWS = ["ask", "answer", "compare", "photos", "photo", "add", "model", "status"]
+SERIOUS = {"serious", "critical"}
+
+
+def open_view(visitor: Visitor, town: Town, view: str) -> Page:
+    if view == "photo":
+        stored = town.get("/search", role="database", limit=1)["images"][0]
+        page = visitor.visit(f"photo/{stored['image_id']}")
+        expect(page.locator("path.point")).to_be_attached()
+    elif view in ("answer", "compare"):
+        page = visitor.visit("ask")
+        page.locator("input[data-use=ask]").set_input_files(town.queries[0])
+        expect(page.locator(".number-pin").first).to_be_visible()
+        if view == "compare":
+            page.locator(".match").first.click()
+            expect(page.locator(".overlay")).to_be_visible()
+    else:
+        page = visitor.visit(view)
+        if view == "photos":
+            expect(page.locator(".photo-card").first).to_be_visible()
+            page.get_by_text("More filters").click()
+    return page
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("view", VIEWS)
+def test_no_view_has_a_serious_accessibility_fault(
+    visitor: Visitor, town: Town, view: str, scheme: Any
+) -> None:
+    visitor.page.emulate_media(color_scheme=scheme)
+    page = open_view(visitor, town, view)
+    faults = [
+        f"{fault['id']}: {node['html'][:200]} {node['failureSummary']}"
+        for fault in Axe().run(page)["violations"]
+        if fault["impact"] in SERIOUS
+        for node in fault["nodes"]
+    ]
+    assert faults == []
+
+
+@pytest.mark.parametrize("view", VIEWS)
+def test_no_view_is_wider_than_a_narrow_phone(visitor: Visitor, town: Town, view: str) -> None:
+    visitor.page.set_viewport_size({"width": 320, "height": 640})
+    page = open_view(visitor, town, view)
+    assert page.evaluate("document.documentElement.scrollWidth") <= 320
+
+
+def focused(page: Page) -> str:
+    name: str = page.evaluate(
+        "document.activeElement.getAttribute('aria-label') || document.activeElement.textContent"
+    )
+    return name.strip()
+
+
+def test_a_match_is_reached_by_keyboard_alone(visitor: Visitor, town: Town) -> None:
+    stored = town.get("/search", role="database", limit=1)["images"][0]
+    page = visitor.visit(f"ask/{stored['image_id']}")
+    expect(page.locator(".match")).to_have_count(12)
+    page.locator(".skip").press("Enter")
+    for _ in range(40):
+        page.keyboard.press("Tab")
+        if focused(page).startswith("Match 1"):
+            break
+    outline = page.evaluate("getComputedStyle(document.activeElement).outlineStyle")
+    assert outline == "solid", "who uses the keyboard sees where they are"
+    page.keyboard.press("Enter")
+    expect(page.get_by_role("dialog")).to_be_visible()
+    page.keyboard.press("Escape")
+    expect(page.get_by_role("dialog")).to_have_count(0)
+    assert focused(page).startswith("Match 1")
+
+
+def test_views_are_named_and_marked_as_the_current_one(visitor: Visitor) -> None:
+    page = visitor.visit("ask")
+    page.get_by_role("link", name="Model").press("Enter")
+    expect(page.get_by_role("heading", name="Model", exact=True)).to_be_visible()
+    expect(page).to_have_title("Model · riverside · Placewise")
+    expect(page.locator(".tabs [aria-current=page]")).to_have_text("Model")

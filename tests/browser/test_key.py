@@ -1,0 +1,50 @@
+"""A server that wants a key is asked for it by the page."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+
+import pytest
+from playwright.sync_api import Browser, Page, expect
+
+from tests.support.photos import photo_bytes
+from tests.support.server import ServerProcess
+
+KEY = "a-key-of-ones-own-0123456789"
+
+
+@pytest.fixture(scope="module")
+def locked(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServerProcess]:
+    with ServerProcess(tmp_path_factory.mktemp("locked") / "home", admin_key=KEY) as server:
+        server.indexed(photo_bytes(1), "first.jpg")
+        yield server
+
+
+@pytest.fixture
+def page(browser: Browser, locked: ServerProcess) -> Iterator[Page]:
+    context = browser.new_context()
+    opened = context.new_page()
+    opened.goto(f"{locked.client.base_url}")
+    yield opened
+    context.close()
+
+
+def give(page: Page, key: str) -> None:
+    page.get_by_label("Key", exact=True).fill(key)
+    page.get_by_role("button", name="Go on").click()
+
+
+def test_the_key_is_asked_for_once_and_kept_for_the_tab_alone(page: Page) -> None:
+    expect(page.get_by_role("dialog")).to_contain_text("wants a key")
+    give(page, "x" * 20)
+    expect(page.get_by_role("dialog")).to_contain_text("does not know this key")
+    give(page, KEY)
+    expect(page.get_by_role("heading", name="Where was this taken?")).to_be_visible()
+    # Pictures are fetched with the key, too.
+    expect(page.locator(".mosaic img")).to_have_attribute("src", re.compile("^blob:"))
+    assert page.evaluate("sessionStorage.getItem('placewise-key')") == KEY
+    assert KEY not in page.evaluate("JSON.stringify(localStorage) + document.cookie")
+    page.reload()
+    expect(page.get_by_role("heading", name="Where was this taken?")).to_be_visible()
+    expect(page.get_by_role("dialog")).to_have_count(0)

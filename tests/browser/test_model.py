@@ -1,0 +1,60 @@
+"""Fitting a vocabulary on the page, and seeing what it has gained."""
+
+from __future__ import annotations
+
+from playwright.sync_api import expect
+
+from tests.browser.conftest import MAP, Town, Visitor
+
+
+def test_a_vocabulary_is_fitted_with_a_bar_and_compared_with_the_one_before(
+    visitor: Visitor, town: Town
+) -> None:
+    page = visitor.visit("model")
+    expect(page.locator(".standing .chip")).to_have_text("Foreign")
+    page.get_by_role("button", name="Fit a vocabulary…").click()
+    page.get_by_label("Photos to learn from, at most").fill("60")
+    page.get_by_role("button", name="Fit it", exact=True).click()
+    expect(page.get_by_role("progressbar", name="Fitting a vocabulary")).to_be_visible()
+    expect(page.locator(".standing .chip")).to_have_text("Its own")
+    assert town.get(f"/maps/{MAP}")["vocabulary"] == "own"
+
+    page.get_by_role("button", name="Measure now").click()
+    expect(page.get_by_role("heading", name="Before and after")).to_be_visible()
+    before, after = reversed(
+        [one["figures"]["leave_one_out"]["R@1"] for one in _newest_of_each(town)]
+    )
+    shown = page.locator("table.recalls").last.locator("tbody tr").first
+    expect(shown.locator("td").nth(0)).to_contain_text(f"{100 * before:.1f} %")
+    expect(shown.locator("td").nth(1)).to_contain_text(f"{100 * after:.1f} %")
+    vocabularies = town.get("/vocabularies")
+    with page.expect_download() as download:
+        page.get_by_role("button", name="Download").first.click()
+    assert download.value.suggested_filename == f"{vocabularies[0]['vocabulary_id']}.npz"
+
+
+def _newest_of_each(town: Town) -> list[dict[str, dict[str, dict[str, float]]]]:
+    newest: dict[str, dict[str, dict[str, dict[str, float]]]] = {}
+    for one in town.get("/evaluations")["evaluations"]:
+        newest.setdefault(one["generation_id"], one)
+    assert len(newest) == 2
+    return list(newest.values())
+
+
+def test_the_state_of_things_is_told(visitor: Visitor, town: Town) -> None:
+    page = visitor.visit("status")
+    expect(page.locator(".parts li")).to_have_count(3)
+    expect(page.locator(".card .chip.healthy")).to_have_text("healthy")
+    photos = town.get("/database/stats")["total_images"]
+    expect(page.locator(".tile").first).to_contain_text(str(photos))
+    expect(page.get_by_role("heading", name="Newest jobs")).to_be_visible()
+
+
+def test_a_new_map_is_made_and_chosen(visitor: Visitor, town: Town) -> None:
+    page = visitor.visit("photos")
+    page.locator("#map-choice").select_option(label="New map…")
+    page.get_by_label("Name").last.fill("old-town")
+    page.get_by_role("button", name="Make it").click()
+    expect(page.get_by_role("heading", name="This map has no photos yet")).to_be_visible()
+    expect(page.locator("#map-choice")).to_have_value("old-town")
+    assert "old-town" in [one["name"] for one in town.server.client.get("/api/v1/maps").json()]

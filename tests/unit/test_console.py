@@ -1,0 +1,158 @@
+"""The page as the gateway sends it: types, caching, and that nothing is from elsewhere."""
+
+from __future__ import annotations
+
+import gzip
+import re
+from pathlib import Path
+
+import httpx2
+import pytest
+from fastapi import FastAPI
+from pydantic import ValidationError
+from starlette.testclient import TestClient
+
+from services.console import PAGE
+from services.gateway.console import console_router
+from shared.problems import install_problem_handlers
+from shared.settings import Settings
+
+TILES = "https://tiles.example.org/{z}/{x}/{y}.png"
+HTML = {"Accept": "text/html,*/*"}
+SOURCES = sorted(PAGE.rglob("*"))
+
+
+def served(settings: Settings) -> TestClient:
+    app = FastAPI(docs_url=None, redoc_url=None)
+    install_problem_handlers(app)
+    app.include_router(console_router(settings))
+    return TestClient(app, base_url="http://localhost")
+
+
+@pytest.fixture
+def page(settings: Settings) -> TestClient:
+    return served(settings)
+
+
+def policy(answer: httpx2.Response) -> dict[str, str]:
+    parts = answer.headers["content-security-policy"].split("; ")
+    return {name: value for name, _, value in (part.partition(" ") for part in parts)}
+
+
+def test_browsers_get_the_page_and_programs_what_this_is(page: TestClient) -> None:
+    shown = page.get("/", headers=HTML)
+    assert shown.headers["content-type"] == "text/html; charset=utf-8"
+    assert "<title>Placewise</title>" in shown.text
+    told = page.get("/", headers={"Accept": "*/*"})
+    assert told.json()["service"] == "Placewise"
+    for answer in (shown, told):
+        assert "Accept" in answer.headers["vary"]
+
+
+@pytest.mark.parametrize(
+    ("path", "media_type"),
+    [
+        ("app.js", "text/javascript; charset=utf-8"),
+        ("views/ask.js", "text/javascript; charset=utf-8"),
+        ("style.css", "text/css; charset=utf-8"),
+        ("mark.svg", "image/svg+xml"),
+        ("settings.json", "application/json"),
+        ("leaflet/leaflet.js", "text/javascript; charset=utf-8"),
+        ("api/swagger-ui-bundle.js", "text/javascript; charset=utf-8"),
+    ],
+)
+def test_files_have_their_type_and_are_small_on_the_way(
+    page: TestClient, path: str, media_type: str
+) -> None:
+    zipped = page.get(f"/console/{path}", headers={"Accept-Encoding": "gzip"})
+    plain = page.get(f"/console/{path}", headers={"Accept-Encoding": "identity"})
+    assert zipped.headers["content-type"] == plain.headers["content-type"] == media_type
+    assert zipped.headers["content-encoding"] == "gzip"
+    assert "content-encoding" not in plain.headers
+    assert zipped.content == plain.content
+    assert zipped.headers["etag"] != plain.headers["etag"]
+    assert int(zipped.headers["content-length"]) == len(gzip.compress(plain.content, 9, mtime=0))
+
+
+def test_a_browser_that_has_a_file_is_not_sent_it_again(page: TestClient) -> None:
+    first = page.get("/console/app.js")
+    again = page.get("/console/app.js", headers={"If-None-Match": first.headers["etag"]})
+    assert (again.status_code, again.content) == (304, b"")
+    assert again.headers["etag"] == first.headers["etag"]
+    other = page.get("/console/app.js", headers={"If-None-Match": '"another"'})
+    assert other.status_code == 200
+
+
+@pytest.mark.parametrize("path", ["nothing.js", "../app.py", "%2e%2e/__init__.py", "index.html"])
+def test_only_the_pages_own_files_are_sent(page: TestClient, path: str) -> None:
+    answer = page.get(f"/console/{path}")
+    assert answer.status_code == 404
+    assert answer.json()["code"] == "path_not_found"
+
+
+def test_nothing_but_this_server_may_be_loaded(page: TestClient) -> None:
+    allowed = policy(page.get("/", headers=HTML))
+    assert allowed["default-src"] == "'self'"
+    assert allowed["img-src"] == "'self' blob: data:"
+    assert not any("unsafe" in value for value in allowed.values())
+    for path in ("/docs", "/redoc"):
+        assert "script-src" not in policy(page.get(path)), "scripts are this server's alone"
+
+
+def test_the_tile_server_alone_is_added_to_what_may_be_loaded(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("MAP_TILES", TILES)
+    monkeypatch.setenv("MAP_ATTRIBUTION", "© somebody")
+    page = served(Settings())
+    allowed = policy(page.get("/", headers=HTML))
+    assert allowed["img-src"] == "'self' blob: data: https://tiles.example.org"
+    said = page.get("/console/settings.json").json()
+    assert (said["map_tiles"], said["map_attribution"]) == (TILES, "© somebody")
+
+
+@pytest.mark.parametrize(
+    "tiles",
+    [
+        "tiles.example.org/{z}/{x}/{y}.png",
+        "https://tiles.example.org/",
+        "https://tiles.example.org; script-src */{z}/{x}/{y}.png",
+        "javascript:alert({z}{x}{y})",
+    ],
+)
+def test_what_is_no_address_of_tiles_is_refused(
+    monkeypatch: pytest.MonkeyPatch, tiles: str
+) -> None:
+    monkeypatch.setenv("MAP_TILES", tiles)
+    monkeypatch.setenv("MAP_ATTRIBUTION", "© somebody")
+    with pytest.raises(ValidationError, match="is no address of tiles"):
+        Settings()
+
+
+def test_tiles_without_attribution_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MAP_TILES", TILES)
+    with pytest.raises(ValidationError, match="MAP_ATTRIBUTION"):
+        Settings()
+
+
+@pytest.mark.parametrize("path", [path for path in SOURCES if path.suffix == ".html"])
+def test_pages_have_no_script_or_style_in_them(path: Path) -> None:
+    text = path.read_text()
+    assert not re.search(r"<style|\sstyle=|\son\w+=", text)
+    assert all(tag.endswith("></script>") for tag in re.findall(r"<script.*?</script>", text))
+
+
+@pytest.mark.parametrize("path", [path for path in SOURCES if path.is_file()])
+def test_no_file_of_the_page_names_another_server(path: Path) -> None:
+    addresses = re.findall(r"https?://[^\s\"'`)]+", path.read_text())
+    assert set(addresses) <= {"http://www.w3.org/2000/svg"}
+
+
+def test_every_module_that_is_imported_is_there(page: TestClient) -> None:
+    wanted = set()
+    for path in PAGE.rglob("*.js"):
+        for name in re.findall(r"(?:from|import)\s*\(?\"(\.[^\"]+)\"", path.read_text()):
+            wanted.add((path.parent / name).resolve().relative_to(PAGE).as_posix())
+    assert wanted
+    for name in sorted(wanted):
+        assert page.get(f"/console/{name}").status_code == 200, name
