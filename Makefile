@@ -15,7 +15,7 @@ UV_VERSION := 0.13.8
 INSTALLED := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help setup run test test-browser pictures lint types bench demo env clean
+.PHONY: help setup run test test-browser pictures client lint types bench demo env clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F':.*## ' '{printf "  make %-13s %s\n", $$1, $$2}'
@@ -49,6 +49,9 @@ test-browser: $(INSTALLED) ## the page in a real Chromium (apt-get install chrom
 
 pictures: $(INSTALLED) ## the same, and the screenshots in docs/pictures anew
 	PLACEWISE_TEST_BROWSER=1 PLACEWISE_PICTURES=docs/pictures $(BIN)/python -m pytest tests/browser
+
+client: $(INSTALLED) ## the synchronous client anew, from the asynchronous one
+	$(BIN)/python -m tools.make_sync_client
 
 lint: $(INSTALLED) ## ruff, formatting and the import contracts
 	$(BIN)/ruff check .
