@@ -91,7 +91,7 @@ class AsyncClient(AsyncWire):
 
     async def import_prefix(self, prefix: str) -> Json:
         """Start a batch with every photo of the server's store whose key begins with `prefix`."""
-        return await self._call("POST", "/upload/batch", data={"prefix": prefix})
+        return await self._call("POST", "/upload/batch", files={"prefix": (None, prefix)})
 
     def batch_items(self, job_id: UUID | str, *states: str) -> AsyncIterator[Json]:
         """The photos of a batch that are in one of the states, or all of them."""

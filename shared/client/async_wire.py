@@ -23,6 +23,7 @@ from shared.client.sending import (
     Json,
     OnWait,
     Patience,
+    Seekable,
     checked_address,
     given,
     name_of,
@@ -97,7 +98,7 @@ class AsyncWire:
             return await self._call("POST", path, stream, files=files, **options)
 
     async def _call(
-        self, method: str, path: str, body: BinaryIO | None = None, **options: Any
+        self, method: str, path: str, body: Seekable | None = None, **options: Any
     ) -> Json:
         """One call of the API, repeated as patience allows; `body` is read from its begin."""
         if method == "POST" and self._patience.seconds:

@@ -89,7 +89,7 @@ class Client(Wire):
 
     def import_prefix(self, prefix: str) -> Json:
         """Start a batch with every photo of the server's store whose key begins with `prefix`."""
-        return self._call("POST", "/upload/batch", data={"prefix": prefix})
+        return self._call("POST", "/upload/batch", files={"prefix": (None, prefix)})
 
     def batch_items(self, job_id: UUID | str, *states: str) -> Iterator[Json]:
         """The photos of a batch that are in one of the states, or all of them."""

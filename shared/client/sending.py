@@ -11,7 +11,7 @@ import random
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, Protocol
 
 import httpx2
 
@@ -32,6 +32,10 @@ OnWait = Callable[[PlacewiseError, float], object]
 """Told of each wait before it begins: why, and how many seconds."""
 
 
+class Seekable(Protocol):
+    def seek(self, offset: int, whence: int = ..., /) -> int: ...
+
+
 @dataclass(frozen=True, slots=True)
 class Patience:
     """For how long a call is repeated, and who is told."""
@@ -47,7 +51,8 @@ class Patience:
         said = error.extra.get("retry_after_seconds")
         if said is None:
             # Up to a quarter more: callers that were cut off together don't come back together.
-            seconds = min(RETRY_SECONDS * 2**times, MOST_BACKOFF_SECONDS) * random.uniform(1, 1.25)  # noqa: S311
+            doubled = min(RETRY_SECONDS * 2.0**times, MOST_BACKOFF_SECONDS)
+            seconds = doubled * random.uniform(1, 1.25)  # noqa: S311
         else:
             seconds = min(max(float(said), RETRY_SECONDS), MOST_RETRY_SECONDS)
         self.on_wait(error, seconds)

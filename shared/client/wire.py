@@ -22,6 +22,7 @@ from shared.client.sending import (
     Json,
     OnWait,
     Patience,
+    Seekable,
     checked_address,
     given,
     name_of,
@@ -93,7 +94,7 @@ class Wire:
             files = {"file": (called or name_of(file), stream)}
             return self._call("POST", path, stream, files=files, **options)
 
-    def _call(self, method: str, path: str, body: BinaryIO | None = None, **options: Any) -> Json:
+    def _call(self, method: str, path: str, body: Seekable | None = None, **options: Any) -> Json:
         """One call of the API, repeated as patience allows; `body` is read from its begin."""
         if method == "POST" and self._patience.seconds:
             key = {IDEMPOTENCY_KEY: str(new_id())}

@@ -15,24 +15,7 @@ from pydantic import BaseModel
 
 import placewise
 from placewise import answers
-from services.gateway import (
-    batches,
-    evaluations,
-    figures,
-    history,
-    jobs,
-    maps,
-    model_changes,
-    photos,
-    similarity,
-    upload,
-)
-from services.gateway.schemas import (
-    ClusterShareAnswer,
-    EstimateAnswer,
-    ExplanationAnswer,
-    Progress,
-)
+from services.gateway import batches, evaluations, figures, history, maps, schemas
 from tests.unit.test_client import FakeServer, running_server
 from tools.make_sync_client import FILES, ROOT, synchronous
 
@@ -75,21 +58,21 @@ PHOTO = {
 }
 STARTED = {"job_id": JOB["job_id"], "status": "queued", "status_url": "/", "result_url": None}
 SAME: list[tuple[type[BaseModel], type[BaseModel]]] = [
-    (answers.Photo, photos.PhotoAnswer),
-    (answers.OnePhoto, photos.OnePhotoAnswer),
-    (answers.Deleted, photos.DeleteAnswer),
-    (answers.Uploaded, upload.UploadAnswer),
-    (answers.Similar, similarity.SimilarityAnswer),
-    (answers.Estimate, EstimateAnswer),
-    (answers.Explanation, ExplanationAnswer),
-    (answers.ClusterShare, ClusterShareAnswer),
-    (answers.Progress, Progress),
-    (answers.Job, jobs.JobAnswer),
-    (answers.Started, model_changes.JobStarted),
+    (answers.Photo, schemas.PhotoAnswer),
+    (answers.OnePhoto, schemas.OnePhotoAnswer),
+    (answers.Deleted, schemas.DeleteAnswer),
+    (answers.Uploaded, schemas.UploadAnswer),
+    (answers.Similar, schemas.SimilarityAnswer),
+    (answers.Estimate, schemas.EstimateAnswer),
+    (answers.Explanation, schemas.ExplanationAnswer),
+    (answers.ClusterShare, schemas.ClusterShareAnswer),
+    (answers.Progress, schemas.Progress),
+    (answers.Job, schemas.JobAnswer),
+    (answers.Started, schemas.JobStarted),
     (answers.BatchStarted, batches.BatchStarted),
     (answers.BatchItem, batches.BatchItemAnswer),
-    (answers.Vocabulary, model_changes.VocabularyAnswer),
-    (answers.Generation, model_changes.GenerationAnswer),
+    (answers.Vocabulary, schemas.VocabularyAnswer),
+    (answers.Generation, schemas.GenerationAnswer),
     (answers.Evaluation, evaluations.EvaluationAnswer),
     (answers.Search, history.SearchAnswer),
     (answers.Map, maps.MapAnswer),
