@@ -258,14 +258,6 @@ class AsyncClient(AsyncWire):
         """Write a tar with `descriptors.npy`, `names.txt` and `photos.csv` to `file`."""
         await self._fetch(f"/generations/{generation_id}/descriptors", file, on_received)
 
-    async def export_geojson(
-        self,
-        file: BinaryIO,
-        on_received: Callable[[int], object] = lambda received_bytes: None,
-    ) -> None:
-        """Write the map's photos as a GeoJSON FeatureCollection to `file`."""
-        await self._fetch("/export/geojson", file, on_received)
-
     async def maps(self) -> list[Json]:
         """Every map of the server."""
         found: Any = await self._call("GET", "/maps")

@@ -254,14 +254,6 @@ class Client(Wire):
         """Write a tar with `descriptors.npy`, `names.txt` and `photos.csv` to `file`."""
         self._fetch(f"/generations/{generation_id}/descriptors", file, on_received)
 
-    def export_geojson(
-        self,
-        file: BinaryIO,
-        on_received: Callable[[int], object] = lambda received_bytes: None,
-    ) -> None:
-        """Write the map's photos as a GeoJSON FeatureCollection to `file`."""
-        self._fetch("/export/geojson", file, on_received)
-
     def maps(self) -> list[Json]:
         """Every map of the server."""
         found: Any = self._call("GET", "/maps")
