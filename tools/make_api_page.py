@@ -14,8 +14,8 @@ from shared.settings import Settings
 PAGE = Path(__file__).parents[1] / "docs" / "api-calls.md"
 HEAD = """# Every call
 
-Made of the description that a server gives on `/openapi.json`, by `make api-page`. What the calls have
-in common stands on [the API in short](api.md).
+Made of the description that a server gives on `/openapi.json`, by `make api-page`. What the calls
+have in common stands on [the API in short](api.md).
 """
 
 

@@ -201,7 +201,7 @@ def _read(
         said = read_jsonl(received.manifest or b"", "the manifest")
         return list(_files(received.files, said)), BatchSource.FILES, {}
     if received.prefix is not None:
-        return [], BatchSource.PREFIX, {"prefix": _prefix(received.prefix, gateway.settings)}
+        return [], BatchSource.PREFIX, {"prefix": checked_prefix(received.prefix, gateway.settings)}
     said = read_jsonl(received.manifest or b"", "the manifest", (KEY_FIELD,))
     _check_keys(said, gateway.settings.import_prefix)
     if not said:
@@ -245,7 +245,7 @@ def _files(files: list[UploadedFile], said: list[Said]) -> Iterator[dict[str, An
         yield item
 
 
-def _prefix(said: str, settings: Settings) -> str:
+def checked_prefix(said: str, settings: Settings) -> str:
     """The folder of keys that is meant; 422 unless the operator has given it free."""
     prefix = said
     if said.startswith("s3://"):

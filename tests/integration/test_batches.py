@@ -13,6 +13,7 @@ import pytest
 from sqlalchemy import func, select
 
 from services.extractor.worker import ExtractorWorker
+from services.gateway.batches import checked_prefix
 from services.steward.batches import bring_in as bring_in_module
 from services.steward.batches import worker as worker_module
 from services.steward.batches.worker import BatchWorker
@@ -21,7 +22,7 @@ from services.steward.delete_maps import delete_maps
 from shared.catalog.maps import ensure_default_map
 from shared.catalog.photos import Photo
 from shared.catalog.session import Catalog
-from shared.errors import Unavailable
+from shared.errors import Unavailable, Unprocessable
 from shared.intake import incoming as incoming_module
 from shared.intake import store_photo as store_photo_module
 from shared.jobs import InProcessHints, Job, JobKind, JobState, free_expired_leases
@@ -153,6 +154,18 @@ def test_every_photo_below_a_prefix_comes_in_and_again_nothing_twice(batches: Ba
 def test_a_prefix_that_was_not_given_free_is_refused(batches: Batches, prefix: str) -> None:
     answer = batches.service("POST", "/upload/batch", files={"prefix": (None, prefix)})
     problem(answer, 422, "invalid_field")
+
+
+def test_a_prefix_may_be_written_as_an_address_in_the_servers_own_bucket(
+    settings: Settings,
+) -> None:
+    own = settings.model_copy(update={"s3_endpoint": "http://s3:9000", "s3_bucket": "city"})
+    assert checked_prefix("s3://city/imports/monday", own) == "imports/monday/"
+    assert checked_prefix("imports/monday/", own) == "imports/monday/"
+    for wrong in ("s3://other/imports/monday", "s3://city/originals", "s3://city", "s3://"):
+        with pytest.raises(Unprocessable) as caught:
+            checked_prefix(wrong, own)
+        assert caught.value.code == "invalid_field"
 
 
 def test_a_prefix_without_photos_fails_and_says_so(batches: Batches) -> None:
