@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import sys
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
@@ -171,7 +172,7 @@ def _read(manifest: Path) -> bytes:
         ) from error
 
 
-def _refuse_options(what: str, given: dict[str, object]) -> None:
+def _refuse_options(what: str, given: Mapping[str, object]) -> None:
     """InvalidRequest (`not_for_archives`): what the server reads itself takes no options."""
     if wrong := [name for name, value in given.items() if value]:
         raise InvalidRequest(
