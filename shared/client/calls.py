@@ -84,8 +84,12 @@ class Client(Wire):
     def import_objects(self, manifest: Sequence[Json]) -> Json:
         """Start a batch with objects of the server's store; each line has a `key` and the form's
         fields."""
+        return self.import_manifest(as_lines(manifest))
+
+    def import_manifest(self, lines: bytes) -> Json:
+        """`import_objects` with the lines as JSONL."""
         headers = {"Content-Type": "application/x-ndjson"}
-        return self._call("POST", "/upload/batch", content=as_lines(manifest), headers=headers)
+        return self._call("POST", "/upload/batch", content=lines, headers=headers)
 
     def import_prefix(self, prefix: str) -> Json:
         """Start a batch with every photo of the server's store whose key begins with `prefix`."""

@@ -56,5 +56,6 @@ def test_each_row_is_the_descriptor_of_its_line(service: Service) -> None:
 
 
 def test_descriptors_of_a_generation_that_is_not_there_are_not_found(service: Service) -> None:
+    service.indexed(1)
     answer = service("GET", f"/generations/{new_id()}/descriptors")
     problem(answer, 404, "generation_not_found")
