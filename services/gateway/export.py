@@ -6,6 +6,7 @@ memory at a time.
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import io
 import tarfile
@@ -74,18 +75,19 @@ def descriptors(
     """Every live photo's descriptor: `descriptors.npy`, (photos, dimension) float32, each row of
     length 1; in the same order `photos.csv` and `names.txt`.
     """
-    table = tempfile.SpooledTemporaryFile(KEPT_BYTES)  # noqa: SIM115  # closed by the stream
-    names = tempfile.SpooledTemporaryFile(KEPT_BYTES)  # noqa: SIM115
-    with gateway.catalog.read() as session:
+    with contextlib.ExitStack() as files, gateway.catalog.read() as session:
         generation = get_generation(session, get_map(session, map_name).id, generation_id)
+        table = files.enter_context(tempfile.SpooledTemporaryFile(KEPT_BYTES))
+        names = files.enter_context(tempfile.SpooledTemporaryFile(KEPT_BYTES))
         parts = _write_tables(session, generation, table, names)
         header = _npy_header(sum(len(part.rows) for part in parts), generation.dimension)
+        files = files.pop_all()  # now the stream's, which closes them
     rows = sum(len(part.rows) for part in parts)
     size = len(header) + rows * generation.dimension * np.dtype(np.float32).itemsize
     members = [("photos.csv", table.tell()), ("names.txt", names.tell()), ("descriptors.npy", size)]
 
     def stream() -> Iterator[bytes]:
-        with table, names:
+        with files:
             for (name, size_bytes), content in zip(
                 members,
                 (_pieces(table), _pieces(names), _rows(gateway.store, header, parts)),
