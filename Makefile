@@ -15,7 +15,7 @@ UV_VERSION := 0.13.8
 INSTALLED := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help setup run test test-browser test-api-fuzz pictures lint types bench demo env clean
+.PHONY: help setup run test test-browser test-api-fuzz pictures client api-page lint types bench demo env clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F':.*## ' '{printf "  make %-13s %s\n", $$1, $$2}'
@@ -52,6 +52,12 @@ test-api-fuzz: $(INSTALLED) ## very many made-up calls by the API's description 
 
 pictures: $(INSTALLED) ## the same, and the screenshots in docs/pictures anew
 	PLACEWISE_TEST_BROWSER=1 PLACEWISE_PICTURES=docs/pictures $(BIN)/python -m pytest tests/browser
+
+client: $(INSTALLED) ## the synchronous client anew, from the asynchronous one
+	$(BIN)/python -m tools.make_sync_client
+
+api-page: $(INSTALLED) ## docs/api-calls.md anew, from the API's description
+	$(BIN)/python -m tools.make_api_page
 
 lint: $(INSTALLED) ## ruff, formatting and the import contracts
 	$(BIN)/ruff check .

@@ -12,11 +12,14 @@ from shared.errors import Unprocessable
 # MPO, which many phones write under the name JPEG (a JPEG with a second picture behind it), is
 # opened by Pillow as JPEG: naming it here is a KeyError for everything but a JPEG.
 FORMATS = ("JPEG", "PNG", "WEBP", "BMP", "TIFF")
-ACCEPTED = "JPEG, PNG, WebP, BMP or TIFF"
+ACCEPTED = "JPEG, PNG, WebP, BMP, TIFF or HEIC"
+HEIC = "image/heic"
+# The first brand of files of HEVC pictures: `mif1` may hold others, which their header tells.
+HEIC_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"mif1")
 # What Pillow raises for damaged photos and EXIF; UnidentifiedImageError is an OSError.
 BROKEN = (OSError, SyntaxError, ValueError, TypeError, LookupError, EOFError, struct.error)
 # Of files that are looked for in folders and archives; what they are is told by their content.
-PHOTO_SUFFIXES = {".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff"}
+PHOTO_SUFFIXES = {".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff", ".heic", ".heif"}
 SNIFFED_BYTES = 16  # enough to tell every accepted format
 
 # Our own limit is checked from the header before anything is decoded.
@@ -36,6 +39,8 @@ def sniff_media_type(begin: bytes) -> str | None:
     # "BM" alone begins many texts: a bitmap has two reserved fields, which are zero.
     if begin.startswith(b"BM") and begin[6:10] == b"\x00\x00\x00\x00":
         return "image/bmp"
+    if begin[4:8] == b"ftyp" and begin[8:12] in HEIC_BRANDS:
+        return HEIC
     return None
 
 
@@ -44,11 +49,11 @@ def open_photo(file: BinaryIO) -> Image.Image:
     return Image.open(file, formats=FORMATS)
 
 
-def check_pixels(image: Image.Image, max_pixels: int) -> None:
+def check_pixels(width: int, height: int, max_pixels: int) -> None:
     """Unprocessable (`too_many_pixels`) when the header promises more than the limit."""
-    if image.width * image.height > max_pixels:
+    if width * height > max_pixels:
         raise Unprocessable(
             "too_many_pixels",
-            f"The photo has {image.width} x {image.height} pixels; "
+            f"The photo has {width} x {height} pixels; "
             f"the limit is {max_pixels} in all (MAX_IMAGE_PIXELS).",
         )

@@ -1,15 +1,20 @@
-"""`placewise index DIR` or `placewise index ARCHIVE`: many photos into the map."""
+"""`placewise index`: many photos into the map, from a folder, an archive, a list or a bucket."""
 
 from __future__ import annotations
 
+import contextlib
+import json
 import sys
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from services.cli.configuration import read_settings
 from services.cli.connect import connect
+from services.cli.journal import Journal
 from services.cli.output import (
     JsonOption,
     KeyOption,
@@ -21,21 +26,28 @@ from services.cli.output import (
     print_json,
     progress_bar,
 )
-from services.cli.photo_places import find_photos
-from services.cli.upload_archive import check_archive, upload_archive
+from services.cli.photo_places import FoundPhoto, find_photos, photos_of_manifest
+from services.cli.upload_batch import (
+    check_archive,
+    import_keys,
+    import_prefix,
+    names_keys,
+    upload_archive,
+)
 from services.cli.upload_many import FitOption, UpdateOption, upload_many
+from services.cli.whole_file import check_out, whole_or_nothing
 from shared.catalog.photos import PhotoRole
 from shared.client import Json
 from shared.errors import InvalidRequest
 
 
 def index(
-    folder: Annotated[
-        Path,
+    source: Annotated[
+        str,
         typer.Argument(
-            metavar="DIR|ARCHIVE",
-            exists=True,
-            help="A folder, which is searched recursively; or a zip, tar or gzipped tar.",
+            metavar="DIR|ARCHIVE|MANIFEST.jsonl|s3://BUCKET/PREFIX",
+            help="A folder, which is searched recursively; a zip, tar or gzipped tar; a list of "
+            "photos, one JSON object a line; or a prefix of the server's own bucket.",
         ),
     ],
     table: Annotated[
@@ -62,53 +74,120 @@ def index(
         typer.Option(help="`query`: labelled queries, which `placewise evaluate` asks with."),
     ] = PhotoRole.DATABASE,
     update: UpdateOption = False,
+    journal: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Write down what the server has taken; a run that finds the file sends only the "
+            "rest. For DIR and lists of files.",
+        ),
+    ] = None,
+    failures: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE.jsonl", help="Write the refused and failed photos with their reasons."
+        ),
+    ] = None,
     fit: FitOption = True,
     map_name: MapOption = None,
     server: ServerOption = None,
     key: KeyOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Upload every photo of a folder or an archive and wait until all are searchable.
+    """Upload every photo of a folder, an archive, a list or a bucket's prefix and wait until all
+    are searchable.
 
-    Coordinates come from the CSV, from @UTM@ file names, or from EXIF. Run it again after an
-    interruption: what is there already is not described twice. An archive brings its own table:
-    photos.csv or manifest.jsonl.
+    Coordinates come from the CSV or the list, from @UTM@ file names, or from EXIF. Run it again
+    after an interruption: what is there already is not described twice. An archive brings its own
+    table: photos.csv or manifest.jsonl.
     """
-    with explained(as_json):
-        if folder.is_file():
-            check_archive(folder)
-            _check_options(table, utm_zone, places, role, update)
-            with connect(server, map_name, key) as client, progress_bar() as progress:
-                report = upload_archive(client, folder, fit, progress)
-            _end(report, map_name, role, as_json)
-            return
-        photos = find_photos(folder, table, utm_zone, places_by_folder=places)
-        if role != PhotoRole.DATABASE:
-            photos = [replace(p, fields={**p.fields, "role": role}) for p in photos]
-        with connect(server, map_name, key) as client, progress_bar() as progress:
-            # Labelled queries teach no vocabulary: they must not start a fit either.
-            learns = fit and role == PhotoRole.DATABASE
-            report = upload_many(client, photos, learns, progress, update=update)
-        _end(report, map_name, role, as_json)
-
-
-def _check_options(
-    table: Path | None, utm_zone: str | None, places: bool, role: PhotoRole, update: bool
-) -> None:
-    """An archive is read by the server, which knows of no options."""
-    given = {
+    only_folder = {
         "--csv": table,
         "--utm-zone": utm_zone,
         "--places-by-folder": places,
         "--role": role != PhotoRole.DATABASE,
-        "--update": update,
     }
+    of_server = {**only_folder, "--update": update, "--journal": journal}
+    with explained(as_json):
+        if failures is not None:
+            check_out(failures, ".jsonl", "a list of failures")
+        path = Path(source)
+        if source.startswith("s3://"):
+            _refuse_options("a bucket's prefix", of_server)
+            with connect(server, map_name, key) as client, progress_bar() as progress:
+                report = import_prefix(client, source, fit, progress)
+        elif path.is_dir():
+            photos = find_photos(path, table, utm_zone, places_by_folder=places)
+            if role != PhotoRole.DATABASE:
+                photos = [replace(p, fields={**p.fields, "role": role}) for p in photos]
+            # Labelled queries teach no vocabulary: they must not start a fit either.
+            learns = fit and role == PhotoRole.DATABASE
+            report = _upload(photos, learns, update, journal, server, map_name, key)
+        elif path.suffix == ".jsonl":
+            _refuse_options("a list", only_folder)
+            data = _read(path)
+            if names_keys(data):
+                _refuse_options("a list of keys", of_server)
+                with connect(server, map_name, key) as client, progress_bar() as progress:
+                    report = import_keys(client, data, fit, progress)
+            else:
+                photos = photos_of_manifest(path, data)
+                report = _upload(photos, fit, update, journal, server, map_name, key)
+        else:
+            check_archive(path)
+            _refuse_options("an archive", of_server)
+            with connect(server, map_name, key) as client, progress_bar() as progress:
+                report = upload_archive(client, path, fit, progress)
+        if failures is not None:
+            _write_failures(failures, report)
+        _end(report, map_name, role, as_json)
+
+
+def _upload(
+    photos: list[FoundPhoto],
+    fit: bool,
+    update: bool,
+    journal: Path | None,
+    server: str | None,
+    map_name: str | None,
+    key: str | None,
+) -> Json:
+    with (
+        connect(server, map_name, key) as client,
+        progress_bar() as progress,
+        contextlib.ExitStack() as opened,
+    ):
+        # A server that a command starts for itself has another port each time.
+        url = server or str(read_settings().placewise_home.resolve())
+        written = opened.enter_context(Journal(journal, url, map_name)) if journal else None
+        return upload_many(client, photos, fit, progress, update=update, journal=written)
+
+
+def _read(manifest: Path) -> bytes:
+    try:
+        return manifest.read_bytes()
+    except OSError as error:
+        raise InvalidRequest(
+            "unreadable_file", f"Can't read {manifest}: {error.strerror}"
+        ) from error
+
+
+def _refuse_options(what: str, given: Mapping[str, object]) -> None:
+    """InvalidRequest (`not_for_archives`): what the server reads itself takes no options."""
     if wrong := [name for name, value in given.items() if value]:
         raise InvalidRequest(
             "not_for_archives",
-            f"{', '.join(wrong)}: only for folders. Put what is to be said into the archive, as "
-            "photos.csv or manifest.jsonl; or unpack it and index the folder.",
+            f"{', '.join(wrong)}: not for {what}. Put what is to be said into its table or its "
+            "lines; or index a folder.",
         )
+
+
+def _write_failures(out: Path, report: Json) -> None:
+    """One JSON object a line: `outcome`, `path`, `reason`; an empty file where there is none."""
+    with whole_or_nothing(out) as file:
+        for outcome in ("refused", "failed"):
+            for item in report[outcome]:
+                file.write(json.dumps({"outcome": outcome, **item}).encode() + b"\n")
 
 
 def _end(report: Json, map_name: str | None, role: PhotoRole, as_json: bool) -> None:

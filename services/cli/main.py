@@ -20,6 +20,7 @@ COMMANDS = {
     "index": ("index", "index"),
     "import-anyloc": ("import_anyloc", "import_anyloc"),
     "query": ("ask", "query"),
+    "export": ("export", "app"),
     "describe": ("describe", "describe"),
     "evaluate": ("evaluate", "evaluate"),
     "compare": ("compare", "compare"),

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from shared.datasets.utm_names import fields_of_name
 from shared.errors import InvalidRequest
-from shared.intake.manifest import bad_lines, read_csv
+from shared.intake.manifest import MOST_NAMED, bad_lines, read_csv, read_jsonl
 from shared.photo_formats import PHOTO_SUFFIXES
 
 
@@ -42,6 +42,25 @@ def find_photos(
         if places_by_folder and path.parent != folder:
             fields["place"] = path.parent.name
         found.append(FoundPhoto(path, {**fields, **said.get(path, {})}))
+    return found
+
+
+def photos_of_manifest(manifest: Path, data: bytes) -> list[FoundPhoto]:
+    """The photos that the lines of a JSONL manifest name, relative to where it lies.
+
+    Raises InvalidRequest (`bad_manifest`), also for a photo that is not there.
+    """
+    found = []
+    missing = []
+    for line in read_jsonl(data, str(manifest)):
+        path = manifest.parent / line.name
+        if not path.is_file():
+            missing.append((line.line, f"there is no photo {path}"))
+        found.append(FoundPhoto(path, {**fields_of_name(path.name, None), **line.fields}))
+    if missing:
+        raise bad_lines("bad_manifest", str(manifest), missing[:MOST_NAMED])
+    if not found:
+        raise InvalidRequest("no_photos", f"{manifest} has no line.")
     return found
 
 

@@ -12,11 +12,12 @@ import typer
 from rich.markup import escape
 from rich.progress import Progress, TaskID
 
+from services.cli.journal import Acknowledged, Journal
 from services.cli.output import messages, shown
 from services.cli.photo_places import FoundPhoto
 from services.cli.vocabulary import fit_and_wait
 from shared.client import FINISHED, Client, Json
-from shared.errors import Conflict, PlacewiseError
+from shared.errors import Conflict, NotFound, PlacewiseError
 
 FIT_FROM_PHOTOS = 50
 UPLOADS_AT_ONCE = 4
@@ -48,10 +49,12 @@ def upload_many(
     progress: Progress,
     *,
     update: bool = False,
+    journal: Journal | None = None,
 ) -> Json:
     """Upload, describe, and fit a vocabulary where the map needs one. Running it again uploads
-    the same bytes again and describes nothing twice; with `update`, what is now said otherwise of
-    a photo that is there already is changed, else such a photo is refused.
+    the same bytes again and describes nothing twice; what the journal has is not even sent. With
+    `update`, what is now said otherwise of a photo that is there already is changed, else such a
+    photo is refused.
 
     Returns counts (`photos`, `uploaded`, `already_there`, `searchable` in the whole map), what is
     `refused` and `failed` with the reasons, and the map's `vocabulary`.
@@ -71,12 +74,20 @@ def upload_many(
 
     waited_for: set[str] = set()
     patient = client.patient(AWAY_SECONDS, show_wait)
-    for photo, outcome in _upload_all(patient, photos, update):
+    left = photos
+    if journal is not None:
+        left, taken = _not_yet_taken(photos, journal)
+        pending += taken
+        counts["already_there"] += len(photos) - len(left)
+        progress.update(uploading, completed=len(photos) - len(left))
+    for photo, outcome in _upload_all(patient, left, update):
         progress.update(uploading, advance=1, description="uploading")
         if isinstance(outcome, PlacewiseError):
             refused.append(_fault(photo, outcome.detail))
             continue
         counts["already_there" if outcome["already_there"] else "uploaded"] += 1
+        if journal is not None:
+            journal.add(photo, Acknowledged(outcome["file_id"], outcome["job_id"]))
         if outcome["status"] not in FINISHED:
             pending.append((photo, outcome["job_id"]))
     describing = progress.add_task("describing", total=len(pending))
@@ -96,6 +107,19 @@ def upload_many(
         "vocabulary": stats["vocabulary"],
         "fitted": vocabulary,
     }
+
+
+def _not_yet_taken(photos: list[FoundPhoto], journal: Journal) -> tuple[list[FoundPhoto], Pending]:
+    """The photos that the journal does not have, and the jobs of those that it has."""
+    left: list[FoundPhoto] = []
+    taken: Pending = []
+    for photo in photos:
+        done = journal.done(photo)
+        if done is None:
+            left.append(photo)
+        elif done.job_id is not None:
+            taken.append((photo, done.job_id))
+    return left, taken
 
 
 def fit_if_worth_it(client: Client, stats: Json, progress: Progress) -> tuple[Json, Json | None]:
@@ -152,7 +176,11 @@ def _wait_all(
     for photo, job_id in pending:
         wait_seconds = 0.0
         while True:
-            job = client.job(job_id, wait_seconds)
+            try:
+                job = client.job(job_id, wait_seconds)
+            except NotFound:  # a journal's photo, deleted since: that was meant
+                progress.advance(bar)
+                break
             wait_seconds = LOOK_SECONDS
             if job["state"] in FINISHED:
                 progress.advance(bar)

@@ -20,6 +20,7 @@ from services.gateway.receive_batch import (
     FILE,
     MANIFEST,
     NDJSON,
+    PREFIX,
     ReceivedBatch,
     UploadedFile,
     discard,
@@ -58,6 +59,11 @@ BODY = {
                         FILE: {"type": "array", "items": _FILE, "description": "photos"},
                         ARCHIVE: {**_FILE, "description": "one zip, tar or gzipped tar"},
                         MANIFEST: _LINES,
+                        PREFIX: {
+                            "type": "string",
+                            "description": "every photo below it: a folder below IMPORT_PREFIX, "
+                            "or the same as s3://S3_BUCKET/...",
+                        },
                     },
                 }
             },
@@ -118,7 +124,8 @@ async def upload_batch(
     room: RoomDep,
     map_name: MapName = DEFAULT_MAP,
 ) -> BatchStarted:
-    """Bring in many photos: files of a form, one archive, or objects that lie in the store.
+    """Bring in many photos: files of a form, one archive, or objects that lie in the store, named
+    one by one or by their prefix.
 
     One job counts them. Each photo is taken as `POST /upload` takes it; one that is refused is an
     item that has failed, and the others go on.
@@ -177,7 +184,7 @@ def _queue(
         with gateway.catalog.write() as session:
             map_id = get_map(session, map_name).id
             job = start_batch(session, map_id, source, {**params, **whose})
-            if source != BatchSource.ARCHIVE:
+            if source not in (BatchSource.ARCHIVE, BatchSource.PREFIX):  # the steward lists those
                 list_batch(session, job, rows)
             session.flush()
             session.refresh(job)
@@ -210,6 +217,8 @@ def _read(
     if received.files:
         said = read_jsonl(received.manifest or b"", "the manifest")
         return list(_files(received.files, said)), BatchSource.FILES, {}
+    if received.prefix is not None:
+        return [], BatchSource.PREFIX, {"prefix": checked_prefix(received.prefix, gateway.settings)}
     said = read_jsonl(received.manifest or b"", "the manifest", (KEY_FIELD,))
     _check_keys(said, gateway.settings.import_prefix)
     if not said:
@@ -251,6 +260,23 @@ def _files(files: list[UploadedFile], said: list[Said]) -> Iterator[dict[str, An
         else:
             item |= {"state": JobState.FAILED, "error": file.error.as_problem()}
         yield item
+
+
+def checked_prefix(said: str, settings: Settings) -> str:
+    """The folder of keys that is meant; 422 unless the operator has given it free."""
+    prefix = said
+    if said.startswith("s3://"):
+        bucket, _, prefix = said.removeprefix("s3://").partition("/")
+        if settings.s3_endpoint is None or bucket != settings.s3_bucket:
+            raise invalid_field(
+                PREFIX,
+                f"names the bucket {bucket!r}, which is not this Placewise's own. Copy the photos "
+                f"below {settings.import_prefix} of its store",
+            )
+    prefix = prefix.rstrip("/") + "/"
+    if not (prefix.startswith(settings.import_prefix) and is_key(prefix[:-1])):
+        raise invalid_field(PREFIX, f"is not below {settings.import_prefix} (IMPORT_PREFIX)")
+    return prefix
 
 
 def _check_keys(said: list[Said], prefix: str) -> None:

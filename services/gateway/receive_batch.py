@@ -23,9 +23,10 @@ from shared.objects import ObjectStore, ObjectWriter
 from shared.objects.keys import new_archive_key, new_original_key
 from shared.settings import Settings
 
-FILE, ARCHIVE, MANIFEST = "file", "archive", "manifest"
+FILE, ARCHIVE, MANIFEST, PREFIX = "file", "archive", "manifest", "prefix"
 NDJSON = ("application/x-ndjson", "application/jsonl", "application/x-jsonlines")
 PART_HEADER_BYTES = 1024
+MAX_PREFIX_BYTES = 1024  # the longest key that S3 knows
 
 
 @dataclass(slots=True)
@@ -44,6 +45,7 @@ class ReceivedBatch:
     files: list[UploadedFile] = field(default_factory=list)
     archive: UploadedFile | None = None
     manifest: bytes | None = None
+    prefix: str | None = None
 
     def as_said(self) -> list[Any]:
         """What the body said, as JSON: equal for the same files and lines."""
@@ -51,6 +53,7 @@ class ReceivedBatch:
             [[file.name, file.sha256] for file in self.files],
             self.archive and [self.archive.name, self.archive.sha256],
             None if self.manifest is None else hashlib.sha256(self.manifest).hexdigest(),
+            *([] if self.prefix is None else [self.prefix]),
         ]
 
 
@@ -77,11 +80,15 @@ async def receive_batch(request: Request, store: ObjectStore, settings: Settings
         form.finish()
         received = parts.batch
         if not received.files and received.archive is None and received.manifest is None:
-            raise InvalidRequest(
-                "no_file",
-                f"The form has no photos ({FILE!r}, once for each), no archive ({ARCHIVE!r}) and "
-                f"no manifest of keys ({MANIFEST!r}): curl -F archive=@PHOTOS.zip.",
-            )
+            if received.prefix is None:
+                raise InvalidRequest(
+                    "no_file",
+                    f"The form has no photos ({FILE!r}, once for each), no archive ({ARCHIVE!r}), "
+                    f"no manifest of keys ({MANIFEST!r}) and no prefix of keys ({PREFIX!r}): curl "
+                    "-F archive=@PHOTOS.zip.",
+                )
+        elif received.prefix is not None:
+            raise _several_sources("a prefix and something else")
         parts.keep()
     finally:
         await run_in_threadpool(parts.close)
@@ -123,6 +130,7 @@ class _Parts:
         self._settings = settings
         self._name = ""
         self._manifest = bytearray()
+        self._prefix = bytearray()
         self._files_bytes = 0
         self._todo: deque[tuple[UploadedFile, bytes | None]] = deque()
         """A file's next bytes, in order; None at its end."""
@@ -147,11 +155,15 @@ class _Parts:
             if self.batch.manifest is not None:
                 raise _several_sources("two manifests")
             self.batch.manifest = b""
+        elif name == PREFIX:
+            if self.batch.prefix is not None:
+                raise _several_sources("two prefixes")
+            self.batch.prefix = ""
         elif name not in (FILE, ARCHIVE):
             raise invalid_field(
                 name,
-                f"is unknown; known are {FILE}, {ARCHIVE} and {MANIFEST}. What is said of single "
-                "photos belongs into the manifest",
+                f"is unknown; known are {FILE}, {ARCHIVE}, {MANIFEST} and {PREFIX}. What is said "
+                "of single photos belongs into the manifest",
             )
         elif filename is None:
             raise InvalidRequest(
@@ -175,6 +187,11 @@ class _Parts:
             if len(self._manifest) > MAX_MANIFEST_BYTES:
                 raise _manifest_too_large()
             return
+        if self._name == PREFIX:
+            self._prefix += piece
+            if len(self._prefix) > MAX_PREFIX_BYTES:
+                raise invalid_field(PREFIX, f"has more than {MAX_PREFIX_BYTES} bytes")
+            return
         self._files_bytes += len(piece)
         if self._files_bytes > self._settings.max_archive_size:
             raise batch_too_large(self._settings.max_archive_size)
@@ -184,6 +201,11 @@ class _Parts:
     def end(self) -> None:
         if self._name == MANIFEST:
             self.batch.manifest = bytes(self._manifest)
+        elif self._name == PREFIX:
+            try:
+                self.batch.prefix = self._prefix.decode()
+            except UnicodeDecodeError:
+                raise invalid_field(PREFIX, "is not UTF-8") from None
         else:
             assert self._file is not None
             self._todo.append((self._file, None))
@@ -255,7 +277,8 @@ def _several_sources(what: str) -> PlacewiseError:
     return InvalidRequest(
         "several_sources",
         f"The form has {what}. A batch is photos ({FILE!r}), to which one {MANIFEST!r} may be "
-        f"added; or one {ARCHIVE!r}, with its table in it; or one {MANIFEST!r} of keys.",
+        f"added; or one {ARCHIVE!r}, with its table in it; or one {MANIFEST!r} of keys; or one "
+        f"{PREFIX!r} of keys.",
     )
 
 

@@ -26,12 +26,13 @@ from shared.intake.store_photo import Keep, Stored, store_photo
 from shared.jobs import Job, JobState
 from shared.jobs.table import UNFINISHED
 from shared.objects.keys import new_original_key
+from shared.photo_formats import ACCEPTED
 
 router = APIRouter(tags=["photos"])
 
 _TEXT = {"type": "string"}
 FORM = describe_form(
-    "JPEG, PNG, WebP, BMP or TIFF",
+    ACCEPTED,
     latitude={"type": "number", "minimum": -90, "maximum": 90},
     longitude={"type": "number", "minimum": -180, "maximum": 180},
     heading={"type": "number", "minimum": 0, "maximum": 360},

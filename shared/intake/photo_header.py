@@ -5,6 +5,7 @@ EXIF is a hint from a stranger: whatever is missing, broken or out of range is l
 
 from __future__ import annotations
 
+import contextlib
 import math
 import warnings
 from dataclasses import dataclass
@@ -15,7 +16,15 @@ from PIL import Image
 from PIL.ExifTags import GPS, IFD, Base
 
 from shared.errors import Unprocessable
-from shared.photo_formats import BROKEN, check_pixels, open_photo
+from shared.intake.heic_header import read_heic_header
+from shared.photo_formats import (
+    BROKEN,
+    HEIC,
+    SNIFFED_BYTES,
+    check_pixels,
+    open_photo,
+    sniff_media_type,
+)
 
 ROTATED = (5, 6, 7, 8)  # EXIF orientations that swap width and height
 
@@ -38,8 +47,12 @@ def read_photo_header(file: BinaryIO, max_pixels: int) -> PhotoHeader:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # strange EXIF is no reason to refuse a photo
+            begin = file.read(SNIFFED_BYTES)
+            file.seek(0)
+            if sniff_media_type(begin) == HEIC:
+                return _heic_header(file, max_pixels)
             with open_photo(file) as image:
-                check_pixels(image, max_pixels)
+                check_pixels(image.width, image.height, max_pixels)
                 return _header(image)
     except BROKEN as error:
         raise Unprocessable(
@@ -53,6 +66,21 @@ def _header(image: Image.Image) -> PhotoHeader:
     # Pillow gives the size of a TIFF as it stands upright, that of all others as stored.
     if image.format != "TIFF" and _orientation(exif) in ROTATED:
         width, height = height, width
+    return _with_exif(width, height, exif)
+
+
+def _heic_header(file: BinaryIO, max_pixels: int) -> PhotoHeader:
+    """Its size is that of the boxes: EXIF's orientation does not count in HEIC."""
+    found = read_heic_header(file)
+    check_pixels(found.width, found.height, max_pixels)
+    exif = Image.Exif()
+    if found.exif:
+        with contextlib.suppress(*BROKEN):
+            exif.load(found.exif)
+    return _with_exif(found.width, found.height, exif)
+
+
+def _with_exif(width: int, height: int, exif: Image.Exif) -> PhotoHeader:
     gps = _directory(exif, IFD.GPSInfo)
     latitude = _degrees(gps.get(GPS.GPSLatitude), gps.get(GPS.GPSLatitudeRef), "NS", limit=90)
     longitude = _degrees(gps.get(GPS.GPSLongitude), gps.get(GPS.GPSLongitudeRef), "EW", limit=180)

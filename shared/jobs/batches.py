@@ -59,6 +59,7 @@ class BatchSource(StrEnum):
     FILES = "files"  # uploaded one by one: they lie in the object store already
     ARCHIVE = "archive"  # members of an uploaded archive
     KEYS = "keys"  # objects that others have put into the store
+    PREFIX = "prefix"  # all such objects below a prefix, which the steward lists
 
 
 class BatchItem(Base):

@@ -28,7 +28,7 @@ def retry_batch(session: Session, job: Job) -> None:
         )
         .order_by(BatchItem.number)
     ).all()
-    from_keys = job.params["source"] == BatchSource.KEYS
+    from_keys = job.params["source"] in (BatchSource.KEYS, BatchSource.PREFIX)
     again = 0
     for begin in range(0, len(items), AT_ONCE):
         some = items[begin : begin + AT_ONCE]

@@ -16,7 +16,15 @@ from PIL import __version__ as pillow_version
 from PIL.ExifTags import Base
 
 from shared.errors import Unprocessable
-from shared.photo_formats import ACCEPTED, BROKEN, check_pixels, open_photo
+from shared.photo_formats import (
+    ACCEPTED,
+    BROKEN,
+    HEIC,
+    SNIFFED_BYTES,
+    check_pixels,
+    open_photo,
+    sniff_media_type,
+)
 from shared.vision.preprocessing import Preprocessing
 from shared.vision.resample import Pixels
 
@@ -46,13 +54,13 @@ def decode(data: bytes, preprocessing: Preprocessing, max_pixels: int) -> Decode
 
     Only the first frame is read. Transparent parts show black, samples of 16 bits keep their upper
     eight. Raises Unprocessable (`undecodable_photo` with the decoder's own reason,
-    `too_many_pixels`, `photo_too_small`).
+    `too_many_pixels`, `photo_too_small`, `no_heic_decoder`).
     """
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # a strange tag is no reason to refuse the pixels
-            with open_photo(io.BytesIO(data)) as image:
-                check_pixels(image, max_pixels)
+            with _opened(data) as image:
+                check_pixels(image.width, image.height, max_pixels)
                 image.load()
                 as_stored = to_rgb(image)
                 upright = turn_upright(image, as_stored)
@@ -73,6 +81,22 @@ def decode(data: bytes, preprocessing: Preprocessing, max_pixels: int) -> Decode
             "undecodable_photo",
             "The photo needs more memory to decode than one photo may have.",
         ) from error
+
+
+def _opened(data: bytes) -> Image.Image:
+    if sniff_media_type(data[:SNIFFED_BYTES]) != HEIC:
+        return open_photo(io.BytesIO(data))
+    try:
+        import pillow_heif  # an extra: its wheels bring libraries under licences of their own
+    except ImportError as error:
+        raise Unprocessable(
+            "no_heic_decoder",
+            "This server's extractor has no decoder for HEIC. Install the extra `heic` there "
+            "(pip install 'placewise[heic]') and retry the job, or send the photo as JPEG.",
+        ) from error
+    pillow_heif.options.DECODE_THREADS = 1  # the pool has as many children as there are cores
+    pillow_heif.register_heif_opener(thumbnails=False)
+    return Image.open(io.BytesIO(data), formats=("HEIF",))
 
 
 def turn_upright(image: Image.Image, rgb: Image.Image) -> Image.Image:

@@ -211,7 +211,7 @@ def test_truncated_jpeg_is_refused(service: Describing, share: float) -> None:
 def test_text_is_refused_whatever_its_file_is_called(service: Describing) -> None:
     error = service.refusal(b"These are notes about a photo, and no photo.\n" * 50)
     assert error.code == "undecodable_photo"
-    assert "not JPEG, PNG, WebP, BMP or TIFF" in error.detail
+    assert "not JPEG, PNG, WebP, BMP, TIFF or HEIC" in error.detail
 
 
 # --- photos of many sizes --------------------------------------------------------------------

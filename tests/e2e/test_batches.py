@@ -12,8 +12,10 @@ from pathlib import Path
 from typing import Any
 
 import httpx2
+import numpy as np
 import pytest
 
+import placewise
 from shared.client import Client
 from shared.errors import InvalidRequest
 from shared.objects.s3 import S3Store
@@ -134,6 +136,87 @@ def test_index_says_what_is_no_archive_and_what_an_archive_can_not_be_told(
     assert "--role" in refused["detail"]
     path.write_bytes(zip_of({"readme.txt": b"hello"}))
     assert index(server, path, code=1)["code"] == "no_photos"
+
+
+def test_index_takes_a_list_goes_on_after_a_break_and_writes_what_failed(
+    server: ServerProcess, tmp_path: Path
+) -> None:
+    for name, data in photos(170, 171).items():
+        (tmp_path / name).write_bytes(data)
+    (tmp_path / "bad.jpg").write_bytes(b"no photo")
+    listed = tmp_path / "list.jsonl"
+    names = ("170.jpg", "171.jpg", "bad.jpg")
+    lines = [json.dumps({"filename": name, "place": "hall"}) for name in names]
+    listed.write_text("\n".join(lines))
+    journal, failures = tmp_path / "journal.jsonl", tmp_path / "failures.jsonl"
+    options = ("--journal", str(journal), "--failures", str(failures))
+    report = index(server, listed, *options, code=1)
+    assert (report["uploaded"], len(report["refused"])) == (2, 1)
+    [failure] = [json.loads(line) for line in failures.read_text().splitlines()]
+    assert failure["outcome"] == "refused"
+    assert failure["path"].endswith("bad.jpg")
+    found = server.ask(photo_bytes(171), top_k=1).json()["similar_images"][0]
+    assert found["place"] == "hall"
+
+    journal.write_text("".join(journal.read_text().splitlines(keepends=True)[:2]))
+    listed.write_text("\n".join(lines[:2]))
+    report = index(server, listed, *options)
+    assert (report["uploaded"], report["already_there"]) == (0, 2)
+    assert len(journal.read_text().splitlines()) == 3
+    assert failures.read_text() == ""
+
+
+def test_index_brings_in_a_list_of_keys(server: ServerProcess, tmp_path: Path) -> None:
+    imports = server.home / "objects" / "imports" / "keys"
+    imports.mkdir(parents=True)
+    (imports / "180.jpg").write_bytes(photo_bytes(180))
+    listed = tmp_path / "keys.jsonl"
+    listed.write_text(json.dumps({"key": "imports/keys/180.jpg", "latitude": 45, "longitude": 7}))
+    assert index(server, listed)["uploaded"] == 1
+    refused = index(server, listed, "--journal", str(tmp_path / "j.jsonl"), code=1)
+    assert refused["code"] == "not_for_archives"
+
+
+def test_the_client_brings_in_a_prefix(server: ServerProcess) -> None:
+    imports = server.home / "objects" / "imports" / "prefix"
+    imports.mkdir(parents=True)
+    for name, data in photos(190, 191).items():
+        (imports / name).write_bytes(data)
+    with placewise.connect(str(server.client.base_url)) as places:
+        started = places.import_prefix("imports/prefix")
+        assert places.wait(started).progress.done == 2
+        assert [item.name for item in places.batch_items(started)] == [
+            "imports/prefix/190.jpg",
+            "imports/prefix/191.jpg",
+        ]
+
+
+def test_export_writes_what_other_programs_read(server: ServerProcess, tmp_path: Path) -> None:
+    uploaded = server.client.post(
+        "/api/v1/upload", files={"file": ("195.jpg", photo_bytes(195))}, data={"place": "export"}
+    ).json()
+    server.finished(uploaded["job_id"])
+
+    def export(*arguments: str) -> dict[str, Any]:
+        env = environment(server.home)
+        ended = run_command("export", *arguments, "--json", env=env, cwd=tmp_path)
+        assert ended.returncode == 0, ended.stdout + ended.stderr
+        written: dict[str, Any] = json.loads(ended.stdout)
+        return written
+
+    rows = export("descriptors", "--out", str(tmp_path / "rows"))
+    mapped = np.load(tmp_path / "rows" / "descriptors.npy", mmap_mode="r")
+    assert mapped.shape == (rows["rows"], rows["dimension"])
+    names = (tmp_path / "rows" / "names.txt").read_text().splitlines()
+    assert len(names) == len(mapped)
+    assert "195.jpg" in names
+    export("geojson", "--out", str(tmp_path / "map.geojson"))
+    features = json.loads((tmp_path / "map.geojson").read_text())["features"]
+    assert {"export"} <= {one["properties"]["place"] for one in features}
+    pairs = export("pairs", "--out", str(tmp_path / "pairs.txt"), "--top-k", "1", "--names", "id")
+    lines = (tmp_path / "pairs.txt").read_text().splitlines()
+    assert len(lines) == pairs["pairs"] > 0
+    assert all(len(set(line.split())) == 2 for line in lines)
 
 
 def test_a_bomb_does_no_harm(server: ServerProcess) -> None:

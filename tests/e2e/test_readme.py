@@ -122,11 +122,33 @@ def test_every_command_of_the_readme_does_what_the_readme_shows(place: Path, por
             job = json.loads(done.stdout)["status_url"]
             httpx2.get(f"http://127.0.0.1:{port}{job}", params={"wait": 60}, timeout=90)
         ran += 1
-    assert ran >= 11
+    assert ran >= 14
+
+
+def test_the_readmes_python_prints_an_estimate(place: Path, port: int) -> None:
+    [block] = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
+    (place / "example.py").write_text(block.replace(ADDRESS, f"127.0.0.1:{port}"))
+    done = _run(".venv/bin/python example.py", place)
+    assert "in_map=" in done.stdout
+    assert "latitude=" in done.stdout
 
 
 @pytest.mark.parametrize(
-    "target", ["help", "setup", "run", "test", "lint", "types", "bench", "demo", "env", "clean"]
+    "target",
+    [
+        "help",
+        "setup",
+        "run",
+        "test",
+        "lint",
+        "types",
+        "bench",
+        "demo",
+        "env",
+        "client",
+        "api-page",
+        "clean",
+    ],
 )
 def test_make_knows_the_target(target: str) -> None:
     subprocess.run(["make", "-n", target], cwd=REPOSITORY, check=True, capture_output=True)

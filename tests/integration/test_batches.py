@@ -13,6 +13,7 @@ import pytest
 from sqlalchemy import func, select
 
 from services.extractor.worker import ExtractorWorker
+from services.gateway.batches import checked_prefix
 from services.steward.batches import bring_in as bring_in_module
 from services.steward.batches import worker as worker_module
 from services.steward.batches.worker import BatchWorker
@@ -21,7 +22,7 @@ from services.steward.delete_maps import delete_maps
 from shared.catalog.maps import ensure_default_map
 from shared.catalog.photos import Photo
 from shared.catalog.session import Catalog
-from shared.errors import Unavailable
+from shared.errors import Unavailable, Unprocessable
 from shared.intake import incoming as incoming_module
 from shared.intake import store_photo as store_photo_module
 from shared.jobs import InProcessHints, Job, JobKind, JobState, free_expired_leases
@@ -60,6 +61,8 @@ class Batches:
             sent.append(("archive", ("photos", parts["archive"])))
         if "manifest" in parts:
             sent.append(("manifest", ("manifest.jsonl", parts["manifest"])))
+        if "prefix" in parts:
+            sent.append(("prefix", (None, parts["prefix"])))
         started = self.service.json("POST", "/upload/batch", 202, files=sent)
         return UUID(started["job_id"])
 
@@ -119,6 +122,64 @@ def files(*numbers: int) -> list[tuple[str, bytes]]:
 
 def lines(*objects: dict[str, Any]) -> bytes:
     return b"".join(json.dumps(one).encode() + b"\n" for one in objects)
+
+
+# --- a prefix ----------------------------------------------------------------------------------
+
+
+def test_every_photo_below_a_prefix_comes_in_and_again_nothing_twice(batches: Batches) -> None:
+    names = ("monday/1.jpg", "monday/north/2.JPG", "tuesday/3.jpg")
+    for number, name in enumerate(names, start=1):
+        batches.store.put(f"imports/{name}", photo_bytes(number))
+    batches.store.put("imports/monday/notes.txt", b"no photo")
+    batches.store.put("imports/monday/4.heic", b"nor this")
+    for already_there in (False, True):
+        job_id = batches.start(prefix="imports/monday/")
+        job = batches.finish(job_id)
+        items = batches.items(job_id)
+        assert [item["name"] for item in items] == [
+            "imports/monday/1.jpg",
+            "imports/monday/4.heic",
+            "imports/monday/north/2.JPG",
+        ]
+        assert codes(items) == [None, "unsupported_photo", None]
+        assert [item["already_there"] for item in items] == [already_there, False, already_there]
+        assert (job["result"]["ignored"], counts(job)) == (1, (2, 3, 1))
+    assert len(batches.photos()) == 2
+    assert len(batches.keys("imports/")) == 5, "they are copied; the originals stay"
+
+
+@pytest.mark.parametrize(
+    "prefix", ["originals/", "importsx/", "imports/../originals", "", "s3://elsewhere/imports/a"]
+)
+def test_a_prefix_that_was_not_given_free_is_refused(batches: Batches, prefix: str) -> None:
+    answer = batches.service("POST", "/upload/batch", files={"prefix": (None, prefix)})
+    problem(answer, 422, "invalid_field")
+
+
+def test_a_prefix_may_be_written_as_an_address_in_the_servers_own_bucket(
+    settings: Settings,
+) -> None:
+    own = settings.model_copy(update={"s3_endpoint": "http://s3:9000", "s3_bucket": "city"})
+    assert checked_prefix("s3://city/imports/monday", own) == "imports/monday/"
+    assert checked_prefix("imports/monday/", own) == "imports/monday/"
+    for wrong in ("s3://other/imports/monday", "s3://city/originals", "s3://city", "s3://"):
+        with pytest.raises(Unprocessable) as caught:
+            checked_prefix(wrong, own)
+        assert caught.value.code == "invalid_field"
+
+
+def test_a_prefix_without_photos_fails_and_says_so(batches: Batches) -> None:
+    job = batches.finish(batches.start(prefix="imports/nothing"))
+    assert (job["state"], job["error"]["code"]) == ("failed", "no_photos")
+
+
+def test_a_prefix_with_too_many_photos_brings_in_none(batches: Batches) -> None:
+    for number in range(3):
+        batches.store.put(f"imports/{number}.jpg", photo_bytes(number))
+    job = batches.finish(batches.start(prefix="imports"), batches.new_worker(max_batch_photos=2))
+    assert (job["state"], job["error"]["code"]) == ("failed", "too_many_photos")
+    assert batches.photos() == []
 
 
 # --- three forms -------------------------------------------------------------------------------

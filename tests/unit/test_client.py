@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import socket
@@ -71,14 +72,22 @@ class Handler(BaseHTTPRequestHandler):
         """Keep the test's output clean."""
 
 
-@pytest.fixture
-def server() -> Iterator[FakeServer]:
+@contextlib.contextmanager
+def running_server() -> Iterator[FakeServer]:
     with FakeServer() as made:
         thread = threading.Thread(target=made.serve_forever, kwargs={"poll_interval": 0.01})
         thread.start()
+        try:
+            yield made
+        finally:
+            made.shutdown()
+            thread.join()
+
+
+@pytest.fixture
+def server() -> Iterator[FakeServer]:
+    with running_server() as made:
         yield made
-        made.shutdown()
-        thread.join()
 
 
 @pytest.fixture
@@ -228,7 +237,8 @@ def slept(monkeypatch: pytest.MonkeyPatch) -> list[float]:
 
     # The client's alone: threads that other tests have left go by the real one.
     own = SimpleNamespace(sleep=sleep, monotonic=lambda: clock[0])
-    monkeypatch.setattr("shared.client.time", own)
+    monkeypatch.setattr("shared.client.wire.time", own)
+    monkeypatch.setattr("shared.client.sending.random", SimpleNamespace(uniform=lambda low, _: low))
     return waits
 
 
@@ -295,7 +305,7 @@ def test_patience_ends_with_the_last_error(server: FakeServer, slept: list[float
     with Client(server.url, patience_seconds=2) as client, pytest.raises(Unavailable) as caught:
         client.stats()
     assert caught.value.code == "search_behind"
-    assert slept == [0.5] * 4
+    assert slept == [0.5, 1, 2]
 
 
 def test_a_server_that_says_when_to_come_again_is_obeyed_however_long(

@@ -187,7 +187,7 @@ def test_truncated_photo_is_an_error_and_not_a_grey_picture(media: str) -> None:
 @pytest.mark.parametrize("data", [b"", b"this is a text\n" * 40, b"\xff\xd8\xff\xe0", b"GIF89a"])
 def test_what_is_no_photo_is_an_error_that_names_what_is_accepted(data: bytes) -> None:
     assert reason(data).code == "undecodable_photo"
-    assert "not JPEG, PNG, WebP, BMP or TIFF" in reason(data).detail
+    assert "not JPEG, PNG, WebP, BMP, TIFF or HEIC" in reason(data).detail
 
 
 def test_formats_that_are_not_accepted_are_not_decoded() -> None:

@@ -16,6 +16,7 @@ from sqlalchemy.orm import Session
 
 from services.steward.batches.bring_in import BringIn
 from services.steward.batches.list_archive import list_archive
+from services.steward.batches.list_prefix import list_prefix
 from services.steward.metrics import StewardMetrics
 from services.steward.take import Stopped, Taker
 from shared.catalog.session import Catalog
@@ -23,6 +24,7 @@ from shared.errors import PlacewiseError
 from shared.jobs import Hints, Job, JobKind, JobState
 from shared.jobs.batches import (
     BatchItem,
+    BatchSource,
     batch_result,
     follow_items,
     list_batch,
@@ -59,6 +61,7 @@ class BatchWorker:
         metrics: StewardMetrics | None = None,
     ) -> None:
         self._catalog = catalog
+        self._store = store
         self._settings = settings
         self._bring_in = BringIn(catalog, store, hints, settings)
         counted = metrics or StewardMetrics(CollectorRegistry())
@@ -88,11 +91,15 @@ class BatchWorker:
         self._rest(job)
 
     def _list(self, job: Job) -> None:
-        """Only archives come without items: the gateway lists files and keys."""
+        """Archives and prefixes come without items: the gateway lists files and keys."""
         with self._catalog.write() as session:
             for mine in held(session, token_of(job), [job]):
                 mine.stage = "list"
-        listing = list_archive(self._bring_in.archive_of(job))
+        if job.params["source"] == BatchSource.PREFIX:
+            most = self._settings.max_batch_photos
+            listing = list_prefix(self._store, job.params["prefix"], most)
+        else:
+            listing = list_archive(self._bring_in.archive_of(job))
         with self._catalog.write() as session:
             for mine in held(session, token_of(job), [job]):
                 mine.params = {**mine.params, "ignored": listing.ignored}

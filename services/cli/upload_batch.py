@@ -1,7 +1,9 @@
-"""An archive of photos into a map: sent as it is, brought in by the server, waited for."""
+"""A batch into a map, brought in by the server and waited for: an archive that is sent as it is, or
+objects of the server's own store."""
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 from rich.progress import Progress, TaskID
@@ -10,6 +12,7 @@ from services.cli.upload_many import LOOK_SECONDS, fit_if_worth_it
 from shared.archive_formats import ACCEPTED_ARCHIVES, SNIFFED_ARCHIVE_BYTES, sniff_archive
 from shared.client import FINISHED, Client, Json
 from shared.errors import InvalidRequest, Unprocessable
+from shared.intake.manifest import KEY_FIELD
 
 
 def check_archive(path: Path) -> None:
@@ -36,6 +39,29 @@ def upload_archive(client: Client, archive: Path, fit: bool, progress: Progress)
     started = client.upload_archive(
         archive, lambda sent_bytes: progress.update(sending, completed=sent_bytes)
     )
+    return _finish(client, started, fit, progress)
+
+
+def import_prefix(client: Client, prefix: str, fit: bool, progress: Progress) -> Json:
+    """As `upload_archive`, with every photo of the server's store below the prefix."""
+    return _finish(client, client.import_prefix(prefix), fit, progress)
+
+
+def names_keys(manifest: bytes) -> bool:
+    """Does the first line of a JSONL manifest name an object by its key, not a file?"""
+    first = next((line for line in manifest.splitlines() if line.strip()), b"")
+    try:
+        return KEY_FIELD in json.loads(first)
+    except (ValueError, TypeError, RecursionError):
+        return False  # whoever reads it whole says what is wrong
+
+
+def import_keys(client: Client, manifest: bytes, fit: bool, progress: Progress) -> Json:
+    """As `upload_archive`, with the objects that the lines of the manifest name by `key`."""
+    return _finish(client, client.import_manifest(manifest), fit, progress)
+
+
+def _finish(client: Client, started: Json, fit: bool, progress: Progress) -> Json:
     describing = progress.add_task("describing", total=None)
     job = _wait(client, started["job_id"], progress, describing)
     stats, fitted = client.stats(), None

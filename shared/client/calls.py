@@ -1,0 +1,278 @@
+"""The calls of the HTTP API, as JSON.
+
+Made of `async_calls.py` by `make client`: change that one, not this.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, BinaryIO
+from urllib.parse import quote
+from uuid import UUID
+
+from shared.client.sending import (
+    API,
+    FINISHED,
+    POLL_SECONDS,
+    Json,
+    Watched,
+    as_lines,
+    given,
+    hashed,
+    name_of,
+    opened,
+    unreadable,
+)
+from shared.client.wire import Wire
+
+
+class Client(Wire):
+    """Every call of one server and one map, answered with the API's JSON."""
+
+    def upload(self, photo: Path, filename: str | None = None, **fields: Any) -> Json:
+        """Store a photo; `fields` are the form's (`latitude`, `longitude`, `place`, ...).
+
+        It is called `filename`, or as its file is.
+        """
+        said = {name: str(value) for name, value in fields.items() if value is not None}
+        return self._send_file("/upload", photo, filename, data=said)
+
+    def upload_direct(self, photo: Path, filename: str | None = None, **fields: Any) -> Json:
+        """`upload` past the server, straight to its bucket; `fields` as JSON values.
+
+        Raises Conflict (`no_direct_uploads`) where the server keeps photos in a folder.
+        """
+        with opened(photo) as file:
+            size, sha256 = hashed(file)
+            about = {
+                "filename": filename or name_of(photo),
+                "file_size": size,
+                "sha256": sha256,
+            }
+            begun = self._call("POST", "/uploads/presign", json={**about, **given(**fields)})
+            self._put(begun, file)
+        return self._call("POST", begun["complete_url"].removeprefix(API))
+
+    def upload_archive(
+        self, archive: Path, on_sent: Callable[[int], object] = lambda sent_bytes: None
+    ) -> Json:
+        """Start a batch with the photos of a zip or tar; `on_sent` sees the bytes sent so far."""
+        try:
+            with Watched(archive.open("rb"), on_sent) as opened:
+                files = {"archive": (name_of(archive), opened)}
+                return self._call("POST", "/upload/batch", opened, files=files)
+        except OSError as error:
+            raise unreadable(archive, error) from error
+
+    def upload_files(self, photos: Sequence[Path], manifest: Sequence[Json] = ()) -> Json:
+        """Start a batch with these photos; each line of the manifest has a `filename` and the
+        form's fields."""
+        with contextlib.ExitStack() as opened:
+            files: list[tuple[str, Any]] = []
+            for photo in photos:
+                try:
+                    file = opened.enter_context(photo.open("rb"))
+                except OSError as error:
+                    raise unreadable(photo, error) from error
+                files.append(("file", (photo.name, file)))
+            if manifest:
+                files.append(("manifest", ("manifest.jsonl", as_lines(manifest))))
+            return self._call("POST", "/upload/batch", files=files)
+
+    def import_objects(self, manifest: Sequence[Json]) -> Json:
+        """Start a batch with objects of the server's store; each line has a `key` and the form's
+        fields."""
+        return self.import_manifest(as_lines(manifest))
+
+    def import_manifest(self, lines: bytes) -> Json:
+        """`import_objects` with the lines as JSONL."""
+        headers = {"Content-Type": "application/x-ndjson"}
+        return self._call("POST", "/upload/batch", content=lines, headers=headers)
+
+    def import_prefix(self, prefix: str) -> Json:
+        """Start a batch with every photo of the server's store whose key begins with `prefix`."""
+        return self._call("POST", "/upload/batch", files={"prefix": (None, prefix)})
+
+    def batch_items(self, job_id: UUID | str, *states: str) -> Iterator[Json]:
+        """The photos of a batch that are in one of the states, or all of them."""
+        return self.each(f"/jobs/{job_id}/items", "items", state=list(states) or None)
+
+    def cancel_job(self, job_id: UUID | str) -> Json:
+        return self._call("POST", f"/jobs/{job_id}/cancel")
+
+    def retry_job(self, job_id: UUID | str) -> Json:
+        """Queue a failed job again; of a batch, its failed items."""
+        return self._call("POST", f"/jobs/{job_id}/retry")
+
+    def similar_to_file(
+        self,
+        photo: Path,
+        top_k: int = 10,
+        min_score: float | None = None,
+        wait_seconds: int = 60,
+        rerank: int | None = None,
+        explain: bool = False,
+        **filters: Any,
+    ) -> Json:
+        """The photos most similar to one that is not stored; the rest as in `similar_to`."""
+        params = given(
+            top_k=top_k,
+            min_score=min_score,
+            rerank=rerank,
+            explain=explain or None,
+            **filters,
+        )
+        answer = self._send_file(
+            "/similarity",
+            photo,
+            params=params,
+            headers={"Prefer": f"wait={wait_seconds}"},
+        )
+        return self._result_of(answer)
+
+    def similar_to(
+        self,
+        file_id: UUID | str,
+        top_k: int = 10,
+        min_score: float | None = None,
+        rerank: int | None = None,
+        explain: bool = False,
+        **filters: Any,
+    ) -> Json:
+        """The photos most similar to a stored one, of those that pass the filters: `near`
+        ("LAT,LON,RADIUS_M"), `box` ("S,W,N,E"), `captured_after`, `captured_before`, `place`,
+        `tags` and `ids` (separated by commas); `word_weights=False` ranks by the plain cosine.
+        The first `rerank` of them are compared patch by patch; `explain` says of each what makes
+        it similar."""
+        params = given(
+            top_k=top_k,
+            min_score=min_score,
+            rerank=rerank,
+            explain=explain or None,
+            **filters,
+        )
+        return self._result_of(self._call("POST", f"/similarity/{file_id}", params=params))
+
+    def _result_of(self, answer: Json) -> Json:
+        """The answer itself, waited for where it is a job's: one job may lead to another."""
+        while "result_url" in answer:
+            self.wait_for(answer["job_id"])
+            answer = self._call("GET", answer["result_url"].removeprefix(API))
+        return answer
+
+    def job(self, job_id: UUID | str, wait_seconds: float = 0) -> Json:
+        return self._call("GET", f"/jobs/{job_id}", params={"wait": wait_seconds})
+
+    def wait_for(
+        self,
+        job_id: UUID | str,
+        on_progress: Callable[[Json], object] = lambda job: None,
+        poll_seconds: float = POLL_SECONDS,
+    ) -> Json:
+        """The job once it has ended; `on_progress` sees it after every poll."""
+        while True:
+            job = self.job(job_id, wait_seconds=poll_seconds)
+            on_progress(job)
+            if job["state"] in FINISHED:
+                return job
+
+    def photo(self, file_id: UUID | str) -> Json:
+        return self._call("GET", f"/uploads/{file_id}")
+
+    def image(self, file_id: UUID | str) -> bytes:
+        """The photo's bytes as they were uploaded."""
+        return self._get_bytes(f"/uploads/{file_id}/image")
+
+    def patch_photo(self, file_id: UUID | str, **fields: Any) -> Json:
+        return self._call("PATCH", f"/uploads/{file_id}", json=fields)
+
+    def delete_photo(self, file_id: UUID | str) -> Json:
+        return self._call("DELETE", f"/uploads/{file_id}")
+
+    def search(self, **filters: Any) -> Json:
+        """Photos by what is known of them; see `GET /search`."""
+        return self._call("GET", "/search", params=given(**filters))
+
+    def fit_vocabulary(self, **wanted: int) -> Json:
+        """Start fitting; `clusters`, `sample` and `seed` may be given."""
+        return self._call("POST", "/vocabularies", json=wanted)
+
+    def import_vocabulary(self, file: Path) -> Json:
+        """Start switching to the vocabulary in a `.npz` or `.npy` file."""
+        return self._send_file("/vocabularies/import", file)
+
+    def vocabulary_file(self, vocabulary_id: UUID | str) -> bytes:
+        """A vocabulary as a file that `import_vocabulary` takes: `.npz` (it begins with `PK`), or
+        `.npy` where no one knows what it was learnt with."""
+        return self._get_bytes(f"/vocabularies/{vocabulary_id}/file")
+
+    def vocabularies(self) -> list[Json]:
+        found: Any = self._call("GET", "/vocabularies")
+        return list(found)
+
+    def start_generation(
+        self, *, vocabulary_id: UUID | str | None = None, pca: int | None = None
+    ) -> Json:
+        """Start switching to a vocabulary that the map has, or to descriptors of `pca` dimensions;
+        with neither, to whole ones of an extractor without vocabulary."""
+        wanted = given(vocabulary_id=vocabulary_id and str(vocabulary_id), pca=pca)
+        return self._call("POST", "/generations", json=wanted)
+
+    def generations(self) -> list[Json]:
+        found: Any = self._call("GET", "/generations")
+        return list(found)
+
+    def evaluate(self, **wanted: int) -> Json:
+        """Start an evaluation of the map; `sample` and `seed` may be given."""
+        return self._call("POST", "/evaluations", json=wanted)
+
+    def learn_word_weights(self, generation_id: UUID | str, **wanted: int) -> Json:
+        """Start learning the weights of the active generation's words; `sample` and `seed` may be
+        given."""
+        return self._call("POST", f"/generations/{generation_id}/word-weights", json=wanted)
+
+    def word_weights(self, generation_id: UUID | str) -> Json:
+        """What the map's places have taught of the generation's words."""
+        return self._call("GET", f"/generations/{generation_id}/word-weights")
+
+    def evaluations(self, limit: int = 50) -> list[Json]:
+        """The map's evaluations, newest first."""
+        page = self._call("GET", "/evaluations", params={"limit": limit})
+        found: list[Json] = page["evaluations"]
+        return found
+
+    def searches(self, limit: int = 50) -> list[Json]:
+        """What was asked, newest first."""
+        page = self._call("GET", "/searches", params={"limit": limit})
+        found: list[Json] = page["searches"]
+        return found
+
+    def export_descriptors(
+        self,
+        generation_id: UUID | str,
+        file: BinaryIO,
+        on_received: Callable[[int], object] = lambda received_bytes: None,
+    ) -> None:
+        """Write a tar with `descriptors.npy`, `names.txt` and `photos.csv` to `file`."""
+        self._fetch(f"/generations/{generation_id}/descriptors", file, on_received)
+
+    def maps(self) -> list[Json]:
+        """Every map of the server."""
+        found: Any = self._call("GET", "/maps")
+        return list(found)
+
+    def create_map(self, name: str, extractor: str | None = None) -> Json:
+        return self._call("POST", "/maps", json=given(name=name, extractor=extractor))
+
+    def delete_map(self, name: str) -> Json:
+        """Delete a map with all its photos."""
+        return self._call("DELETE", f"/maps/{quote(name, safe='')}")
+
+    def health(self) -> Json:
+        """The state of each part; Unavailable where one is away."""
+        return self._call("GET", "/health")
+
+    def stats(self) -> Json:
+        return self._call("GET", "/database/stats")

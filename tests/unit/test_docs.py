@@ -1,0 +1,59 @@
+"""The documentation: every call stands in it, and every link leads somewhere."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from tools.make_api_page import PAGE, description, page
+
+ROOT = Path(__file__).parents[2]
+PAGES = sorted([ROOT / "README.md", *ROOT.glob("docs/**/*.md"), ROOT / "benchmarks/RESULTS.md"])
+# What the API page says in short: `/jobs/{id}/events`, `/retry`.
+SHORT = (ROOT / "docs" / "api.md").read_text()
+
+
+def anchors(text: str) -> set[str]:
+    """Of a page's headings, as GitHub makes them."""
+    found = set()
+    for heading in re.findall(r"^#+ (.+)$", text, re.MULTILINE):
+        plain = re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", heading).lower()
+        found.add(re.sub(r"[^\w\- ]", "", plain).replace(" ", "-"))
+    return found
+
+
+def test_page_of_calls_is_what_the_server_describes() -> None:
+    assert PAGE.read_text() == page(), "run `make api-page`"
+
+
+def test_every_call_is_described_in_a_sentence() -> None:
+    for path, methods in description()["paths"].items():
+        for method, call in methods.items():
+            assert call.get("description"), f"{method} {path}"
+
+
+def test_every_call_stands_in_the_short_page() -> None:
+    """By the last word of its path that is no parameter."""
+    missing = []
+    for path in description()["paths"]:
+        words = [word for word in path.split("/") if word and not word.startswith("{")]
+        if words and f"/{words[-1]}" not in SHORT:
+            missing.append(path)
+    assert missing == []
+
+
+@pytest.mark.parametrize("found", PAGES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_links_between_pages_lead_somewhere(found: Path) -> None:
+    text = re.sub(r"```.*?```", "", found.read_text(), flags=re.DOTALL)
+    broken = []
+    for link in re.findall(r"\]\(([^)\s]+)\)", text):
+        if "://" in link or link.startswith("mailto:"):
+            continue
+        name, _, anchor = link.partition("#")
+        target = (found.parent / name).resolve() if name else found
+        whole = target.exists() and target.is_relative_to(ROOT)
+        if not whole or (anchor and anchor not in anchors(target.read_text())):
+            broken.append(link)
+    assert broken == []

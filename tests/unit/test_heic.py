@@ -1,0 +1,141 @@
+"""HEIC: its header is read without its decoder, its pixels only in the decoding child."""
+
+from __future__ import annotations
+
+import builtins
+import io
+import random
+from typing import Any
+
+import numpy as np
+import pillow_heif
+import pytest
+from PIL import Image
+from PIL.ExifTags import GPS, IFD, Base
+
+from shared.errors import Unprocessable
+from shared.intake.photo_header import read_photo_header
+from shared.photo_formats import sniff_media_type
+from shared.vision.decode import THUMBNAIL_PIXELS, decode
+from shared.vision.preprocessing import get_preprocessing
+from tests.support.photos import photo_image
+
+PIXELS = 50_000_000
+SQUARE = get_preprocessing("square32")
+
+
+def heic(image: Image.Image, **options: Any) -> bytes:
+    buffer = io.BytesIO()
+    pillow_heif.from_pillow(image).save(buffer, quality=95, **options)
+    return buffer.getvalue()
+
+
+def taken_in_turin(orientation: int = 1) -> bytes:
+    exif = Image.Exif()
+    exif[Base.Orientation] = orientation
+    exif[IFD.GPSInfo] = {
+        GPS.GPSLatitudeRef: "N",
+        GPS.GPSLatitude: (45.0, 4.0, 12.0),
+        GPS.GPSLongitudeRef: "E",
+        GPS.GPSLongitude: (7.0, 41.0, 24.0),
+    }
+    return exif.tobytes()
+
+
+PHOTO = heic(photo_image(1, 320, 200), exif=taken_in_turin())
+
+
+@pytest.fixture
+def no_decoder(monkeypatch: pytest.MonkeyPatch) -> None:
+    imported = builtins.__import__
+
+    def refuse(name: str, *args: Any, **kwargs: Any) -> Any:
+        if name == "pillow_heif":
+            raise ModuleNotFoundError(name)
+        return imported(name, *args, **kwargs)
+
+    monkeypatch.setattr(builtins, "__import__", refuse)
+
+
+def test_heic_is_known_by_its_content() -> None:
+    assert sniff_media_type(PHOTO[:16]) == "image/heic"
+    assert sniff_media_type(b"\0\0\0\x20ftypavif\0\0\0\0") is None
+    assert sniff_media_type(b"\0\0\0\x20ftypisom\0\0\0\0") is None
+
+
+def test_header_says_size_and_place_without_the_decoder(no_decoder: None) -> None:
+    header = read_photo_header(io.BytesIO(PHOTO), PIXELS)
+    assert (header.width, header.height) == (320, 200)
+    assert header.latitude == pytest.approx(45.07)
+    assert header.longitude == pytest.approx(7.69)
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_header_and_decoder_agree_on_what_is_upright(orientation: int) -> None:
+    image = photo_image(2, 96, 64)
+    exif = Image.Exif()
+    exif[Base.Orientation] = orientation
+    data = heic(image, exif=exif.tobytes())
+    header = read_photo_header(io.BytesIO(data), PIXELS)
+    with Image.open(io.BytesIO(decode(data, SQUARE, PIXELS).thumbnail)) as thumbnail:
+        assert (header.width > header.height) == (thumbnail.width > thumbnail.height)
+    assert pillow_heif.open_heif(io.BytesIO(data)).size == (header.width, header.height)
+
+
+def test_pixels_and_thumbnail_are_those_of_the_photo() -> None:
+    decoded = decode(PHOTO, SQUARE, PIXELS)
+    expected = SQUARE.apply(photo_image(1, 320, 200)).astype(float)
+    assert np.abs(decoded.pixels - expected).mean() < 12
+    with Image.open(io.BytesIO(decoded.thumbnail)) as thumbnail:
+        assert thumbnail.format == "JPEG"
+        assert max(thumbnail.size) == THUMBNAIL_PIXELS
+        assert not thumbnail.getexif()
+
+
+def test_too_many_pixels_are_refused_from_the_header(no_decoder: None) -> None:
+    with pytest.raises(Unprocessable) as caught:
+        read_photo_header(io.BytesIO(PHOTO), 320 * 200 - 1)
+    assert caught.value.code == "too_many_pixels"
+
+
+def test_an_extractor_without_the_decoder_says_what_to_install(no_decoder: None) -> None:
+    with pytest.raises(Unprocessable) as caught:
+        decode(PHOTO, SQUARE, PIXELS)
+    assert caught.value.code == "no_heic_decoder"
+    assert "placewise[heic]" in caught.value.detail
+
+
+def test_an_avif_that_calls_itself_mif1_is_refused() -> None:
+    data = PHOTO.replace(b"ftypheic", b"ftypmif1").replace(b"hvc1", b"av01")
+    assert sniff_media_type(data[:16]) == "image/heic"
+    with pytest.raises(Unprocessable) as caught:
+        read_photo_header(io.BytesIO(data), PIXELS)
+    assert caught.value.code == "undecodable_photo"
+
+
+def test_no_damage_to_a_header_is_more_than_a_refusal() -> None:
+    """Each byte that is wrong, and each length at which a file may end."""
+    rng = random.Random(1)
+    end = PHOTO.index(b"mdat") + 64
+    for _ in range(3000):
+        data = bytearray(PHOTO)
+        for _ in range(rng.randint(1, 4)):
+            data[rng.randrange(12, end)] = rng.randrange(256)
+        try:
+            header = read_photo_header(io.BytesIO(bytes(data)), PIXELS)
+        except Unprocessable as error:
+            assert error.code in ("undecodable_photo", "too_many_pixels")  # noqa: PT017
+        else:
+            assert 0 < header.width * header.height <= PIXELS
+    for size in range(16, end):
+        try:
+            read_photo_header(io.BytesIO(PHOTO[:size]), PIXELS)
+        except Unprocessable as error:
+            assert error.code == "undecodable_photo"  # noqa: PT017
+
+
+@pytest.mark.parametrize("kept", [0.3, 0.6, 0.9])
+def test_a_photo_that_is_cut_off_can_not_be_decoded(kept: float) -> None:
+    with pytest.raises(Unprocessable) as caught:
+        decode(PHOTO[: int(len(PHOTO) * kept)], SQUARE, PIXELS)
+    assert caught.value.code == "undecodable_photo"
