@@ -213,11 +213,17 @@ class Client(Wire):
         return list(found)
 
     def start_generation(
-        self, *, vocabulary_id: UUID | str | None = None, pca: int | None = None
+        self,
+        *,
+        vocabulary_id: UUID | str | None = None,
+        pca: int | None = None,
+        extractor: str | None = None,
     ) -> Json:
-        """Start switching to a vocabulary that the map has, or to descriptors of `pca` dimensions;
-        with neither, to whole ones of an extractor without vocabulary."""
-        wanted = given(vocabulary_id=vocabulary_id and str(vocabulary_id), pca=pca)
+        """Start switching to a vocabulary that the map has, to descriptors of `pca` dimensions, or
+        to another extractor; with none, to whole ones of an extractor without vocabulary."""
+        wanted = given(
+            vocabulary_id=vocabulary_id and str(vocabulary_id), pca=pca, extractor=extractor
+        )
         return self._call("POST", "/generations", json=wanted)
 
     def generations(self) -> list[Json]:
@@ -269,6 +275,42 @@ class Client(Wire):
     def delete_map(self, name: str) -> Json:
         """Delete a map with all its photos."""
         return self._call("DELETE", f"/maps/{quote(name, safe='')}")
+
+    def add_model(
+        self,
+        checkpoint: Path,
+        name: str,
+        *,
+        licence: str | None = None,
+        note: str | None = None,
+        on_sent: Callable[[int], object] = lambda sent_bytes: None,
+    ) -> Json:
+        """Start adding a checkpoint as the model `name`; `on_sent` sees the bytes sent so far."""
+        said = given(name=name, licence=licence, note=note)
+        with opened(checkpoint) as file:
+            files = {"file": (name_of(checkpoint), Watched(file, on_sent))}
+            return self._call("POST", "/models", file, files=files, data=said)
+
+    def models(self) -> list[Json]:
+        """The models that were added."""
+        answer = self._call("GET", "/models")
+        return list(answer["models"])
+
+    def remove_model(self, name: str) -> Json:
+        return self._call("DELETE", f"/models/{quote(name, safe='')}")
+
+    def keys(self) -> list[Json]:
+        """Every key of the server, for an admin; the keys themselves are shown to nobody."""
+        found: Any = self._call("GET", "/keys")
+        return list(found)
+
+    def create_key(self, name: str, scopes: Sequence[str], **limits: Any) -> Json:
+        """A new key: `key` of the answer is shown this once. `limits` are those of POST /keys."""
+        wanted = {"name": name, "scopes": list(scopes), **given(**limits)}
+        return self._call("POST", "/keys", json=wanted)
+
+    def revoke_key(self, key_id: str) -> Json:
+        return self._call("DELETE", f"/keys/{key_id}")
 
     def health(self) -> Json:
         """The state of each part; Unavailable where one is away."""

@@ -37,7 +37,7 @@ def undecodable(
 def _fault_of(path: Path) -> str | None:
     try:
         with path.open("rb") as file, open_photo(file) as image:
-            check_pixels(image, MOST_PIXELS)
+            check_pixels(image.width, image.height, MOST_PIXELS)
             image.load()
     except Unprocessable as error:
         return error.detail

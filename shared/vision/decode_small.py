@@ -32,7 +32,7 @@ def decode_small(path: Path, size: tuple[int, int], max_pixels: int = MAX_PIXELS
         with warnings.catch_warnings(), path.open("rb") as file:
             warnings.simplefilter("ignore")  # a strange tag is no reason to refuse the pixels
             with open_photo(file) as image:
-                check_pixels(image, max_pixels)
+                check_pixels(image.width, image.height, max_pixels)
                 image.draft("RGB", (height, width) if _on_its_side(image) else (width, height))
                 image.load()
                 upright = turn_upright(image, to_rgb(image))
