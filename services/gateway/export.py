@@ -22,6 +22,7 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from services.gateway.context import DEFAULT_MAP, GatewayDep, GenerationId, MapName
+from services.gateway.key_check import READ
 from shared.catalog.chunks import Descriptor, live_chunks
 from shared.catalog.generations import Generation, get_generation
 from shared.catalog.maps import get_map
@@ -63,6 +64,7 @@ class _Part:
 
 @router.get(
     "/generations/{generation_id}/descriptors",
+    dependencies=[READ],
     operation_id="export_descriptors",
     response_class=StreamingResponse,
     responses=TAR,
