@@ -15,7 +15,7 @@ UV_VERSION := 0.13.8
 INSTALLED := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help setup run test test-browser test-api-fuzz pictures client api-page lint types bench demo env clean
+.PHONY: help setup run test test-deploy test-browser test-api-fuzz pictures client api-page lint types bench demo env clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F':.*## ' '{printf "  make %-13s %s\n", $$1, $$2}'
@@ -44,13 +44,16 @@ run: $(INSTALLED) ## serve the embedded Placewise on http://HOST:PORT, data unde
 test: $(INSTALLED) ## every test (PLACEWISE_TEST_DATA=FOLDER adds those on real photos)
 	$(BIN)/python -m pytest tests --numprocesses auto --dist loadfile --no-loadscope-reorder
 
+test-deploy: $(INSTALLED) ## the files for containers and Kubernetes alone (`make test` has them, too)
+	$(BIN)/python -m pytest tests/deploy
+
 test-browser: $(INSTALLED) ## the page in a real Chromium (apt-get install chromium)
 	PLACEWISE_TEST_BROWSER=1 $(BIN)/python -m pytest tests/browser
 
 test-api-fuzz: $(INSTALLED) ## very many made-up calls by the API's description (PLACEWISE_FUZZ_EXAMPLES=)
 	PLACEWISE_FUZZ_EXAMPLES=$${PLACEWISE_FUZZ_EXAMPLES:-200} $(BIN)/python -m pytest tests/integration/test_api_fuzz.py --timeout 7200
 
-pictures: $(INSTALLED) ## the same, and the screenshots in docs/pictures anew
+pictures: $(INSTALLED) ## test-browser, and the screenshots in docs/pictures anew
 	PLACEWISE_TEST_BROWSER=1 PLACEWISE_PICTURES=docs/pictures $(BIN)/python -m pytest tests/browser
 
 client: $(INSTALLED) ## the synchronous client anew, from the asynchronous one

@@ -140,6 +140,7 @@ def test_the_readmes_python_prints_an_estimate(place: Path, port: int) -> None:
         "setup",
         "run",
         "test",
+        "test-deploy",
         "lint",
         "types",
         "bench",
