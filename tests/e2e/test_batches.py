@@ -276,7 +276,7 @@ def test_a_batch_in_separate_services_outlives_its_steward(
             deployment.start("gateway")
             deployment.start("extractor")
             steward = deployment.start("steward")
-            with httpx2.Client(base_url=deployment.address("gateway", 1), timeout=60) as client:
+            with deployment.client(1) as client:
                 until(lambda: client.get("/readyz").is_success)
                 archive = zip_of(photos(*range(count)) | {"photos.csv": table(*range(count))})
                 answer = client.post("/api/v1/upload/batch", files={"archive": ("a", archive)})

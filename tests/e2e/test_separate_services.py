@@ -50,6 +50,11 @@ class Deployment:
         self._processes.append(process)
         return process
 
+    def client(self, number: int) -> httpx2.Client:
+        """Of the gateway that was started as the `number`th process, with its key."""
+        headers = {"Authorization": f"Bearer {SERVICES_KEY}"}
+        return httpx2.Client(base_url=self.address("gateway", number), headers=headers, timeout=60)
+
     def address(self, service: str, number: int) -> str:
         """Where the process started as the `number`th says that it serves."""
         log = self.root / f"{service}-{number}.log"
@@ -106,9 +111,7 @@ def test_services_in_processes_of_their_own_do_what_the_embedded_one_does(
     deployment.start("gateway")
     extractors = [deployment.start("extractor") for _ in range(2)]
     stewards = [deployment.start("steward") for _ in range(2)]
-    headers = {"Authorization": f"Bearer {SERVICES_KEY}"}
-    url = deployment.address("gateway", 2)
-    with httpx2.Client(base_url=url, headers=headers, timeout=60) as client:
+    with deployment.client(2) as client:
         until(lambda: client.get("/readyz").is_success)
 
         def put(number: int) -> dict[str, Any]:
@@ -171,7 +174,7 @@ def test_an_extractor_that_has_never_seen_a_model_fetches_it(
     deployment.start("gateway")
     first = deployment.start("extractor", placewise_home=tmp_path / "first")
     deployment.start("steward")
-    with httpx2.Client(base_url=deployment.address("gateway", 1), timeout=60) as client:
+    with deployment.client(1) as client:
         until(lambda: client.get("/readyz").is_success)
 
         def done(answer: httpx2.Response) -> bool:
