@@ -101,7 +101,7 @@ def test_each_hostile_file_is_refused_or_handled_and_the_service_goes_on(
     assert {path.name for path in server.home.parent.iterdir()} == around, "nothing lies beside it"
     assert server.process.poll() is None
     assert server.client.get("/readyz").status_code == 200
-    good = server.indexed(photo_bytes(5), "good.jpg")
-    asked = server.ask(near_copy(5)).json()
+    good = server.indexed(photo_bytes(901), "good.jpg")
+    asked = server.ask(near_copy(901)).json()
     assert asked["similar_images"][0]["image_id"] == good
     assert "Traceback" not in server.log_path.read_text(errors="replace")
