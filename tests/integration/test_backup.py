@@ -251,8 +251,8 @@ def test_only_an_empty_placewise_is_restored_into(
     with pytest.raises(Conflict) as caught:
         restored(tmp_path / "backup", service.catalog, service.store)  # type: ignore[arg-type]
     assert caught.value.code == "target_not_empty"
-    other_store.put("originals/another", b"photo")
-    with pytest.raises(Conflict, match="originals/another"):
+    other_store.put("vocabularies/another", b"centres")
+    with pytest.raises(Conflict, match="vocabularies/another"):
         restored(tmp_path / "backup", other_catalog, other_store)
 
 
