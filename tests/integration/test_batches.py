@@ -775,10 +775,10 @@ def test_an_item_that_kills_its_stewards_is_given_up_and_the_others_come_in(
     job_id = batches.start(archive=zip_of(files(*range(4))))
     real = incoming_module.examine
 
-    def die_of_one(store: ObjectStore, received: Any, max_pixels: int) -> Any:
+    def die_of_one(store: ObjectStore, received: Any, *rest: Any, **said: Any) -> Any:
         if received.filename == "2.jpg":
             raise Killed
-        return real(store, received, max_pixels)
+        return real(store, received, *rest, **said)
 
     monkeypatch.setattr(bring_in_module, "examine", die_of_one)
     for _ in range(3):
