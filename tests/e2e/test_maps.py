@@ -112,6 +112,8 @@ def test_every_call_says_how_to_make_the_map_that_is_missing(server: ServerProce
             body: dict[str, Any] = {}
             if "multipart/form-data" in content:
                 body = {"files": {"file": ("photo.jpg", photo_bytes(1))}}
+                if path.endswith("/models"):
+                    body["data"] = {"name": "mine"}
             elif "application/json" in content:
                 body = {"json": {}}
             here = re.sub(r"{\w+}", lambda _: str(uuid4()), path)
