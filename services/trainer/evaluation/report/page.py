@@ -110,7 +110,9 @@ def _further(result: Result) -> dict[str, Any]:
         said["recall at 99 % precision"] = f"{found.recall_at_99_precision:.1%}"
     if measured.curve is not None:
         said["area under precision and recall"] = f"{measured.curve.area:.3f}"
-    return said | {name.replace("_", " "): value for name, value in result.about.items()}
+    for name, value in result.about.items():
+        said[name.replace("_", " ")] = f"{value:.1f}" if isinstance(value, float) else value
+    return said
 
 
 def _published(result: Result) -> str:
