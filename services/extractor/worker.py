@@ -157,20 +157,25 @@ class ExtractorWorker:
     def _drain(self, first: Work, stop: threading.Event, until: float, result: DrainResult) -> None:
         work: Work | None = None
         ahead: Work | None = first
+
+        def time_is_up() -> bool:
+            return stop.is_set() or time.monotonic() > until
+
         try:
             while ahead is not None:
-                if stop.is_set() or time.monotonic() > until:
+                if time_is_up():
                     with ahead.lease:
                         self._setbacks.give_back(ahead.jobs)
                     result.more = True
                     break
                 work = ahead
-                if work.jobs[0].priority < Priority.QUERY:
-                    query = self._take(result, least_priority=Priority.QUERY)
-                    if query is not None:
-                        self._go_on_with(query, result, stop)
                 # Taken before the forward pass: the next photos are decoded while it runs.
                 ahead = self._take(result)
+                if not _is_query(work):
+                    # A query would wait for the batch, and for the one that is being published.
+                    while ahead is not None and _is_query(ahead) and not time_is_up():
+                        self._go_on_with(ahead, result, stop)
+                        ahead = self._take(result)
                 self._go_on_with(work, result, stop)
                 if ahead is None:
                     self._await_published(result)  # which may set jobs free again
@@ -186,7 +191,7 @@ class ExtractorWorker:
         if _has_to_be_alone(work):
             self._await_published(result)
             self._do(work, result)
-        elif work.jobs[0].priority >= Priority.QUERY:
+        elif _is_query(work):
             self._do(work, result, company=0 if self._behind is None else 1)
         else:
             with self._queries_beside(result, stop):
@@ -322,6 +327,10 @@ class ExtractorWorker:
         """Decoding, in other processes, is done: a fall from here on may be the photos' fault."""
         with self._catalog.write() as session:
             begin(session, work.token, len(work.jobs) + company)
+
+
+def _is_query(work: Work) -> bool:
+    return work.jobs[0].priority >= Priority.QUERY
 
 
 def _has_to_be_alone(work: Work) -> bool:

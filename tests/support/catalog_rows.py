@@ -48,23 +48,26 @@ def add_map(session: Session, name: str = "default", extractor: str = "test-tiny
     return made
 
 
+def made_up_photo(map_id: UUID, **columns: Any) -> dict[str, Any]:
+    """The columns of a photo without bytes in any store; `columns` replace what is made up."""
+    number = next(NUMBERS)
+    return {
+        "id": new_id(),
+        "map_id": map_id,
+        "sha256": hashlib.sha256(str(number).encode()).hexdigest(),
+        "object_key": new_original_key(),
+        "filename": f"photo-{number}.jpg",
+        "media_type": "image/jpeg",
+        "size_bytes": 1000 + number,
+        "width": 64,
+        "height": 48,
+        **columns,
+    }
+
+
 def add_photo(session: Session, map_id: UUID, **columns: Any) -> Photo:
     """A live photo without bytes in any store; `columns` replace what is made up."""
-    number = next(NUMBERS)
-    photo = Photo(
-        **{
-            "id": new_id(),
-            "map_id": map_id,
-            "sha256": hashlib.sha256(str(number).encode()).hexdigest(),
-            "object_key": new_original_key(),
-            "filename": f"photo-{number}.jpg",
-            "media_type": "image/jpeg",
-            "size_bytes": 1000 + number,
-            "width": 64,
-            "height": 48,
-            **columns,
-        }
-    )
+    photo = Photo(**made_up_photo(map_id, **columns))
     session.add(photo)
     session.flush()
     return photo

@@ -25,6 +25,12 @@ STOP_SECONDS = 60.0  # SeaweedFS takes half of it
 # while its server is down.
 PORTS = range(18_000, 32_000)
 
+# Each process that runs tests has some of them to itself, and gives none out twice: between the
+# choice of a port and the server's start nothing keeps it.
+WORKERS = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
+WORKER = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
+_fresh = random.sample(PORTS[WORKER::WORKERS], len(PORTS[WORKER::WORKERS]))
+
 # Waits for the end of its input, which is the end of the tests, however they end. In a session of
 # its own: Ctrl-C is for the tests, which may still need the servers to end in good order.
 WATCH = 'cat > /dev/null; kill -9 "$1" 2> /dev/null; rm -rf "$2"'
@@ -39,7 +45,7 @@ def free_ports(count: int) -> list[int]:
     found: list[int] = []
     with contextlib.ExitStack() as held:
         while len(found) < count:
-            port = random.choice(PORTS)
+            port = _fresh.pop()
             listener = held.enter_context(socket.socket())
             with contextlib.suppress(OSError):
                 listener.bind(("127.0.0.1", port))
