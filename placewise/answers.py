@@ -153,6 +153,7 @@ class Job(Answer):
     finished_at: datetime | None
     status_url: str
     result_url: str | None
+    request_id: str | None
 
     @property
     def finished(self) -> bool:

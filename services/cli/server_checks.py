@@ -94,6 +94,7 @@ def objects_check(settings: Settings) -> str:
     from shared.objects.open_store import open_store  # the minio client takes its time
 
     store = open_store(settings, alone=False)
+    store.check()  # some servers make a bucket of the first object: a misspelt name would go unseen
     key = f"work/doctor-{new_id()}/probe"
     started = time.perf_counter()
     try:

@@ -355,7 +355,7 @@ def test_no_lease_is_held_on_when_the_catalog_went_away_in_a_drain(
     calls = iter(range(10))
 
     def claim_or_fail(*arguments: Any, **options: Any) -> list[Job]:
-        if next(calls) == 3:  # a batch is done, the next one is taken and being decoded
+        if next(calls) == 2:  # a batch is done, the next one is taken and being decoded
             raise OperationalError("the catalog is away", None, Exception())
         return claim(*arguments, **options)
 

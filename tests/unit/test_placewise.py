@@ -36,6 +36,7 @@ JOB = {
     "finished_at": None,
     "status_url": "/api/v1/jobs/01a1fca4-c1a2-7356-bf32-75e2c2a0d083",
     "result_url": None,
+    "request_id": "01a1fca4-c1a2-7356-bf32-75e2c2a0d083",
 }
 PHOTO = {
     "image_id": "01a1fca4-c1a2-7356-bf32-75e1cb64beb1",
