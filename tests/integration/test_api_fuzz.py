@@ -140,11 +140,7 @@ def test_without_a_key_nothing_but_what_is_open_is_answered(fuzzed: Door) -> Non
             case.validate_response(answer, checks=PROMISED)
             if case.path.startswith("/api/"):
                 assert answer.status_code == 401, case.path
-                assert answer.json()["code"] == code, (
-                    answer.request.headers.get_list("authorization"),
-                    headers,
-                    case.headers,
-                )
+                assert answer.json()["code"] == code
 
     each_call(fuzzed, check, 1)
 
