@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import shutil
 from collections.abc import Iterator
@@ -22,6 +23,7 @@ from tests.support.servers import (
     start_redis,
     start_s3,
 )
+from tests.support.spare_databases import SpareDatabases
 
 REAL_PHOTOS = "PLACEWISE_TEST_DATA"
 BROWSER = "PLACEWISE_TEST_BROWSER"
@@ -126,18 +128,22 @@ def _migrate(url: str) -> None:
     catalog.close()
 
 
+@pytest.fixture(scope="session")
+def spare_databases(postgres: PostgresServer, migrated_postgres: str) -> SpareDatabases:
+    return SpareDatabases(postgres, migrated_postgres)
+
+
 @pytest.fixture(params=["sqlite", "postgresql"])
 def catalog(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Catalog]:
     """An empty, migrated catalog: each test that takes it runs on SQLite and on PostgreSQL."""
-    if request.param == "sqlite":
-        copy = shutil.copy(request.getfixturevalue("migrated_sqlite"), tmp_path)
-        opened = Catalog(f"sqlite:///{copy}")
-    else:
-        server: PostgresServer = request.getfixturevalue("postgres")
-        template: str = request.getfixturevalue("migrated_postgres")
-        opened = Catalog(server.new_database(template))
-    yield opened
-    opened.close()
+    with contextlib.ExitStack() as stack:
+        if request.param == "sqlite":
+            copy = shutil.copy(request.getfixturevalue("migrated_sqlite"), tmp_path)
+            url = f"sqlite:///{copy}"
+        else:
+            spare: SpareDatabases = request.getfixturevalue("spare_databases")
+            url = stack.enter_context(spare.one())
+        yield stack.enter_context(contextlib.closing(Catalog(url)))
 
 
 @pytest.fixture
