@@ -6,6 +6,7 @@ The one foreign address that a page may load from is that of MAP_TILES.
 
 from __future__ import annotations
 
+import functools
 import json
 from importlib.resources import files
 from pathlib import Path
@@ -37,12 +38,8 @@ OF_DESCRIPTIONS = "; style-src 'self' 'unsafe-inline'; worker-src blob:"
 
 
 def console_router(settings: Settings) -> APIRouter:
-    """The routes of the page; its files are read here, once."""
-    assets = dict(read_assets(PAGE))
-    for folder, package, inner, names in LIBRARIES:
-        there = Path(str(files(package))) / inner
-        for name in names:
-            assets[f"{folder}/{name}"] = Asset.of(Path(name).suffix, (there / name).read_bytes())
+    """The routes of the page."""
+    assets = dict(_files())
     pages = {name: assets.pop(name) for name in PAGES}
     assets["settings.json"] = Asset.of(".json", json.dumps(_said_to_the_page(settings)).encode())
 
@@ -108,3 +105,14 @@ def _headers(settings: Settings) -> dict[str, str]:
         "Referrer-Policy": "strict-origin-when-cross-origin",
         "X-Content-Type-Options": "nosniff",
     }
+
+
+@functools.cache
+def _files() -> dict[str, Asset]:
+    """All that pages load, by its path on this server: read, and compressed, once."""
+    found = dict(read_assets(PAGE))
+    for folder, package, inner, names in LIBRARIES:
+        there = Path(str(files(package))) / inner
+        for name in names:
+            found[f"{folder}/{name}"] = Asset.of(Path(name).suffix, (there / name).read_bytes())
+    return found

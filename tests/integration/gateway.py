@@ -36,9 +36,16 @@ class Service:
         self.catalog, self.store, self.settings = catalog, store, settings
         self.search = SearchWorker(catalog, store, settings)
         gateway = Gateway(catalog, store, InProcessHints(), self.search, settings, NoKeys())
-        self._client = TestClient(create_app(gateway), base_url="http://localhost")
+        self._app = create_app(gateway)
+        self._client = TestClient(self._app, base_url="http://localhost")
         self.make_worker = make_worker
         self._worker: ExtractorWorker | None = None
+
+    def let_threads_call(self) -> None:
+        """FastAPI works a route out at its first call. In a gateway that is the one event loop's;
+        here each call has a loop of its own, and no two threads may do it at once.
+        """
+        self._app.openapi()
 
     @property
     def worker(self) -> ExtractorWorker:

@@ -247,6 +247,7 @@ def test_a_call_under_way_is_told_to_come_again(service: Service, store: FolderS
         assert go_on.wait(timeout=30)
         return reader(*arguments)
 
+    service.let_threads_call()
     with pytest.MonkeyPatch.context() as patch, ThreadPoolExecutor(1) as pool:
         patch.setattr("shared.intake.incoming.read_photo_header", slowly)
         first = pool.submit(upload, service, photo_bytes(1))
@@ -330,6 +331,8 @@ def test_the_same_call_at_two_gateways_at_once_has_one_effect(
                 return answer
             problem(answer, 409, "idempotency_key_in_use")
 
+    for gateway in gateways:
+        gateway.let_threads_call()
     with ThreadPoolExecutor(8) as pool:
         answers = list(pool.map(one, range(8)))
     assert sum(REPLAYED not in answer.headers for answer in answers) == 1

@@ -209,6 +209,7 @@ def test_the_default_map_is_made_anew_and_empty(
 
 def test_deleting_a_map_by_many_at_once_deletes_it_once(service: Service) -> None:
     service.json("POST", "/maps", 201, json={"name": "town"})
+    service.let_threads_call()
     with ThreadPoolExecutor(4) as pool:
         answers = list(pool.map(lambda _: service("DELETE", "/maps/town").status_code, range(4)))
     assert set(answers) <= {200, 404}
@@ -220,6 +221,7 @@ def test_a_map_is_made_once_by_many_at_once(service: Service) -> None:
     def make(_: int) -> int:
         return service("POST", "/maps", json={"name": "town"}).status_code
 
+    service.let_threads_call()
     with ThreadPoolExecutor(4) as pool:
         assert sorted(pool.map(make, range(4))) == [201, 409, 409, 409]
 
@@ -319,6 +321,7 @@ def test_uploads_while_their_map_is_deleted_are_refused_or_go_with_it(
         service.json("DELETE", "/maps/gone")
         remove_all(catalog, store)
 
+    service.let_threads_call()
     with ThreadPoolExecutor(5) as pool:
         uploads = [pool.submit(upload, number) for number in range(4)]
         deleting = pool.submit(delete)
