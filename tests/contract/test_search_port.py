@@ -242,6 +242,9 @@ def assert_answers(response: SearchResponse, expected: list[tuple[UUID, float]])
 
 OpenPort = Callable[..., SearchPort]
 
+# How rows are scanned has nothing to do with the catalog.
+whatever_the_catalog = pytest.mark.parametrize("catalog", ["sqlite"], indirect=True)
+
 
 class SearchPortContract:
     """Every promise of the port. A subclass's fixture `port` opens one on the map `places`.
@@ -517,7 +520,7 @@ class SearchPortContract:
     ) -> None:
         places.add(unit_rows(1, 3))
         reference = places.query(unit_rows(2, 1)[0])
-        search = port(search_wait_seconds=0.05)
+        search = port(search_wait_seconds=0.05, search_timeout_seconds=1)
         with pytest.raises(Unavailable) as caught:
             search.search(places.request(reference, min_version=places.version + 1))
         assert caught.value.code == "search_behind"
@@ -734,6 +737,7 @@ class TestSearchWorker(SearchPortContract):
         assert worker.status().rows == 10
 
 
+@whatever_the_catalog
 class TestSearchWorkerByCodes(TestSearchWorker):
     """The same promises where rows are told apart by their codes first."""
 
@@ -744,6 +748,7 @@ class TestSearchWorkerByCodes(TestSearchWorker):
         always_by_codes(monkeypatch)
 
 
+@whatever_the_catalog
 class TestSearchWorkerByInt8(TestSearchWorker):
     """The same promises where rows of middle length are told apart by their int8 codes."""
 
@@ -781,6 +786,7 @@ class TestSearchWorkerByInt8(TestSearchWorker):
         assert response.certificate == "exhaustive"
 
 
+@whatever_the_catalog
 class TestSearchWorkerDeterministic(TestSearchWorker):
     """The same promises of `mode=deterministic`, whose codes are made when they are asked for."""
 
@@ -853,6 +859,7 @@ class TestSearchWorkerDeterministic(TestSearchWorker):
         assert_answers(search.search(request), places.brute_force(vector))
 
 
+@whatever_the_catalog
 class TestSearchWorkerOnADevice(TestSearchWorker):
     """The same promises where the rows lie on a device: PyTorch's CPU stands for a GPU."""
 
@@ -956,7 +963,7 @@ class TestSearchOverHttp(SearchPortContract):
         vector = unit_rows(9, 1)[0]
         request = places.request(places.query(vector))
         request = request.model_copy(update={"mode": Mode.DETERMINISTIC})
-        search = port(search_wait_seconds=0.2)
+        search = port(search_wait_seconds=0.2, search_timeout_seconds=1)
         try:
             with pytest.raises(Unavailable) as caught:
                 search.search(request)
