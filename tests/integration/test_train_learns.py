@@ -18,7 +18,7 @@ from shared.datasets.sets import open_evaluation_set
 from shared.vision.place_models.checkpoint import load_checkpoint
 
 SIDE = 64
-EPOCHS = 8
+EPOCHS = 6
 
 
 def test_a_short_run_clearly_beats_the_untrained_network_on_held_out_places(
