@@ -28,19 +28,26 @@ from tests.support.spare_databases import SpareDatabases
 REAL_PHOTOS = "PLACEWISE_TEST_DATA"
 BROWSER = "PLACEWISE_TEST_BROWSER"
 TESTS = Path(__file__).parent
-# A long test that begins last is waited for alone.
-LONGEST_FIRST = ("faults", "deploy", "e2e", "integration", "contract", "unit")
+# Some wait for other processes, the others calculate; the longest of each come first, as one that
+# begins last is waited for alone.
+WAITING = ("faults", "deploy", "e2e", "browser")
+CALCULATING = ("integration", "contract", "unit")
 
 # As the command does before torch is loaded; see services/cli/__init__.py.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 
+def pytest_xdist_auto_num_workers() -> int:
+    """One more than there are cores: something always waits."""
+    return (os.cpu_count() or 1) + 1
+
+
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """What waits most comes first, beside what calculates. Without the real photos, the tests that
-    need them are deselected, and so are those in a browser where none is asked for; one line says
-    so."""
-    kinds = {kind: place for place, kind in enumerate(LONGEST_FIRST)}
-    items.sort(key=lambda item: kinds.get(_kind(item), len(kinds)))
+    """Files that wait lie evenly among those that calculate, so that both go on at any time.
+    Without the real photos, the tests that need them are deselected, and so are those in a browser
+    where none is asked for; one line says so."""
+    places = {**_places(items, WAITING), **_places(items, CALCULATING)}
+    items.sort(key=lambda item: places[item.path])
     without = [
         item
         for item in items
@@ -50,6 +57,13 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     if without:
         config.hook.pytest_deselected(items=without)
         items[:] = [item for item in items if item not in without]
+
+
+def _places(items: list[pytest.Item], kinds: tuple[str, ...]) -> dict[Path, float]:
+    """For each file with tests of the kinds, how much of them lies before it: from 0 to 1."""
+    files = {item.path: kinds.index(_kind(item)) for item in items if _kind(item) in kinds}
+    ordered = sorted(files, key=files.__getitem__)
+    return {file: place / len(ordered) for place, file in enumerate(ordered)}
 
 
 def _kind(item: pytest.Item) -> str:
