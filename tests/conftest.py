@@ -37,6 +37,7 @@ CALCULATING = ("integration", "contract", "unit")
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 
+@pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers() -> int:
     """One more than there are cores: something always waits."""
     return (os.cpu_count() or 1) + 1

@@ -922,13 +922,19 @@ def _once_made(search: SearchPort, request: SearchRequest) -> SearchResponse:
     raise AssertionError("the codes never came")
 
 
+@pytest.mark.parametrize(
+    ("catalog", "replicas"),
+    [("sqlite", (1,)), ("postgresql", (2, 1, 1))],
+    ids=["one shard", "three shards, one of them twice"],
+    indirect=["catalog"],
+)
 class TestSearchOverHttp(SearchPortContract):
     """The same promises, with HTTP between and the map's slots spread over workers."""
 
-    @pytest.fixture(params=[(1,), (2, 1, 1)], ids=["one shard", "three shards, one of them twice"])
+    @pytest.fixture
     def port(
         self,
-        request: pytest.FixtureRequest,
+        replicas: tuple[int, ...],
         catalog: Catalog,
         store: FolderStore,
         settings: Settings,
@@ -940,7 +946,7 @@ class TestSearchOverHttp(SearchPortContract):
                 wait = float(str(changes.get("search_wait_seconds", settings.search_wait_seconds)))
                 patience = {"search_timeout_seconds": max(10.0, 5 * wait)}
                 own = settings.model_copy(update=patience | changes)
-                tier = SearchTier(catalog, store, own, request.param)
+                tier = SearchTier(catalog, store, own, replicas)
                 tier.follow()  # a search brings only one replica of a shard up to date
                 return running.enter_context(tier).port
 

@@ -1,4 +1,4 @@
-"""The short form of `placewise bench chaos`: every fault once, then the counts."""
+"""The short form of `placewise bench chaos`: every kind of fault once, then the counts."""
 
 from __future__ import annotations
 
@@ -9,12 +9,27 @@ import pytest
 from benchmarks.chaos import run_chaos
 from benchmarks.chaos.faults import every_fault
 
+# The same kind as another one, on another process or connection: `placewise bench chaos` has them.
+ANOTHER_OF_ITS_KIND = {
+    "kill -9 of search-1-0",
+    "connections to PostgreSQL cut",
+    "connections to PostgreSQL slow",
+    "connections to Redis refused",
+    "connections to Redis cut",
+    "connections to the S3 store refused",
+    "connections to the S3 store slow",
+}
+
 
 @pytest.mark.timeout(900)
 def test_whatever_dies_no_photo_is_lost_doubled_or_stuck_and_no_answer_is_wrong(
     tmp_path: Path,
 ) -> None:
-    run = run_chaos(tmp_path, photos=200, fault_seconds=1.0, seed=20_261_121, executed=False)
+    faults = [fault for fault in every_fault() if fault.name not in ANOTHER_OF_ITS_KIND]
+    assert len(faults) == len(every_fault()) - len(ANOTHER_OF_ITS_KIND)
+    run = run_chaos(
+        tmp_path, photos=150, fault_seconds=1.0, seed=20_261_121, faults=faults, executed=False
+    )
     assert run.good, "\n".join([*map(str, run.outcomes), *run.details])
-    assert len(run.outcomes) == len(every_fault())
+    assert len(run.outcomes) == len(faults)
     assert run.asked >= len(run.outcomes), "questions were compared with what is right"

@@ -38,6 +38,9 @@ from tests.support.checkpoints import (
 from tests.support.photos import photo_bytes
 from tests.support.problems import field_refused, problem
 
+# tests/e2e/test_serve_models.py does the same on SQLite.
+pytestmark = pytest.mark.parametrize("catalog", ["postgresql"], indirect=True)
+
 PHOTOS = 3
 
 

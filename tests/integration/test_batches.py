@@ -38,6 +38,9 @@ from tests.support.photos import photo_bytes
 from tests.support.problems import problem
 from tests.support.servers import S3Server
 
+# tests/e2e/test_batches.py does the same on SQLite.
+pytestmark = pytest.mark.parametrize("catalog", ["postgresql"], indirect=True)
+
 ROUNDS = 60
 
 
@@ -157,6 +160,7 @@ def test_a_prefix_that_was_not_given_free_is_refused(batches: Batches, prefix: s
     problem(answer, 422, "invalid_field")
 
 
+@pytest.mark.usefixtures("catalog")
 def test_a_prefix_may_be_written_as_an_address_in_the_servers_own_bucket(
     settings: Settings,
 ) -> None:

@@ -47,6 +47,9 @@ from tests.support.photos import near_copy, photo_bytes
 from tests.support.problems import field_refused, problem
 from tests.support.small_gpu import make_too_heavy
 
+# tests/e2e/test_look_closely.py does the same on SQLite.
+pytestmark = pytest.mark.parametrize("catalog", ["postgresql"], indirect=True)
+
 
 @pytest.fixture
 def settings(monkeypatch: pytest.MonkeyPatch) -> Settings:

@@ -39,6 +39,9 @@ from tests.integration.workplace import Workplace, expected_row, same
 from tests.support.added import none_added
 from tests.support.photos import photo_bytes
 
+# tests/e2e/test_vocabulary_command.py does the same on SQLite.
+pytestmark = pytest.mark.parametrize("catalog", ["postgresql"], indirect=True)
+
 PHOTOS = 14
 KEPT = 5
 CPU = torch.device("cpu")
