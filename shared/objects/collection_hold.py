@@ -44,8 +44,8 @@ class Hold:
             f"{self.orphans} of {self.objects} objects ({self.orphan_bytes / 1e6:.1f} MB) are "
             f"known to no row of the catalog, and {why}: nothing was collected. If the catalog is "
             "not the right one, put the right one back, or run `placewise verify --repair`. If "
-            "they are garbage: `placewise storage collect` lists them, and `placewise storage collect "
-            "--confirm` moves them to the trash."
+            "they are garbage: `placewise storage collect` lists them, and with --confirm it moves "
+            "them to the trash."
         )
 
 

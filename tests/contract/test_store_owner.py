@@ -270,6 +270,7 @@ def test_files_that_people_put_into_a_folder_do_not_keep_a_catalog_from_it(
     catalog: Catalog, tmp_path: Path
 ) -> None:
     settings = Settings(placewise_home=tmp_path / "home", upload_dir=tmp_path / "photos")
+    settings.placewise_home.mkdir()
     store = open_store(settings)
     for key in ("imports/city/1.jpg", "originals/holiday.jpg"):
         store.put(key, b"theirs")
