@@ -12,6 +12,7 @@ from shared.catalog.away import as_unavailable
 from shared.catalog.installation import Installation
 from shared.catalog.open_catalog import open_catalog
 from shared.errors import Misconfigured
+from shared.objects import FolderStore, OwnedStore
 from shared.objects.collection_hold import read_hold
 from shared.objects.open_store import open_store
 from shared.objects.store_owner import read_owner, taken
@@ -21,9 +22,14 @@ from shared.settings import Settings
 
 def collection_check(settings: Settings) -> str:
     """Whether the store belongs to this catalog, and whether orphans are collected."""
-    if settings.s3_endpoint is None and not (settings.placewise_home / "objects").exists():
+    folder = settings.placewise_home / "objects"
+    store: OwnedStore
+    if settings.s3_endpoint is not None:
+        store = open_store(settings, alone=False)
+    elif folder.exists():
+        store = FolderStore(folder, alone=False)  # UPLOAD_DIR, which has no notes, is not marked
+    else:
         return "nothing is stored yet"
-    store = open_store(settings, alone=False)
     owner = read_owner(store)
     if owner is None:
         return "the object store has no owner yet; the next start marks it"

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import logging
 import os
 import shutil
 import stat
@@ -21,6 +22,8 @@ from shared.ids import new_id
 from shared.objects.keys import TRASH, check_key, is_key
 from shared.objects.port import ObjectInfo
 from shared.private_files import create_private_file, make_private_folder, write_private
+
+log = logging.getLogger(__name__)
 
 # No file there, or a folder on the way or at the end: to a store of keys it is all the same.
 MISSING = (FileNotFoundError, NotADirectoryError, IsADirectoryError)
@@ -209,6 +212,8 @@ class FolderStore:
                             deleted += 1
                 for directory, _, _ in os.walk(day, topdown=False):
                     _remove_empty_folders(Path(directory), trash)
+        if deleted:
+            log.warning("no room on the disk: %d objects of the trash were deleted", deleted)
         return deleted
 
     def _copy(self, path: Path, key: str) -> None:
