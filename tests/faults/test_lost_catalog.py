@@ -110,7 +110,7 @@ def _fill(running: ServerProcess, numbers: range) -> None:
 
 
 def _searchable(running: ServerProcess) -> int:
-    (found,) = running.client.get("/api/v1/maps").json()["maps"]
+    (found,) = running.client.get("/api/v1/maps").json()
     return int(found["searchable"])
 
 
