@@ -15,7 +15,7 @@ from uuid import UUID
 
 from shared.errors import Misconfigured
 from shared.objects.folder import MARK, PARTIAL, FolderStore
-from shared.objects.keys import ORIGINALS, is_original_key
+from shared.objects.keys import ORIGINALS, QUERIES, WORK, is_original_key
 from shared.objects.port import OwnedStore
 from shared.objects.s3 import S3Store
 
@@ -130,12 +130,14 @@ def _check_unmarked(store: OwnedStore, named: Collection[str], import_prefix: st
 
 
 def _holds_objects(store: OwnedStore, import_prefix: str) -> bool:
-    """Whether it holds objects of some Placewise. What lies under IMPORT_PREFIX, or was put into
-    UPLOAD_DIR by hand, is no reason to refuse a folder."""
-    in_bucket = isinstance(store, S3Store)
+    """Whether it holds objects of some Placewise. What lies under IMPORT_PREFIX is its owner's. In
+    a folder, which earlier releases did not mark, neither does count what was put into UPLOAD_DIR
+    by hand, nor what a query has left for an hour."""
     for info in store.list(""):
+        if info.key.startswith((MARK, import_prefix)):
+            continue
         by_hand = info.key.startswith(ORIGINALS) and not is_original_key(info.key)
-        if not info.key.startswith((MARK, import_prefix)) and (in_bucket or not by_hand):
+        if isinstance(store, S3Store) or not (by_hand or info.key.startswith((QUERIES, WORK))):
             return True
     return False
 

@@ -266,13 +266,13 @@ def test_empty_store_is_refused_by_a_catalog_with_photos(
     assert caught.value.code == "object_store_changed"
 
 
-def test_files_that_people_put_into_a_folder_do_not_keep_a_catalog_from_it(
+def test_files_of_people_and_of_queries_do_not_keep_a_catalog_from_a_folder(
     catalog: Catalog, tmp_path: Path
 ) -> None:
     settings = Settings(placewise_home=tmp_path / "home", upload_dir=tmp_path / "photos")
     settings.placewise_home.mkdir()
     store = open_store(settings)
-    for key in ("imports/city/1.jpg", "originals/holiday.jpg"):
+    for key in ("imports/city/1.jpg", "originals/holiday.jpg", f"queries/{new_id()}"):
         store.put(key, b"theirs")
     open_own_store(catalog, settings, alone=False)
 

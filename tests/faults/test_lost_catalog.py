@@ -197,6 +197,9 @@ def test_adopted_store_keeps_what_its_new_catalog_does_not_know(filled: Filled) 
         assert confirmed["moved"] >= len(originals)
         assert filled.originals() == set()
         assert filled.kept() >= originals
+        verified = json.loads(filled.command("verify", "--json").stdout)
+        assert verified["trash_objects"] == confirmed["moved"]
+        assert verified["trash_bytes"] > 0
         back = json.loads(filled.command("storage", "restore-trash", "--json").stdout)
         assert back == {"restored": confirmed["moved"], "kept_in_trash": 0}
     assert filled.originals() == originals
