@@ -41,7 +41,7 @@ from services.steward.queue import free_leases
 from services.steward.webhooks.deliver import WebhookSender
 from shared.api_keys import Scope, hash_key, is_loopback, new_local_key
 from shared.catalog.connections import Limits
-from shared.catalog.installation import open_own_store
+from shared.catalog.installation import check_before_new_catalog, open_own_store
 from shared.catalog.keys import has_admin_key, make_key
 from shared.catalog.maps import ensure_default_map
 from shared.catalog.open_catalog import open_catalog
@@ -106,6 +106,8 @@ def standalone(settings: Settings) -> Iterator[Standalone]:
         held.enter_context(lock_home(home))
         listener = held.enter_context(listening(settings.host, settings.port))
         catalog = open_catalog(settings, "embedded")
+        held.callback(catalog.close)
+        check_before_new_catalog(catalog, settings)
         migrate(catalog)
         store = open_own_store(catalog, settings, alone=True)
         hints = InProcessHints()
@@ -161,7 +163,6 @@ def standalone(settings: Settings) -> Iterator[Standalone]:
             for part in parts:
                 part.join()
             extractor.close()
-            catalog.close()
 
 
 def _make_keys(

@@ -12,6 +12,7 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from shared.errors import Misconfigured
+from shared.private_files import FILE_MODE, make_private_folder, write_private
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +33,7 @@ def running_server(home: Path) -> RunningServer | None:
     """The server that serves the folder now, or None."""
     if not _lock_file(home).exists():
         return None
-    with contextlib.suppress(Timeout), FileLock(_lock_file(home), timeout=0):
+    with contextlib.suppress(Timeout), FileLock(_lock_file(home), timeout=0, mode=FILE_MODE):
         return None
     with contextlib.suppress(FileNotFoundError, ValueError, KeyError):
         said = json.loads(address_file(home).read_text())
@@ -50,8 +51,8 @@ def address_of_running(home: Path) -> str | None:
 def lock_home(home: Path) -> Iterator[None]:
     """The folder for this process alone; Misconfigured (`home_in_use`, `home_unwritable`)."""
     try:
-        home.mkdir(parents=True, exist_ok=True)
-        lock = FileLock(_lock_file(home), timeout=0)
+        make_private_folder(home)
+        lock = FileLock(_lock_file(home), timeout=0, mode=FILE_MODE)
         lock.acquire()
     except Timeout:
         where = address_of_running(home) or "another process"
@@ -81,18 +82,6 @@ def announced(home: Path, url: str, key: str | None = None) -> Iterator[None]:
         yield
     finally:
         address_file(home).unlink(missing_ok=True)
-
-
-def write_private(file: Path, text: str) -> None:
-    """The whole file at once, durable, and from its first byte readable by this user alone."""
-    partial = file.with_name(f".{file.name}.partial")
-    partial.unlink(missing_ok=True)  # a killed process's; its mode is not to be trusted
-    descriptor = os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-    with os.fdopen(descriptor, "w") as opened:
-        opened.write(text)
-        opened.flush()
-        os.fsync(opened.fileno())
-    partial.replace(file)
 
 
 def _lock_file(home: Path) -> Path:

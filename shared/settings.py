@@ -314,7 +314,22 @@ class Settings(BaseSettings):
         3600.0, ge=0, description="life of a generation after it was replaced"
     )
     orphan_age_seconds: float = Field(
-        86_400.0, ge=0, description="age at which an object that no row knows is removed"
+        86_400.0,
+        ge=0,
+        description="age at which an object that no row knows is moved to the trash",
+    )
+    trash_days: float = Field(
+        7.0,
+        ge=0,
+        description="days for which such objects stay in the trash; emptied sooner when the disk "
+        "is nearly full",
+    )
+    collect_max_share: float = Field(
+        0.1,
+        ge=0,
+        le=1,
+        description="share of all objects; with more orphans than this (and than 100), none is "
+        "moved before `placewise storage collect --confirm`",
     )
 
     job_retention_days: float = Field(

@@ -23,6 +23,8 @@ from shared.catalog.installation import ensure_installation, open_own_store
 from shared.catalog.open_catalog import open_catalog
 from shared.catalog.schema import migrate
 from shared.home import lock_home
+from shared.objects.open_store import open_store
+from shared.objects.store_owner import read_owner
 
 SHOWN = 10
 
@@ -83,6 +85,7 @@ def restore(
             lambda: open_own_store(catalog, settings, alone=alone),
             settings.import_prefix,
             progress,
+            store_owner=read_owner(open_store(settings, alone=False)),
         )
     if as_json:
         print_json(asdict(restored))

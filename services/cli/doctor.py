@@ -26,6 +26,7 @@ from services.cli.service_checks import (
     search_check,
     steward_check,
 )
+from services.cli.store_checks import collection_check, permissions_check
 from shared.catalog.open_catalog import open_catalog
 from shared.catalog.photos import Photo
 from shared.client import Client
@@ -58,10 +59,12 @@ def doctor(server: ServerOption = None, key: KeyOption = None, as_json: JsonOpti
     checks.append(("settings", _settings))
     if settings.s3_endpoint is None or settings.database_url is None:
         checks.append(("folder", _folder))  # else a service may have none that it can write to
+        checks.append(("permissions", permissions_check))
     if settings.s3_endpoint is None:
         checks.append(("uploads", _uploads))
     else:
         checks.append(("objects", objects_check))
+    checks.append(("collection", collection_check))
     if settings.database_url is None:
         checks += [("server", _server), ("vocabulary", _vocabulary)]
     else:

@@ -14,12 +14,12 @@ from shared.catalog.open_catalog import open_catalog
 from shared.catalog.schema import check_schema
 from shared.catalog.session import Catalog
 from shared.errors import Misconfigured
-from shared.objects import ObjectStore
+from shared.objects import OwnedStore
 from shared.settings import Settings
 
 
 @contextlib.contextmanager
-def what_is_stored(settings: Settings, command: str) -> Iterator[tuple[Catalog, ObjectStore]]:
+def what_is_stored(settings: Settings, command: str) -> Iterator[tuple[Catalog, OwnedStore]]:
     """Both, while the service runs or not.
 
     Raises Misconfigured: `nothing_stored` for a folder without a catalog, those of `check_schema`

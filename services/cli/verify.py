@@ -16,6 +16,7 @@ from shared.integrity.check import check
 from shared.integrity.repair import repair
 from shared.integrity.report import Report, Wrong
 from shared.jobs import InProcessHints
+from shared.objects.trash import measure_trash
 
 SHOWN = 20
 WHAT_TO_DO = {
@@ -52,6 +53,8 @@ def verify(
                 report.orphans += 1
                 report.orphan_bytes += info.size_bytes
                 progress("objects that no row knows", report.orphans, report.orphans)
+            trash = measure_trash(store)
+            report.trash_objects, report.trash_bytes = trash.objects, trash.size_bytes
             # Workers look every second, and the steward sends hints.
             queued = repair(catalog, InProcessHints(), report) if mend else None
     if as_json:
@@ -73,6 +76,8 @@ def _as_dict(report: Report, queued: int | None) -> dict[str, Any]:
         "faults": faults,
         "orphans": report.orphans,
         "orphan_bytes": report.orphan_bytes,
+        "trash_objects": report.trash_objects,
+        "trash_bytes": report.trash_bytes,
         "queued_photos": queued,
     }
 
@@ -87,7 +92,13 @@ def _print(report: Report, queued: int | None) -> None:
     if report.orphans:
         answers.print(
             f"{report.orphans} objects ({report.orphan_bytes / 1e6:.1f} MB) are known to no row: "
-            "just coming in, or left by a crash; the steward removes old ones",
+            "just coming in, or left by a crash; the steward moves old ones to the trash",
+            soft_wrap=True,
+        )
+    if report.trash_objects:
+        answers.print(
+            f"{report.trash_objects} objects ({report.trash_bytes / 1e6:.1f} MB) are in the trash; "
+            "`placewise storage restore-trash` puts them back",
             soft_wrap=True,
         )
     for fault in report.faults[:SHOWN]:

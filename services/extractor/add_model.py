@@ -22,6 +22,7 @@ from shared.jobs.leases import held
 from shared.model_names import PREFIX
 from shared.objects import ObjectStore
 from shared.objects.keys import new_model_key
+from shared.private_files import create_private_file, make_private_folder
 from shared.vision.backbones.trained import TrainedModel
 from shared.vision.place_models.checkpoint import Checkpoint, load_checkpoint
 from shared.vision.place_models.model_file import encode_model
@@ -107,10 +108,10 @@ class AddModel:
         if there is not None:
             yield there
             return
-        self._folder.mkdir(parents=True, exist_ok=True)
+        make_private_folder(self._folder)
         path = self._folder / f"{new_id()}.partial"
         try:
-            with self._store.open(key) as source, path.open("xb") as file:
+            with self._store.open(key) as source, create_private_file(path) as file:
                 while piece := source.read(PIECE_BYTES):
                     file.write(piece)
             yield path

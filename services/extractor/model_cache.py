@@ -17,6 +17,7 @@ from typing import BinaryIO
 from shared.errors import Unavailable
 from shared.ids import new_id
 from shared.objects import ObjectStore
+from shared.private_files import create_private_file, make_private_folder
 
 log = logging.getLogger(__name__)
 
@@ -53,10 +54,10 @@ class ModelCache:
         return path
 
     def _fetch(self, key: str, sha256: str, path: Path) -> None:
-        self._folder.mkdir(parents=True, exist_ok=True)
+        make_private_folder(self._folder)
         partial = self._folder / f"{new_id()}.partial"
         try:
-            with self._store.open(key) as source, partial.open("xb") as file:
+            with self._store.open(key) as source, create_private_file(partial) as file:
                 _check(source, key, sha256, file)
                 file.flush()
                 os.fsync(file.fileno())

@@ -20,6 +20,7 @@ from shared.catalog.chunks import Chunk
 from shared.chunks import codes_key, decode_rows
 from shared.errors import NotFound
 from shared.objects import ObjectStore
+from shared.private_files import create_private_file
 
 if TYPE_CHECKING:
     from shared.codes.int8 import Int8Codes
@@ -163,7 +164,7 @@ def _held(stored: NDArray[Number], now: NDArray[Number], wanted: bool) -> NDArra
 
 
 def _write(target: Path, data: bytes) -> None:
-    with target.open("wb") as file:
+    with create_private_file(target) as file:
         file.write(data)
         file.flush()
         os.fsync(file.fileno())

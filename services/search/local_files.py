@@ -20,6 +20,7 @@ from pathlib import Path
 from shared.chunks import corrupt
 from shared.ids import new_id
 from shared.objects import ObjectStore
+from shared.private_files import create_private_file, make_private_folder
 
 log = logging.getLogger(__name__)
 
@@ -76,7 +77,7 @@ class LocalFiles:
         path = self._folder / name
         with contextlib.suppress(FileNotFoundError), path.open("rb") as file:
             return _map(file.fileno())
-        self._folder.mkdir(parents=True, exist_ok=True)
+        make_private_folder(self._folder)
         partial = self._folder / f"{new_id()}.partial"
         try:
             make(partial)
@@ -106,7 +107,7 @@ class LocalFiles:
 
     def _fetch(self, key: str, sha256: str, target: Path) -> None:
         digest = hashlib.sha256()
-        with self._store.open(key) as source, target.open("wb") as file:
+        with self._store.open(key) as source, create_private_file(target) as file:
             while piece := source.read(PIECE_BYTES):
                 digest.update(piece)
                 file.write(piece)

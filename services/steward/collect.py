@@ -1,4 +1,4 @@
-"""Removing what nothing refers to any more. Objects go before the rows that remember them.
+"""Garbage collection. Objects go before the rows that remember them, orphans go to the trash first.
 
 An object is deleted first and its row after it: a crash in between repeats the deletion, which
 harms nothing, while the other order would leave bytes that no one knows of.
@@ -8,8 +8,11 @@ from __future__ import annotations
 
 import contextlib
 import logging
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
-from datetime import timedelta
+from dataclasses import dataclass, field
+from datetime import datetime, timedelta
+from itertools import groupby, islice
 from uuid import UUID
 
 from sqlalchemy import and_, delete, exists, or_, select, update
@@ -26,9 +29,11 @@ from shared.catalog.session import Catalog
 from shared.catalog.vocabularies import Vocabulary
 from shared.catalog.whitenings import StoredWhitening
 from shared.chunks import codes_key, delete_chunk, manifest_key
+from shared.errors import Conflict
 from shared.jobs.batches import BatchItem
 from shared.jobs.table import MODEL_CHANGES, QUERY_JOBS, UNFINISHED, Job, JobKind, JobState
-from shared.objects import ObjectStore
+from shared.objects import ObjectStore, OwnedStore
+from shared.objects.collection_hold import Hold, HoldReason, end_hold, read_hold, write_hold
 from shared.objects.keys import (
     ARCHIVES,
     CHECKPOINTS,
@@ -49,11 +54,14 @@ from shared.objects.keys import (
     thumbnail_key,
 )
 from shared.objects.port import ObjectInfo
+from shared.objects.trash import TrashSize, expire_trash, move_to_trash
 from shared.settings import Settings
 
 log = logging.getLogger(__name__)
 
 AT_ONCE = 500  # rows looked at in one transaction
+REMEMBERED = 10_000  # orphans that need no second walk over the store
+ALWAYS_COLLECTED = 100  # orphans: in a small store, a few are a large share
 COMPLETED_SECONDS = 86_400.0  # for which a completed direct upload is remembered
 
 
@@ -257,29 +265,142 @@ def collect_brought(catalog: Catalog, store: ObjectStore, prefix: str, kind: Job
             store.delete(key)
 
 
-def collect_orphans(catalog: Catalog, store: ObjectStore, age_seconds: float) -> int:
-    """Remove objects older than `age_seconds` that no row knows; how many."""
-    removed = 0
-    for info in orphans(catalog, store, age_seconds):
-        store.delete(info.key)
-        removed += 1
-    if removed:
-        log.info("%d orphaned objects removed", removed)
-    return removed
+class CollectionHeld(Conflict):
+    """Orphans are not collected before someone decides."""
+
+    def __init__(self, hold: Hold) -> None:
+        super().__init__("collection_held", hold.describe())
+        self.hold = hold
 
 
-def orphans(catalog: Catalog, store: ObjectStore, age_seconds: float) -> Iterator[ObjectInfo]:
-    """Objects older than `age_seconds` that no row knows: crashes between object and commit."""
+@dataclass(slots=True)
+class StoreCount:
+    """What a walk over the store has counted."""
+
+    objects: int = 0
+    orphans: Counter[str] = field(default_factory=Counter)
+    """By prefix."""
+    orphan_bytes: Counter[str] = field(default_factory=Counter)
+    """By prefix."""
+
+
+def collect_orphans(
+    catalog: Catalog,
+    store: OwnedStore,
+    age_seconds: float,
+    *,
+    max_share: float = 1.0,
+    confirmed: bool = False,
+    catalog_is_behind: Callable[[Catalog, OwnedStore], bool] = lambda catalog, store: False,
+) -> int:
+    """Move objects older than `age_seconds` that no row knows to the trash; how many.
+
+    Raises CollectionHeld before anything is moved, unless `confirmed`: where the catalog is behind
+    its store, where it adopted the store without knowing them, and where they are more than
+    `max_share` of all objects and more than ALWAYS_COLLECTED. The store then has a note of it.
+    """
+    count, first = StoreCount(), list[ObjectInfo]()
+    for info in orphans(catalog, store, age_seconds, count):
+        if len(first) < REMEMBERED:
+            first.append(info)
+    found, before = count.orphans.total(), read_hold(store)
+    if found and not confirmed:
+        reason = None
+        if catalog_is_behind(catalog, store):
+            reason = HoldReason.CATALOG_BEHIND
+        elif before is not None and before.reason == HoldReason.ADOPTED:
+            reason = HoldReason.ADOPTED
+        elif found > max(ALWAYS_COLLECTED, max_share * count.objects):
+            reason = HoldReason.SHARE
+        if reason is not None:
+            hold = Hold(reason, found, count.orphan_bytes.total(), count.objects)
+            if hold != before:
+                write_hold(store, hold)
+            raise CollectionHeld(hold)
+    moved = _move_orphans(catalog, store, first)
+    if found > len(first):
+        moved += _move_orphans(catalog, store, orphans(catalog, store, age_seconds))
+    if before is not None and (confirmed or before.reason != HoldReason.ADOPTED):
+        end_hold(store)
+    if moved:
+        log.info("%d orphaned objects were moved to the trash", moved)
+    return moved
+
+
+def count_store(catalog: Catalog | None, store: ObjectStore) -> StoreCount:
+    """All objects, and those of any age that no row knows; without a catalog: none is known."""
+    count = StoreCount()
+    if catalog is not None:
+        for _ in orphans(catalog, store, 0.0, count):
+            pass
+        return count
+    for prefix in REFERENCED:
+        for info in _counted(store.list(prefix), count):
+            if prefix != ORIGINALS or is_original_key(info.key):
+                count.orphans[prefix] += 1
+                count.orphan_bytes[prefix] += info.size_bytes
+    return count
+
+
+def orphans(
+    catalog: Catalog, store: ObjectStore, age_seconds: float, count: StoreCount | None = None
+) -> Iterator[ObjectInfo]:
+    """Objects older than `age_seconds` that no row knows: crashes between object and commit.
+
+    `count`, if given, is brought up to date meanwhile.
+    """
+    count = StoreCount() if count is None else count
+    before = _now(catalog) - timedelta(seconds=age_seconds)
+    for prefix in REFERENCED:
+        for some in _batches(_counted(store.list(prefix), count)):
+            for info in _unknown(catalog, prefix, [i for i in some if i.modified_at < before]):
+                count.orphans[prefix] += 1
+                count.orphan_bytes[prefix] += info.size_bytes
+                yield info
+
+
+def _counted(found: Iterable[ObjectInfo], count: StoreCount) -> Iterator[ObjectInfo]:
+    for info in found:
+        count.objects += 1
+        yield info
+
+
+def _batches(found: Iterable[ObjectInfo]) -> Iterator[list[ObjectInfo]]:
+    iterator = iter(found)
+    while some := list(islice(iterator, AT_ONCE)):
+        yield some
+
+
+def _unknown(catalog: Catalog, prefix: str, some: list[ObjectInfo]) -> list[ObjectInfo]:
+    """Those that no row knows; all of them lie under the prefix."""
+    if not some:
+        return []
     with catalog.read() as session:
-        now = session.execute(select(db_now())).scalar_one()
-    before = now - timedelta(seconds=age_seconds)
-    for prefix, referenced in REFERENCED.items():
-        old = [info for info in store.list(prefix) if info.modified_at < before]
-        for begin in range(0, len(old), AT_ONCE):
-            some = old[begin : begin + AT_ONCE]
-            with catalog.read() as session:
-                known = set(referenced(session, [info.key for info in some]))
-            yield from (info for info in some if info.key not in known)
+        known = set(REFERENCED[prefix](session, [info.key for info in some]))
+    return [info for info in some if info.key not in known]
+
+
+def _move_orphans(catalog: Catalog, store: OwnedStore, found: Iterable[ObjectInfo]) -> int:
+    """Move them to today's trash, but those that a row knows by now; how many."""
+    today, moved = _now(catalog).date(), 0
+    for prefix, same_prefix in groupby(found, lambda info: info.key.partition("/")[0] + "/"):
+        for some in _batches(same_prefix):
+            for info in _unknown(catalog, prefix, some):
+                moved += move_to_trash(store, info.key, today)
+    return moved
+
+
+def empty_expired_trash(
+    catalog: Catalog, store: ObjectStore, trash_days: float
+) -> tuple[int, TrashSize]:
+    """Delete what was moved to the trash more than `trash_days` ago; how many objects, and what is
+    left."""
+    return expire_trash(store, _now(catalog) - timedelta(days=trash_days))
+
+
+def _now(catalog: Catalog) -> datetime:
+    with catalog.read() as session:
+        return session.execute(select(db_now())).scalar_one()
 
 
 def collect(catalog: Catalog, store: ObjectStore, settings: Settings) -> None:

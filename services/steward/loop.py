@@ -12,7 +12,12 @@ from prometheus_client import CollectorRegistry
 from sqlalchemy.exc import SQLAlchemyError
 
 from services.steward.auto_evaluate import evaluate_changed_maps
-from services.steward.collect import collect, collect_orphans
+from services.steward.collect import (
+    CollectionHeld,
+    collect,
+    collect_orphans,
+    empty_expired_trash,
+)
 from services.steward.compact import compact
 from services.steward.count_maps import count_large_maps
 from services.steward.counted_store import CountedStore
@@ -31,12 +36,14 @@ from shared.catalog.away import Outage
 from shared.catalog.session import Catalog
 from shared.heartbeat import Heartbeat
 from shared.jobs import Hints
-from shared.objects import ObjectStore
+from shared.objects import OwnedStore
 from shared.settings import Settings
 
 log = logging.getLogger(__name__)
 
 TICK_SECONDS = 0.25
+# The trash is emptied before the gateway refuses uploads (MIN_FREE_BYTES).
+FREE_TRASH_FACTOR = 2
 
 
 @dataclass(slots=True)
@@ -53,7 +60,7 @@ class Steward:
     def __init__(
         self,
         catalog: Catalog,
-        store: ObjectStore,
+        store: OwnedStore,
         hints: Hints,
         settings: Settings,
         metrics: StewardMetrics | None = None,
@@ -119,9 +126,12 @@ class Steward:
             Duty(
                 "collect orphans",
                 3600.0,
-                lambda: collect_orphans(
-                    catalog, counted("collect_orphans"), settings.orphan_age_seconds
-                ),
+                lambda: _collect_orphans(catalog, store, settings, metrics),
+            ),
+            Duty(
+                "free trash",
+                10.0,
+                lambda: _free_trash(store, FREE_TRASH_FACTOR * settings.min_free_bytes, metrics),
             ),
         ]
 
@@ -151,3 +161,26 @@ class Steward:
             )
         self._metrics.duty(duty.name, outcome, time.monotonic() - started)
         duty.due = time.monotonic() + duty.every_seconds
+
+
+def _collect_orphans(
+    catalog: Catalog, store: OwnedStore, settings: Settings, metrics: StewardMetrics
+) -> None:
+    """Move orphans to the trash and delete what has been there long enough, or hold both back."""
+    try:
+        moved = collect_orphans(
+            catalog, store, settings.orphan_age_seconds, max_share=settings.collect_max_share
+        )
+    except CollectionHeld as held:
+        metrics.collection_held.set(1)
+        log.error("collection is held: %s", held.detail)
+        return
+    metrics.collection_held.set(0)
+    metrics.objects_trashed.inc(moved)
+    deleted, left = empty_expired_trash(catalog, store, settings.trash_days)
+    metrics.objects_deleted.labels("collect_orphans").inc(deleted)
+    metrics.trash_bytes.set(left.size_bytes)
+
+
+def _free_trash(store: OwnedStore, least_free_bytes: int, metrics: StewardMetrics) -> None:
+    metrics.objects_deleted.labels("free_trash").inc(store.free_trash(least_free_bytes))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable, Mapping
 
-from prometheus_client import CollectorRegistry, Counter, Histogram
+from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
 from prometheus_client.core import GaugeMetricFamily
 from prometheus_client.metrics_core import Metric
 from prometheus_client.registry import Collector
@@ -49,6 +49,21 @@ class StewardMetrics:
             f"{PREFIX}_objects_deleted",
             "Objects that nothing refers to any more.",
             ["duty"],
+            registry=registry,
+        )
+        self.objects_trashed = Counter(
+            f"{PREFIX}_objects_trashed",
+            "Orphaned objects that were moved to the trash.",
+            registry=registry,
+        )
+        self.collection_held = Gauge(
+            f"{PREFIX}_collection_held",
+            "1 while orphans are not collected before `placewise storage collect --confirm`.",
+            registry=registry,
+        )
+        self.trash_bytes = Gauge(
+            f"{PREFIX}_trash_bytes",
+            "Bytes in the trash after the last collection.",
             registry=registry,
         )
         self._jobs = Counter(

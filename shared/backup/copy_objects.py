@@ -8,12 +8,21 @@ from collections.abc import Iterator
 from shared.backup.folder import BackupFolder, Kept
 from shared.objects import ObjectStore
 from shared.objects.folder import MARK
-from shared.objects.keys import FEATURES, INCOMING, ORIGINALS, QUERIES, WORK, is_original_key
+from shared.objects.keys import (
+    FEATURES,
+    INCOMING,
+    ORIGINALS,
+    QUERIES,
+    TRASH,
+    WORK,
+    is_original_key,
+)
 from shared.objects.port import ObjectInfo
 
 PIECE_BYTES = 1024 * 1024
-# Made again when they are wanted, or of calls that have ended by the time of a restore.
-LEFT_OUT = (INCOMING, QUERIES, FEATURES, WORK)
+# Notes of the store itself; made again when they are wanted; of calls that have ended by the time
+# of a restore; orphans.
+LEFT_OUT = (MARK, INCOMING, QUERIES, FEATURES, TRASH, WORK)
 
 
 def objects_to_keep(store: ObjectStore, import_prefix: str) -> Iterator[ObjectInfo]:
@@ -21,7 +30,7 @@ def objects_to_keep(store: ObjectStore, import_prefix: str) -> Iterator[ObjectIn
     What lies under `import_prefix`, or was put into UPLOAD_DIR by hand, is its owner's."""
     for info in store.list(""):
         others = info.key.startswith(ORIGINALS) and not is_original_key(info.key)
-        if info.key == MARK or others or info.key.startswith((*LEFT_OUT, import_prefix)):
+        if others or info.key.startswith((*LEFT_OUT, import_prefix)):
             continue
         yield info
 

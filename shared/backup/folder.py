@@ -13,7 +13,6 @@ from __future__ import annotations
 import contextlib
 import functools
 import json
-import os
 import shutil
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
@@ -24,6 +23,7 @@ from filelock import FileLock, Timeout
 
 from shared.errors import Conflict, Misconfigured
 from shared.objects.folder import FolderStore
+from shared.private_files import FILE_MODE, make_private_folder, write_private
 
 FORMAT = 1
 LOCK = ".backup.lock"
@@ -94,7 +94,7 @@ class BackupFolder:
     @contextlib.contextmanager
     def locked(self) -> Iterator[None]:
         """For this process alone; Conflict (`backup_in_use`) while another one has it."""
-        lock = FileLock(self.path / LOCK, timeout=0)
+        lock = FileLock(self.path / LOCK, timeout=0, mode=FILE_MODE)
         try:
             lock.acquire()
         except Timeout:
@@ -109,7 +109,7 @@ class BackupFolder:
     def open_for_writing(self) -> None:
         """Make the folder, or go on with what is there. Misconfigured (`not_a_backup`) for one that
         holds something else."""
-        self.path.mkdir(parents=True, exist_ok=True)
+        make_private_folder(self.path)
         there = {entry.name for entry in self.path.iterdir()} - {LOCK}
         if there and not there & {"objects.jsonl", "backup.json"}:
             raise Misconfigured(
@@ -117,7 +117,7 @@ class BackupFolder:
                 f"{self.path} holds something that is no backup. Give an empty folder, or one "
                 "that a backup was begun in.",
             )
-        self._index_file.touch()
+        self._index_file.touch(FILE_MODE)
         self.read_index()
 
     def read_index(self) -> None:
@@ -139,26 +139,16 @@ class BackupFolder:
     def finish(self, about: About, keep: set[str]) -> None:
         """From here on the folder is this backup. Objects that are not in `keep`, and the rows of
         the backup before, go."""
-        write_whole(self.path / "backup.json", json.dumps(asdict(about), indent=2) + "\n")
+        write_private(self.path / "backup.json", json.dumps(asdict(about), indent=2) + "\n")
         objects = self.objects
         for key in self.index.keys() - keep:
             objects.delete(key)
             del self.index[key]
         lines = (json.dumps(asdict(kept)) + "\n" for kept in self.index.values())
-        write_whole(self._index_file, "".join(lines))
+        write_private(self._index_file, "".join(lines))
         for old in self.path.glob("catalog-*"):
             if old.name != about.catalog:
                 shutil.rmtree(old)
-
-
-def write_whole(file: Path, text: str) -> None:
-    """The whole file at once, and durable."""
-    partial = file.with_name(f".{file.name}.partial")
-    with partial.open("w") as opened:
-        opened.write(text)
-        opened.flush()
-        os.fsync(opened.fileno())
-    partial.replace(file)
 
 
 def open_backup(path: Path) -> tuple[BackupFolder, About]:

@@ -47,10 +47,14 @@ def restore_backup(
     open_store: Callable[[], ObjectStore],
     import_prefix: str,
     progress: Progress = lambda what, done, total: None,
+    *,
+    store_owner: str | None = None,
 ) -> Restored:
     """The catalog, its schema up to date, and the store become what the backup holds.
 
-    `open_store` is called once the catalog has the backup's installation id. Raises Conflict
+    `store_owner` is the installation id that the store is marked with, None for a store without a
+    mark. `open_store` is called once the catalog has the backup's installation id, or has kept its
+    own because the store is marked with that. Raises Conflict
     (`target_not_empty`) where something else lies, and Misconfigured: `backup_of_another_release`,
     `backup_damaged` (the target then stays without rows).
     """
@@ -59,7 +63,7 @@ def restore_backup(
         _check_schema(session, about)
         _check_catalog_empty(session)
         installation = ensure_installation(session)
-        if installation.bucket is None:  # no bucket carries its mark: it may become the other
+        if installation.bucket is None and store_owner != str(installation.id):
             installation.id = UUID(about.installation_id)
     store = open_store()
     strange = next(

@@ -21,6 +21,7 @@ from shared.catalog.live_processes import LiveProcess
 from shared.catalog.schema_compatibility import SchemaCompatibility
 from shared.catalog.search_workers import RegisteredWorker
 from shared.errors import Misconfigured
+from shared.private_files import FILE_MODE, FOLDER_MODE
 
 ROWS_AT_ONCE = 1000
 LEVEL = 1  # of gzip: rows shrink to a fifth, and the disk stays the slower part
@@ -44,13 +45,15 @@ def tables() -> list[Table]:
 
 def dump_rows(session: Session, folder: Path, progress: Progress) -> dict[str, int]:
     """Every row into `<table>.jsonl.gz`; how many each table has."""
-    folder.mkdir()
+    folder.mkdir(FOLDER_MODE)
     counts = {}
     for table in tables():
         total = session.scalar(select(func.count()).select_from(table)) or 0
         done = 0
         rows = session.execute(select(table).execution_options(yield_per=ROWS_AT_ONCE))
-        with gzip.open(folder / f"{table.name}.jsonl.gz", "wt", compresslevel=LEVEL) as lines:
+        file = folder / f"{table.name}.jsonl.gz"
+        file.touch(FILE_MODE)
+        with gzip.open(file, "wt", compresslevel=LEVEL) as lines:
             for row in rows.mappings():
                 values = {name: _as_json(value) for name, value in row.items()}
                 lines.write(json.dumps(values, ensure_ascii=False) + "\n")

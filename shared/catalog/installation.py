@@ -1,13 +1,14 @@
 """The installation: which Placewise this catalog is, and where its objects lie.
 
-Every object belongs to one catalog: what it does not know is removed as an orphan. So the bucket
-carries the catalog's id (`shared.objects.bucket_owner`), and the catalog remembers its bucket. A
-restored backup of the catalog has the id in it, and so finds the bucket to be its own.
+Every object belongs to one catalog: what it does not know is collected as an orphan. So the store
+carries the catalog's id (`shared.objects.store_owner`), and the catalog remembers its bucket. A
+restored backup of the catalog has the id in it, and so finds the store to be its own.
 """
 
 from __future__ import annotations
 
 from datetime import datetime
+from pathlib import Path
 from uuid import UUID
 
 from sqlalchemy import CheckConstraint, Integer, Uuid, select
@@ -15,13 +16,20 @@ from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
 from shared.catalog.base import Base, JsonValue, UtcDateTime, db_now
+from shared.catalog.chunks import Chunk
+from shared.catalog.models import Model
+from shared.catalog.photos import Photo
 from shared.catalog.session import Catalog
+from shared.catalog.vocabularies import Vocabulary
+from shared.catalog.whitenings import StoredWhitening
 from shared.ids import new_id
-from shared.objects import ObjectStore
-from shared.objects.bucket_owner import Place, check_no_bucket, claim_bucket
+from shared.objects import OwnedStore
+from shared.objects.folder import MARK
 from shared.objects.open_store import open_store
-from shared.objects.s3 import S3Store
+from shared.objects.store_owner import Place, check_free, claim_store, place_of
 from shared.settings import Settings
+
+SAMPLE_KEYS = 20  # of each table
 
 
 class Installation(Base):
@@ -53,22 +61,53 @@ def ensure_installation(session: Session) -> Installation:
     return made
 
 
-def open_own_store(catalog: Catalog, settings: Settings, *, alone: bool) -> ObjectStore:
+def open_own_store(catalog: Catalog, settings: Settings, *, alone: bool) -> OwnedStore:
     """The object store of the settings, once it is sure to be this catalog's own.
 
-    Raises Misconfigured as `open_store`, `claim_bucket` and `check_no_bucket` do, and Unavailable
-    for a bucket that can't be used now.
+    Raises Misconfigured as `open_store` and `claim_store` do, and Unavailable for a bucket that
+    can't be used now.
     """
     store = open_store(settings, alone=alone)
     with catalog.write() as session:
         installation = ensure_installation(session)
-    if not isinstance(store, S3Store):
-        check_no_bucket(installation.bucket)
-        return store
-    place = claim_bucket(
-        store, installation.id, installation.bucket, settings.placewise_home / "objects"
+    place = claim_store(
+        store,
+        installation.id,
+        installation.bucket,
+        settings.placewise_home / "objects",
+        lambda: _some_named_keys(catalog),
+        settings.import_prefix,
     )
     if place != installation.bucket:
         with catalog.write() as session:
             ensure_installation(session).bucket = place
     return store
+
+
+def check_before_new_catalog(catalog: Catalog, settings: Settings) -> None:
+    """Refuse to create an SQLite catalog beside objects of another one, before its file exists: a
+    restored file would otherwise meet the new one. Misconfigured as `open_own_store`."""
+    file = Path(catalog.url.database or "") if catalog.is_sqlite else None
+    if file is not None and (not file.exists() or file.stat().st_size == 0):
+        check_free(open_store(settings, alone=False), settings.import_prefix)
+
+
+def adopt_store(catalog: Catalog, store: OwnedStore) -> None:
+    """Make this catalog the owner of the store, whoever owned it."""
+    with catalog.write() as session:
+        installation = ensure_installation(session)
+        store.write_note(MARK, str(installation.id).encode())
+        installation.bucket = place_of(store)
+
+
+def _some_named_keys(catalog: Catalog) -> list[str]:
+    """A sample of the keys that the catalog's rows name; [] for a catalog that names none."""
+    found: list[str] = []
+    with catalog.read() as session:
+        for table in (Photo, Chunk, Vocabulary, StoredWhitening, Model):
+            named = table.object_key.is_not(None) & (table.object_key != "")
+            keys = select(table.object_key).where(named)
+            if table is Photo:
+                keys = keys.where(Photo.deleted_at.is_(None))
+            found += filter(None, session.scalars(keys.limit(SAMPLE_KEYS)))
+    return found

@@ -23,6 +23,7 @@ from shared.catalog.away import as_unavailable, sqlstate
 from shared.catalog.connections import Limits
 from shared.catalog.session import Catalog
 from shared.errors import Misconfigured, PlacewiseError, Unavailable
+from shared.private_files import FILE_MODE, make_private_folder
 
 log = logging.getLogger(__name__)
 
@@ -133,7 +134,9 @@ def _stored(catalog: Catalog) -> tuple[str | None, str | None]:
 def _migrate_sqlite(catalog: Catalog) -> None:
     """In one transaction, which keeps every other process out."""
     if catalog.url.database:
-        Path(catalog.url.database).parent.mkdir(parents=True, exist_ok=True)
+        file = Path(catalog.url.database)
+        make_private_folder(file.parent)
+        file.touch(FILE_MODE)  # SQLite gives its -wal and -shm files the same mode
     with catalog.engine.execution_options(placewise_write=True).begin() as connection:
         config = _config()
         config.attributes["connection"] = connection

@@ -36,5 +36,7 @@ class Report:
     read_bytes: int = 0
     faults: list[Fault] = field(default_factory=list)
     orphans: int = 0
-    """Objects that no row knows. The steward removes them when they are old enough."""
+    """Objects that no row knows. The steward moves them to the trash when they are old enough."""
     orphan_bytes: int = 0
+    trash_objects: int = 0
+    trash_bytes: int = 0

@@ -17,11 +17,22 @@
 | `queries/<job>.json` | what a comparison has come to |
 | `features/<generation>/<photo>.npy` | a photo's local features, with LOCAL_FEATURES=keep |
 | `work/<job>/...` | what a sliced job keeps between its slices |
+| `trash/<day>/<key>` | an orphan that was moved there on that day, until TRASH_DAYS are over |
 | `imports/...` (IMPORT_PREFIX) | what others have put there; it is only read |
+
+Notes of the store itself are no objects: `.placewise` (whose store it is, `store_owner`) and
+`.placewise-hold` (orphans are not collected until someone decides, `collection_hold`).
 """
 
 from shared.objects.folder import FolderStore
-from shared.objects.port import DirectStore, ObjectInfo, ObjectStore, ObjectWriter, PresignedPut
+from shared.objects.port import (
+    DirectStore,
+    ObjectInfo,
+    ObjectStore,
+    ObjectWriter,
+    OwnedStore,
+    PresignedPut,
+)
 
 __all__ = [
     "DirectStore",
@@ -29,5 +40,6 @@ __all__ = [
     "ObjectInfo",
     "ObjectStore",
     "ObjectWriter",
+    "OwnedStore",
     "PresignedPut",
 ]

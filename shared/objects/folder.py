@@ -8,24 +8,32 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import logging
 import os
+import shutil
 import stat
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path, PurePosixPath
 from typing import BinaryIO
 
 from shared.errors import NotFound, StorageFull, Unavailable
 from shared.ids import new_id
-from shared.objects.keys import check_key, is_key
+from shared.objects.keys import TRASH, check_key, is_key
 from shared.objects.port import ObjectInfo
+from shared.private_files import create_private_file, make_private_folder, write_private
+
+log = logging.getLogger(__name__)
 
 # No file there, or a folder on the way or at the end: to a store of keys it is all the same.
 MISSING = (FileNotFoundError, NotADirectoryError, IsADirectoryError)
 PARTIAL = ".partial"  # the folder of files being written: same file system, so rename is atomic
 MARK = ".placewise"  # the file that says whose folder it is (`shared.objects.upload_dir`)
-RESERVED = (PARTIAL, MARK)
+# Another folder's part of the trash, on its own disk: so a move into the trash is a rename.
+TRASH_ELSEWHERE = f"{MARK}-trash"
 FULL_RETRY_SECONDS = 60
+FULL = (errno.ENOSPC, errno.EDQUOT)
+PIECE_BYTES = 1024 * 1024
 
 
 class FolderStore:
@@ -43,7 +51,7 @@ class FolderStore:
         self.root = root
         self._elsewhere = dict(elsewhere or {})
         for folder in self._folders():
-            (folder / PARTIAL).mkdir(parents=True, exist_ok=True)
+            make_private_folder(folder / PARTIAL)
             for left_over in (folder / PARTIAL).iterdir() if alone else ():
                 left_over.unlink()
 
@@ -54,7 +62,11 @@ class FolderStore:
 
     def writer(self, key: str) -> FolderWriter:
         folder, parts = self._place(key)
-        return FolderWriter(folder.joinpath(*parts), folder / PARTIAL / str(new_id()))
+        return FolderWriter(
+            folder.joinpath(*parts),
+            folder / PARTIAL / str(new_id()),
+            lambda: self._empty_trash(folder) > 0,
+        )
 
     def put(self, key: str, data: bytes) -> None:
         writer = self.writer(key)
@@ -72,9 +84,7 @@ class FolderStore:
         try:
             return self.path(key).open("rb")
         except MISSING:
-            raise NotFound(
-                "object_not_found", f"The object store has no {key!r}.", key=key
-            ) from None
+            raise _not_found(key) from None
 
     def read_range(self, key: str, begin: int, size_bytes: int) -> bytes:
         with self.open(key) as file:
@@ -92,19 +102,69 @@ class FolderStore:
         return _info(key, status) if stat.S_ISREG(status.st_mode) else None
 
     def delete(self, key: str) -> None:
+        path = self.path(key)
         with contextlib.suppress(*MISSING):
-            self.path(key).unlink()
+            path.unlink()
+        if key.startswith(TRASH):  # or a folder would be left for each day
+            _remove_empty_folders(path.parent, self._trash_of(self._place(key)[0]))
 
     def list(self, prefix: str) -> Iterator[ObjectInfo]:
         yield from self._list_folder(self.root, "", prefix)
         for name, folder in self._elsewhere.items():
             yield from self._list_folder(folder, f"{name}/", prefix)
+            if TRASH.startswith(prefix) or prefix.startswith(TRASH):
+                with contextlib.suppress(*MISSING):
+                    for day in sorted((folder / TRASH_ELSEWHERE).iterdir()):
+                        yield from self._list_folder(day, f"{TRASH}{day.name}/{name}/", prefix)
+
+    def move(self, source: str, target: str) -> None:
+        old, new = self.path(source), self.path(target)
+        if self.head(source) is None:
+            raise _not_found(source)
+        try:
+            os.utime(old)
+            made = _make_parents(new)
+            try:
+                old.replace(new)
+            except OSError as error:
+                if error.errno != errno.EXDEV:
+                    raise
+                self._copy(old, target)  # one of the folders is a mount of its own
+                old.unlink()
+        except MISSING:
+            raise _not_found(source) from None
+        for folder in (*made, old.parent):
+            _sync_folder(folder)
+
+    def free_trash(self, least_free_bytes: int) -> int:
+        return sum(self._empty_trash(folder, least_free_bytes) for folder in self._folders())
+
+    def read_note(self, name: str) -> bytes | None:
+        try:
+            return self._note(name).read_bytes()
+        except FileNotFoundError:
+            return None
+
+    def write_note(self, name: str, data: bytes, *, replace: bool = True) -> None:
+        note, partial = self._note(name), self.root / PARTIAL / str(new_id())
+        write_private(partial, data.decode())
+        if replace:
+            partial.replace(note)
+        else:
+            with contextlib.suppress(FileExistsError):
+                note.hardlink_to(partial)  # of two at the same moment one succeeds
+            partial.unlink()
+        _sync_folder(self.root)
+
+    def delete_note(self, name: str) -> None:
+        self._note(name).unlink(missing_ok=True)
 
     def check(self) -> None:
         for folder in self._folders():
             probe = folder / PARTIAL / str(new_id())
             try:
-                probe.write_bytes(b"ok")
+                with create_private_file(probe) as file:
+                    file.write(b"ok")
                 probe.unlink()
             except OSError as error:
                 raise Unavailable(
@@ -120,11 +180,51 @@ class FolderStore:
     def _place(self, key: str) -> tuple[Path, Sequence[str]]:
         """The folder that a key lies in, and the names that lead to it from there."""
         folder, parts = self.root, check_key(key).split("/")
+        if f"{parts[0]}/" == TRASH and len(parts) > 3 and parts[2] in self._elsewhere:
+            return self._elsewhere[parts[2]], [TRASH_ELSEWHERE, parts[1], *parts[3:]]
         if parts[0] in self._elsewhere and len(parts) > 1:
             folder, parts = self._elsewhere[parts[0]], parts[1:]
-        if parts[0] in RESERVED:
+        if _is_reserved(parts[0]):
             raise ValueError(f"the name {parts[0]} is the store's own: {key!r}")
         return folder, parts
+
+    def _note(self, name: str) -> Path:
+        if not name.startswith(MARK) or not is_key(name) or "/" in name:
+            raise ValueError(f"not the name of a note: {name!r}")
+        return self.root / name
+
+    def _trash_of(self, folder: Path) -> Path:
+        return folder / (TRASH.rstrip("/") if folder == self.root else TRASH_ELSEWHERE)
+
+    def _empty_trash(self, folder: Path, least_free_bytes: int | None = None) -> int:
+        """Delete what lies in the trash of this folder, oldest day first, all or until its disk has
+        this much free; how many files."""
+        trash, deleted = self._trash_of(folder), 0
+        with contextlib.suppress(*MISSING):
+            for day in sorted(trash.iterdir()):
+                free = shutil.disk_usage(folder).free
+                if least_free_bytes is not None and free >= least_free_bytes:
+                    break
+                for directory, _, names in os.walk(day):
+                    for name in names:
+                        with contextlib.suppress(*MISSING):
+                            Path(directory, name).unlink()
+                            deleted += 1
+                for directory, _, _ in os.walk(day, topdown=False):
+                    _remove_empty_folders(Path(directory), trash)
+        if deleted:
+            log.warning("no room on the disk: %d objects of the trash were deleted", deleted)
+        return deleted
+
+    def _copy(self, path: Path, key: str) -> None:
+        writer = self.writer(key)
+        try:
+            with path.open("rb") as file:
+                while piece := file.read(PIECE_BYTES):
+                    writer.write(piece)
+            writer.commit()
+        finally:
+            writer.abort()
 
     def _list_folder(self, folder: Path, begin: str, prefix: str) -> Iterator[ObjectInfo]:
         """The objects in one of the folders, whose keys begin with `begin`."""
@@ -132,12 +232,14 @@ class FolderStore:
             return
         below = prefix.removeprefix(begin) if prefix.startswith(begin) else ""
         start = folder.joinpath(*PurePosixPath(below).parts[: below.count("/")])
-        for directory, _, names in os.walk(start):
+        for directory, folders, names in os.walk(start):
+            if Path(directory) == folder:
+                folders[:] = [name for name in folders if not _is_reserved(name)]
             for name in names:
                 path = Path(directory, name)
                 inside = path.relative_to(folder)
                 key = begin + inside.as_posix()
-                if inside.parts[0] in RESERVED or not key.startswith(prefix) or not is_key(key):
+                if _is_reserved(inside.parts[0]) or not key.startswith(prefix) or not is_key(key):
                     continue
                 if self.path(key) != path:
                     continue  # in the root's own folder of a name that lies elsewhere
@@ -151,7 +253,7 @@ def _room() -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+        if error.errno not in FULL:
             raise
         raise StorageFull(
             "disk_full",
@@ -161,42 +263,71 @@ def _room() -> Iterator[None]:
 
 
 class FolderWriter:
-    """Writes beside the target and renames on `commit`."""
+    """Writes beside the target and renames on `commit`. On a full disk it goes on where
+    `make_room` could delete something."""
 
     @_room()
-    def __init__(self, target: Path, partial: Path) -> None:
+    def __init__(self, target: Path, partial: Path, make_room: Callable[[], bool]) -> None:
         self._target = target
         self._partial = partial
+        self._make_room = make_room
         # Unbuffered: what a full disk did not take is not tried again by closing the file.
-        self._file = partial.open("wb", buffering=0)
+        self._file = create_private_file(partial, buffering=0)
 
     @_room()
     def write(self, data: bytes) -> None:
         left = memoryview(data)
         while left:
-            left = left[self._file.write(left) :]
+            try:
+                left = left[self._file.write(left) :]
+            except OSError as error:
+                if error.errno not in FULL or not self._make_room():
+                    raise
 
     @_room()
     def commit(self) -> None:
         os.fsync(self._file.fileno())
         self._file.close()
-        # The rename has to survive a power cut, too, and so has every folder made for it.
-        changed = [self._target.parent]
-        while not changed[-1].exists():
-            changed.append(changed[-1].parent)
         try:
-            self._target.parent.mkdir(parents=True, exist_ok=True)
+            made = _make_parents(self._target)
             self._partial.replace(self._target)
         except (FileExistsError, IsADirectoryError, NotADirectoryError) as error:
             raise ValueError(
                 f"{self._target.name!r}: one object's key continues another object's key"
             ) from error
-        for folder in changed:
+        for folder in made:
             _sync_folder(folder)
 
     def abort(self) -> None:
         self._file.close()
         self._partial.unlink(missing_ok=True)
+
+
+def _not_found(key: str) -> NotFound:
+    return NotFound("object_not_found", f"The object store has no {key!r}.", key=key)
+
+
+def _is_reserved(name: str) -> bool:
+    """Whether a name directly in one of the folders is the store's own: no object lies there."""
+    return name == PARTIAL or name.startswith(MARK)
+
+
+def _make_parents(file: Path) -> Sequence[Path]:
+    """Create the folders of a file that is to be renamed. Those that changed by that: the rename
+    has to survive a power cut, and so has every folder made for it."""
+    changed = [file.parent]
+    while not changed[-1].exists():
+        changed.append(changed[-1].parent)
+    make_private_folder(file.parent)
+    return changed
+
+
+def _remove_empty_folders(folder: Path, top: Path) -> None:
+    """The folder and those above it, up to `top`, as far as they are empty."""
+    with contextlib.suppress(OSError):
+        while folder.is_relative_to(top):
+            folder.rmdir()
+            folder = folder.parent
 
 
 def _sync_folder(folder: Path) -> None:

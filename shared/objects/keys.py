@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from datetime import date
 from uuid import UUID
 
 from shared.errors import Misconfigured
@@ -15,6 +16,7 @@ MODELS = "models/"
 ORIGINALS = "originals/"
 QUERIES = "queries/"
 THUMBNAILS = "thumbnails/"
+TRASH = "trash/"
 VOCABULARIES = "vocabularies/"
 WHITENINGS = "whitenings/"
 WORK = "work/"
@@ -28,6 +30,7 @@ OWN = (
     ORIGINALS,
     QUERIES,
     THUMBNAILS,
+    TRASH,
     VOCABULARIES,
     WHITENINGS,
     WORK,
@@ -46,6 +49,19 @@ def check_key(key: str) -> str:
     """The key itself; ValueError where it is none."""
     if not is_key(key):
         raise ValueError(f"not an object key: {key!r}")
+    return key
+
+
+def trash_key(key: str, day: date) -> str:
+    """Where an object lies that was moved to the trash on this day (UTC)."""
+    return f"{TRASH}{day.isoformat()}/{key}"
+
+
+def key_before_trash(trashed: str) -> str:
+    """The key that an object of the trash had before. ValueError for no key of `trash_key`."""
+    _, _, key = trashed.removeprefix(TRASH).partition("/")
+    if not trashed.startswith(TRASH) or not key:
+        raise ValueError(f"not a key of the trash: {trashed!r}")
     return key
 
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from shared.objects.folder import FolderStore
 from shared.objects.keys import check_import_prefix
-from shared.objects.port import ObjectStore
+from shared.objects.port import OwnedStore
 from shared.objects.s3 import Bucket, S3Store
 from shared.objects.upload_dir import place_originals
 from shared.settings import Settings
 
 
-def open_store(settings: Settings, *, alone: bool = True) -> ObjectStore:
+def open_store(settings: Settings, *, alone: bool = True) -> OwnedStore:
     """The bucket at S3_ENDPOINT, else the folder PLACEWISE_HOME/objects with UPLOAD_DIR.
 
     `alone` says that no other process writes there: a folder is then tidied of half-written files.

@@ -84,7 +84,33 @@ class ObjectStore(Protocol):
         """Raise Unavailable when objects can't be written now."""
 
 
-class DirectStore(ObjectStore, Protocol):
+class OwnedStore(ObjectStore, Protocol):
+    """A store that belongs to one catalog (`shared.objects.store_owner`) and has a trash.
+
+    A *note* is a small file of the store itself, beside the objects and no object: its name begins
+    with `.placewise`, which no key may do.
+    """
+
+    def move(self, source: str, target: str) -> None:
+        """Give the object another key. `modified_at` becomes the time of the move; an object at
+        `target` is replaced. After a crash it is at `source`, at `target`, or whole at both.
+        NotFound where there is no `source`."""
+
+    def free_trash(self, least_free_bytes: int) -> int:
+        """Delete objects of the trash, oldest day first, until each local disk that has some of it
+        has this much free; how many. 0 for a store on another machine."""
+
+    def read_note(self, name: str) -> bytes | None:
+        """None where there is no note of this name."""
+
+    def write_note(self, name: str, data: bytes, *, replace: bool = True) -> None:
+        """Write the note whole. With `replace=False` one that is there already stays."""
+
+    def delete_note(self, name: str) -> None:
+        """Remove the note; a missing one is not an error."""
+
+
+class DirectStore(OwnedStore, Protocol):
     """A store that callers may send objects to themselves: a bucket."""
 
     def presign_put(

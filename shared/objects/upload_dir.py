@@ -13,10 +13,10 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from shared.errors import Misconfigured
-from shared.home import write_private
 from shared.ids import new_id
 from shared.objects.folder import MARK
 from shared.objects.keys import ORIGINALS
+from shared.private_files import make_private_folder, write_private
 
 NAME = ORIGINALS.rstrip("/")
 
@@ -41,7 +41,7 @@ def place_originals(home: Path, objects: Path, upload_dir: Path | None) -> Mappi
     _check_apart(objects, upload_dir)
     mark = upload_dir / MARK
     try:
-        upload_dir.mkdir(parents=True, exist_ok=True)
+        make_private_folder(upload_dir)
         found = mark.read_text().strip() if mark.exists() else None
         if not os.access(upload_dir, os.W_OK | os.X_OK):
             raise PermissionError(0, "this user may not write there")
@@ -55,7 +55,7 @@ def place_originals(home: Path, objects: Path, upload_dir: Path | None) -> Mappi
                 )
             _check_none_stored(objects / NAME, upload_dir)
             found = str(new_id())
-            mark.write_text(f"{found}\n")
+            write_private(mark, f"{found}\n")
         elif found != before.get("id"):
             raise Misconfigured(
                 "upload_dir_taken",

@@ -6,16 +6,22 @@ What only a bucket does is in `test_s3_store`.
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
+import stat
 import threading
-from collections.abc import Iterable, Iterator
-from datetime import UTC, datetime, timedelta
+from collections.abc import Callable, Iterable, Iterator
+from datetime import UTC, date, datetime, timedelta
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
-from shared.errors import NotFound, Unavailable
-from shared.objects import FolderStore, ObjectStore
+from shared.errors import NotFound, StorageFull, Unavailable
+from shared.objects import FolderStore, ObjectStore, OwnedStore
+from shared.objects.folder import MARK
+from shared.objects.keys import trash_key
 from shared.objects.s3 import S3Store
 from tests.support.servers import S3Server, start_moto
 
@@ -363,8 +369,115 @@ class ObjectStoreContract:
         assert keys_of(store) == []
         assert store.head("originals/large") is None
 
+    # --- of a store that belongs to one catalog ---
+
+    def test_moved_object_has_its_new_key_alone_and_counts_as_written_now(
+        self, store: OwnedStore
+    ) -> None:
+        store.put("originals/a", b"bytes")
+        store.put("trash/2026-11-22/originals/a", b"of an earlier move")
+        if isinstance(store, FolderStore):
+            os.utime(store.path("originals/a"), (0, 0))
+        store.move("originals/a", "trash/2026-11-22/originals/a")
+        assert keys_of(store) == ["trash/2026-11-22/originals/a"]
+        assert store.get("trash/2026-11-22/originals/a") == b"bytes"
+        (info,) = store.list("trash/")
+        assert datetime.now(UTC) - info.modified_at < timedelta(hours=1)
+        store.move("trash/2026-11-22/originals/a", "originals/a")
+        assert keys_of(store) == ["originals/a"]
+        assert store.get("originals/a") == b"bytes"
+
+    @pytest.mark.parametrize("key", ["originals/none", "chunks"])
+    def test_what_is_no_object_can_not_be_moved(self, store: OwnedStore, key: str) -> None:
+        store.put("chunks/a", b"bytes")
+        with pytest.raises(NotFound):
+            store.move(key, "trash/2026-11-22/a")
+        assert keys_of(store) == ["chunks/a"]
+
+    @pytest.mark.parametrize("key", ["originals/a", "chunks/1/a.npy", "a"])
+    def test_key_in_the_trash_is_listed_read_and_deleted_like_any_other(
+        self, store: OwnedStore, key: str
+    ) -> None:
+        trashed = trash_key(key, date(2026, 11, 22))
+        store.put(trashed, b"bytes")
+        for prefix in ("", "trash/", "trash/2026-11-22/", trashed):
+            assert keys_of(store, prefix) == [trashed]
+        for prefix in ("originals/", "trash/2026-11-21/", "trash/2026-11-22/other"):
+            assert keys_of(store, prefix) == []
+        assert store.get(trashed) == b"bytes"
+        store.delete(trashed)
+        assert keys_of(store) == []
+
+    def test_note_is_no_object_and_may_be_written_once_or_again(self, store: OwnedStore) -> None:
+        assert store.read_note(".placewise-test") is None
+        store.write_note(".placewise-test", b"one", replace=False)
+        store.write_note(".placewise-test", b"two", replace=False)
+        assert store.read_note(".placewise-test") == b"one"
+        store.write_note(".placewise-test", b"three")
+        assert store.read_note(".placewise-test") == b"three"
+        assert not [key for key in keys_of(store) if not key.startswith(MARK)]
+        store.delete_note(".placewise-test")
+        store.delete_note(".placewise-test")
+        assert store.read_note(".placewise-test") is None
+        for name in ("originals/a", ".placewise/a", "../.placewise"):
+            with pytest.raises(ValueError):
+                store.read_note(name)
+
 
 class TestFolderStore(ObjectStoreContract):
+    def test_nearly_full_disk_frees_the_oldest_trash_until_there_is_room(
+        self, store: FolderStore, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        days = [date(2026, 11, day) for day in (20, 21, 22)]
+        for day in days:
+            store.put(trash_key("originals/a", day), bytes(1000))
+        store.put("originals/b", b"no garbage")
+
+        def usage(_: Path) -> object:
+            return SimpleNamespace(free=10_000 - 1000 * len(keys_of(store, "trash/")))
+
+        monkeypatch.setattr("shared.objects.folder.shutil.disk_usage", usage)
+        assert store.free_trash(7000) == 0
+        assert store.free_trash(8500) == 2
+        assert keys_of(store) == ["originals/b", trash_key("originals/a", days[-1])]
+        assert [path.name for path in (store.root / "trash").iterdir()] == ["2026-11-22"]
+
+    def test_full_disk_empties_the_trash_and_goes_on_writing(
+        self, store: FolderStore, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        store.put(trash_key("originals/a", date(2026, 11, 22)), b"garbage")
+        writer = store.writer("originals/b")
+        write = writer._file.write
+
+        class FullWhileThereIsTrash:
+            def write(self, data: memoryview) -> int:
+                if keys_of(store, "trash/"):
+                    raise OSError(errno.ENOSPC, "No space left on device")
+                return write(data)
+
+            def __getattr__(self, name: str) -> object:
+                return getattr(file, name)
+
+        file = writer._file
+        monkeypatch.setattr(writer, "_file", FullWhileThereIsTrash())
+        writer.write(b"a photo")
+        writer.commit()
+        assert keys_of(store) == ["originals/b"]
+        assert store.get("originals/b") == b"a photo"
+
+    def test_files_and_folders_are_private_whatever_the_umask_is(self, tmp_path: Path) -> None:
+        before = os.umask(0)
+        try:
+            store = FolderStore(tmp_path / "new" / "objects", {"originals": tmp_path / "photos"})
+            for key in ("originals/a", "chunks/deep/b"):
+                store.put(key, b"bytes")
+            store.move("originals/a", trash_key("originals/a", date(2026, 11, 22)))
+            store.write_note(".placewise", b"owner")
+        finally:
+            os.umask(before)
+        for path in tmp_path.rglob("*"):
+            assert stat.S_IMODE(path.stat().st_mode) == (0o700 if path.is_dir() else 0o600), path
+
     @pytest.mark.parametrize("key", [".partial/a", ".placewise"])
     def test_the_names_of_its_own_files_are_no_keys(self, store: FolderStore, key: str) -> None:
         with pytest.raises(ValueError):
@@ -456,6 +569,19 @@ class TestFolderStoreWithOriginalsElsewhere(ObjectStoreContract):
         assert keys_of(store, "orig") == ["originals-too/4", "originals/1", "originals/deep/2"]
         assert keys_of(store, "originals/d") == ["originals/deep/2"]
 
+    def test_trash_of_another_folder_lies_on_its_own_disk(
+        self, store: FolderStore, tmp_path: Path
+    ) -> None:
+        trashed = trash_key("originals/1", date(2026, 11, 22))
+        store.put("originals/1", b"photo")
+        store.move("originals/1", trashed)
+        assert [path.name for path in (tmp_path / "photos").rglob("1")] == ["1"]
+        assert keys_of(store) == [trashed]
+        assert keys_of(store, "originals/") == []
+        assert store.free_trash(2**62) == 1
+        assert keys_of(store) == []
+        assert not (tmp_path / "photos" / ".placewise-trash").exists()
+
     def test_files_are_half_written_on_the_disk_that_they_are_for(
         self, store: FolderStore, tmp_path: Path
     ) -> None:
@@ -495,6 +621,33 @@ class TestS3Store(ObjectStoreContract):
     @pytest.fixture
     def store(self, s3: S3Server) -> S3Store:
         return S3Store(s3.new_bucket())
+
+    def test_full_store_empties_the_trash_and_goes_on_writing(
+        self, store: S3Store, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        client = store.bucket.client
+        trashed = [trash_key(f"originals/{n}", date(2026, 11, 22)) for n in range(3)]
+        for name in ("put_object", "_upload_part", "copy_object"):
+            for key in trashed:
+                store.put(key, b"garbage")
+            call = getattr(client, name)
+
+            def refuse_while_there_is_trash(
+                *arguments: Any, call: Callable[..., Any] = call, **options: Any
+            ) -> Any:
+                if keys_of(store, "trash/"):
+                    raise StorageFull("object_store_full", "The object store has no room left.")
+                return call(*arguments, **options)
+
+            with monkeypatch.context() as patched:
+                patched.setattr(client, name, refuse_while_there_is_trash)
+                if name == "copy_object":
+                    store.copy("originals/put_object", f"originals/{name}")
+                else:
+                    size = 1000 if name == "put_object" else 6 * MEGABYTE
+                    store.put(f"originals/{name}", bytes(size))
+            assert keys_of(store, "trash/") == []
+            assert store.head(f"originals/{name}") is not None
 
 
 @pytest.fixture(scope="module")

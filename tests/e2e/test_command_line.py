@@ -380,7 +380,8 @@ def test_a_setting_that_can_not_be_read_is_named(tmp_path: Path) -> None:
 def test_doctor_finds_the_running_server(server: ServerProcess, placewise: CommandLine) -> None:
     findings = {finding["part"]: finding for finding in placewise("doctor", "--json").json()}
     assert set(findings) == {
-        *("python", "settings", "folder", "uploads", "server", "vocabulary"),
+        *("python", "settings", "folder", "permissions", "uploads", "collection"),
+        *("server", "vocabulary"),
         *("device", "memory", "extractor"),
     }
     assert all(finding["ok"] for finding in findings.values())

@@ -16,7 +16,7 @@ from services.gateway.keys import NoKeys
 from services.search.worker import SearchWorker
 from shared.catalog.session import Catalog
 from shared.jobs import InProcessHints
-from shared.objects import ObjectStore
+from shared.objects import OwnedStore
 from shared.settings import Settings
 from tests.support.photos import photo_bytes
 
@@ -29,7 +29,7 @@ class Service:
     def __init__(
         self,
         catalog: Catalog,
-        store: ObjectStore,
+        store: OwnedStore,
         settings: Settings,
         make_worker: Callable[[], ExtractorWorker],
     ) -> None:

@@ -116,6 +116,26 @@ def test_a_backup_goes_from_either_database_into_the_other_and_answers_the_same(
     assert report.checked["chunk"] >= 1
 
 
+@pytest.mark.parametrize("is_marked", [True, False])
+def test_restored_catalog_has_the_id_of_its_store_or_else_of_the_backup(
+    service: Service,
+    backed_up: Callable[[], Any],
+    other_catalog: Catalog,
+    other_store: FolderStore,
+    tmp_path: Path,
+    is_marked: bool,
+) -> None:
+    about = backed_up()
+    with other_catalog.write() as session:
+        own = str(ensure_installation(session).id)
+    folder, _ = open_backup(tmp_path / "backup")
+    owner = own if is_marked else None  # as after a first start, which marks the store
+    restore_backup(folder, about, other_catalog, lambda: other_store, IMPORTS, store_owner=owner)
+    with other_catalog.write() as session:
+        restored_id = str(ensure_installation(session).id)
+    assert restored_id == (own if is_marked else about.installation_id)
+
+
 def test_a_backup_taken_again_copies_only_what_is_new_and_forgets_what_is_gone(
     service: Service, backed_up: Callable[[], Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

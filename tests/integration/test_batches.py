@@ -27,8 +27,8 @@ from shared.intake import incoming as incoming_module
 from shared.intake import store_photo as store_photo_module
 from shared.jobs import InProcessHints, Job, JobKind, JobState, free_expired_leases
 from shared.jobs.batches import BatchItem
-from shared.objects import FolderStore, ObjectStore
-from shared.objects.keys import ARCHIVES
+from shared.objects import FolderStore, ObjectStore, OwnedStore
+from shared.objects.keys import ARCHIVES, TRASH
 from shared.objects.s3 import S3Store
 from shared.settings import Settings
 from tests.integration.gateway import Service
@@ -102,7 +102,9 @@ class Batches:
             return list(session.scalars(select(Photo).order_by(Photo.filename)))
 
     def keys(self, prefix: str = "") -> set[str]:
-        return {info.key for info in self.store.list(prefix)}
+        return {
+            info.key for info in self.store.list(prefix) if prefix or not info.key.startswith(TRASH)
+        }
 
 
 @pytest.fixture
@@ -857,7 +859,7 @@ def on_s3(
     """As `batches`, with the objects in a bucket. No photo is described: extractors have others."""
     with catalog.write() as session:
         ensure_default_map(session, settings.extractor)
-    store: ObjectStore = S3Store(s3.new_bucket())
+    store: OwnedStore = S3Store(s3.new_bucket())
     return Batches(Service(catalog, store, settings, make_worker), settings)
 
 

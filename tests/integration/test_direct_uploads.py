@@ -23,6 +23,7 @@ from shared.catalog.photos import Photo
 from shared.catalog.session import Catalog
 from shared.intake.photo_header import read_photo_header
 from shared.objects import FolderStore
+from shared.objects.keys import TRASH
 from shared.objects.s3 import S3Store
 from shared.settings import Settings
 from tests.integration.gateway import Service
@@ -72,7 +73,7 @@ def complete(service: Service, upload: dict[str, Any], **options: Any) -> httpx2
 
 
 def keys(store: S3Store, prefix: str = "") -> set[str]:
-    return {info.key for info in store.list(prefix)}
+    return {info.key for info in store.list(prefix) if prefix or not info.key.startswith(TRASH)}
 
 
 def photos(catalog: Catalog) -> int:

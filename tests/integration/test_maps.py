@@ -39,6 +39,7 @@ from shared.intake.store_photo import store_photo
 from shared.jobs import InProcessHints, Job, JobKind, JobState
 from shared.jobs.batches import BatchItem
 from shared.objects import FolderStore
+from shared.objects.keys import TRASH
 from shared.settings import Settings
 from tests.integration.gateway import Service
 from tests.support.added import none_added
@@ -69,7 +70,7 @@ def rows(catalog: Catalog) -> Counter[str]:
 
 
 def objects(store: FolderStore) -> set[str]:
-    return {info.key for info in store.list("")}
+    return {info.key for info in store.list("") if not info.key.startswith(TRASH)}
 
 
 def id_of(service: Service, name: str) -> UUID:

@@ -11,11 +11,13 @@ from typing import Any
 from uuid import UUID
 
 import pytest
+from prometheus_client import CollectorRegistry
 from sqlalchemy import func, select, update
 
 from services.steward import collect as collect_module
 from services.steward import compact as compact_module
 from services.steward.collect import (
+    CollectionHeld,
     collect,
     collect_deleted_photos,
     collect_ended_generations,
@@ -23,9 +25,11 @@ from services.steward.collect import (
     collect_queries,
     collect_superseded_chunks,
     collect_work,
+    empty_expired_trash,
 )
 from services.steward.compact import compact, merge_slot
 from services.steward.loop import Duty, Steward
+from services.steward.metrics import StewardMetrics
 from services.steward.queue import resend_hints
 from shared.catalog.base import db_now_plus
 from shared.catalog.chunks import Chunk, Descriptor, count_searchable, live_chunks
@@ -40,8 +44,11 @@ from shared.chunks import read_chunk, write_chunk
 from shared.ids import new_id
 from shared.jobs import InProcessHints, Job, JobKind, JobState
 from shared.objects import FolderStore
+from shared.objects.collection_hold import Hold, HoldReason, read_hold, write_hold
 from shared.objects.keys import (
+    TRASH,
     incoming_key,
+    key_before_trash,
     new_original_key,
     new_vocabulary_key,
     query_key,
@@ -49,6 +56,7 @@ from shared.objects.keys import (
     thumbnail_key,
     work_key,
 )
+from shared.objects.trash import TrashSize, restore_trash
 from shared.settings import Settings
 from tests.integration.workplace import same
 from tests.support.catalog_rows import (
@@ -123,7 +131,9 @@ class House:
             )
 
     def objects(self, prefix: str = "") -> set[str]:
-        return {info.key for info in self.store.list(prefix)}
+        return {
+            info.key for info in self.store.list(prefix) if prefix or not info.key.startswith(TRASH)
+        }
 
     def age(self, keys: set[str], seconds: float) -> None:
         then = time.time() - seconds
@@ -497,6 +507,110 @@ def _live_objects(house: House) -> set[str]:
         )
         add_job(session, house.map_id, JobKind.IMPORT, params={"object_key": waiting})
     return house.objects()
+
+
+def test_orphans_lie_in_the_trash_until_their_days_are_over(house: House) -> None:
+    live = _live_objects(house)
+    orphans = {new_original_key(), query_key(new_id())}
+    for key in orphans:
+        house.store.put(key, b"orphan")
+    house.age(orphans, 2 * DAY_SECONDS)
+    assert collect_orphans(house.catalog, house.store, DAY_SECONDS) == 2
+    trashed = house.objects("trash/")
+    assert {key_before_trash(key) for key in trashed} == orphans
+    assert empty_expired_trash(house.catalog, house.store, 7.0) == (0, TrashSize(2, 12))
+    house.age(trashed, 7.1 * DAY_SECONDS)
+    house.age({first := min(trashed)}, 6.9 * DAY_SECONDS)
+    assert empty_expired_trash(house.catalog, house.store, 7.0) == (1, TrashSize(1, 6))
+    assert house.objects("trash/") == {first}
+    assert house.objects() == live
+
+
+def test_what_is_restored_from_the_trash_is_kept_as_long_as_a_new_orphan(house: House) -> None:
+    live, orphan, taken = _live_objects(house), new_original_key(), new_original_key()
+    for key in (orphan, taken):
+        house.store.put(key, b"orphan")
+    house.age({orphan, taken}, 2 * DAY_SECONDS)
+    assert collect_orphans(house.catalog, house.store, DAY_SECONDS) == 2
+    house.store.put(taken, b"another one")
+    restored = {
+        key_before_trash(info.key): back for info, back in restore_trash(house.store, "originals/")
+    }
+    assert restored == {orphan: True, taken: False}
+    assert house.store.get(taken) == b"another one"
+    assert collect_orphans(house.catalog, house.store, DAY_SECONDS) == 0
+    assert house.objects() == live | {orphan, taken}
+    assert len(house.objects("trash/")) == 1
+
+
+def test_collection_of_more_than_a_share_is_held_before_anything_is_moved(
+    house: House, settings: Settings, monkeypatch: pytest.MonkeyPatch, caplog: Any
+) -> None:
+    monkeypatch.setattr(collect_module, "ALWAYS_COLLECTED", 3)
+    monkeypatch.setattr(collect_module, "REMEMBERED", 2)
+    live = _live_objects(house)
+    orphans = {new_original_key() for _ in range(4)}
+    for key in orphans:
+        house.store.put(key, b"orphan")
+    house.age(orphans, 2 * DAY_SECONDS)
+    metrics = StewardMetrics(CollectorRegistry())
+    steward = Steward(house.catalog, house.store, InProcessHints(), settings, metrics)
+    (duty,) = [duty for duty in steward.duties if duty.name == "collect orphans"]
+    share = settings.collect_max_share
+    assert share * len(live | orphans) < 4
+
+    duty.do()
+    assert house.objects() == live | orphans
+    assert house.objects("trash/") == set()
+    assert metrics.collection_held._value.get() == 1
+    assert "4 of" in caplog.text
+    assert caplog.records[-1].levelname == "ERROR"
+    hold = read_hold(house.store)
+    assert hold is not None
+    assert (hold.reason, hold.orphans, hold.orphan_bytes) == (HoldReason.SHARE, 4, 24)
+    with pytest.raises(CollectionHeld):
+        collect_orphans(house.catalog, house.store, DAY_SECONDS, max_share=share)
+
+    assert collect_orphans(house.catalog, house.store, DAY_SECONDS, confirmed=True) == 4
+    assert house.objects() == live
+    assert len(house.objects("trash/")) == 4
+    assert read_hold(house.store) is None
+    duty.do()
+    assert metrics.collection_held._value.get() == 0
+    assert metrics.trash_bytes._value.get() == 24
+
+
+def test_hold_ends_by_itself_once_the_catalog_knows_the_objects_again(
+    house: House, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(collect_module, "ALWAYS_COLLECTED", 0)
+    photo_id, _ = upload(house.catalog, house.store, house.map_id, b"photo")
+    with house.catalog.read() as session:
+        key = session.get_one(Photo, photo_id).object_key
+    house.age({key}, 2 * DAY_SECONDS)
+    house.change(Photo, photo_id, object_key="originals/other")
+    with pytest.raises(CollectionHeld):
+        collect_orphans(house.catalog, house.store, DAY_SECONDS, max_share=0.1)
+    house.change(Photo, photo_id, object_key=key)
+    assert collect_orphans(house.catalog, house.store, DAY_SECONDS, max_share=0.1) == 0
+    assert read_hold(house.store) is None
+
+
+def test_single_orphan_is_held_where_the_catalog_is_behind_or_adopted_the_store(
+    house: House,
+) -> None:
+    house.store.put(orphan := new_original_key(), b"orphan")
+    house.age({orphan}, 2 * DAY_SECONDS)
+    with pytest.raises(CollectionHeld) as caught:
+        collect_orphans(house.catalog, house.store, DAY_SECONDS, catalog_is_behind=lambda *_: True)
+    assert caught.value.hold.reason == HoldReason.CATALOG_BEHIND
+    write_hold(house.store, Hold(HoldReason.ADOPTED, 1, 6, 1))
+    assert collect_orphans(house.catalog, house.store, 3 * DAY_SECONDS) == 0  # it is too young
+    with pytest.raises(CollectionHeld) as caught:
+        collect_orphans(house.catalog, house.store, DAY_SECONDS)
+    assert caught.value.hold.reason == HoldReason.ADOPTED
+    assert house.objects() == {orphan}
+    assert collect_orphans(house.catalog, house.store, DAY_SECONDS, confirmed=True) == 1
 
 
 def test_an_orphan_goes_once_no_row_refers_to_it_any_more(house: House) -> None:

@@ -26,6 +26,7 @@ from shared.jobs import InProcessHints, Job, JobKind, JobState, free_expired_lea
 from shared.jobs.model_changes import cancel_model_change, start_model_change
 from shared.jobs.table import UNFINISHED, get_job
 from shared.objects import FolderStore
+from shared.objects.keys import TRASH
 from shared.recipes import get_recipe
 from shared.settings import Settings
 from shared.vision.decode import decode
@@ -178,7 +179,9 @@ class Workplace:
             return session.get_one(Vocabulary, UUID(str(vocabulary_id)))
 
     def keys(self, prefix: str) -> set[str]:
-        return {info.key for info in self.store.list(prefix)}
+        return {
+            info.key for info in self.store.list(prefix) if prefix or not info.key.startswith(TRASH)
+        }
 
 
 def expected_row(extractor: str, data: bytes, centres: Centres | None = None) -> Rows:

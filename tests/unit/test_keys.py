@@ -16,7 +16,8 @@ from services.gateway.keys import Caller, CatalogKeys, Keys, NoKeys, read_bearer
 from shared.api_keys import Scope, granted, hash_key, is_loopback, new_key, shown_prefix
 from shared.catalog.session import Catalog
 from shared.errors import Forbidden, Unauthorized, Unavailable
-from shared.home import announced, running_server, write_private
+from shared.home import announced, running_server
+from shared.private_files import write_private
 from shared.settings import Settings
 
 KEY = "pw_0123456789abcdef"

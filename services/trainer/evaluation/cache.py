@@ -17,6 +17,7 @@ import numpy as np
 
 from services.trainer.evaluation.describe import Describe, Rows
 from shared.errors import InvalidRequest
+from shared.private_files import FILE_MODE, make_private_folder
 
 BATCH = 32  # rows that are read from the cache together
 ROW_OVERHEAD_BYTES = 100  # of SQLite, for a row: key, page slack
@@ -90,7 +91,8 @@ class CachedDescribe:
             yield from np.asarray(batch, np.float32)
 
     def _open(self) -> sqlite3.Connection:
-        self._folder.mkdir(parents=True, exist_ok=True)
+        make_private_folder(self._folder)
+        self._file.touch(FILE_MODE)
         kept = sqlite3.connect(self._file, timeout=BUSY_SECONDS, isolation_level=None)
         kept.execute("PRAGMA journal_mode = WAL")
         kept.execute("PRAGMA synchronous = NORMAL")

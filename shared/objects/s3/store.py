@@ -2,21 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import contextlib
+import logging
+from collections.abc import Callable, Iterator
 from datetime import UTC
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, TypeVar
 
 from minio.commonconfig import REPLACE, CopySource
 from minio.error import S3Error
 
-from shared.errors import NotFound
-from shared.objects.keys import check_key
+from shared.errors import NotFound, StorageFull, Unavailable
+from shared.objects.folder import MARK
+from shared.objects.keys import TRASH, check_key, is_key
 from shared.objects.port import ObjectInfo, PresignedPut
 from shared.objects.s3.bucket import NO_KEY, Bucket
 from shared.objects.s3.presign import presign_put
 from shared.objects.s3.reader import S3Reader, open_object, read_range
 from shared.objects.s3.writer import S3Writer
+
+log = logging.getLogger(__name__)
+
+T = TypeVar("T")
 
 PROBE = ".placewise-check"  # no object: an upload that is begun and given up
 
@@ -28,7 +35,7 @@ class S3Store:
         self.bucket = bucket
 
     def writer(self, key: str) -> S3Writer:
-        return S3Writer(self.bucket, check_key(key))
+        return S3Writer(self.bucket, check_key(key), self._with_room)
 
     def put(self, key: str, data: bytes) -> None:
         writer = self.writer(key)
@@ -101,14 +108,57 @@ class S3Store:
 
     def copy(self, source: str, target: str) -> None:
         client, bucket = self.bucket.client, self.bucket.name
-        with self.bucket.explained(check_key(source)):
-            # What the sender said of the bytes (a type, an encoding) is not taken over.
-            client.copy_object(
-                bucket,
-                check_key(target),
-                CopySource(bucket, source),
-                metadata_directive=REPLACE,
-            )
+        check_key(source), check_key(target)
+
+        def send() -> None:
+            with self.bucket.explained(source):
+                # What the sender said of the bytes (a type, an encoding) is not taken over.
+                client.copy_object(
+                    bucket, target, CopySource(bucket, source), metadata_directive=REPLACE
+                )
+
+        self._with_room(send)
+
+    def move(self, source: str, target: str) -> None:
+        self.copy(source, target)
+        self.delete(source)
+
+    def free_trash(self, least_free_bytes: int) -> int:
+        return 0  # the server's disk is its own; `_with_room` is for when it says that it is full
+
+    def read_note(self, name: str) -> bytes | None:
+        try:
+            return self.get(_note(name))
+        except NotFound:
+            return None
+
+    def write_note(self, name: str, data: bytes, *, replace: bool = True) -> None:
+        # Not every server knows conditional writes: who must be the first reads it again.
+        if replace or self.read_note(name) is None:
+            self.put(_note(name), data)
+
+    def delete_note(self, name: str) -> None:
+        self.delete(_note(name))
+
+    def _with_room(self, send: Callable[[], T]) -> T:
+        """What `send` returns. Where the store has no room, the trash is emptied first."""
+        try:
+            return send()
+        except StorageFull:
+            if not self._empty_trash():
+                raise
+        return send()
+
+    def _empty_trash(self) -> bool:
+        """Delete what lies in the trash; whether there was something."""
+        deleted = 0
+        with contextlib.suppress(Unavailable):
+            for info in self.list(TRASH):
+                self.delete(info.key)
+                deleted += 1
+        if deleted:
+            log.warning("the object store is full: %d objects of the trash were deleted", deleted)
+        return deleted > 0
 
     def check(self) -> None:
         """Asks whether the bucket is there and may be written to. A full disk shows only when
@@ -121,3 +171,9 @@ class S3Store:
                 raise self.bucket.missing()
             upload_id = client._create_multipart_upload(bucket, PROBE, {})
             client._abort_multipart_upload(bucket, PROBE, upload_id)
+
+
+def _note(name: str) -> str:
+    if not name.startswith(MARK) or not is_key(name) or "/" in name:
+        raise ValueError(f"not the name of a note: {name!r}")
+    return name

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import io
 import logging
+from collections.abc import Callable
+from typing import Any
 
 from minio.datatypes import Part
 
@@ -25,8 +27,12 @@ class S3Writer:
     and the narrow range of its version in pyproject.toml.
     """
 
-    def __init__(self, bucket: Bucket, key: str) -> None:
+    def __init__(
+        self, bucket: Bucket, key: str, with_room: Callable[[Callable[[], Any]], Any]
+    ) -> None:
+        """`with_room` calls what it is given, and once more where room could be made for it."""
         self._bucket = bucket
+        self._with_room = with_room
         self._key = key
         self._buffer = bytearray()
         self._upload_id: str | None = None
@@ -45,8 +51,13 @@ class S3Writer:
     def commit(self) -> None:
         client, bucket = self._bucket.client, self._bucket.name
         if self._upload_id is None:
-            with self._bucket.explained():
-                client.put_object(bucket, self._key, io.BytesIO(self._buffer), len(self._buffer))
+
+            def send() -> None:
+                with self._bucket.explained():
+                    data = io.BytesIO(self._buffer)
+                    client.put_object(bucket, self._key, data, len(self._buffer))
+
+            self._with_room(send)
         else:
             self._send_part()
             with self._bucket.explained():
@@ -77,11 +88,14 @@ class S3Writer:
     def _send_part(self) -> None:
         client, bucket = self._bucket.client, self._bucket.name
         number = len(self._parts) + 1
-        with self._bucket.explained():
-            if self._upload_id is None:
-                self._upload_id = client._create_multipart_upload(bucket, self._key, {})
-            etag = client._upload_part(
-                bucket, self._key, bytes(self._buffer), None, self._upload_id, number
-            )
-        self._parts.append(Part(number, etag))
+
+        def send() -> str:
+            with self._bucket.explained():
+                if self._upload_id is None:
+                    self._upload_id = client._create_multipart_upload(bucket, self._key, {})
+                return client._upload_part(
+                    bucket, self._key, bytes(self._buffer), None, self._upload_id, number
+                )
+
+        self._parts.append(Part(number, self._with_room(send)))
         self._buffer.clear()

@@ -1,0 +1,325 @@
+"""One store for one catalog, and never a start with the objects out of reach."""
+
+from __future__ import annotations
+
+import shutil
+import threading
+from collections.abc import Callable, Iterator
+from enum import StrEnum
+from pathlib import Path
+from uuid import UUID
+
+import pytest
+from sqlalchemy import select
+
+from shared.catalog.installation import (
+    Installation,
+    adopt_store,
+    check_before_new_catalog,
+    ensure_installation,
+    open_own_store,
+)
+from shared.catalog.maps import Map
+from shared.catalog.photos import Photo
+from shared.catalog.session import Catalog
+from shared.errors import Misconfigured
+from shared.ids import new_id
+from shared.objects import ObjectStore, OwnedStore
+from shared.objects.folder import MARK, FolderStore
+from shared.objects.open_store import open_store
+from shared.objects.s3 import Bucket, S3Store
+from shared.objects.store_owner import read_owner
+from shared.settings import Settings
+from tests.support.catalog_rows import add_map, upload
+from tests.support.servers import PostgresServer, S3Server
+
+
+@pytest.fixture
+def bucket(s3: S3Server) -> Bucket:
+    return s3.new_bucket()
+
+
+@pytest.fixture
+def other_catalog(migrated_sqlite: Path, tmp_path: Path) -> Iterator[Catalog]:
+    copy = shutil.copy(migrated_sqlite, tmp_path / "other.sqlite")
+    opened = Catalog(f"sqlite:///{copy}")
+    yield opened
+    opened.close()
+
+
+@pytest.fixture
+def started(s3: S3Server, tmp_path: Path) -> Callable[[Catalog, Bucket], ObjectStore]:
+    """What each service does at its start."""
+
+    def start(catalog: Catalog, bucket: Bucket) -> ObjectStore:
+        settings = Settings(placewise_home=tmp_path / "home", **s3.variables(bucket.name))
+        return open_own_store(catalog, settings, alone=False)
+
+    return start
+
+
+Started = Callable[[Catalog, Bucket], ObjectStore]
+
+
+def refused(started: Started, catalog: Catalog, bucket: Bucket, code: str) -> str:
+    with pytest.raises(Misconfigured) as caught:
+        started(catalog, bucket)
+    assert caught.value.code == code
+    return caught.value.detail
+
+
+def copied(source: Bucket, target: Bucket) -> None:
+    for info in S3Store(source).list(""):
+        S3Store(target).put(info.key, S3Store(source).get(info.key))
+
+
+def test_an_installation_has_one_id_for_ever(catalog: Catalog) -> None:
+    with catalog.write() as session:
+        first = ensure_installation(session).id
+    with catalog.write() as session:
+        assert ensure_installation(session).id == first
+        assert len(session.scalars(select(Installation)).all()) == 1
+
+
+def test_two_catalogs_have_two_ids(catalog: Catalog, other_catalog: Catalog) -> None:
+    ids = set()
+    for one in (catalog, other_catalog):
+        with one.write() as session:
+            ids.add(ensure_installation(session).id)
+    assert len(ids) == 2
+
+
+def test_empty_bucket_is_taken_and_taken_again_at_the_next_start(
+    started: Started, catalog: Catalog, bucket: Bucket
+) -> None:
+    started(catalog, bucket).put("originals/a", b"x")
+    started(catalog, bucket)
+    with catalog.read() as session:
+        owner = ensure_installation(session).id
+    assert S3Store(bucket).get(MARK).decode() == str(owner)
+
+
+def test_services_that_start_together_agree_on_the_bucket(
+    started: Started, catalog: Catalog, bucket: Bucket
+) -> None:
+    opened: list[ObjectStore] = []
+    threads = [
+        threading.Thread(target=lambda: opened.append(started(catalog, bucket))) for _ in range(4)
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(opened) == 4
+
+
+def test_bucket_of_another_catalog_is_refused(
+    started: Started, catalog: Catalog, other_catalog: Catalog, bucket: Bucket
+) -> None:
+    started(catalog, bucket)
+    said = refused(started, other_catalog, bucket, "bucket_taken")
+    assert bucket.name in said
+    assert "DATABASE_URL" in said
+
+
+def test_bucket_with_other_things_in_it_is_refused_and_left_alone(
+    started: Started, catalog: Catalog, bucket: Bucket
+) -> None:
+    S3Store(bucket).put("thumbnails/theirs", b"x")
+    refused(started, catalog, bucket, "bucket_taken")
+    assert [info.key for info in S3Store(bucket).list("")] == ["thumbnails/theirs"]
+
+
+def test_another_bucket_than_the_one_of_before_is_refused(
+    started: Started, catalog: Catalog, bucket: Bucket, s3: S3Server
+) -> None:
+    started(catalog, bucket)
+    assert bucket.name in refused(started, catalog, s3.new_bucket(), "object_store_changed")
+
+
+def test_copy_of_the_whole_bucket_is_the_same_bucket(
+    started: Started, catalog: Catalog, bucket: Bucket, s3: S3Server
+) -> None:
+    started(catalog, bucket)
+    moved = s3.new_bucket()
+    copied(bucket, moved)
+    started(catalog, moved)
+    refused(started, catalog, s3.new_bucket(), "object_store_changed")
+
+
+def test_restored_backup_of_the_catalog_keeps_its_bucket(
+    started: Started, postgres: PostgresServer, migrated_postgres: str, bucket: Bucket
+) -> None:
+    url = postgres.new_database(migrated_postgres)
+    before = Catalog(url)
+    started(before, bucket).put("originals/a", b"x")
+    before.close()
+    restored = Catalog(postgres.new_database(url.rsplit("/", 1)[1]))
+    assert started(restored, bucket).get("originals/a") == b"x"
+    restored.close()
+
+
+def test_home_with_objects_in_its_folder_takes_no_bucket(
+    started: Started, catalog: Catalog, bucket: Bucket, tmp_path: Path
+) -> None:
+    store = FolderStore(tmp_path / "home" / "objects")
+    half = store.writer("originals/half")
+    half.write(b"no object yet")
+    store.put("originals/a", b"x")
+    refused(started, catalog, bucket, "object_store_changed")
+    store.delete("originals/a")
+    assert list((tmp_path / "home" / "objects" / ".partial").iterdir())
+    started(catalog, bucket)
+    half.abort()
+
+
+def test_catalog_with_objects_in_a_bucket_takes_no_folder(
+    started: Started, catalog: Catalog, bucket: Bucket, tmp_path: Path
+) -> None:
+    started(catalog, bucket)
+    with pytest.raises(Misconfigured) as caught:
+        open_own_store(catalog, Settings(placewise_home=tmp_path / "home"), alone=False)
+    assert caught.value.code == "object_store_changed"
+    assert bucket.name in caught.value.detail
+
+
+# --- a folder, and what holds for both ---------------------------------------------------------
+
+
+class Kind(StrEnum):
+    FOLDER = "folder"
+    BUCKET = "bucket"
+
+
+@pytest.fixture(params=list(Kind))
+def used(request: pytest.FixtureRequest, tmp_path: Path) -> Settings:
+    """Settings with a store that was never used: a folder or a bucket."""
+    home = tmp_path / "home"
+    if request.param == Kind.FOLDER:
+        return Settings(placewise_home=home)
+    server: S3Server = request.getfixturevalue("s3")
+    return Settings(placewise_home=home, **server.variables(server.new_bucket().name))
+
+
+TAKEN = ("folder_taken", "bucket_taken")
+
+
+def photo_of_before(catalog: Catalog, settings: Settings) -> OwnedStore:
+    """The store as a release left it that marked no folder: with a photo of the catalog."""
+    store = open_store(settings)
+    with catalog.write() as session:
+        map_id = add_map(session).id
+    upload(catalog, store, map_id, b"photo")
+    return store
+
+
+def test_store_of_another_catalog_is_refused_and_the_ways_out_are_named(
+    used: Settings, catalog: Catalog, other_catalog: Catalog
+) -> None:
+    open_own_store(catalog, used, alone=False).put("originals/a", b"x")
+    with pytest.raises(Misconfigured) as caught:
+        open_own_store(other_catalog, used, alone=False)
+    assert caught.value.code in TAKEN
+    for way in ("Restore the catalog", "placewise rebuild-catalog", "placewise storage adopt"):
+        assert way in caught.value.detail
+    assert open_own_store(catalog, used, alone=False).get("originals/a") == b"x"
+
+
+def test_store_without_a_mark_is_marked_where_the_catalog_knows_its_photos(
+    used: Settings, catalog: Catalog, other_catalog: Catalog
+) -> None:
+    store = photo_of_before(catalog, used)
+    lost, _ = upload(catalog, store, _map_of(catalog), b"lost")
+    with catalog.read() as session:
+        store.delete(session.get_one(Photo, lost).object_key)  # one of them, by another fault
+    assert read_owner(store) is None
+    with pytest.raises(Misconfigured) as caught:
+        open_own_store(other_catalog, used, alone=False)
+    assert caught.value.code in TAKEN
+    assert read_owner(store) is None
+    open_own_store(catalog, used, alone=False)
+    with catalog.write() as session:
+        assert read_owner(store) == str(ensure_installation(session).id)
+
+
+def _map_of(catalog: Catalog) -> UUID:
+    with catalog.read() as session:
+        return session.scalars(select(Map.id)).one()
+
+
+def test_store_of_strange_objects_is_refused_by_a_catalog_with_photos_of_its_own(
+    used: Settings, catalog: Catalog, tmp_path: Path
+) -> None:
+    photo_of_before(catalog, Settings(placewise_home=tmp_path / "elsewhere"))
+    open_store(used).put(f"originals/{new_id()}", b"of another one")
+    with pytest.raises(Misconfigured) as caught:
+        open_own_store(catalog, used, alone=False)
+    assert caught.value.code in TAKEN
+
+
+def test_empty_store_is_refused_by_a_catalog_with_photos(
+    used: Settings, catalog: Catalog, tmp_path: Path
+) -> None:
+    photo_of_before(catalog, Settings(placewise_home=tmp_path / "elsewhere"))
+    with pytest.raises(Misconfigured, match="mounted") as caught:
+        open_own_store(catalog, used, alone=False)
+    assert caught.value.code == "object_store_changed"
+
+
+def test_files_of_people_and_of_queries_do_not_keep_a_catalog_from_a_folder(
+    catalog: Catalog, tmp_path: Path
+) -> None:
+    settings = Settings(placewise_home=tmp_path / "home", upload_dir=tmp_path / "photos")
+    settings.placewise_home.mkdir()
+    store = open_store(settings)
+    for key in ("imports/city/1.jpg", "originals/holiday.jpg", f"queries/{new_id()}"):
+        store.put(key, b"theirs")
+    open_own_store(catalog, settings, alone=False)
+
+
+def test_two_catalogs_that_start_together_never_share_a_folder(
+    catalog: Catalog, other_catalog: Catalog, tmp_path: Path
+) -> None:
+    settings = Settings(placewise_home=tmp_path / "home")
+    barrier, outcomes = threading.Barrier(2), list[str]()
+
+    def start(one: Catalog) -> None:
+        barrier.wait()
+        try:
+            open_own_store(one, settings, alone=False)
+            outcomes.append("owner")
+        except Misconfigured as error:
+            outcomes.append(error.code)
+
+    threads = [threading.Thread(target=start, args=(one,)) for one in (catalog, other_catalog)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert sorted(outcomes) == ["folder_taken", "owner"]
+
+
+def test_new_catalog_is_not_even_created_beside_a_used_store(
+    used: Settings, catalog: Catalog, tmp_path: Path
+) -> None:
+    new = Catalog(f"sqlite:///{tmp_path / 'new.sqlite'}")
+    check_before_new_catalog(new, used)
+    open_own_store(catalog, used, alone=False)
+    with pytest.raises(Misconfigured) as caught:
+        check_before_new_catalog(new, used)
+    assert caught.value.code in TAKEN
+    assert not (tmp_path / "new.sqlite").exists()
+    check_before_new_catalog(other := Catalog(str(catalog.url)), used)  # one that exists
+    for opened in (new, other):
+        opened.close()
+
+
+def test_adopted_store_belongs_to_the_new_catalog_alone(
+    used: Settings, catalog: Catalog, other_catalog: Catalog
+) -> None:
+    store = open_own_store(catalog, used, alone=False)
+    adopt_store(other_catalog, store)
+    open_own_store(other_catalog, used, alone=False)
+    with pytest.raises(Misconfigured) as caught:
+        open_own_store(catalog, used, alone=False)
+    assert caught.value.code in TAKEN

@@ -1,0 +1,207 @@
+"""The catalog removed, another one, or an older one: no original of the store is deleted.
+
+Orphans of any age may be collected here (ORPHAN_AGE_SECONDS=0), and each start of a server collects
+at once.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from subprocess import CompletedProcess
+from typing import Any
+
+import pytest
+
+from shared.objects import OwnedStore
+from shared.objects.keys import ORIGINALS, TRASH, key_before_trash
+from shared.objects.open_store import open_store
+from shared.settings import Settings
+from tests.support.metrics import read
+from tests.support.photos import photo_bytes
+from tests.support.server import ServerProcess, environment, run_command
+from tests.support.servers import S3Server
+
+WAIT_SECONDS = 60.0
+EARLY, LATE = 2, 3  # photos before and after the catalog was copied
+SETTINGS = {"orphan_age_seconds": 0, "auto_fit_photos": 1000, "auto_evaluate_photos": 0}
+
+
+@dataclass
+class Filled:
+    """A home whose server has ended, and a copy of its catalog from before the last photos."""
+
+    home: Path
+    older_catalog: Path
+    settings: dict[str, Any]
+
+    def copy(self, target: Path) -> Filled:
+        """The same, for a test that changes it. A bucket stays the same one."""
+        shutil.copytree(self.home, target)
+        return Filled(target, self.older_catalog, self.settings)
+
+    @property
+    def store(self) -> OwnedStore:
+        return open_store(Settings(placewise_home=self.home, **self.settings), alone=False)
+
+    def originals(self) -> set[str]:
+        return {info.key for info in self.store.list(ORIGINALS)}
+
+    def kept(self) -> set[str]:
+        """The keys of all objects, those in the trash by the keys that they had before."""
+        keys = {info.key for info in self.store.list("")}
+        return {key_before_trash(key) if key.startswith(TRASH) else key for key in keys}
+
+    def remove_catalog(self) -> None:
+        for file in self.home.glob("catalog.sqlite*"):
+            file.unlink()
+
+    def server(self, **more: Any) -> ServerProcess:
+        return ServerProcess(self.home, **self.settings, **more)
+
+    def command(self, *arguments: str, **more: Any) -> CompletedProcess[str]:
+        env = environment(self.home, **SETTINGS, **self.settings, **more)
+        return run_command(*arguments, env=env, cwd=self.home.parent)
+
+    def check_refused(self, *arguments: str, **more: Any) -> None:
+        done = self.command(*arguments, **more)
+        assert done.returncode == 1, done.stderr
+        assert "folder_taken" in done.stderr or "bucket_taken" in done.stderr
+        assert "placewise rebuild-catalog" in done.stderr
+        assert "placewise storage adopt" in done.stderr
+
+
+@pytest.fixture(scope="module", params=["folder", "bucket"])
+def filled_once(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Filled:
+    folder = tmp_path_factory.mktemp(request.param)
+    variables: dict[str, Any] = {}
+    if request.param == "bucket":
+        server: S3Server = request.getfixturevalue("s3")
+        variables = server.variables(server.new_bucket().name)
+    filled = Filled(folder / "home", folder / "older.sqlite", variables)
+    with filled.server() as running:
+        _fill(running, range(EARLY))
+        assert running.stop() == 0
+        shutil.copy(filled.home / "catalog.sqlite", filled.older_catalog)
+        running.start()
+        _fill(running, range(EARLY, EARLY + LATE))
+        assert running.stop() == 0
+    assert len(filled.originals()) == EARLY + LATE
+    return filled
+
+
+@pytest.fixture
+def filled(filled_once: Filled, tmp_path: Path) -> Iterator[Filled]:
+    """A copy of the home. Of a bucket nothing may be missing at the end of a test."""
+    before = filled_once.kept()
+    yield filled_once.copy(tmp_path / "copied")
+    assert filled_once.kept() == before
+
+
+def _fill(running: ServerProcess, numbers: range) -> None:
+    for number in numbers:
+        photo = {"file": ("photo.jpg", photo_bytes(number))}
+        assert running.client.post("/api/v1/upload", files=photo).status_code == 202
+    _wait_for(lambda: _searchable(running) == numbers.stop)
+
+
+def _searchable(running: ServerProcess) -> int:
+    (found,) = running.client.get("/api/v1/maps").json()
+    return int(found["searchable"])
+
+
+def _wait_for(condition: Any) -> None:
+    deadline = time.monotonic() + WAIT_SECONDS
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
+
+
+def _figures(running: ServerProcess) -> dict[str, dict[tuple[tuple[str, str], ...], float]]:
+    return read(running.client.get("/metrics").text)
+
+
+def _wait_for_collection(running: ServerProcess) -> None:
+    done = (("duty", "collect_orphans"), ("outcome", "done"))
+    _wait_for(lambda: _figures(running).get("placewise_steward_duties_total", {}).get(done, 0) >= 1)
+
+
+def test_removed_catalog_stops_every_start_and_no_object_is_touched(filled: Filled) -> None:
+    before = {info.key for info in filled.store.list("")}
+    filled.remove_catalog()
+    filled.check_refused("serve")
+    assert not (filled.home / "catalog.sqlite").exists(), "a restored file would meet it"
+    assert {info.key for info in filled.store.list("")} == before
+
+
+def test_wrong_catalog_stops_every_start_and_no_object_is_touched(
+    filled: Filled, migrated_sqlite: Path, tmp_path: Path
+) -> None:
+    before = {info.key for info in filled.store.list("")}
+    wrong = shutil.copy(migrated_sqlite, tmp_path / "wrong.sqlite")
+    for command in ("serve", "steward", "verify"):
+        filled.check_refused(
+            command,
+            database_url=f"sqlite:///{wrong}",
+            redis_url="redis://127.0.0.1:1/0",
+            **({} if command == "serve" else {"search_urls": "http://127.0.0.1:1"}),
+        )
+    assert {info.key for info in filled.store.list("")} == before
+
+
+def test_older_catalog_deletes_no_original(filled: Filled) -> None:
+    # With the hold of a catalog that is behind its store, none is moved either: the originals are
+    # then the same before and after, and `placewise_steward_collection_held` is 1.
+    before, originals = filled.kept(), filled.originals()
+    filled.remove_catalog()
+    shutil.copy(filled.older_catalog, filled.home / "catalog.sqlite")
+    with filled.server(**SETTINGS) as running:
+        assert _searchable(running) == EARLY
+        _wait_for_collection(running)
+        assert running.stop() == 0
+    assert filled.kept() >= originals
+    assert filled.kept() == before
+    done = filled.command("storage", "restore-trash", "--json")
+    assert done.returncode == 0, done.stderr
+    assert filled.originals() == originals
+
+
+def test_adopted_store_keeps_what_its_new_catalog_does_not_know(filled: Filled) -> None:
+    originals, before = filled.originals(), {info.key for info in filled.store.list("")}
+    owner = filled.store.read_note(".placewise")
+    assert owner is not None
+    filled.remove_catalog()
+    shown = filled.command("storage", "adopt", "--json")
+    assert shown.returncode == 0, shown.stderr
+    said = json.loads(shown.stdout)
+    assert said["adopted"] is False
+    assert said["unknown"]["originals/"]["objects"] == len(originals)
+    filled.check_refused("serve")
+
+    assert filled.command("storage", "adopt", "--confirm").returncode == 0
+    with filled.server(**SETTINGS) as running:
+        _wait_for_collection(running)
+        assert _figures(running)["placewise_steward_collection_held"] == {(): 1}
+        assert filled.originals() == originals
+        findings = json.loads(filled.command("doctor", "--json").stdout)
+        (found,) = [one for one in findings if one["part"] == "collection"]
+        assert not found["ok"]
+        assert "storage collect" in found["detail"]
+        listed = json.loads(filled.command("storage", "collect", "--json").stdout)
+        assert (listed["moved"], listed["held"]) == (0, "adopted")
+        confirmed = json.loads(filled.command("storage", "collect", "--confirm", "--json").stdout)
+        assert confirmed["moved"] >= len(originals)
+        assert filled.originals() == set()
+        assert filled.kept() >= originals
+        verified = json.loads(filled.command("verify", "--json").stdout)
+        assert verified["trash_objects"] == confirmed["moved"]
+        assert verified["trash_bytes"] > 0
+        back = json.loads(filled.command("storage", "restore-trash", "--json").stdout)
+        assert back == {"restored": confirmed["moved"], "kept_in_trash": 0}
+    assert filled.originals() == originals
+    filled.store.write_note(".placewise", owner)  # of the bucket, for the other tests
+    assert {info.key for info in filled.store.list("")} >= before

@@ -1,0 +1,117 @@
+"""What is stored can be read by the service's own user alone, whatever the umask is."""
+
+from __future__ import annotations
+
+import os
+import stat
+from collections.abc import Iterator, Sequence
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from services.cli.store_checks import permissions_check
+from services.search.local_files import LocalFiles
+from services.trainer.evaluation.cache import CachedDescribe
+from shared.backup.folder import BackupFolder, Kept
+from shared.backup.rows import dump_rows
+from shared.catalog.schema import migrate
+from shared.catalog.session import Catalog
+from shared.errors import Misconfigured
+from shared.home import announced, lock_home
+from shared.objects import FolderStore
+from shared.objects.upload_dir import place_originals
+from shared.private_files import create_private_file, make_private_folder
+from shared.settings import Settings
+
+
+@pytest.fixture
+def no_umask() -> Iterator[None]:
+    """As in a shell in which every new file can be read and written by everyone."""
+    before = os.umask(0)
+    yield
+    os.umask(before)
+
+
+def check_private(folder: Path) -> int:
+    found = [folder, *folder.rglob("*")]
+    for path in found:
+        assert stat.S_IMODE(path.stat().st_mode) == (0o700 if path.is_dir() else 0o600), path
+    return len(found)
+
+
+@pytest.mark.usefixtures("no_umask")
+def test_home_catalog_and_marks_are_private(tmp_path: Path) -> None:
+    home = tmp_path / "deep" / "home"
+    with lock_home(home), announced(home, "http://localhost"):
+        catalog = Catalog(f"sqlite:///{home / 'catalog.sqlite'}")
+        migrate(catalog)
+        place_originals(home, home / "objects", home / "photos")
+        with catalog.write():
+            assert {path.name for path in home.iterdir()} >= {
+                "catalog.sqlite-wal",
+                "catalog.sqlite-shm",
+                "server.lock",
+                "server.json",
+            }
+            check_private(tmp_path / "deep")
+        catalog.close()
+
+
+@pytest.mark.usefixtures("no_umask")
+def test_backup_is_private(migrated_sqlite: Path, tmp_path: Path) -> None:
+    folder = BackupFolder(tmp_path / "backup")
+    folder.open_for_writing()
+    catalog = Catalog(f"sqlite:///{migrated_sqlite}")
+    with folder.locked(), catalog.read() as session:
+        dump_rows(session, folder.path / "catalog-1", lambda *_: None)
+        folder.objects.put("originals/a", b"photo")
+        folder.note(Kept("originals/a", 5, "0" * 64, "2026-11-22T00:00:00+00:00"))
+        assert check_private(folder.path) > 10
+    catalog.close()
+
+
+@pytest.mark.usefixtures("no_umask")
+def test_caches_are_private(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def describe(photos: Sequence[Path]) -> Iterator[Any]:
+        yield np.zeros((len(photos), 4), np.float32)
+
+    describe.seconds, describe.photos = 0.0, 0  # type: ignore[attr-defined]
+    (tmp_path / "photo.jpg").write_bytes(b"photo")
+    kept = CachedDescribe(describe, tmp_path / "rows", {}, most_bytes=10**9)  # type: ignore[arg-type]
+    list(kept([tmp_path / "photo.jpg"]))
+    store = FolderStore(tmp_path / "objects")
+    store.put("chunks/a.npy", b"rows")
+    monkeypatch.setattr(store, "file", lambda key: None)  # as a bucket
+    LocalFiles(store, tmp_path / "search").map("chunks/a.npy", sha256(b"rows").hexdigest())
+    for folder in ("rows", "search"):
+        assert check_private(tmp_path / folder) > 1
+
+
+def test_folder_that_exists_keeps_its_mode_and_a_file_is_no_folder(tmp_path: Path) -> None:
+    (tmp_path / "wide").mkdir(0o755)
+    make_private_folder(tmp_path / "wide")
+    assert stat.S_IMODE((tmp_path / "wide").stat().st_mode) == 0o755
+    with create_private_file(tmp_path / "file") as file:
+        file.write(b"x")
+    for path in (tmp_path / "file", tmp_path / "file" / "below"):
+        with pytest.raises(NotADirectoryError):
+            make_private_folder(path)
+
+
+def test_doctor_names_what_others_can_read_and_how_to_change_it(tmp_path: Path) -> None:
+    home, photos = tmp_path / "home", tmp_path / "photos"
+    settings = Settings(placewise_home=home, upload_dir=photos)
+    assert "nothing" in permissions_check(settings)
+    home.mkdir(0o755)
+    photos.mkdir(0o750)
+    (home / "catalog.sqlite").touch(0o644)
+    with pytest.raises(Misconfigured) as caught:
+        permissions_check(settings)
+    assert f"chmod -R go-rwx '{home}' '{photos}' '{home / 'catalog.sqlite'}'" in caught.value.detail
+    assert stat.S_IMODE(home.stat().st_mode) == 0o755, "it changes nothing by itself"
+    for folder in (home, photos):
+        folder.chmod(0o700)
+    assert "only this user" in permissions_check(settings)
