@@ -172,6 +172,7 @@ def _vocabulary(settings: Settings) -> str:
 def _server(settings: Settings) -> str:
     running = running_server(settings.placewise_home)
     if running is not None:
+        gateway_check(running.url, running.key)
         with Client(running.url, key=running.key) as client:
             maps = client.maps()
         searchable, photos = sum(m["searchable"] for m in maps), sum(m["photos"] for m in maps)

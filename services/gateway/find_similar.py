@@ -165,6 +165,7 @@ def search(gateway: Gateway, query: Query, wanted: Wanted) -> Found:
         rows_scanned=response.rows_scanned,
         rows_reranked=response.rows_reranked,
         snapshot_version=response.snapshot_version,
+        degraded=bool(response.missing),
         missing=list(response.missing),
     )
     history = Search(

@@ -12,11 +12,13 @@ from prometheus_client import CollectorRegistry
 from sqlalchemy.exc import SQLAlchemyError
 
 from services.steward.auto_evaluate import evaluate_changed_maps
+from services.steward.batches.worker import resume_batches
 from services.steward.collect import collect, collect_orphans
 from services.steward.compact import compact
 from services.steward.count_maps import count_large_maps
 from services.steward.counted_store import CountedStore
 from services.steward.delete_maps import delete_maps
+from services.steward.mend_generations import mend_generations
 from services.steward.metrics import StewardMetrics
 from services.steward.model_changes import advance_model_changes, fit_maps_that_wait
 from services.steward.queue import free_leases, resend_hints
@@ -32,6 +34,7 @@ from shared.catalog.session import Catalog
 from shared.heartbeat import Heartbeat
 from shared.jobs import Hints
 from shared.objects import ObjectStore
+from shared.read_retries import ReadRetries
 from shared.settings import Settings
 
 log = logging.getLogger(__name__)
@@ -61,6 +64,7 @@ class Steward:
         self._metrics = metrics = metrics or StewardMetrics(CollectorRegistry())
         self._outage = Outage("steward")
         self._heartbeat = Heartbeat(settings.heartbeat_file)
+        merge_retries = ReadRetries()
 
         def counted(duty: str) -> CountedStore:
             return CountedStore(store, metrics.objects_deleted.labels(duty).inc)
@@ -79,6 +83,8 @@ class Steward:
                 0.5,
                 lambda: advance_model_changes(catalog, hints),
             ),
+            Duty("mend generations", 5.0, lambda: mend_generations(catalog, store)),
+            Duty("resume batches", 5.0, lambda: resume_batches(catalog, settings)),
             Duty("remove dead search workers", 2.0, lambda: remove_dead_workers(catalog)),
             Duty(
                 "fit maps that wait",
@@ -89,7 +95,9 @@ class Steward:
             Duty(
                 "compact",
                 5.0,
-                lambda: metrics.slots_merged.inc(compact(catalog, store, settings.compact_chunks)),
+                lambda: metrics.slots_merged.inc(
+                    compact(catalog, store, settings.compact_chunks, merge_retries)
+                ),
             ),
             Duty("delete maps", 1.0, lambda: delete_maps(catalog, counted("delete_maps"))),
             Duty("collect", 10.0, lambda: collect(catalog, counted("collect"), settings)),
