@@ -28,6 +28,7 @@ from services.cli.service_checks import (
 )
 from shared.catalog.open_catalog import open_catalog
 from shared.catalog.photos import Photo
+from shared.catalog.unusable import check_pages
 from shared.client import Client
 from shared.errors import Misconfigured, PlacewiseError
 from shared.home import running_server
@@ -182,6 +183,7 @@ def _server(settings: Settings) -> str:
         return "not running, and nothing is stored yet (start it: make run)"
     catalog = open_catalog(settings, "doctor")
     try:
+        check_pages(catalog, max_bytes=None)
         with catalog.read() as session:
             photos = session.scalar(
                 select(func.count()).select_from(Photo).where(Photo.deleted_at.is_(None))

@@ -31,6 +31,8 @@ from services.steward.retention import (
 from services.steward.search_workers import remove_dead_workers
 from shared.catalog.away import Outage
 from shared.catalog.session import Catalog
+from shared.catalog.unusable import sqlite_file
+from shared.disk_reserve import DiskReserve
 from shared.heartbeat import Heartbeat
 from shared.jobs import Hints
 from shared.objects import ObjectStore
@@ -69,7 +71,11 @@ class Steward:
         def counted(duty: str) -> CountedStore:
             return CountedStore(store, metrics.objects_deleted.labels(duty).inc)
 
+        # Of the catalog's own disk, where it is a file.
+        catalog_file = sqlite_file(catalog)
+        reserve = catalog_file and DiskReserve(catalog_file.parent, settings.min_free_bytes)
         self.duties = [
+            *([Duty("keep disk reserve", 5.0, reserve.keep)] if reserve else []),
             Duty(
                 "free leases",
                 1.0,

@@ -9,12 +9,14 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
+import shutil
 import stat
 from collections.abc import Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path, PurePosixPath
 from typing import BinaryIO
 
+from shared.disk_reserve import DISK_FULL
 from shared.errors import NotFound, StorageFull, Unavailable
 from shared.ids import new_id
 from shared.objects.keys import check_key, is_key
@@ -26,6 +28,7 @@ PARTIAL = ".partial"  # the folder of files being written: same file system, so 
 MARK = ".placewise"  # the file that says whose folder it is (`shared.objects.upload_dir`)
 RESERVED = (PARTIAL, MARK)
 FULL_RETRY_SECONDS = 60
+KEPT_FREE_BYTES = 16 * 1024 * 1024  # the last of the disk is the catalog's: it deletes with that
 
 
 class FolderStore:
@@ -107,6 +110,8 @@ class FolderStore:
                 probe.write_bytes(b"ok")
                 probe.unlink()
             except OSError as error:
+                if error.errno in DISK_FULL:
+                    raise _full() from error
                 raise Unavailable(
                     "object_store_unavailable",
                     f"Can't write below {folder.name}: {error.strerror}. "
@@ -151,13 +156,17 @@ def _room() -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+        if error.errno not in DISK_FULL:
             raise
-        raise StorageFull(
-            "disk_full",
-            "The disk of the object store is full: make room on it, or delete photos or maps.",
-            retry_after_seconds=FULL_RETRY_SECONDS,
-        ) from error
+        raise _full() from error
+
+
+def _full() -> StorageFull:
+    return StorageFull(
+        "disk_full",
+        "The disk of the object store is full: make room on it, or delete photos or maps.",
+        retry_after_seconds=FULL_RETRY_SECONDS,
+    )
 
 
 class FolderWriter:
@@ -167,6 +176,8 @@ class FolderWriter:
     def __init__(self, target: Path, partial: Path) -> None:
         self._target = target
         self._partial = partial
+        if shutil.disk_usage(partial.parent).free < KEPT_FREE_BYTES:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         # Unbuffered: what a full disk did not take is not tried again by closing the file.
         self._file = partial.open("wb", buffering=0)
 
