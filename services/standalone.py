@@ -48,6 +48,7 @@ from shared.catalog.open_catalog import open_catalog
 from shared.catalog.schema import migrate
 from shared.catalog.search_workers import forget_dead_workers
 from shared.catalog.session import Catalog
+from shared.catalog.unusable import sqlite_file
 from shared.disk_reserve import DiskReserve
 from shared.errors import Misconfigured
 from shared.home import announced, lock_home
@@ -105,9 +106,10 @@ def standalone(settings: Settings) -> Iterator[Standalone]:
     home = settings.placewise_home
     with contextlib.ExitStack() as held:
         held.enter_context(lock_home(home))
-        DiskReserve(home, settings.min_free_bytes).release()
         listener = held.enter_context(listening(settings.host, settings.port))
         catalog = open_catalog(settings, "embedded")
+        if (file := sqlite_file(catalog)) is not None:
+            DiskReserve(file.parent, settings.min_free_bytes).release()
         migrate(catalog)
         store = open_own_store(catalog, settings, alone=True)
         hints = InProcessHints()

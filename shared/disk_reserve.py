@@ -33,8 +33,10 @@ class DiskReserve:
 
     def release(self) -> None:
         """Delete the reserve when the disk is nearly full."""
+        if not self._file.exists():
+            return
         free = shutil.disk_usage(self._folder).free
-        if free < RELEASE_BELOW_BYTES and self._file.exists():
+        if free < RELEASE_BELOW_BYTES:
             self._file.unlink(missing_ok=True)
             log.warning(
                 "the disk of %s is full (%d bytes free): %d bytes that were set aside for the "

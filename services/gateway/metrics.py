@@ -97,7 +97,7 @@ class _Fullness(Collector):
         jobs = GaugeMetricFamily(
             f"{PREFIX}_jobs",
             "Jobs that are not finished, and failed ones that are kept. Waiting: for a vocabulary, "
-            "for descriptors, for search.",
+            "for descriptors, for search, for disk space.",
             labels=["kind", "state"],
         )
         oldest = GaugeMetricFamily(

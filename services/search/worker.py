@@ -42,6 +42,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 WAIT_STEP_SECONDS = 0.01
+FILE_CHECK_SECONDS = 5.0  # between two looks at whether mapped files were changed
 
 
 class SearchWorker:
@@ -76,6 +77,7 @@ class SearchWorker:
         self._residency = Residency(device or open_device(settings.search_device))
         self._int8 = Int8Maker(store, self._folder, self._attach_int8)
         self._unreadable = ReadRetries()
+        self._files_due: dict[UUID, float] = {}  # when each generation's files are looked at next
 
     def run(self, stop: threading.Event) -> None:
         """Follow what answers until `stop` is set."""
@@ -108,8 +110,10 @@ class SearchWorker:
             if now.state not in states:
                 continue
             snapshot = self._snapshots.get(generation_id)
-            if snapshot is None or snapshot.version < now.version or self._can_mend(snapshot):
+            if snapshot is None or snapshot.version < now.version:
                 self._advance(generation_id, now.version)
+            elif self._can_mend(snapshot):
+                self._advance(generation_id, now.version, damaged=snapshot)
             self._fill_device(generation_id)
             self.lags.level(generation_id, looked_at)
         for generation_id in self._snapshots.keys() - wanted.keys():
@@ -118,6 +122,7 @@ class SearchWorker:
         with self._swap:
             self._snapshots = {k: v for k, v in self._snapshots.items() if k in wanted}
             self._loading = {k: v for k, v in self._loading.items() if k in wanted or v.locked()}
+            self._files_due = {k: v for k, v in self._files_due.items() if k in wanted}
         self._unreadable.forget_others(
             {key for snapshot in self._snapshots.values() for key in snapshot.missing}
         )
@@ -197,12 +202,15 @@ class SearchWorker:
                 )
             time.sleep(WAIT_STEP_SECONDS)
 
-    def _advance(self, generation_id: UUID, version: int) -> Snapshot | None:
+    def _advance(
+        self, generation_id: UUID, version: int, damaged: Snapshot | None = None
+    ) -> Snapshot | None:
+        """The generation at this version or a later one; another snapshot than `damaged`."""
         with self._swap:
             loading = self._loading.setdefault(generation_id, threading.Lock())
         with loading:
             old = self._snapshots.get(generation_id)
-            if old is not None and old.version >= version and not self._can_mend(old):
+            if old is not None and old.version >= version and old is not damaged:
                 return old  # another thread loaded it while this one waited
             new = advance(
                 self._catalog,
@@ -221,10 +229,14 @@ class SearchWorker:
             return new
 
     def _can_mend(self, snapshot: Snapshot) -> bool:
-        """Whether a chunk is to be read again: one that is missing, or that was damaged since."""
-        return self._unreadable.any_due(snapshot.missing) or any(
-            chunk.was_changed() for chunk in snapshot.chunks
-        )
+        """Whether a chunk is to be read again: one that is missing, or whose file was changed."""
+        if self._unreadable.any_due(snapshot.missing):
+            return True
+        now = time.monotonic()
+        if now < self._files_due.get(snapshot.generation_id, 0.0):
+            return False
+        self._files_due[snapshot.generation_id] = now + FILE_CHECK_SECONDS
+        return any(chunk.was_changed() for chunk in snapshot.chunks)
 
     def _fill_device(self, generation_id: UUID) -> None:
         """Put the generation on the device, if there is one, or take it from there after a failure.

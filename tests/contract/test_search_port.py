@@ -30,6 +30,7 @@ from hypothesis.stateful import (
 from numpy.typing import NDArray
 
 from services.search import answer, gpu
+from services.search import worker as worker_module
 from services.search.load import Loader
 from services.search.loaded_chunk import StoredChunk
 from services.search.metrics import SearchMetrics
@@ -749,6 +750,7 @@ class TestSearchWorker(SearchPortContract):
     ) -> None:
         """Reading such a mapping would end the process. A deleted file is read on."""
         monkeypatch.setattr(read_retries, "FIRST_RETRY_SECONDS", 0.0)
+        monkeypatch.setattr(worker_module, "FILE_CHECK_SECONDS", 0.0)
         places = SmallMap(catalog, store)
         places.add(unit_rows(1, 5))
         kept = places.reference(places.add(unit_rows(2, 5))[0])[0]

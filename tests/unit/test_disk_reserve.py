@@ -9,7 +9,6 @@ from types import SimpleNamespace
 
 import pytest
 
-from shared import disk_reserve
 from shared.disk_reserve import RESERVE_BYTES, DiskReserve
 from shared.errors import StorageFull
 from shared.home import address_file, announced
@@ -50,7 +49,7 @@ def test_a_reserve_that_finds_no_room_leaves_nothing(
     def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr(disk_reserve.os, "posix_fallocate", full, raising=False)
+    monkeypatch.setattr("shared.disk_reserve.os.posix_fallocate", full, raising=False)
     DiskReserve(tmp_path, 0).keep()
     assert list(tmp_path.iterdir()) == []
 
