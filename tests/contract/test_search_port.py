@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Collection, Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 from uuid import UUID
 
 import numpy as np
@@ -731,7 +731,12 @@ class TestSearchWorker(SearchPortContract):
         store.put(key, _damaged(store.get(key), "flipped"))
         opened: list[str] = []
         open_object = store.open
-        monkeypatch.setattr(store, "open", lambda key: (opened.append(key), open_object(key))[1])
+
+        def counted(key: str) -> BinaryIO:
+            opened.append(key)
+            return open_object(key)
+
+        monkeypatch.setattr(store, "open", counted)
         worker = SearchWorker(catalog, store, settings)
         for seed in (2, 3):
             worker.follow()

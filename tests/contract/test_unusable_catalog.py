@@ -192,7 +192,7 @@ def test_a_full_disk_at_the_start_is_said_with_the_free_bytes(
         raise OperationalError("PRAGMA journal_mode = WAL", {}, original)
 
     event.listen(catalog.engine, "begin", full)
-    usage = shutil._ntuple_diskusage(100, 100, 0)  # type: ignore[attr-defined]
+    usage = shutil._ntuple_diskusage(100, 100, 0)
     monkeypatch.setattr("shared.catalog.unusable.shutil.disk_usage", lambda folder: usage)
     with pytest.raises(Misconfigured, match="Make room") as caught:
         migrate(catalog)
