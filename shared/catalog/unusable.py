@@ -54,7 +54,7 @@ def check_pages(catalog: Catalog, max_bytes: int | None = MAX_CHECKED_BYTES) -> 
     with opening(catalog), catalog.read() as session:
         found = session.scalar(text("PRAGMA quick_check(1)"))
     if found != "ok":
-        raise _damaged(path, str(found).replace("\n", " "))
+        raise _damaged(path, str(found).splitlines()[-1])
 
 
 def sqlite_file(catalog: Catalog) -> Path | None:
