@@ -125,6 +125,7 @@ class Similar(Answer):
     rows_scanned: int
     rows_reranked: int
     snapshot_version: int
+    degraded: bool = False
     missing: list[str]
 
 

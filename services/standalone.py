@@ -48,6 +48,8 @@ from shared.catalog.open_catalog import open_catalog
 from shared.catalog.schema import migrate
 from shared.catalog.search_workers import forget_dead_workers
 from shared.catalog.session import Catalog
+from shared.catalog.unusable import sqlite_file
+from shared.disk_reserve import DiskReserve
 from shared.errors import Misconfigured
 from shared.home import announced, lock_home
 from shared.jobs import InProcessHints
@@ -107,6 +109,8 @@ def standalone(settings: Settings) -> Iterator[Standalone]:
         listener = held.enter_context(listening(settings.host, settings.port))
         catalog = open_catalog(settings, "embedded")
         held.callback(catalog.close)
+        if (file := sqlite_file(catalog)) is not None:
+            DiskReserve(file.parent, settings.min_free_bytes).release()
         check_before_new_catalog(catalog, settings)
         migrate(catalog)
         store = open_own_store(catalog, settings, alone=True)

@@ -35,6 +35,10 @@ CODED_BYTES = 8_000_000
 # Rows are unit vectors, or zero: with a length further off than this, one is damaged.
 LENGTH_MARGIN = 1e-3
 
+CORRUPT = "chunk_corrupt"
+
+CORRUPT = "chunk_corrupt"
+
 HEADER_BYTES = 1024  # what is read to find out where the rows begin: NumPy's header has 128
 
 
@@ -139,7 +143,7 @@ def read_chunk(store: ObjectStore, object_key: str, sha256: str) -> Rows:
 def corrupt(object_key: str) -> Unavailable:
     """A chunk's bytes are not those of its hash."""
     return Unavailable(
-        "chunk_corrupt",
+        CORRUPT,
         f"The chunk {object_key} is not what was written (its hash differs). "
         "Restore the object from a backup, or describe its photos again: placewise verify "
         "--repair.",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import logging
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -11,8 +12,11 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
+from shared.disk_reserve import DISK_FULL
 from shared.errors import Misconfigured
 from shared.private_files import FILE_MODE, make_private_folder, write_private
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +81,18 @@ def lock_home(home: Path) -> Iterator[None]:
 def announced(home: Path, url: str, key: str | None = None) -> Iterator[None]:
     """While the block runs, this user's commands find the server at `url` through its folder."""
     said = {"url": url, "pid": os.getpid()} | ({"key": key} if key else {})
-    write_private(address_file(home), json.dumps(said))
+    try:
+        write_private(address_file(home), json.dumps(said))
+    except OSError as error:
+        if error.errno not in DISK_FULL:
+            raise
+        address_file(home).unlink(missing_ok=True)  # of a killed server
+        log.warning(
+            "the disk of %s is full: commands don't find this server by its folder, and need "
+            "--server %s",
+            home,
+            url,
+        )
     try:
         yield
     finally:

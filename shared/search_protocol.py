@@ -22,7 +22,7 @@ from shared.shards import WHOLE
 EXHAUSTIVE = "exhaustive"  # every row was compared exactly
 BOUND = "bound"  # no row that was left out can reach the answer, whatever it holds
 STATISTICAL = "statistical"  # the same but for a chance of about 1 in 10^8
-NONE = "none"  # the search ended early: better rows may be missing
+NONE = "none"  # the search ended early, or lacks a part of the map: better rows may be missing
 CERTIFICATES = (EXHAUSTIVE, BOUND, STATISTICAL, NONE)
 """How an answer can have been reached, strongest first."""
 

@@ -208,7 +208,8 @@ class Settings(BaseSettings):
     min_free_bytes: int = Field(
         500_000_000,
         ge=0,
-        description="of the disks of PLACEWISE_HOME and UPLOAD_DIR; with less, nothing is taken",
+        description="of the disks of PLACEWISE_HOME and UPLOAD_DIR; with less free, uploads are "
+        "rejected and batches wait; query photos are rejected below a tenth of it",
     )
 
     # How photos are described.

@@ -29,6 +29,7 @@ from services.cli.service_checks import (
 from services.cli.store_checks import collection_check, permissions_check
 from shared.catalog.open_catalog import open_catalog
 from shared.catalog.photos import Photo
+from shared.catalog.unusable import check_pages
 from shared.client import Client
 from shared.errors import Misconfigured, PlacewiseError
 from shared.home import running_server
@@ -175,6 +176,7 @@ def _vocabulary(settings: Settings) -> str:
 def _server(settings: Settings) -> str:
     running = running_server(settings.placewise_home)
     if running is not None:
+        gateway_check(running.url, running.key)
         with Client(running.url, key=running.key) as client:
             maps = client.maps()
         searchable, photos = sum(m["searchable"] for m in maps), sum(m["photos"] for m in maps)
@@ -184,6 +186,7 @@ def _server(settings: Settings) -> str:
         return "not running, and nothing is stored yet (start it: make run)"
     catalog = open_catalog(settings, "doctor")
     try:
+        check_pages(catalog, max_bytes=None)
         with catalog.read() as session:
             photos = session.scalar(
                 select(func.count()).select_from(Photo).where(Photo.deleted_at.is_(None))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any
@@ -63,12 +64,31 @@ def explained(as_json: bool) -> Iterator[None]:
     try:
         yield
     except PlacewiseError as error:
-        if as_json:
-            print_json(error.as_problem())
-        else:
-            # What went wrong is no markup: a file's name may hold brackets.
-            messages.print(f"[red]{error.code}[/red]: {escape(error.detail)}", soft_wrap=True)
+        _print_error(error, as_json)
         raise typer.Exit(1) from error
+    except Exception as error:
+        unavailable = _database_problem(error)
+        if unavailable is None:
+            raise
+        _print_error(unavailable, as_json)
+        raise typer.Exit(1) from error
+
+
+def _database_problem(error: Exception) -> PlacewiseError | None:
+    """The explanation of a failure of the catalog; None for every other error."""
+    if "sqlalchemy" not in sys.modules:
+        return None
+    from shared.catalog.away import as_unavailable  # most commands do without a database
+
+    return as_unavailable(error)
+
+
+def _print_error(error: PlacewiseError, as_json: bool) -> None:
+    if as_json:
+        print_json(error.as_problem())
+    else:
+        # What went wrong is no markup: a file's name may hold brackets.
+        messages.print(f"[red]{error.code}[/red]: {escape(error.detail)}", soft_wrap=True)
 
 
 def progress_bar() -> Progress:

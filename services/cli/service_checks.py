@@ -21,6 +21,7 @@ from shared.settings import Settings
 OVERDUE_SECONDS = 30.0  # for which an expired lease may lie there: the steward looks every second
 SEARCH_SECONDS = 5.0
 MOST_LAG_SECONDS = 30.0
+MAX_NAMED_CHUNKS = 10
 
 
 def search_check(settings: Settings) -> str:
@@ -46,7 +47,11 @@ def search_check(settings: Settings) -> str:
             if late > MOST_LAG_SECONDS:
                 ill.append(f"{url} is {late:.0f} s behind")
             if status.missing:
-                ill.append(f"{url} can't read {len(status.missing)} chunks (placewise verify)")
+                named = ", ".join(status.missing[:MAX_NAMED_CHUNKS])
+                ill.append(
+                    f"{url} can't read {len(status.missing)} chunks, and answers without them: "
+                    f"{named} (placewise verify --repair)"
+                )
             ill += [f"{url}: {d.name} failed" for d in status.devices if d.failure is not None]
     counts = {int(shard.split("/")[1]) for shard in shards}
     unanswered = [

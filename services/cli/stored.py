@@ -13,6 +13,7 @@ from shared.catalog.installation import open_own_store
 from shared.catalog.open_catalog import open_catalog
 from shared.catalog.schema import check_schema
 from shared.catalog.session import Catalog
+from shared.catalog.unusable import opening
 from shared.errors import Misconfigured
 from shared.objects import OwnedStore
 from shared.settings import Settings
@@ -33,7 +34,8 @@ def what_is_stored(settings: Settings, command: str) -> Iterator[tuple[Catalog, 
         )
     catalog = open_catalog(settings, command, UNLIMITED)
     try:
-        check_schema(catalog)
+        with opening(catalog):
+            check_schema(catalog)
         yield catalog, open_own_store(catalog, settings, alone=False)
     except SQLAlchemyError as error:
         unavailable = as_unavailable(error)

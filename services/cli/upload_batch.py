@@ -4,15 +4,19 @@ objects of the server's own store."""
 from __future__ import annotations
 
 import json
+import time
 from pathlib import Path
 
 from rich.progress import Progress, TaskID
 
+from services.cli.output import messages
 from services.cli.upload_many import LOOK_SECONDS, fit_if_worth_it
 from shared.archive_formats import ACCEPTED_ARCHIVES, SNIFFED_ARCHIVE_BYTES, sniff_archive
 from shared.client import FINISHED, Client, Json
 from shared.errors import InvalidRequest, Unprocessable
 from shared.intake.manifest import KEY_FIELD
+
+WAITING_LOOK_SECONDS = 2.0
 
 
 def check_archive(path: Path) -> None:
@@ -92,14 +96,20 @@ def _finish(client: Client, started: Json, fit: bool, progress: Progress) -> Jso
 
 def _wait(client: Client, job_id: str, progress: Progress, bar: TaskID) -> Json:
     """The job once it has ended, or waits for a vocabulary."""
-    wait_seconds = 0.0
+    wait_seconds, told = 0.0, False
     while True:
         job = client.job(job_id, wait_seconds)
         wait_seconds = LOOK_SECONDS
         done: Json = job["progress"]
         progress.update(bar, completed=done["done"] + done["failed"], total=done["total"] or None)
-        if job["state"] in FINISHED or job["waiting_for"]:
+        if job["state"] in FINISHED or job["waiting_for"] == "vocabulary":
             return job
+        if job["waiting_for"]:
+            if not told:
+                what = job["waiting_for"].replace("_", " ")
+                messages.print(f"The batch waits for {what} on the server, and goes on by itself.")
+            told = True
+            time.sleep(WAITING_LOOK_SECONDS)  # a server answers at once for a job that waits
 
 
 def _fault(item: Json) -> Json:

@@ -7,12 +7,14 @@ here, and the search is asked again for more until k live ones are found or ther
 from __future__ import annotations
 
 import itertools
+import logging
 import time
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
 from uuid import UUID
 
+from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.orm import Session
 
 from services.gateway.choose_weights import choose_weights
@@ -25,17 +27,20 @@ from services.gateway.schemas import (
     job_url,
 )
 from services.gateway.wanted import Wanted
+from shared.catalog.away import as_unavailable
 from shared.catalog.chunks import descriptor_of
 from shared.catalog.generations import Generation, active_generation
 from shared.catalog.maps import Map, get_map
 from shared.catalog.photos import Photo, get_photo, live_photos
 from shared.catalog.searches import Search
 from shared.catalog.vocabularies import standing_of
-from shared.errors import Conflict, Gone
+from shared.errors import Conflict, Gone, StorageFull
 from shared.estimate.evidence import DEPTH
 from shared.jobs import Job, JobState
 from shared.photo_filter import EVERYTHING, PhotoFilter
 from shared.search_protocol import Hit, SearchRequest, SearchResponse
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,8 +121,13 @@ def find_similar(gateway: Gateway, query: Query, wanted: Wanted) -> SimilarityAn
     """The most similar live photos that are wanted, without the query itself, and the place that
     they point to; noted in the history."""
     found = search(gateway, query, wanted)
-    with gateway.catalog.write() as session:
-        session.add(found.history)
+    try:
+        with gateway.catalog.write() as session:
+            session.add(found.history)
+    except SQLAlchemyError as error:
+        if not isinstance(as_unavailable(error), StorageFull):
+            raise
+        log.warning("the disk of the catalog is full: the search is not added to the history")
     return found.frame.with_photos(
         SimilarPhoto(
             similarity_score=hit.score,
@@ -165,6 +175,7 @@ def search(gateway: Gateway, query: Query, wanted: Wanted) -> Found:
         rows_scanned=response.rows_scanned,
         rows_reranked=response.rows_reranked,
         snapshot_version=response.snapshot_version,
+        degraded=bool(response.missing),
         missing=list(response.missing),
     )
     history = Search(

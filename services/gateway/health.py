@@ -14,14 +14,17 @@ from services.gateway.context import Gateway, GatewayDep
 from services.gateway.key_check import READ
 from services.gateway.room import Kind, Room, RoomDep
 from services.gateway.schemas import Answer
+from shared.catalog.away import as_unavailable
 from shared.catalog.maps import Map
-from shared.errors import PlacewiseError
+from shared.errors import PlacewiseError, StorageFull
 from shared.settings import Settings
 
 probes = APIRouter(tags=["operations"])
 router = APIRouter(tags=["operations"])
 
 WORST_FIRST = ("unhealthy", "degraded", "healthy")
+
+MAX_NAMED_CHUNKS = 10
 
 VERSION = version("placewise")
 
@@ -92,10 +95,10 @@ def livez() -> ProbeAnswer:
 
 @probes.head("/readyz", include_in_schema=False)
 @probes.get("/readyz", operation_id="readyz", response_model=ProbeAnswer)
-def readyz(gateway: GatewayDep, response: Response) -> ProbeAnswer:
-    """503 while a part that every call needs is away. Where only some shards of search are, the
-    rest still answers, and says so."""
-    ready = all(part.status != "unhealthy" for part in _parts(gateway).values())
+def readyz(gateway: GatewayDep, room: RoomDep, response: Response) -> ProbeAnswer:
+    """503 while a part that every call needs is away. What is only degraded is ready: without some
+    shards or chunks the rest still answers, and on a full disk photos can be deleted."""
+    ready = all(part.status != "unhealthy" for part in _parts(gateway, room).values())
     response.status_code = 200 if ready else 503
     return ProbeAnswer(status="ready" if ready else "not ready")
 
@@ -103,8 +106,9 @@ def readyz(gateway: GatewayDep, response: Response) -> ProbeAnswer:
 @router.head("/health", include_in_schema=False, dependencies=[READ])
 @router.get("/health", operation_id="health", response_model=HealthAnswer, dependencies=[READ])
 def health(gateway: GatewayDep, room: RoomDep, response: Response) -> HealthAnswer:
-    """The state of each part; 503 when one is away, or `degraded`: a part of it is away."""
-    parts = _parts(gateway)
+    """The state of each part; 503 when one is away, or `degraded`: chunks or shards of the map
+    can't be searched, or uploads are refused because the disk is full."""
+    parts = _parts(gateway, room)
     states = {part.status for part in parts.values()}
     response.status_code = 200 if states == {"healthy"} else 503
     return HealthAnswer(
@@ -127,15 +131,15 @@ def _load(settings: Settings, room: Room) -> LoadAnswer:
         receiving_uploads=room.being_received(Kind.UPLOAD),
         receiving_queries=room.being_received(Kind.QUERY),
         max_concurrent_uploads=settings.max_concurrent_uploads,
-        free_bytes=room.free_bytes(),
+        free_bytes=room.disk.free_bytes(),
         min_free_bytes=settings.min_free_bytes,
     )
 
 
-def _parts(gateway: Gateway) -> dict[str, PartAnswer]:
+def _parts(gateway: Gateway, room: Room) -> dict[str, PartAnswer]:
     return {
         "catalog": _catalog(gateway),
-        "object_store": _object_store(gateway),
+        "object_store": _object_store(gateway, room),
         "search": _search(gateway),
     }
 
@@ -144,14 +148,19 @@ def _catalog(gateway: Gateway) -> PartAnswer:
     try:
         with gateway.catalog.read() as session:
             session.scalar(select(Map.id).limit(1))
-    except SQLAlchemyError:
-        return PartAnswer(status="unhealthy", detail="the catalog can't be reached")
+    except SQLAlchemyError as error:
+        unavailable = as_unavailable(error)
+        detail = unavailable.detail if unavailable else "the catalog can't be reached"
+        return PartAnswer(status="unhealthy", detail=detail)
     return PartAnswer(status="healthy")
 
 
-def _object_store(gateway: Gateway) -> PartAnswer:
+def _object_store(gateway: Gateway, room: Room) -> PartAnswer:
     try:
         gateway.store.check()
+        room.disk.check()
+    except StorageFull as error:
+        return PartAnswer(status="degraded", detail=f"uploads are refused: {error.detail}")
     except PlacewiseError as error:
         return PartAnswer(status="unhealthy", detail=error.detail)
     return PartAnswer(status="healthy")
@@ -162,9 +171,17 @@ def _search(gateway: Gateway) -> PartAnswer:
         status = gateway.search.status()
     except PlacewiseError as error:
         return PartAnswer(status="unhealthy", detail=error.detail)
+    wrong = []
     if status.away:
-        named = ", ".join(status.away)
-        return PartAnswer(status="degraded", detail=f"no search worker answers for: {named}")
+        wrong.append(f"no search worker answers for: {', '.join(status.away)}")
     if status.missing:
-        return PartAnswer(status="unhealthy", detail=f"{len(status.missing)} chunks can't be read")
+        named = ", ".join(status.missing[:MAX_NAMED_CHUNKS])
+        more = len(status.missing) - MAX_NAMED_CHUNKS
+        wrong.append(
+            f"{len(status.missing)} chunks can't be read: {named}"
+            + (f" and {more} more" if more > 0 else "")
+            + " (placewise verify --repair)"
+        )
+    if wrong:
+        return PartAnswer(status="degraded", detail="; ".join(wrong))
     return PartAnswer(status="healthy", detail=f"{status.rows} rows in memory")

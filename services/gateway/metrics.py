@@ -83,7 +83,7 @@ class _Fullness(Collector):
         for kind in Kind:
             receiving.add_metric([kind.name.lower()], self._room.being_received(kind))
         yield receiving
-        free = self._room.free_bytes()
+        free = self._room.disk.free_bytes()
         if free is not None:
             yield GaugeMetricFamily(
                 f"{PREFIX}_disk_free_bytes", "Of the disks that Placewise writes to itself.", free
@@ -97,7 +97,7 @@ class _Fullness(Collector):
         jobs = GaugeMetricFamily(
             f"{PREFIX}_jobs",
             "Jobs that are not finished, and failed ones that are kept. Waiting: for a vocabulary, "
-            "for descriptors, for search.",
+            "for descriptors, for search, for disk space.",
             labels=["kind", "state"],
         )
         oldest = GaugeMetricFamily(

@@ -12,13 +12,11 @@ from __future__ import annotations
 
 import contextlib
 import math
-import shutil
 import threading
 import time
 from collections import Counter
 from collections.abc import Iterator
 from enum import StrEnum
-from pathlib import Path
 from typing import Annotated
 from uuid import UUID
 
@@ -28,7 +26,8 @@ from services.gateway.context import DEFAULT_MAP, GatewayDep, MapName
 from services.gateway.key_check import caller_of
 from services.gateway.keys import Caller
 from shared.catalog.session import Catalog
-from shared.errors import StorageFull, TooManyRequests
+from shared.disk_space import QUERY_SHARE, DiskSpace
+from shared.errors import TooManyRequests
 from shared.jobs.waiting import Waiting, look_at_queue
 from shared.settings import Settings
 
@@ -36,7 +35,6 @@ LOOK_SECONDS = 1.0
 LOOK_SHARE = 20  # a look that takes long is taken seldom: one part in so many of the time
 RELIEF = 0.9  # of a limit: come again when the queue has shrunk to this
 MOST_RETRY_SECONDS = 60
-DISK_RETRY_SECONDS = 60
 RECEIVING_RETRY_SECONDS = 1
 
 
@@ -51,7 +49,7 @@ class Room:
     def __init__(self, catalog: Catalog, settings: Settings) -> None:
         self._catalog = catalog
         self._settings = settings
-        self._folders = _local_folders(settings)
+        self.disk = DiskSpace(settings)
         self._looking = threading.Lock()
         self._seen: Waiting | None = None
         self._next_look = 0.0
@@ -63,7 +61,7 @@ class Room:
 
         Raises TooManyRequests (`queue_full`) and StorageFull (`disk_full`).
         """
-        self.check_disk()
+        self.disk.check()
         seen, settings = self.look(), self._settings
         taken = sum(count for name, count in self._taken.items() if name is not None)
         for what, waiting, most in (
@@ -79,8 +77,9 @@ class Room:
         self._taken[map_name] += 1
 
     def take_query(self) -> None:
-        """Room for one more query photo; raises as `take_job` does."""
-        self.check_disk()
+        """Room for one more query photo; raises as `take_job` does. While uploads are refused for
+        want of disk space, queries go on down to QUERY_SHARE of MIN_FREE_BYTES."""
+        self.disk.check(QUERY_SHARE)
         seen, most = self.look(), self._settings.max_queued_queries
         waiting = seen.queries + self._taken[None]
         if waiting >= most:
@@ -107,22 +106,6 @@ class Room:
 
     def being_received(self, kind: Kind) -> int:
         return self._receiving[kind]
-
-    def check_disk(self) -> None:
-        """StorageFull (`disk_full`) when the disk has less free than MIN_FREE_BYTES."""
-        free, least = self.free_bytes(), self._settings.min_free_bytes
-        if free is not None and free < least:
-            raise StorageFull(
-                "disk_full",
-                f"The server's disk has {free // 1_000_000} MB free, and keeps "
-                f"{least // 1_000_000} MB (MIN_FREE_BYTES). Make room, or delete photos or maps.",
-                retry_after_seconds=DISK_RETRY_SECONDS,
-                free_bytes=free,
-            )
-
-    def free_bytes(self) -> int | None:
-        """Of the disks that this Placewise writes to itself, the least; None where it does not."""
-        return min((shutil.disk_usage(_existing(f)).free for f in self._folders), default=None)
 
     def look(self) -> Waiting:
         """The queue as it was a moment ago."""
@@ -192,17 +175,3 @@ def _queue_full(what: str, waiting: int, most: int, per_second: float) -> TooMan
         waiting=waiting,
         limit=most,
     )
-
-
-def _local_folders(settings: Settings) -> list[Path]:
-    folders = [settings.upload_dir] if settings.upload_dir else []
-    if settings.s3_endpoint is None or settings.database_url is None:
-        folders.append(settings.placewise_home)
-    return folders
-
-
-def _existing(folder: Path) -> Path:
-    """The folder, or the one above it that it will be made in."""
-    while not folder.exists():
-        folder = folder.parent
-    return folder

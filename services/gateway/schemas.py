@@ -153,10 +153,12 @@ class SimilarityAnswer(Answer):
     certificate: str = Field(
         description="`exhaustive`: every row was compared exactly; `bound`: none that was left out "
         "can be in the answer; `statistical`: the same but for a chance of 1 in 10^8; `none`: the "
-        "search ended early"
+        "search ended early, or a part of the map could not be searched (`missing`)"
     )
     certified_k: int = Field(
-        0, description="so many of the first photos are certain: all, unless it ended early"
+        0,
+        description="so many of the first photos are certain: all, unless it ended early; 0 where "
+        "a part of the map is missing",
     )
     max_z: float | None = Field(
         None,
@@ -165,7 +167,13 @@ class SimilarityAnswer(Answer):
     rows_scanned: int
     rows_reranked: int
     snapshot_version: int
-    missing: list[str] = Field(description="parts of the map that could not be searched")
+    degraded: bool = Field(
+        False, description="true: `missing` names parts of the map that could not be searched"
+    )
+    missing: list[str] = Field(
+        description="what could not be searched: chunks (`chunks/....npy`) that can't be read, and "
+        "shards (`shard 1/3`) of which no search worker answers"
+    )
 
     def with_photos(self, photos: Iterable[SimilarPhoto]) -> SimilarityAnswer:
         """The same answer with these photos."""
@@ -195,7 +203,10 @@ class JobAnswer(Answer):
         description="of a model change: sample, cluster, describe, "
         "load; of a batch: list, store, describe"
     )
-    waiting_for: str | None = Field(description="what has to be there before the job can go on")
+    waiting_for: str | None = Field(
+        description="what has to be there before the job can go on: `vocabulary`, `descriptors`, "
+        "`search`, or of a batch `disk_space`"
+    )
     awaited: list[str] | None = Field(
         description="the search workers that it waits for, once they take longer than a minute"
     )

@@ -24,7 +24,8 @@ READY_LAG_SECONDS = 5.0
 
 
 class Readiness(BaseModel):
-    """`reasons` says in words why the worker is not ready; empty when it is."""
+    """`status` is `ready`, `degraded` (ready, without the chunks in `missing`) or `not ready`, for
+    `reasons`."""
 
     status: str
     shard: str
@@ -63,7 +64,8 @@ def create_app(worker: SearchWorker, registry: CollectorRegistry | None = None) 
 
     @app.get("/readyz", operation_id="readyz", response_model=Readiness)
     async def readyz(response: Response) -> Readiness:
-        """503 while what answers is behind the catalog, or a chunk of it can't be read."""
+        """503 while what answers is behind the catalog. A chunk that can't be read makes the
+        worker `degraded`, and the rest is answered: no restart would mend it."""
         found = readiness(worker)
         response.status_code = 503 if found.reasons else 200
         return found
@@ -90,10 +92,8 @@ def readiness(worker: SearchWorker) -> Readiness:
                 f"generation {generation_id} is {lag.versions} versions behind, "
                 f"level {lag.seconds:.1f} s ago"
             )
-        if generation_id in status.incomplete:
-            reasons.append(f"chunks of generation {generation_id} can't be read")
     return Readiness(
-        status="not ready" if reasons else "ready",
+        status="not ready" if reasons else "degraded" if status.missing else "ready",
         shard=status.shard,
         reasons=reasons,
         lags=status.lags,

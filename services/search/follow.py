@@ -24,6 +24,7 @@ from shared.catalog.session import Catalog
 from shared.chunks import CODED_DIMENSION
 from shared.errors import NotFound, Unavailable
 from shared.objects import ObjectStore
+from shared.read_retries import ReadRetries
 from shared.search_protocol import Part
 from shared.shards import WHOLE, Shard
 
@@ -63,13 +64,15 @@ def advance(
     memory: Memory,
     generation_id: UUID,
     old: Snapshot | None,
+    unreadable: ReadRetries,
     shard: Shard = WHOLE,
 ) -> Snapshot | None:
     """The shard's part of the generation as it is now, reusing what `old` has loaded; None when
     the generation is gone.
 
     Reads the catalog in one consistent transaction. A chunk that can't be read, or whose hash
-    differs, is named in `missing`, and the rest is served. Files are kept below `folder`.
+    differs, is named in `missing`, and the rest is served; it is read again once `unreadable` says
+    that it is due. Files are kept below `folder`.
     """
     loader = loader_of(store, folder, generation_id)
     with catalog.read() as session:
@@ -79,10 +82,12 @@ def advance(
             return None
         version = session.get_one(Map, generation.map_id).version
         chunks = [c for c in live_chunks(session, generation_id) if shard.owns(c.slot)]
-        known = {chunk.chunk_id: chunk for chunk in old.chunks} if old else {}
+        known = {c.chunk_id: c for c in old.chunks if not c.was_changed()} if old else {}
         changed = changed_since(session, generation.map_id, old.version) if old else []
         facts_of = {
-            chunk.id: live_facts(session, chunk.id) for chunk in chunks if chunk.id not in known
+            chunk.id: live_facts(session, chunk.id)
+            for chunk in chunks
+            if chunk.id not in known and unreadable.is_due(chunk.object_key)
         }
     changes = {photo.photo_id: photo for photo in changed}
     loaded: list[LoadedChunk] = []
@@ -91,17 +96,21 @@ def advance(
         if chunk.id in known:
             loaded.append(_changed(known[chunk.id], changes))
             continue
+        if chunk.id not in facts_of:
+            missing.append(chunk.object_key)
+            continue
         try:
             stored = loader.rows(chunk)
         except (Unavailable, NotFound, ValueError, OSError) as error:
-            log.error("chunk %s can't be served: %s", chunk.object_key, error)
+            unreadable.failed(chunk.object_key, error)
             missing.append(chunk.object_key)
             continue
+        unreadable.succeeded(chunk.object_key)
         photos = PhotoColumns.of(len(stored.rows), facts_of[chunk.id])
         loaded.append(LoadedChunk(chunk.id, chunk.object_key, stored.rows, photos, stored=stored))
     large = sum(chunk.rows.nbytes for chunk in loaded) >= CODED_FROM_BYTES
     if large:
-        loaded = [_coded(loader, chunk) for chunk in loaded]
+        loaded = _with_codes(loader, loaded)
         _warm_up(loaded)
     loader.keep_only(loaded)
     middle = bool(loaded) and loaded[0].rows.shape[1] < CODED_DIMENSION
@@ -144,6 +153,16 @@ def _held(memory: Memory, snapshot: Snapshot) -> Snapshot:
             for number, (name, size_bytes) in enumerate(parts)
         ),
     )
+
+
+def _with_codes(loader: Loader, chunks: list[LoadedChunk]) -> list[LoadedChunk]:
+    """The chunks with their sign codes; as they are where those can't be had now, for then every
+    row is compared, to the same answers."""
+    try:
+        return [_coded(loader, chunk) for chunk in chunks]
+    except (Unavailable, OSError) as error:
+        log.error("sign codes can't be loaded, search does without: %s", error)
+        return chunks
 
 
 def _with_int8(loader: Loader, chunks: list[LoadedChunk]) -> list[LoadedChunk]:

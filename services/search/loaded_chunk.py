@@ -30,6 +30,10 @@ class LoadedChunk:
     int8: Int8Codes | None = None
     """None while search does without."""
 
+    def was_changed(self) -> bool:
+        """Whether its file was damaged since it was mapped (`Mapped.was_changed`)."""
+        return self.stored is not None and self.stored.file.was_changed()
+
     def read_ahead(self, row: int) -> None:
         """Say that a row is read next, where it is mapped from a file."""
         if self.stored is not None and self.rows is self.stored.rows:

@@ -33,9 +33,26 @@ OPTIONS = {"trackfd": False} if sys.version_info >= (3, 13) else {}
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Mapped:
-    """A file's bytes; the file may be deleted while they are used."""
+    """A file's bytes; the file may be deleted or replaced while they are used."""
 
     memory: mmap.mmap
+    path: Path
+    state: os.stat_result
+    """Of the file when it was mapped."""
+
+    def was_changed(self) -> bool:
+        """Whether the mapped file itself was written to or truncated: what is read from the
+        mapping then is another row, or ends the process (SIGBUS). A file that was deleted or
+        replaced leaves the mapping as it was."""
+        try:
+            now = self.path.stat()
+        except OSError:
+            return False
+        same = (now.st_dev, now.st_ino) == (self.state.st_dev, self.state.st_ino)
+        return same and (now.st_size, now.st_mtime_ns) != (
+            self.state.st_size,
+            self.state.st_mtime_ns,
+        )
 
     @property
     def size_bytes(self) -> int:
@@ -62,12 +79,30 @@ class LocalFiles:
         """
         file = self._store.file(key)
         if file is None:
-            return self.made(f"{sha256}.npy", lambda target: self._fetch(key, sha256, target))
+            return self._cached(key, sha256)
         with self._store.open(key) as opened:
-            mapped = _map(opened.fileno())
+            mapped = _map(opened.fileno(), file)
         if hashlib.sha256(mapped.memory).hexdigest() != sha256:
             raise corrupt(key)
         return mapped
+
+    def _cached(self, key: str, sha256: str) -> Mapped:
+        """The object from the cache; one that was damaged there is fetched again."""
+        name = f"{sha256}.npy"
+        fetched = False
+
+        def fetch(target: Path) -> None:
+            nonlocal fetched
+            fetched = True
+            self._fetch(key, sha256, target)
+
+        with contextlib.suppress(ValueError):  # an empty file can't be mapped
+            mapped = self.made(name, fetch)
+            if fetched or hashlib.sha256(mapped.memory).hexdigest() == sha256:
+                return mapped
+        log.warning("the cached copy of %s is damaged, and is fetched again", key)
+        self.remove(name)
+        return self.made(name, fetch)
 
     def made(self, name: str, make: Callable[[Path], None]) -> Mapped:
         """The file of this name in the folder; where there is none, `make` writes one.
@@ -76,13 +111,13 @@ class LocalFiles:
         """
         path = self._folder / name
         with contextlib.suppress(FileNotFoundError), path.open("rb") as file:
-            return _map(file.fileno())
+            return _map(file.fileno(), path)
         make_private_folder(self._folder)
         partial = self._folder / f"{new_id()}.partial"
         try:
             make(partial)
             with partial.open("rb") as file:
-                mapped = _map(file.fileno())
+                mapped = _map(file.fileno(), path)
             partial.replace(path)
         finally:
             partial.unlink(missing_ok=True)
@@ -117,5 +152,6 @@ class LocalFiles:
             os.fsync(file.fileno())
 
 
-def _map(descriptor: int) -> Mapped:
-    return Mapped(mmap.mmap(descriptor, 0, access=mmap.ACCESS_READ, **OPTIONS))
+def _map(descriptor: int, path: Path) -> Mapped:
+    memory = mmap.mmap(descriptor, 0, access=mmap.ACCESS_READ, **OPTIONS)
+    return Mapped(memory, path, os.fstat(descriptor))

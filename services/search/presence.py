@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from uuid import UUID
 
 from sqlalchemy.exc import SQLAlchemyError
@@ -33,7 +33,7 @@ class Presence:
         self._worker = worker
         self._name = name
         self._url = url
-        self._told: Mapping[UUID, int] | None = None
+        self._told: tuple[Mapping[UUID, int], Sequence[str]] | None = None
         self._told_at = 0.0
 
     def run(self, stop: threading.Event) -> None:
@@ -54,9 +54,10 @@ class Presence:
 
     def tell(self) -> None:
         """Write what there is to tell: news at once, else a heartbeat when it is due."""
-        loaded = self._worker.status().loaded
-        if loaded == self._told and time.monotonic() - self._told_at < HEARTBEAT_SECONDS:
+        status = self._worker.status()
+        news = status.loaded, status.missing
+        if news == self._told and time.monotonic() - self._told_at < HEARTBEAT_SECONDS:
             return
         with self._catalog.write() as session:
-            tell_of_worker(session, self.id, self._name, self._url, self._worker.shard, loaded)
-        self._told, self._told_at = loaded, time.monotonic()
+            tell_of_worker(session, self.id, self._name, self._url, self._worker.shard, *news)
+        self._told, self._told_at = news, time.monotonic()

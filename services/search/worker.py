@@ -29,7 +29,8 @@ from shared.catalog.session import Catalog
 from shared.chunks import Row
 from shared.errors import InvalidRequest, Unavailable
 from shared.objects import ObjectStore
-from shared.search_protocol import Mode, SearchRequest, SearchResponse, SearchStatus
+from shared.read_retries import ReadRetries
+from shared.search_protocol import NONE, Mode, SearchRequest, SearchResponse, SearchStatus
 from shared.settings import Settings
 from shared.shards import WHOLE, Shard
 from shared.word_weights.learn import weigh
@@ -41,6 +42,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 WAIT_STEP_SECONDS = 0.01
+FILE_CHECK_SECONDS = 5.0  # between two looks at whether mapped files were changed
 
 
 class SearchWorker:
@@ -74,6 +76,8 @@ class SearchWorker:
         self._loading: dict[UUID, threading.Lock] = {}
         self._residency = Residency(device or open_device(settings.search_device))
         self._int8 = Int8Maker(store, self._folder, self._attach_int8)
+        self._unreadable = ReadRetries()
+        self._files_due: dict[UUID, float] = {}  # when each generation's files are looked at next
 
     def run(self, stop: threading.Event) -> None:
         """Follow what answers until `stop` is set."""
@@ -92,8 +96,8 @@ class SearchWorker:
                 outage.over()
             except SQLAlchemyError as error:  # what is loaded goes on answering
                 outage.met(error)
-            except OSError:
-                log.exception("search can't load what is new; serving what is loaded")
+            except (OSError, Unavailable) as error:
+                log.error("search can't load what is new; serving what is loaded: %s", error)
             stop.wait(self._settings.search_follow_seconds)
 
     def follow(self, states: Collection[GenerationState] = FOLLOWED) -> None:
@@ -106,8 +110,10 @@ class SearchWorker:
             if now.state not in states:
                 continue
             snapshot = self._snapshots.get(generation_id)
-            if snapshot is None or snapshot.version < now.version or snapshot.missing:
+            if snapshot is None or snapshot.version < now.version:
                 self._advance(generation_id, now.version)
+            elif self._can_mend(snapshot):
+                self._advance(generation_id, now.version, damaged=snapshot)
             self._fill_device(generation_id)
             self.lags.level(generation_id, looked_at)
         for generation_id in self._snapshots.keys() - wanted.keys():
@@ -116,6 +122,10 @@ class SearchWorker:
         with self._swap:
             self._snapshots = {k: v for k, v in self._snapshots.items() if k in wanted}
             self._loading = {k: v for k, v in self._loading.items() if k in wanted or v.locked()}
+            self._files_due = {k: v for k, v in self._files_due.items() if k in wanted}
+        self._unreadable.forget_others(
+            {key for snapshot in self._snapshots.values() for key in snapshot.missing}
+        )
 
     def search(self, request: SearchRequest) -> SearchResponse:
         snapshot = self.snapshot(request.generation_id, request.min_version)
@@ -139,8 +149,9 @@ class SearchWorker:
             found = weighted_answer(snapshot, query, weighted, asked, question, self._glances)
         return SearchResponse(
             hits=found.hits,
-            certificate=found.certificate,
-            certified_k=found.certified_k,
+            # Better rows may lie in what is missing.
+            certificate=NONE if snapshot.missing else found.certificate,
+            certified_k=0 if snapshot.missing else found.certified_k,
             rows_scanned=found.rows_scanned,
             rows_reranked=found.rows_reranked,
             max_z=found.max_z,
@@ -191,12 +202,15 @@ class SearchWorker:
                 )
             time.sleep(WAIT_STEP_SECONDS)
 
-    def _advance(self, generation_id: UUID, version: int) -> Snapshot | None:
+    def _advance(
+        self, generation_id: UUID, version: int, damaged: Snapshot | None = None
+    ) -> Snapshot | None:
+        """The generation at this version or a later one; another snapshot than `damaged`."""
         with self._swap:
             loading = self._loading.setdefault(generation_id, threading.Lock())
         with loading:
             old = self._snapshots.get(generation_id)
-            if old is not None and old.version >= version and not old.missing:
+            if old is not None and old.version >= version and old is not damaged:
                 return old  # another thread loaded it while this one waited
             new = advance(
                 self._catalog,
@@ -205,6 +219,7 @@ class SearchWorker:
                 self._memory,
                 generation_id,
                 old,
+                self._unreadable,
                 self.shard,
             )
             if new is not None:
@@ -212,6 +227,16 @@ class SearchWorker:
                 with self._swap:
                     self._snapshots = {**self._snapshots, generation_id: new}
             return new
+
+    def _can_mend(self, snapshot: Snapshot) -> bool:
+        """Whether a chunk is to be read again: one that is missing, or whose file was changed."""
+        if self._unreadable.any_due(snapshot.missing):
+            return True
+        now = time.monotonic()
+        if now < self._files_due.get(snapshot.generation_id, 0.0):
+            return False
+        self._files_due[snapshot.generation_id] = now + FILE_CHECK_SECONDS
+        return any(chunk.was_changed() for chunk in snapshot.chunks)
 
     def _fill_device(self, generation_id: UUID) -> None:
         """Put the generation on the device, if there is one, or take it from there after a failure.

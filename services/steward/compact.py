@@ -20,6 +20,7 @@ from shared.chunks import read_chunk, write_chunk
 from shared.errors import NotFound, Unavailable
 from shared.ids import new_id
 from shared.objects import ObjectStore
+from shared.read_retries import ReadRetries
 
 log = logging.getLogger(__name__)
 
@@ -27,19 +28,22 @@ SLOTS_AT_ONCE = 100  # of which dead rows are counted in one round: 100,000 rows
 DEAD_SHARE = 0.2  # of a chunk's rows: more, and rewriting it is worth the reading
 
 
-def compact(catalog: Catalog, store: ObjectStore, compact_chunks: int) -> int:
-    """Merge every slot that is worth it; returns how many were merged."""
+def compact(
+    catalog: Catalog, store: ObjectStore, compact_chunks: int, retries: ReadRetries | None = None
+) -> int:
+    """Merge every slot that is worth it; returns how many were merged. `retries` keeps the slots
+    whose chunks can't be read from being read with every round."""
+    retries = retries or ReadRetries()
     merged = 0
     for generation_id, slot in _worth_merging(catalog, compact_chunks):
+        name = f"slot {slot} of generation {generation_id}"
+        if not retries.is_due(name):
+            continue
         try:
             merged += merge_slot(catalog, store, generation_id, slot)
+            retries.succeeded(name)
         except (Unavailable, NotFound) as error:
-            log.error(
-                "slot %d of generation %s stays as it is: %s",
-                slot,
-                generation_id,
-                error,
-            )
+            retries.failed(name, error)
     return merged
 
 

@@ -12,6 +12,7 @@ from prometheus_client import CollectorRegistry
 from sqlalchemy.exc import SQLAlchemyError
 
 from services.steward.auto_evaluate import evaluate_changed_maps
+from services.steward.batches.worker import resume_batches
 from services.steward.collect import (
     CollectionHeld,
     collect,
@@ -22,6 +23,7 @@ from services.steward.compact import compact
 from services.steward.count_maps import count_large_maps
 from services.steward.counted_store import CountedStore
 from services.steward.delete_maps import delete_maps
+from services.steward.mend_generations import mend_generations
 from services.steward.metrics import StewardMetrics
 from services.steward.model_changes import advance_model_changes, fit_maps_that_wait
 from services.steward.queue import free_leases, resend_hints
@@ -34,9 +36,12 @@ from services.steward.retention import (
 from services.steward.search_workers import remove_dead_workers
 from shared.catalog.away import Outage
 from shared.catalog.session import Catalog
+from shared.catalog.unusable import sqlite_file
+from shared.disk_reserve import DiskReserve
 from shared.heartbeat import Heartbeat
 from shared.jobs import Hints
 from shared.objects import OwnedStore
+from shared.read_retries import ReadRetries
 from shared.settings import Settings
 
 log = logging.getLogger(__name__)
@@ -68,11 +73,16 @@ class Steward:
         self._metrics = metrics = metrics or StewardMetrics(CollectorRegistry())
         self._outage = Outage("steward")
         self._heartbeat = Heartbeat(settings.heartbeat_file)
+        merge_retries = ReadRetries()
 
         def counted(duty: str) -> CountedStore:
             return CountedStore(store, metrics.objects_deleted.labels(duty).inc)
 
+        # Of the catalog's own disk, where it is a file.
+        catalog_file = sqlite_file(catalog)
+        reserve = catalog_file and DiskReserve(catalog_file.parent, settings.min_free_bytes)
         self.duties = [
+            *([Duty("keep disk reserve", 5.0, reserve.keep)] if reserve else []),
             Duty(
                 "free leases",
                 1.0,
@@ -86,6 +96,8 @@ class Steward:
                 0.5,
                 lambda: advance_model_changes(catalog, hints),
             ),
+            Duty("mend generations", 5.0, lambda: mend_generations(catalog, store)),
+            Duty("resume batches", 5.0, lambda: resume_batches(catalog, settings)),
             Duty("remove dead search workers", 2.0, lambda: remove_dead_workers(catalog)),
             Duty(
                 "fit maps that wait",
@@ -96,7 +108,9 @@ class Steward:
             Duty(
                 "compact",
                 5.0,
-                lambda: metrics.slots_merged.inc(compact(catalog, store, settings.compact_chunks)),
+                lambda: metrics.slots_merged.inc(
+                    compact(catalog, store, settings.compact_chunks, merge_retries)
+                ),
             ),
             Duty("delete maps", 1.0, lambda: delete_maps(catalog, counted("delete_maps"))),
             Duty("collect", 10.0, lambda: collect(catalog, counted("collect"), settings)),

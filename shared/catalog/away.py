@@ -1,6 +1,6 @@
-"""What a failing catalog means: away for now, too busy, a transaction sacrificed, or a bug.
+"""What a failing catalog means: away, too busy, a transaction sacrificed, full, damaged, or a bug.
 
-Only the first three are worth another try; whoever has a bug in his statement must hear of it.
+Only the first four are worth another try; whoever has a bug in his statement must hear of it.
 """
 
 from __future__ import annotations
@@ -10,13 +10,18 @@ import logging
 from sqlalchemy.exc import DBAPIError, InterfaceError, InternalError, OperationalError
 from sqlalchemy.exc import TimeoutError as PoolTimeout
 
-from shared.errors import Unavailable
+from shared.errors import StorageFull, Unavailable
 
 log = logging.getLogger(__name__)
 
 SACRIFICED = {"40001": "serialization failure", "40P01": "deadlock"}
 TOO_SLOW = {"57014": "the statement took too long", "55P03": "a lock was not to be had"}
 READ_ONLY = "25006"  # the old primary, after a failover
+POSTGRES_FULL = "53100"
+POSTGRES_DAMAGED = ("XX001", "XX002")
+DAMAGED = ("SQLITE_CORRUPT", "SQLITE_NOTADB")
+"""How the names of SQLite's errors begin that mean a damaged file."""
+FULL_RETRY_SECONDS = 60
 
 
 def sqlstate(error: BaseException) -> str | None:
@@ -32,6 +37,26 @@ def as_unavailable(error: BaseException) -> Unavailable | None:
     if not isinstance(error, DBAPIError):
         return None
     state = sqlstate(error)
+    sqlite = str(getattr(error.orig, "sqlite_errorname", ""))
+    if sqlite == "SQLITE_FULL" or state == POSTGRES_FULL:
+        return StorageFull(
+            "disk_full",
+            "The disk of the catalog is full: nothing was changed. Make room on it, or delete "
+            "photos or maps.",
+            retry_after_seconds=FULL_RETRY_SECONDS,
+        )
+    if sqlite.startswith(DAMAGED) or state in POSTGRES_DAMAGED:
+        return Unavailable(
+            "catalog_damaged",
+            f"The catalog is damaged ({reason_of(error)}): nothing was changed. Stop the server, "
+            "then restore a backup or rebuild the catalog; placewise doctor says how.",
+        )
+    if sqlite.startswith("SQLITE_IOERR"):
+        return Unavailable(
+            "catalog_io_error",
+            f"The catalog's disk has failed ({reason_of(error)}): nothing was changed. Look at the "
+            "disk's free space and at the system's log (dmesg), and take a backup.",
+        )
     if state in TOO_SLOW:
         return _busy(TOO_SLOW[state])
     if state in SACRIFICED:
@@ -66,7 +91,7 @@ class Outage:
             log.error("the %s met an error in the catalog", self._who, exc_info=error)
         elif not self._away:
             self._away = True
-            log.warning("the %s waits for the catalog: %s", self._who, _first_line(error))
+            log.warning("the %s waits for the catalog: %s", self._who, reason_of(error))
 
     def over(self) -> None:
         """A round went well."""
@@ -75,5 +100,6 @@ class Outage:
             log.warning("the %s has the catalog back", self._who)
 
 
-def _first_line(error: Exception) -> str:
+def reason_of(error: BaseException) -> str:
+    """The database's own words, without the statement."""
     return str(getattr(error, "orig", None) or error).strip().split("\n", 1)[0]

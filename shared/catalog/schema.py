@@ -22,6 +22,7 @@ from sqlalchemy.exc import DBAPIError, SQLAlchemyError
 from shared.catalog.away import as_unavailable, sqlstate
 from shared.catalog.connections import Limits
 from shared.catalog.session import Catalog
+from shared.catalog.unusable import check_pages, opening
 from shared.errors import Misconfigured, PlacewiseError, Unavailable
 from shared.private_files import FILE_MODE, make_private_folder
 
@@ -46,11 +47,13 @@ def migrate(catalog: Catalog, patience_seconds: float = PATIENCE_SECONDS) -> Non
     On PostgreSQL each migration is a transaction of its own, which gives up after a second when it
     can't have a lock and is tried again: traffic goes on meanwhile. Raises Unavailable
     (`catalog_unavailable`; `catalog_busy` when a lock was not to be had for `patience_seconds`)
-    and Misconfigured (`schema_too_new`).
+    and Misconfigured (`schema_too_new`, and for a file that can't be used as `opening` does).
     """
     try:
         if catalog.is_sqlite:
-            _migrate_sqlite(catalog)
+            with opening(catalog):
+                check_pages(catalog)
+                _migrate_sqlite(catalog)
         else:
             _migrate_postgres(catalog, time.monotonic() + patience_seconds)
     except SQLAlchemyError as error:

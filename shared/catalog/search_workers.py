@@ -6,7 +6,7 @@ memory: it is why a generation is switched in only once it can be answered from.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from datetime import datetime
 from typing import Any
 from uuid import UUID
@@ -19,12 +19,16 @@ from shared.catalog.chunks import Chunk
 from shared.ids import new_id
 from shared.shards import Shard
 
+UNREADABLE = "unreadable"
+"""In `loaded`, beside the generations: the keys of the chunks that the worker can't read."""
+
 # Several heartbeats: a worker that was silent for longer holds up nothing any more.
 DEAD_SECONDS = 10.0
 
 
 class RegisteredWorker(Base):
-    """One process that answers searches. `loaded`: generation id -> version without a gap."""
+    """One process that answers searches. `loaded`: generation id -> version without a gap, and
+    `UNREADABLE`."""
 
     __tablename__ = "search_workers"
 
@@ -49,9 +53,12 @@ def tell_of_worker(
     url: str | None,
     shard: Shard,
     loaded: Mapping[UUID, int],
+    unreadable: Sequence[str] = (),
 ) -> None:
-    """The worker lives, and has loaded these versions."""
-    versions = {str(generation_id): version for generation_id, version in loaded.items()}
+    """The worker lives, has loaded these versions, and can't read these chunks."""
+    versions: dict[str, Any] = {str(id_): version for id_, version in loaded.items()}
+    if unreadable:
+        versions[UNREADABLE] = list(unreadable)
     known = session.execute(
         update(RegisteredWorker)
         .where(RegisteredWorker.id == worker_id)
@@ -82,6 +89,16 @@ def forget_dead_workers(session: Session, *, everyone: bool = False) -> int:
     if not everyone:
         dead = dead.where(RegisteredWorker.seen_at < db_now_plus(-DEAD_SECONDS))
     return rowcount(session.execute(dead))
+
+
+def unreadable_keys(session: Session) -> set[str]:
+    """The chunks that a live worker reports as unreadable."""
+    live = session.scalars(
+        select(RegisteredWorker.loaded).where(
+            RegisteredWorker.seen_at >= db_now_plus(-DEAD_SECONDS)
+        )
+    )
+    return {key for loaded in live for key in loaded.get(UNREADABLE, ())}
 
 
 def workers_without(session: Session, generation_id: UUID, version: int) -> list[RegisteredWorker]:

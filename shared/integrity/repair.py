@@ -29,7 +29,7 @@ def repair(catalog: Catalog, hints: Hints, report: Report) -> int:
     """
     queued = 0
     for chunk_id in dict.fromkeys(f.chunk_id for f in report.faults if f.chunk_id is not None):
-        queued += catalog.run(partial(_give_up, chunk_id=chunk_id))
+        queued += catalog.run(partial(give_up_chunk, chunk_id=chunk_id))
     lost = [fault.photo_id for fault in report.faults if fault.photo_id is not None]
     if lost:
         queued += catalog.run(lambda session: _queue(session, lost))
@@ -38,7 +38,8 @@ def repair(catalog: Catalog, hints: Hints, report: Report) -> int:
     return queued
 
 
-def _give_up(session: Session, chunk_id: UUID) -> int:
+def give_up_chunk(session: Session, chunk_id: UUID) -> int:
+    """Let the chunk's photos be described again, and its rows leave the catalog; how many."""
     chunk = session.get(Chunk, chunk_id)
     if chunk is None or chunk.superseded_at is not None:
         return 0  # merged or mended meanwhile

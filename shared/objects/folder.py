@@ -17,6 +17,7 @@ from datetime import UTC, datetime
 from pathlib import Path, PurePosixPath
 from typing import BinaryIO
 
+from shared.disk_reserve import DISK_FULL
 from shared.errors import NotFound, StorageFull, Unavailable
 from shared.ids import new_id
 from shared.objects.keys import TRASH, check_key, is_key
@@ -32,8 +33,8 @@ MARK = ".placewise"  # the file that says whose folder it is (`shared.objects.up
 # Another folder's part of the trash, on its own disk: so a move into the trash is a rename.
 TRASH_ELSEWHERE = f"{MARK}-trash"
 FULL_RETRY_SECONDS = 60
-FULL = (errno.ENOSPC, errno.EDQUOT)
 PIECE_BYTES = 1024 * 1024
+KEPT_FREE_BYTES = 16 * 1024 * 1024  # the last of the disk is the catalog's: it deletes with that
 
 
 class FolderStore:
@@ -167,6 +168,8 @@ class FolderStore:
                     file.write(b"ok")
                 probe.unlink()
             except OSError as error:
+                if error.errno in DISK_FULL:
+                    raise _full() from error
                 raise Unavailable(
                     "object_store_unavailable",
                     f"Can't write below {folder.name}: {error.strerror}. "
@@ -253,13 +256,17 @@ def _room() -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        if error.errno not in FULL:
+        if error.errno not in DISK_FULL:
             raise
-        raise StorageFull(
-            "disk_full",
-            "The disk of the object store is full: make room on it, or delete photos or maps.",
-            retry_after_seconds=FULL_RETRY_SECONDS,
-        ) from error
+        raise _full() from error
+
+
+def _full() -> StorageFull:
+    return StorageFull(
+        "disk_full",
+        "The disk of the object store is full: make room on it, or delete photos or maps.",
+        retry_after_seconds=FULL_RETRY_SECONDS,
+    )
 
 
 class FolderWriter:
@@ -271,6 +278,9 @@ class FolderWriter:
         self._target = target
         self._partial = partial
         self._make_room = make_room
+        while shutil.disk_usage(partial.parent).free < KEPT_FREE_BYTES:
+            if not make_room():
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         # Unbuffered: what a full disk did not take is not tried again by closing the file.
         self._file = create_private_file(partial, buffering=0)
 
@@ -281,7 +291,7 @@ class FolderWriter:
             try:
                 left = left[self._file.write(left) :]
             except OSError as error:
-                if error.errno not in FULL or not self._make_room():
+                if error.errno not in DISK_FULL or not self._make_room():
                     raise
 
     @_room()

@@ -12,20 +12,23 @@ from shared.shards import Shard
 
 def merge(answers: Sequence[SearchResponse], k: int, away: Iterable[Shard] = ()) -> SearchResponse:
     """The first `k` hits of all, and what has to be known of the way to them: the sums, the least
-    version, the weakest certificate. `away` are the shards that are missing, and are named."""
+    version, the weakest certificate. `away` are the shards that are missing, and are named: of an
+    answer that lacks anything, nothing is certain."""
     hits = _first(k, answers)
+    missing = (
+        *(key for answer in answers for key in answer.missing),
+        *(shard.name for shard in sorted(away)),
+    )
+    weakest = max((answer.certificate for answer in answers), key=_weakness)
     return SearchResponse(
         hits=tuple(hits),
-        certified_k=_certified(hits, answers),
+        certified_k=0 if missing else _certified(hits, answers),
         max_z=max((answer.max_z for answer in answers if answer.max_z is not None), default=None),
-        certificate=max((answer.certificate for answer in answers), key=_weakness),
+        certificate=NONE if missing else weakest,
         rows_scanned=sum(answer.rows_scanned for answer in answers),
         rows_reranked=sum(answer.rows_reranked for answer in answers),
         snapshot_version=min(answer.snapshot_version for answer in answers),
-        missing=(
-            *(key for answer in answers for key in answer.missing),
-            *(shard.name for shard in sorted(away)),
-        ),
+        missing=missing,
     )
 
 

@@ -41,6 +41,10 @@ class Worker:
         """The version of the generation that it had when it was looked at; -1 for none."""
         return -1 if self.status is None else self.status.versions.get(generation_id, -1)
 
+    def lacks_chunks(self, generation_id: UUID) -> bool:
+        """Whether it could not read a chunk of the generation: another replica may have it."""
+        return self.status is not None and generation_id in self.status.incomplete
+
 
 class Workers:
     """The workers at these addresses; thread-safe."""
@@ -93,7 +97,11 @@ class Workers:
             best = self._best(generation_id)
             order = random.sample(best, len(best))  # replicas share the work
             order.sort(
-                key=lambda worker: (not worker.up, worker.version(generation_id) < min_version)
+                key=lambda worker: (
+                    not worker.up,
+                    worker.version(generation_id) < min_version,
+                    worker.lacks_chunks(generation_id),
+                )
             )
             return {
                 shard: [w.url for w in order if w.shard == shard and not w.silent]
@@ -139,5 +147,7 @@ def _shards_of(workers: Sequence[Worker]) -> list[Shard]:
     return [Shard(index, of) for index in range(of)]
 
 
-def _how_far(worker: Worker) -> int:
-    return 0 if worker.status is None else sum(worker.status.versions.values())
+def _how_far(worker: Worker) -> tuple[int, bool]:
+    if worker.status is None:
+        return 0, False
+    return sum(worker.status.versions.values()), not worker.status.missing

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import shutil
 import tempfile
 import threading
@@ -10,7 +11,7 @@ import time
 from collections.abc import Callable, Collection, Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 from uuid import UUID
 
 import numpy as np
@@ -29,11 +30,13 @@ from hypothesis.stateful import (
 from numpy.typing import NDArray
 
 from services.search import answer, gpu
+from services.search import worker as worker_module
 from services.search.load import Loader
 from services.search.loaded_chunk import StoredChunk
 from services.search.metrics import SearchMetrics
 from services.search.worker import SearchWorker
 from services.steward.compact import merge_slot
+from shared import read_retries
 from shared.catalog.chunks import Chunk, Descriptor, live_chunks
 from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.maps import Map, bump_version, lock_map
@@ -579,6 +582,7 @@ class SearchPortContract:
         search = port()
         response = search.search(places.request(places.query(vector), k=20))
         assert response.missing == (key,)
+        assert (response.certificate, response.certified_k) == ("none", 0)
         assert_answers(response, places.brute_force(vector, 20))
         assert search.status().missing == (key,)
 
@@ -694,8 +698,13 @@ class TestSearchWorker(SearchPortContract):
         return open_port
 
     def test_repaired_chunk_is_served_again_without_a_new_version(
-        self, catalog: Catalog, store: FolderStore, settings: Settings
+        self,
+        catalog: Catalog,
+        store: FolderStore,
+        settings: Settings,
+        monkeypatch: pytest.MonkeyPatch,
     ) -> None:
+        monkeypatch.setattr(read_retries, "FIRST_RETRY_SECONDS", 0.0)
         places = SmallMap(catalog, store)
         places.add(unit_rows(1, 5))
         (key,) = places.chunk_keys()
@@ -708,6 +717,62 @@ class TestSearchWorker(SearchPortContract):
         worker.follow()
         assert worker.status().missing == ()
         assert worker.status().rows == 5
+
+    def test_damaged_chunk_is_not_read_again_with_every_look_and_every_new_version(
+        self,
+        catalog: Catalog,
+        store: FolderStore,
+        settings: Settings,
+        monkeypatch: pytest.MonkeyPatch,
+    ) -> None:
+        places = SmallMap(catalog, store)
+        places.add(unit_rows(1, 5))
+        (key,) = places.chunk_keys()
+        store.put(key, _damaged(store.get(key), "flipped"))
+        opened: list[str] = []
+        open_object = store.open
+
+        def counted(key: str) -> BinaryIO:
+            opened.append(key)
+            return open_object(key)
+
+        monkeypatch.setattr(store, "open", counted)
+        worker = SearchWorker(catalog, store, settings)
+        for seed in (2, 3):
+            worker.follow()
+            worker.follow()
+            places.add(unit_rows(seed, 5))
+            request = places.request(places.query(unit_rows(seed, 1)[0]), k=20)
+            assert worker.search(request).missing == (key,)
+        assert opened.count(key) == 1
+
+    def test_chunk_that_is_truncated_while_it_is_mapped_is_left_out(
+        self,
+        catalog: Catalog,
+        store: FolderStore,
+        settings: Settings,
+        monkeypatch: pytest.MonkeyPatch,
+    ) -> None:
+        """Reading such a mapping would end the process. A deleted file is read on."""
+        monkeypatch.setattr(read_retries, "FIRST_RETRY_SECONDS", 0.0)
+        monkeypatch.setattr(worker_module, "FILE_CHECK_SECONDS", 0.0)
+        places = SmallMap(catalog, store)
+        places.add(unit_rows(1, 5))
+        kept = places.reference(places.add(unit_rows(2, 5))[0])[0]
+        (key,) = set(places.chunk_keys()) - {kept}
+        worker = SearchWorker(
+            catalog, store, settings.model_copy(update={"search_memory_bytes": 0})
+        )
+        worker.follow()
+        assert worker.status().rows == 10
+        whole = store.get(key)
+        os.truncate(store.path(key), 200)
+        store.delete(kept)
+        worker.follow()
+        assert (worker.status().missing, worker.status().rows) == ((key,), 5)
+        store.put(key, whole)
+        worker.follow()
+        assert (worker.status().missing, worker.status().rows) == ((), 10)
 
     def test_following_forgets_what_is_no_longer_searched(
         self, catalog: Catalog, store: FolderStore, settings: Settings

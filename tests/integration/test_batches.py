@@ -6,6 +6,7 @@ import json
 import threading
 from collections import Counter
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 from uuid import UUID
 
@@ -16,13 +17,13 @@ from services.extractor.worker import ExtractorWorker
 from services.gateway.batches import checked_prefix
 from services.steward.batches import bring_in as bring_in_module
 from services.steward.batches import worker as worker_module
-from services.steward.batches.worker import BatchWorker
+from services.steward.batches.worker import BatchWorker, resume_batches
 from services.steward.collect import collect_brought, collect_orphans
 from services.steward.delete_maps import delete_maps
 from shared.catalog.maps import ensure_default_map
 from shared.catalog.photos import Photo
 from shared.catalog.session import Catalog
-from shared.errors import Unavailable, Unprocessable
+from shared.errors import StorageFull, Unavailable, Unprocessable
 from shared.intake import incoming as incoming_module
 from shared.intake import store_photo as store_photo_module
 from shared.jobs import InProcessHints, Job, JobKind, JobState, free_expired_leases
@@ -811,6 +812,41 @@ def test_a_batch_pauses_while_the_store_is_away(
     assert (job.state, job.attempts) == (JobState.RUNNING, 0)
     assert job.run_after is not None
     monkeypatch.setattr(FolderStore, "writer", real)
+    assert_each_is_there_once(batches, job_id, 2)
+
+
+def test_a_batch_waits_while_the_disk_is_full_and_goes_on_by_itself(
+    batches: Batches, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    job_id = batches.start(archive=zip_of(files(1, 2)))
+    free = SimpleNamespace(free=batches.settings.min_free_bytes - 1)
+    monkeypatch.setattr("shared.disk_space.shutil.disk_usage", lambda folder: free)
+    assert batches.work()
+    for _ in range(2):
+        resume_batches(batches.catalog, batches.settings)
+        assert not batches.work(), "nothing is taken while it waits"
+    job = batches.job(job_id)
+    assert (job["state"], job["waiting_for"]) == ("running", "disk_space")
+    assert (job["stage"], counts(job), batches.photos()) == ("store", (0, 2, 0), [])
+    free.free += 1
+    resume_batches(batches.catalog, batches.settings)
+    assert_each_is_there_once(batches, job_id, 2)
+
+
+def test_a_batch_waits_while_the_store_has_no_room_and_tries_again(
+    batches: Batches, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    job_id = batches.start(archive=zip_of(files(1, 2)))
+    real: Any = FolderStore.writer
+
+    def full(self: FolderStore, key: str) -> Any:
+        raise StorageFull("object_store_full", "no room")
+
+    monkeypatch.setattr(FolderStore, "writer", full)
+    assert batches.work()
+    assert batches.job(job_id)["waiting_for"] == "disk_space"
+    monkeypatch.setattr(FolderStore, "writer", real)
+    resume_batches(batches.catalog, batches.settings)
     assert_each_is_there_once(batches, job_id, 2)
 
 

@@ -234,14 +234,24 @@ def test_a_full_disk_takes_no_photo_and_answers_all_else(
     (photo,) = service.indexed(1)
     before = {info.key for info in store.list("")}
     free = SimpleNamespace(free=GIGABYTE - 1)
-    monkeypatch.setattr("services.gateway.room.shutil.disk_usage", lambda folder: free)
-    for path in ("/upload", "/similarity", "/vocabularies/import"):
+    monkeypatch.setattr("shared.disk_space.shutil.disk_usage", lambda folder: free)
+    for path in ("/upload", "/vocabularies/import"):
         answer = service("POST", path, files={"file": photo_bytes(2)})
         body = problem(answer, 507, "disk_full")
         assert "MIN_FREE_BYTES" in body["detail"]
         assert int(answer.headers["retry-after"]) > 0
     problem(service("POST", "/vocabularies"), 507, "disk_full")
     assert {info.key for info in store.list("")} == before
+    health = service("GET", "/health").json()
+    assert health["status"] == health["parts"]["object_store"]["status"] == "degraded"
+    assert "MIN_FREE_BYTES" in health["parts"]["object_store"]["detail"]
+    assert service("GET", "/../../readyz").status_code == 200
+    job_id = service.ask(near_copy(1))
+    service.drain()
+    assert service.json("GET", f"/jobs/{job_id}/result")["total_similar"] == 1
+    free.free = GIGABYTE // 10 - 1
+    answer = service("POST", "/similarity", files={"file": photo_bytes(2)})
+    problem(answer, 507, "disk_full")
     assert service.json("POST", f"/similarity/{photo}")["total_similar"] == 0
     service.json("DELETE", f"/uploads/{photo}")
     free.free = GIGABYTE
@@ -257,15 +267,15 @@ def test_the_disk_of_the_originals_counts_too_and_no_disk_where_nothing_lies(
         asked.append(str(folder))
         return SimpleNamespace(free=5 if "photos" in str(folder) else 9)
 
-    monkeypatch.setattr("services.gateway.room.shutil.disk_usage", usage)
+    monkeypatch.setattr("shared.disk_space.shutil.disk_usage", usage)
     photos = settings.placewise_home.parent / "photos"
     photos.mkdir()
     elsewhere = settings.model_copy(update={"upload_dir": photos})
-    assert Room(catalog, elsewhere).free_bytes() == 5
-    assert Room(catalog, settings).free_bytes() == 9
+    assert Room(catalog, elsewhere).disk.free_bytes() == 5
+    assert Room(catalog, settings).disk.free_bytes() == 9
     asked.clear()
     away = settings.model_copy(update={"s3_endpoint": "s3:1", "database_url": "postgresql://db"})
-    assert Room(catalog, away).free_bytes() is None
+    assert Room(catalog, away).disk.free_bytes() is None
     assert asked == []
 
 

@@ -15,7 +15,11 @@ from sqlalchemy import select, update
 
 from services.search.presence import Presence
 from services.search.worker import SearchWorker
+from services.steward import mend_generations as mend_generations_module
+from services.steward import search_workers
+from services.steward.mend_generations import mend_generations
 from services.steward.search_workers import SLOW_SECONDS, remove_dead_workers
+from shared import read_retries
 from shared.catalog.base import db_now, db_now_plus
 from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.maps import Map
@@ -217,8 +221,9 @@ def test_a_worker_that_lives_and_does_not_load_is_named_and_waited_for(
 
 
 def test_a_chunk_that_a_worker_can_not_read_is_not_loaded(
-    fitted: Workplace, register: Register
+    fitted: Workplace, register: Register, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(read_retries, "FIRST_RETRY_SECONDS", 0.0)
     worker = register("worker")
     job_id, new_id = complete(fitted)
     key = next(k for k in fitted.keys(f"chunks/{new_id}/") if k.endswith(".npy"))
@@ -231,6 +236,71 @@ def test_a_chunk_that_a_worker_can_not_read_is_not_loaded(
     worker.catch_up()
     fitted.advance()
     assert fitted.active().id == new_id
+
+
+@pytest.mark.parametrize("damage", ["truncated", "gone"])
+def test_a_damaged_chunk_of_what_is_built_is_described_again_and_then_switched_in(
+    fitted: Workplace, register: Register, monkeypatch: pytest.MonkeyPatch, damage: str
+) -> None:
+    worker = register("worker")
+    job_id, new_id = complete(fitted)
+    key = next(k for k in fitted.keys(f"chunks/{new_id}/") if k.endswith(".npy"))
+    whole = fitted.store.get(key)
+    if damage == "gone":
+        fitted.store.delete(key)
+    else:
+        fitted.store.put(key, whole[:-1])
+    worker.catch_up()
+    mend_generations(fitted.catalog, fitted.store)
+    assert fitted.keys(f"chunks/{new_id}/"), "another look may find it whole"
+    fitted.advance()
+    assert fitted.job(job_id).waiting_for == WaitingFor.SEARCH
+
+    monkeypatch.setattr(search_workers, "SLOW_SECONDS", 0.0)
+    mend_generations(fitted.catalog, fitted.store)
+    fitted.advance()
+    assert fitted.job(job_id).waiting_for == WaitingFor.DESCRIPTORS
+    fitted.drain()
+    fitted.advance()
+    assert fitted.active().id != new_id, "search has not loaded the rows that were made again"
+    worker.catch_up()
+    fitted.advance()
+    assert fitted.job(job_id).state == JobState.SUCCEEDED
+    assert len(found(worker, fitted, fitted.active())) == PHOTOS
+
+
+def test_a_chunk_that_only_its_worker_can_not_read_is_kept(
+    fitted: Workplace, register: Register, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    worker = register("worker")
+    job_id, new_id = complete(fitted)
+    key = next(k for k in fitted.keys(f"chunks/{new_id}/") if k.endswith(".npy"))
+    whole = fitted.store.get(key)
+    fitted.store.put(key, whole[:-1])
+    worker.catch_up()
+    fitted.store.put(key, whole)
+    monkeypatch.setattr(search_workers, "SLOW_SECONDS", 0.0)
+    mend_generations(fitted.catalog, fitted.store)
+    fitted.advance()
+    assert fitted.job(job_id).waiting_for == WaitingFor.SEARCH
+
+
+def test_a_model_change_whose_chunks_are_damaged_again_and_again_fails(
+    fitted: Workplace, register: Register, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(mend_generations_module, "MAX_MENDED_CHUNKS", 0)
+    monkeypatch.setattr(search_workers, "SLOW_SECONDS", 0.0)
+    worker, old = register("worker"), fitted.active()
+    job_id, new_id = complete(fitted)
+    key = next(k for k in fitted.keys(f"chunks/{new_id}/") if k.endswith(".npy"))
+    fitted.store.put(key, fitted.store.get(key)[:-1])
+    worker.catch_up()
+    mend_generations(fitted.catalog, fitted.store)
+    job = fitted.job(job_id)
+    assert job.state == JobState.FAILED
+    assert job.error is not None
+    assert job.error["code"] == "chunk_corrupt"
+    assert fitted.active().id == old.id
 
 
 def test_a_shard_without_a_row_of_it_is_not_waited_for(

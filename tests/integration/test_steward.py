@@ -57,6 +57,7 @@ from shared.objects.keys import (
     work_key,
 )
 from shared.objects.trash import TrashSize, restore_trash
+from shared.read_retries import ReadRetries
 from shared.settings import Settings
 from tests.integration.workplace import same
 from tests.support.catalog_rows import (
@@ -307,6 +308,22 @@ def test_a_corrupt_chunk_stays_and_others_are_merged(house: House) -> None:
     assert house.live() == [(0, 5), (0, 5), (1, 6)]
     house.store.put(broken, whole)
     house.check_rows(photo_ids)
+
+
+def test_a_corrupt_chunk_is_not_read_with_every_round_of_merging(
+    house: House, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    house.chunks(1, 1)
+    with house.catalog.read() as session:
+        broken = live_chunks(session, house.generation_id)[0].object_key
+    whole = house.store.get(broken)
+    house.store.put(broken, whole[:-1])
+    retries = ReadRetries()
+    assert compact(house.catalog, house.store, 2, retries) == 0
+    house.store.put(broken, whole)
+    assert compact(house.catalog, house.store, 2, retries) == 0, "its pause is not over"
+    monkeypatch.setattr("shared.read_retries.time.monotonic", lambda: float("inf"))
+    assert compact(house.catalog, house.store, 2, retries) == 1
 
 
 def test_generations_that_no_longer_answer_are_not_merged(house: House) -> None:

@@ -127,6 +127,20 @@ def test_objects_of_a_bucket_are_fetched_once(tmp_path: Path, folder: Path) -> N
     assert store.opened == 1
 
 
+@pytest.mark.parametrize("damage", [b"", b"x" * 1000], ids=["empty", "other bytes"])
+def test_a_damaged_copy_in_the_cache_is_fetched_again(
+    tmp_path: Path, folder: Path, damage: bytes
+) -> None:
+    bucket = Bucket(tmp_path / "objects")
+    rows = unit_rows(3)
+    chunk = written(bucket, rows)
+    (folder / f"{chunk.sha256}.npy").parent.mkdir(parents=True)
+    (folder / f"{chunk.sha256}.npy").write_bytes(damage)
+    assert np.array_equal(Loader(bucket, folder).rows(chunk).rows, rows)
+    assert np.array_equal(Loader(bucket, folder).rows(chunk).rows, rows)
+    assert bucket.opened == 1
+
+
 def test_files_of_a_folder_are_not_copied(tmp_path: Path, folder: Path) -> None:
     store = FolderStore(tmp_path / "objects")
     Loader(store, folder).rows(written(store, unit_rows(5)))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 from uuid import UUID
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -100,6 +101,17 @@ def test_the_sums_the_least_version_and_all_that_is_missing_are_told() -> None:
     )
     assert (merged.snapshot_version, merged.rows_scanned, merged.rows_reranked) == (8, 7, 3)
     assert merged.missing == ("chunks/a", "chunks/b", "shard 1/4", "shard 3/4")
+
+
+@pytest.mark.parametrize(
+    ("missing", "away"), [(("chunks/a",), []), ((), [Shard(1, 2)])], ids=["chunk", "shard"]
+)
+def test_nothing_is_certain_of_an_answer_that_lacks_a_part_of_the_map(
+    missing: tuple[str, ...], away: list[Shard]
+) -> None:
+    """Also where a worker of the release before promised more."""
+    merged = merge([answer((1, 0.9), certified_k=1, missing=missing)], 1, away)
+    assert (merged.certificate, merged.certified_k) == (NONE, 0)
 
 
 def test_the_weakest_certificate_counts() -> None:

@@ -20,7 +20,8 @@ from services.steward.batches.list_prefix import list_prefix
 from services.steward.metrics import StewardMetrics
 from services.steward.take import Stopped, Taker
 from shared.catalog.session import Catalog
-from shared.errors import PlacewiseError
+from shared.disk_space import DiskSpace
+from shared.errors import PlacewiseError, StorageFull
 from shared.jobs import Hints, Job, JobKind, JobState
 from shared.jobs.batches import (
     BatchItem,
@@ -34,7 +35,7 @@ from shared.jobs.batches import (
     queued_items,
     waits_for_vocabulary,
 )
-from shared.jobs.finish import release, succeed
+from shared.jobs.finish import release, release_waiting, succeed
 from shared.jobs.leases import held, token_of
 from shared.jobs.table import WaitingFor, claimable
 from shared.objects import ObjectStore
@@ -46,6 +47,21 @@ SLICE_SECONDS = 2.0
 FOLLOW_SECONDS = 0.5  # between two looks at what the extractors have done
 TURN_SECONDS = 0.1  # in which another batch is taken first
 AT_ONCE = 50  # items read from the catalog in one go
+
+
+def resume_batches(catalog: Catalog, settings: Settings) -> None:
+    """Let the batches that wait for disk space go on once MIN_FREE_BYTES are free. Of a bucket, how
+    much is free is not known: they try their next photo."""
+    waits = (Job.kind == JobKind.BATCH) & (Job.waiting_for == WaitingFor.DISK_SPACE)
+    with catalog.read() as session:
+        if not session.scalar(select(exists(select(Job.id).where(waits)))):
+            return
+    try:
+        DiskSpace(settings).check()
+    except StorageFull:
+        return
+    with catalog.write() as session:
+        release_waiting(session, waits)
 
 
 class BatchWorker:
@@ -63,6 +79,7 @@ class BatchWorker:
         self._catalog = catalog
         self._store = store
         self._settings = settings
+        self._disk = DiskSpace(settings)
         self._bring_in = BringIn(catalog, store, hints, settings)
         counted = metrics or StewardMetrics(CollectorRegistry())
         self._taker = Taker(catalog, settings, name, (JobKind.BATCH,), counted)
@@ -81,14 +98,20 @@ class BatchWorker:
             self._list(job)
         elif job.attempts >= self._settings.max_attempts:
             self._give_up_next(job)
-        while time.monotonic() < until and (items := self._next_items(job)):
-            for item in items:
-                if stop.is_set():
-                    raise Stopped
-                self._bring_in.bring_in(job, item)
-                if time.monotonic() > until:
-                    break
-        self._rest(job)
+        try:
+            while time.monotonic() < until and (items := self._next_items(job)):
+                for item in items:
+                    if stop.is_set():
+                        raise Stopped
+                    self._disk.check()
+                    self._bring_in.bring_in(job, item)
+                    if time.monotonic() > until:
+                        break
+        except StorageFull as error:
+            log.warning("the batch %s waits for disk space: %s", job.id, error)
+            self._rest(job, WaitingFor.DISK_SPACE)
+        else:
+            self._rest(job)
 
     def _list(self, job: Job) -> None:
         """Archives and prefixes come without items: the gateway lists files and keys."""
@@ -128,8 +151,9 @@ class BatchWorker:
             room = most - photos_ahead(session, most)
             return queued_items(session, job.id, min(AT_ONCE, room)) if room > 0 else []
 
-    def _rest(self, job: Job) -> None:
-        """The slice's end: note the progress; end the batch, or say when it goes on."""
+    def _rest(self, job: Job, waiting_for: WaitingFor | None = None) -> None:
+        """The slice's end: note the progress; end the batch, or say when its queued items go on, or
+        what they wait for."""
         with self._catalog.write() as session:
             mine = lock_map_and_batch(session, job, token_of(job))
             if mine is None:
@@ -137,7 +161,8 @@ class BatchWorker:
             mine.attempts = 0
             counts = follow_items(session, mine)
             if counts[JobState.QUEUED]:
-                release(mine, after_seconds=self._pause_seconds(session, mine))
+                pause = 0.0 if waiting_for else self._pause_seconds(session, mine)
+                release(mine, after_seconds=pause, waiting_for=waiting_for)
                 return
             if counts[JobState.RUNNING]:
                 mine.stage = "describe"

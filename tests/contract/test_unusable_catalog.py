@@ -1,0 +1,201 @@
+"""A catalog that is damaged, full or no catalog: said at the start, and at run time, in words."""
+
+from __future__ import annotations
+
+import logging
+import os
+import shutil
+import sqlite3
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from sqlalchemy import event, text
+from sqlalchemy.exc import OperationalError
+from starlette.testclient import TestClient
+
+from services.gateway.app import create_app
+from services.gateway.context import Gateway
+from services.gateway.keys import NoKeys
+from services.search.worker import SearchWorker
+from shared.catalog.away import as_unavailable
+from shared.catalog.maps import ensure_default_map
+from shared.catalog.schema import migrate
+from shared.catalog.session import Catalog
+from shared.catalog.unusable import check_pages
+from shared.errors import Misconfigured, StorageFull
+from shared.jobs import InProcessHints
+from shared.objects import FolderStore
+from shared.settings import Settings
+from tests.support.problems import problem
+from tests.support.server import environment, run_command
+
+PAGE_BYTES = 4096
+
+
+@pytest.fixture
+def file(migrated_sqlite: Path, tmp_path: Path) -> Path:
+    """A migrated catalog, as a server leaves it behind."""
+    home = tmp_path / "home"
+    home.mkdir()
+    return Path(shutil.copy(migrated_sqlite, home / "catalog.sqlite"))
+
+
+@pytest.fixture
+def catalog(file: Path) -> Iterator[Catalog]:
+    opened = Catalog(f"sqlite:///{file}")
+    yield opened
+    opened.close()
+
+
+def damage_pages(file: Path) -> None:
+    """Every page but the first, which holds the schema's table of tables."""
+    with file.open("r+b") as opened:
+        opened.seek(PAGE_BYTES)
+        opened.write(b"\xa5" * (file.stat().st_size - PAGE_BYTES))
+
+
+def damage_last_page(file: Path) -> None:
+    with file.open("r+b") as opened:
+        opened.seek(-PAGE_BYTES, os.SEEK_END)
+        opened.write(b"\xa5" * PAGE_BYTES)
+
+
+def no_sqlite(file: Path) -> None:
+    file.write_bytes(b"These are notes of someone, and no catalog at all. " * 100)
+
+
+def truncate(file: Path) -> None:
+    os.truncate(file, 3 * PAGE_BYTES)
+
+
+def make_folder(file: Path) -> None:
+    file.unlink()
+    file.mkdir()
+
+
+@pytest.mark.parametrize(
+    ("damage", "code", "says"),
+    [
+        (damage_pages, "catalog_damaged", "placewise rebuild-catalog"),
+        (damage_last_page, "catalog_damaged", "placewise restore FOLDER"),
+        (truncate, "catalog_damaged", "placewise restore FOLDER"),
+        (no_sqlite, "catalog_damaged", "file is not a database"),
+        (make_folder, "catalog_is_folder", "is a folder"),
+    ],
+)
+def test_a_start_names_the_file_and_the_ways_out(
+    file: Path, catalog: Catalog, damage: Callable[[Path], None], code: str, says: str
+) -> None:
+    damage(file)
+    with pytest.raises(Misconfigured) as caught:
+        migrate(catalog)
+    assert caught.value.code == code
+    assert str(file) in caught.value.detail
+    assert says in caught.value.detail
+
+
+def test_a_file_that_may_not_be_written_is_named(
+    file: Path, catalog: Catalog, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its permissions are not changed: to root they mean nothing."""
+    monkeypatch.setattr("shared.catalog.unusable.os.access", lambda path, mode: False)
+    with pytest.raises(Misconfigured, match="permissions") as caught:
+        migrate(catalog)
+    assert (caught.value.code, str(file) in caught.value.detail) == ("catalog_unreadable", True)
+
+
+def test_a_large_catalog_is_read_whole_by_the_doctor_only(file: Path, catalog: Catalog) -> None:
+    damage_last_page(file)
+    check_pages(catalog, max_bytes=PAGE_BYTES)
+    with pytest.raises(Misconfigured, match="placewise restore"):
+        check_pages(catalog, max_bytes=None)
+
+
+@pytest.mark.parametrize("command", ["serve", "doctor"])
+def test_a_command_on_a_damaged_catalog_ends_with_a_sentence(file: Path, command: str) -> None:
+    no_sqlite(file)
+    done = run_command(command, env=environment(file.parent), cwd=file.parent)
+    said = done.stdout + done.stderr
+    assert done.returncode == 1
+    assert str(file) in said
+    assert "placewise rebuild-catalog" in said
+    assert "Traceback" not in said
+
+
+# --- while it runs ---------------------------------------------------------------------------
+
+
+@pytest.fixture
+def client(catalog: Catalog, store: FolderStore, settings: Settings) -> TestClient:
+    with catalog.write() as session:
+        ensure_default_map(session, settings.extractor)
+    search = SearchWorker(catalog, store, settings)
+    gateway = Gateway(catalog, store, InProcessHints(), search, settings, NoKeys())
+    return TestClient(create_app(gateway), base_url="http://localhost")
+
+
+def test_damage_that_is_met_at_run_time_is_a_503_with_one_line_in_the_log(
+    catalog: Catalog, file: Path, client: TestClient, caplog: pytest.LogCaptureFixture
+) -> None:
+    catalog.close()  # its last connection writes the log back into the file
+    damage_pages(file)
+    with caplog.at_level(logging.INFO):
+        problem(client.get("/api/v1/maps"), 503, "catalog_damaged")
+    errors = [record for record in caplog.records if record.levelno >= logging.ERROR]
+    assert [record.exc_info for record in errors] == [None]
+    health = client.get("/api/v1/health")
+    assert health.status_code == 503
+    part = health.json()["parts"]["catalog"]
+    assert part["status"] == "unhealthy"
+    assert "doctor" in part["detail"]
+
+
+def test_a_catalog_without_room_is_a_507(catalog: Catalog, client: TestClient) -> None:
+    def limit(connection: sqlite3.Connection, *_: object) -> None:
+        connection.execute("PRAGMA max_page_count = 1")  # as it is now, and not a page more
+
+    catalog.close()
+    event.listen(catalog.engine, "connect", limit)
+    for number in range(200):
+        answer = client.post("/api/v1/maps", json={"name": f"a-map-with-a-long-name-{number:060}"})
+        if answer.status_code != 201:
+            break
+    problem(answer, 507, "disk_full")
+    assert int(answer.headers["retry-after"]) > 0
+    assert client.get("/api/v1/maps").status_code == 200
+
+
+def test_what_a_failing_disk_says_is_no_word_of_being_away() -> None:
+    original = sqlite3.OperationalError("disk I/O error")
+    original.sqlite_errorname = "SQLITE_IOERR_READ"
+    told = as_unavailable(OperationalError("SELECT 1", {}, original))
+    assert told is not None
+    assert (told.code, told.status) == ("catalog_io_error", 503)
+    assert "dmesg" in told.detail
+
+
+def test_postgresql_without_room_is_full_and_not_away() -> None:
+    class DiskFull(Exception):
+        sqlstate = "53100"
+
+    told = as_unavailable(OperationalError("INSERT", {}, DiskFull("no space left on device")))
+    assert isinstance(told, StorageFull)
+
+
+def test_a_full_disk_at_the_start_is_said_with_the_free_bytes(
+    file: Path, catalog: Catalog, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        original = sqlite3.OperationalError("disk I/O error")
+        original.sqlite_errorname = "SQLITE_IOERR_SHMSIZE"  # as SQLite says on a full tmpfs
+        raise OperationalError("PRAGMA journal_mode = WAL", {}, original)
+
+    event.listen(catalog.engine, "begin", full)
+    usage = shutil._ntuple_diskusage(100, 100, 0)
+    monkeypatch.setattr("shared.catalog.unusable.shutil.disk_usage", lambda folder: usage)
+    with pytest.raises(Misconfigured, match="Make room") as caught:
+        migrate(catalog)
+    assert caught.value.code == "disk_full"
+    with catalog.engine.connect() as connection, pytest.raises(OperationalError):
+        connection.execute(text("SELECT 1"))

@@ -1,0 +1,79 @@
+"""The disk space that is set aside for the catalog."""
+
+from __future__ import annotations
+
+import errno
+import os
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from shared.disk_reserve import RESERVE_BYTES, DiskReserve
+from shared.errors import StorageFull
+from shared.home import address_file, announced
+from shared.objects import FolderStore
+
+GIGABYTE = 1_000_000_000
+
+
+@pytest.fixture
+def disk(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
+    free = SimpleNamespace(free=GIGABYTE)
+    monkeypatch.setattr("shared.disk_reserve.shutil.disk_usage", lambda folder: free)
+    return free
+
+
+def test_the_reserve_is_freed_on_a_full_disk_and_written_again_once_there_is_room(
+    tmp_path: Path, disk: SimpleNamespace
+) -> None:
+    reserve, file = DiskReserve(tmp_path, GIGABYTE // 2), tmp_path / "reserve.bin"
+    reserve.keep()
+    status = file.stat()
+    assert (status.st_size, status.st_mode & 0o777) == (RESERVE_BYTES, 0o600)
+    assert status.st_blocks * 512 >= RESERVE_BYTES, "a hole reserves nothing"
+    disk.free = 0
+    reserve.release()
+    assert not file.exists()
+    disk.free = GIGABYTE // 2
+    reserve.keep()
+    assert not file.exists(), "uploads would be refused for it"
+    disk.free += RESERVE_BYTES
+    reserve.keep()
+    assert file.exists()
+
+
+def test_a_reserve_that_finds_no_room_leaves_nothing(
+    tmp_path: Path, disk: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr("shared.disk_reserve.os.posix_fallocate", full, raising=False)
+    DiskReserve(tmp_path, 0).keep()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_object_store_leaves_the_last_of_the_disk_to_the_catalog(
+    tmp_path: Path, disk: SimpleNamespace
+) -> None:
+    store = FolderStore(tmp_path)
+    disk.free = RESERVE_BYTES - 1
+    with pytest.raises(StorageFull):
+        store.put("originals/a", b"some")
+    assert list(store.list("")) == []
+    disk.free = RESERVE_BYTES
+    store.put("originals/a", b"some")
+
+
+def test_a_server_without_room_for_its_address_starts_and_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    address_file(tmp_path).write_text("of a server that was killed")
+    monkeypatch.setattr("shared.home.write_private", full)
+    with announced(tmp_path, "http://127.0.0.1:1"):
+        assert not address_file(tmp_path).exists()
+    assert "--server http://127.0.0.1:1" in caplog.text
