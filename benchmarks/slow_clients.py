@@ -22,6 +22,7 @@ import time
 from collections.abc import Awaitable, Callable, Iterator
 from dataclasses import dataclass, field
 from http.client import HTTPConnection, HTTPException
+from multiprocessing.synchronize import Event
 from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
@@ -38,7 +39,7 @@ if TYPE_CHECKING:
 WANTED_RATIO = 5.0  # of the p95 without an attack
 WANTED_LOG_BYTES_PER_MINUTE = 1_000_000
 START_SECONDS = 60.0
-SETTLE_SECONDS = 5.0  # until the attack has opened what it can
+SETTLE_SECONDS = 10.0  # until the attack has opened what it can
 CALL_SECONDS = 30.0  # a call that takes longer has failed
 REOPEN_SECONDS = 5.0  # until a client comes back whose connection was closed
 WATCHED_JOBS = 50
@@ -208,9 +209,13 @@ def _call(
 @contextlib.contextmanager
 def _under(attack: Attack) -> Iterator[None]:
     """The attack in a process of its own, begun SETTLE_SECONDS ago."""
-    process = multiprocessing.get_context("spawn").Process(target=_attack, args=(attack,))
+    context = multiprocessing.get_context("spawn")
+    begun = context.Event()
+    process = context.Process(target=_attack, args=(attack, begun))
     process.start()
     try:
+        if not begun.wait(START_SECONDS):
+            raise Unavailable("attack_not_begun", "The process of the slow clients did not start.")
         time.sleep(SETTLE_SECONDS)
         yield
     finally:
@@ -218,9 +223,10 @@ def _under(attack: Attack) -> Iterator[None]:
         process.join()
 
 
-def _attack(attack: Attack) -> None:
+def _attack(attack: Attack, begun: Event) -> None:
     hard = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
     resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
+    begun.set()
     asyncio.run(_attack_together(attack))
 
 

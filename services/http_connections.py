@@ -242,6 +242,10 @@ class LimitedProtocol(H11Protocol):
         super().on_response_complete()
         self._note_state()
 
+    def resume_writing(self) -> None:
+        super().resume_writing()
+        self._unsent_since = time.monotonic()
+
     def _note_state(self) -> None:
         state = self.conn.their_state
         if state is h11.IDLE:
