@@ -2,13 +2,14 @@
 
 uvicorn has no such limits. `LimitedProtocol` adds them to its HTTP/1.1 protocol:
 
-| what | limit | then |
+| what | limit | beyond it |
 |---|---|---|
-| connections in all, and of one address | MAX_CONNECTIONS, MAX_CONNECTIONS_PER_ADDRESS | an idle one is closed; where none is idle, the new one is refused (503, 429) |
-| a request's head | REQUEST_HEAD_SECONDS | 408, or closed where nothing came |
+| connections in all | MAX_CONNECTIONS | an idle one is closed; where none is, 503 |
+| connections of one address | MAX_CONNECTIONS_PER_ADDRESS | the same, 429 |
+| a request's head | REQUEST_HEAD_SECONDS | 408; closed where nothing came |
 | a request's body | MIN_BODY_BYTES_PER_SECOND | 408 |
 | an answer that is not read | STALLED_SECONDS | closed |
-"""  # noqa: E501
+"""
 
 from __future__ import annotations
 
