@@ -11,7 +11,7 @@ from typing import Any
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from shared.problems import REQUEST_ID
+from shared.problems import CLIENT_GONE, CLOSED_WITH, REQUEST_ID
 from shared.telemetry.request_id import HEADER, accept_request_id, under_request_id
 from shared.telemetry.traces import span
 
@@ -68,8 +68,13 @@ class CallLog:
         # For the handler of unforeseen errors, which stands outside of every middleware.
         scope[REQUEST_ID] = request_id
 
+        gone = False
+
         async def counted() -> Message:
+            nonlocal gone
             message = await receive()
+            # Whatever is answered from now on, the client does not get it.
+            gone = gone or (message["type"] == "http.disconnect" and call.begun_seconds is None)
             call.received_bytes += len(message.get("body", b""))
             return message
 
@@ -88,6 +93,8 @@ class CallLog:
             try:
                 await self._app(scope, counted, marked)
             finally:
+                if gone or CLOSED_WITH in scope:
+                    call.status = scope.get(CLOSED_WITH, CLIENT_GONE)
                 call.route = _template(scope)
                 describe(f"{method} {call.route}", status=call.status)
                 self._on_end(call)

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import signal
 import socket
 import threading
 from collections.abc import Callable, Iterator
+from functools import partial
 
 import uvicorn
 from fastapi import FastAPI
 
+from services.http_connections import Connections, LimitedProtocol
 from shared.errors import Misconfigured
 
 BACKLOG = 2048  # connections that wait to be accepted
+# Then those are counted before more are accepted: a crowd can't use up all file descriptors.
+ACCEPTED_AT_ONCE = 16
 # Of a connection without a request. Longer than clients and balancers keep theirs (mostly 60 s):
 # who closes first must not be the one that may be sent a request at the same moment.
 KEEP_ALIVE_SECONDS = 75
@@ -21,21 +26,42 @@ GRACEFUL_SECONDS = 10  # for requests under way when the server is asked to stop
 
 
 class Server(uvicorn.Server):
-    """uvicorn's, that says when it begins to stop: requests under way may then come to an end."""
+    """uvicorn's, with limits for connections, that says when it begins to stop: requests under way
+    may then come to an end."""
 
     on_stop: Callable[[], object]
+    connections: Connections
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        asyncio.get_running_loop().set_exception_handler(self.connections.on_loop_error)
+        await super().startup(sockets)
+        for listener in sockets or []:
+            listener.listen(BACKLOG)  # asyncio takes one number for both
+
+    async def on_tick(self, counter: int) -> bool:
+        if counter % 10 == 0:  # tenths of a second
+            self.connections.check()
+        return await super().on_tick(counter)
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         self.on_stop()
         await super().shutdown(sockets)
 
 
-def http_server(app: FastAPI, *, on_stop: Callable[[], object] = lambda: None) -> Server:
-    """A server of the application, not started yet. `on_stop` is called on its event loop when it
-    takes no more requests; it answers those that it has for GRACEFUL_SECONDS."""
+def http_server(
+    app: FastAPI, connections: Connections, *, on_stop: Callable[[], object] = lambda: None
+) -> Server:
+    """A server of the application, not started yet, within the limits of `connections`. `on_stop`
+    is called on its event loop when it takes no more requests; it answers those that it has for
+    GRACEFUL_SECONDS."""
+    proxies = [str(network) for network in connections.limits.trusted_proxies]
     server = Server(
         uvicorn.Config(
             app,
+            loop="asyncio",
+            http=partial(LimitedProtocol, connections),  # type: ignore[arg-type]
+            forwarded_allow_ips=proxies,
+            backlog=ACCEPTED_AT_ONCE,
             log_config=None,
             access_log=False,  # `call_log` writes them
             timeout_keep_alive=KEEP_ALIVE_SECONDS,
@@ -43,6 +69,7 @@ def http_server(app: FastAPI, *, on_stop: Callable[[], object] = lambda: None) -
         )
     )
     server.on_stop = on_stop
+    server.connections = connections
     return server
 
 

@@ -142,7 +142,9 @@ def standalone(settings: Settings) -> Iterator[Standalone]:
         batches = BatchWorker(catalog, store, hints, settings, name, stewards)
         counted = SearchMetrics(search, registry)
         gateway = Gateway(requests, store, hints, counted, settings, keys, registry)
-        server = http_server(create_app(gateway), on_stop=gateway.job_watch.end_soon)
+        server = http_server(
+            create_app(gateway), gateway.connections, on_stop=gateway.job_watch.end_soon
+        )
         held.enter_context(serving_metrics(settings, registry))
         running = Standalone(url, server, listener, made_key, local_key, threading.Event())
         stop = threading.Event()

@@ -5,6 +5,7 @@ PlacewiseError
 ├── Unauthorized 401            key_missing, key_unknown, key_revoked, key_expired
 ├── Forbidden 403               scope_missing, foreign_page
 ├── NotFound 404                photo_not_found, job_not_found, map_not_found, ...
+├── RequestTimeout 408          request_too_slow
 ├── Conflict 409                not_searchable, coordinates_differ, model_change_running, ...
 ├── Gone 410                    query_expired
 ├── LengthRequired 411          length_required
@@ -88,6 +89,13 @@ class NotFound(PlacewiseError):
     title = "Not found"
 
 
+class RequestTimeout(PlacewiseError):
+    """The request came too slowly; nothing was done. The connection is closed."""
+
+    status = 408
+    title = "The request came too slowly"
+
+
 class Conflict(PlacewiseError):
     status = 409
     title = "Not possible in the present state"
@@ -159,6 +167,7 @@ _BY_STATUS: dict[int, type[PlacewiseError]] = {
         Unauthorized,
         Forbidden,
         NotFound,
+        RequestTimeout,
         Conflict,
         Gone,
         LengthRequired,

@@ -8,10 +8,11 @@ from typing import Any
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
-from fastapi.responses import JSONResponse
+from fastapi.responses import JSONResponse, Response
 from pydantic import BaseModel, ConfigDict
 from sqlalchemy.exc import SQLAlchemyError
 from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect
 
 from shared.catalog.away import as_unavailable
 from shared.errors import InvalidRequest, PlacewiseError, Unprocessable
@@ -23,6 +24,10 @@ log = logging.getLogger(__name__)
 RETRY_AFTER_SECONDS = 2  # of a 503 that knows no better
 REQUEST_ID = "placewise.request_id"
 """Of an ASGI scope: the call's id, where the service gives its calls ids."""
+CLOSED_WITH = "placewise.closed_with"
+"""Of an ASGI scope: what the server answered itself before it closed the connection."""
+CLIENT_GONE = 499
+"""The status of a call whose client has closed the connection: for logs and figures alone."""
 HTTP_CODES = {400: "malformed_body", 404: "path_not_found", 405: "method_not_allowed"}
 
 
@@ -67,6 +72,7 @@ def install_problem_handlers(app: FastAPI) -> None:
     app.add_exception_handler(RequestValidationError, _on_validation_error)
     app.add_exception_handler(HTTPException, _on_http_exception)
     app.add_exception_handler(SQLAlchemyError, _on_database_error)
+    app.add_exception_handler(ClientDisconnect, _on_client_gone)
     app.add_exception_handler(Exception, on_any_error)
 
 
@@ -143,6 +149,10 @@ async def _on_database_error(request: Request, error: Exception) -> JSONResponse
     if unavailable is None:  # a bug: another try would meet it again
         return await on_any_error(request, error)
     return await _on_placewise_error(request, unavailable)
+
+
+async def _on_client_gone(request: Request, error: Exception) -> Response:
+    return Response(status_code=CLIENT_GONE)  # nobody gets it
 
 
 async def on_any_error(request: Request, error: Exception) -> JSONResponse:

@@ -7,6 +7,7 @@ Durations end in `_seconds`, sizes in `_bytes` unless the predecessor's name is 
 from __future__ import annotations
 
 import re
+from ipaddress import ip_network
 from pathlib import Path
 from typing import Literal, Self
 
@@ -52,6 +53,39 @@ class Settings(BaseSettings):
         ge=0,
         description="how long browsers shall use HTTPS alone (Strict-Transport-Security); 0: not "
         "said. For servers that are reached over HTTPS only",
+    )
+
+    # Limits for slow and for many clients. Every HTTP server has those for connections.
+    max_connections: int = Field(
+        2000,
+        ge=1,
+        description="open connections of one server; fewer where the process may open few files",
+    )
+    max_connections_per_address: int = Field(
+        200,
+        ge=0,
+        description="open connections from one address (IPv6: from one /64); 0: no limit",
+    )
+    trusted_proxies: str | None = Field(
+        None,
+        description="addresses or networks of reverse proxies, separated by commas: 10.0.0.5, "
+        "192.168.0.0/16. Their `X-Forwarded-For` is believed, and their connections are not "
+        "limited per address; unset: none",
+    )
+    request_head_seconds: float = Field(
+        20.0, gt=0, description="longest time in which a client sends the head of a request"
+    )
+    min_body_bytes_per_second: int = Field(
+        1000,
+        ge=0,
+        description="slowest rate at which a client sends the body of a request, over 10 seconds; "
+        "0: no limit",
+    )
+    max_event_streams: int = Field(
+        500, ge=0, description="event streams (GET /jobs/ID/events) that one gateway sends at once"
+    )
+    max_event_streams_per_caller: int = Field(
+        100, ge=0, description="the same for one key, and for one address"
     )
 
     # What a key may do, unless it has limits of its own; ADMIN_KEY has none.
@@ -204,6 +238,9 @@ class Settings(BaseSettings):
     )
     max_concurrent_uploads: int = Field(
         32, ge=1, description="files that one gateway receives at once, and as many query photos"
+    )
+    max_concurrent_uploads_per_caller: int = Field(
+        16, ge=1, description="the same for one key, and for one address"
     )
     min_free_bytes: int = Field(
         500_000_000,
@@ -406,6 +443,16 @@ class Settings(BaseSettings):
                 )
         return value
 
+    @field_validator("trusted_proxies")
+    @classmethod
+    def _are_networks(cls, value: str | None) -> str | None:
+        for address in _split(value):
+            try:
+                ip_network(address)
+            except ValueError as error:
+                raise ValueError(f"{error}; expected is one like 10.0.0.5 or 10.0.0.0/8") from None
+        return value
+
     @field_validator("search_shard")
     @classmethod
     def _names_a_shard(cls, value: str) -> str:
@@ -606,6 +653,11 @@ class Settings(BaseSettings):
     def trusted_origins(self) -> tuple[str, ...]:
         """Whose pages may call; () for our own alone."""
         return tuple(dict.fromkeys(_split(self.cors_origins)))
+
+    @property
+    def proxy_addresses(self) -> list[str]:
+        """Addresses and networks of trusted reverse proxies."""
+        return _split(self.trusted_proxies)
 
     def catalog_url(self) -> str:
         """The SQLAlchemy URL of the catalog."""

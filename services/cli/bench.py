@@ -249,6 +249,19 @@ def rolling(as_json: JsonOption = False) -> None:
     _measure("rolling", as_json)
 
 
+@app.command("slow-clients")
+def slow_clients(
+    seconds: Annotated[float, typer.Option(min=1, help="Of each phase.")] = 30,
+    idle: Annotated[int, typer.Option(min=0, help="Connections that send nothing.")] = 1100,
+    bodies: Annotated[int, typer.Option(min=0, help="Uploads of a byte a second.")] = 32,
+    streams: Annotated[int, typer.Option(min=0, help="Event streams.")] = 500,
+    as_json: JsonOption = False,
+) -> None:
+    """How long do other calls take while clients are slow on purpose? The server may open 1,024
+    files."""
+    _measure("slow_clients", as_json, seconds=seconds, idle=idle, bodies=bodies, streams=streams)
+
+
 @app.command("scale")
 def scale(
     given: Annotated[

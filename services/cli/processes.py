@@ -60,7 +60,9 @@ def gateway() -> None:
             requests = catalog.limited(Limits.of_requests(settings))
             keys = CatalogKeys(requests, *admins)
             context = Gateway(requests, store, hints, search, settings, keys)
-            server = http_server(create_app(context), on_stop=context.job_watch.end_soon)
+            server = http_server(
+                create_app(context), context.connections, on_stop=context.job_watch.end_soon
+            )
             messages.print(f"Placewise gateway serves {url}", soft_wrap=True)
             with serving_metrics(settings, context.registry), stopped_by_signals(server):
                 server.run(sockets=[listener])

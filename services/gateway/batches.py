@@ -130,7 +130,7 @@ async def upload_batch(
     One job counts them. Each photo is taken as `POST /upload` takes it; one that is refused is an
     item that has failed, and the others go on.
     """
-    with room.receiving(Kind.UPLOAD):
+    with room.receiving(Kind.UPLOAD, request):
         received = await receive_batch(request, gateway.store, gateway.settings)
     whose = _whose(caller_of(request), gateway.settings)
     started = await run_in_threadpool(_queue, gateway, map_name, received, whose, once)

@@ -13,6 +13,7 @@ from pydantic import BeforeValidator
 
 from services.gateway.job_watch import JobWatch
 from services.gateway.keys import Keys
+from services.http_connections import ConnectionLimits, Connections
 from shared.catalog.maps import DEFAULT_MAP
 from shared.catalog.session import Catalog
 from shared.errors import NotFound, invalid_field
@@ -39,9 +40,11 @@ class Gateway:
     """Of the process's figures: in the embedded Placewise, of all of its parts."""
     started: float = field(default_factory=time.monotonic)
     job_watch: JobWatch = field(init=False)
+    connections: Connections = field(init=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "job_watch", JobWatch(self.catalog))
+        object.__setattr__(self, "connections", Connections(ConnectionLimits.of(self.settings)))
 
 
 def get_gateway(request: Request) -> Gateway:

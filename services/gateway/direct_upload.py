@@ -160,7 +160,7 @@ async def complete(
     """The bytes were sent: check and store the photo. Answers as `POST /upload` does; completed
     again, it answers the same again."""
     key = new_original_key()
-    with room.receiving(Kind.UPLOAD):
+    with room.receiving(Kind.UPLOAD, request):
         key_id = caller_of(request).key_id
         stored = await run_in_threadpool(_complete, gateway, map_name, upload_id, key, key_id)
 

@@ -1,4 +1,4 @@
-"""One look at the job table for all requests that wait for a job's end.
+"""One look at the job table for all requests that wait for a job's end, or for its next change.
 
 Requests that each looked for themselves would have to look rarely; this one may look often, so that
 an answer does not lie there for long.
@@ -9,7 +9,9 @@ from __future__ import annotations
 import asyncio
 import math
 import time
-from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
 from uuid import UUID
 
 from sqlalchemy import select
@@ -19,9 +21,41 @@ from shared.catalog.session import Catalog
 from shared.jobs import Job
 from shared.jobs.table import UNFINISHED
 
-LOOK_SECONDS = 0.02
+LOOK_SECONDS = 0.02  # while someone waits for an end
+CHANGE_LOOK_SECONDS = 0.25  # while someone waits for a change
+LOOK_SHARE = 10  # a look that takes long is taken seldom: one part in so many of the time
 # Of a server that stops: most queries end within it, and the others still get an answer.
 LAST_SECONDS = 5.0
+
+# What changes when a job does. Less than the whole row: it is read often, and of many jobs.
+MARKS = (
+    Job.state,
+    Job.stage,
+    Job.waiting_for,
+    Job.awaited,
+    Job.progress_done,
+    Job.progress_total,
+    Job.progress_failed,
+    Job.attempts,
+)
+Mark = tuple[Any, ...]
+"""The values of MARKS; () for a job that nobody has looked at."""
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """A job after a change, and the mark to wait with for the next one."""
+
+    job: Job
+    mark: Mark
+
+
+@dataclass(eq=False, slots=True)
+class _Waiter:
+    job_id: UUID
+    mark: Mark | None
+    """What its request has seen of the job; None where only the end counts."""
+    future: asyncio.Future[Change | None]
 
 
 class JobWatch:
@@ -29,50 +63,109 @@ class JobWatch:
 
     def __init__(self, catalog: Catalog) -> None:
         self._catalog = catalog
-        self._awaited: Counter[UUID] = Counter()
-        self._look: asyncio.Future[set[UUID]] | None = None
+        self._waiters: set[_Waiter] = set()
+        self._looks: asyncio.Task[None] | None = None
+        self._next_change_look = 0.0
         self._last_moment = math.inf
 
     def end_soon(self) -> None:
-        """The server stops: nobody waits for longer than LAST_SECONDS from now."""
+        """The server stops: nobody waits for a change any more, and for an end not longer than
+        LAST_SECONDS from now."""
         self._last_moment = time.monotonic() + LAST_SECONDS
+        _release(waiter for waiter in self._waiters if waiter.mark is not None)
 
     async def wait_for_end(self, job_id: UUID, seconds: float) -> None:
         """Returns when the job has ended or is gone, at the latest after so many seconds.
 
         Raises what the catalog raises while it is away.
         """
-        deadline = time.monotonic() + seconds
-        self._awaited[job_id] += 1
+        left = min(seconds, self._last_moment - time.monotonic())
         try:
-            while (left := min(deadline, self._last_moment) - time.monotonic()) > 0:
-                await asyncio.sleep(min(LOOK_SECONDS, left))
-                if job_id in await self._ended():
-                    return
+            await self._wait(job_id, None, left)
+        except TimeoutError:
+            return
+
+    async def wait_for_change(self, job_id: UUID, mark: Mark, seconds: float) -> Change | None:
+        """The job once it differs from `mark`; None when it is gone or the server stops.
+
+        Raises TimeoutError after so many seconds, and what the catalog raises while it is away.
+        """
+        if self._last_moment < math.inf:
+            return None
+        return await self._wait(job_id, mark, seconds)
+
+    async def _wait(self, job_id: UUID, mark: Mark | None, seconds: float) -> Change | None:
+        waiter = _Waiter(job_id, mark, asyncio.get_running_loop().create_future())
+        self._waiters.add(waiter)
+        if self._looks is None:
+            self._looks = asyncio.create_task(self._look_while_awaited())
+        try:
+            return await asyncio.wait_for(waiter.future, seconds)
         finally:
-            self._awaited[job_id] -= 1
-            self._awaited += Counter()  # forgets those that nobody awaits any more
+            self._waiters.discard(waiter)
 
-    async def _ended(self) -> set[UUID]:
-        """Those of the awaited jobs that have ended; who asks meanwhile shares the answer."""
-        if self._look is None:
-            self._look = asyncio.ensure_future(
-                run_in_threadpool(_ended, self._catalog, set(self._awaited))
-            )
-            self._look.add_done_callback(self._looked)
-        # Who goes away while waiting must not take the others' answer along.
-        return await asyncio.shield(self._look)
+    async def _look_while_awaited(self) -> None:
+        pause = LOOK_SECONDS
+        try:
+            while self._waiters:
+                await asyncio.sleep(pause)
+                began = time.monotonic()
+                await self._look(began)
+                took = time.monotonic() - began
+                ends = any(waiter.mark is None for waiter in self._waiters)
+                least = LOOK_SECONDS if ends else CHANGE_LOOK_SECONDS
+                pause = max(least, LOOK_SHARE * took)
+        finally:
+            self._looks = None
 
-    def _looked(self, look: asyncio.Future[set[UUID]]) -> None:
-        self._look = None
-        if not look.cancelled():
-            look.exception()  # seen, also where nobody waits for it any more
+    async def _look(self, now: float) -> None:
+        """Wake whose job has ended, or has changed."""
+        due = set(self._waiters)
+        if now >= self._next_change_look:
+            self._next_change_look = now + CHANGE_LOOK_SECONDS
+        else:
+            due = {waiter for waiter in due if waiter.mark is None}
+        if not due:
+            return
+        try:
+            marks = await run_in_threadpool(_marks, self._catalog, {w.job_id for w in due})
+            ready = {waiter for waiter in due if _is_ready(waiter, marks.get(waiter.job_id))}
+            changed = {waiter.job_id for waiter in ready if waiter.mark is not None}
+            jobs = await run_in_threadpool(_jobs, self._catalog, changed) if changed else {}
+        except Exception as error:  # whoever waits raises it
+            for waiter in due:
+                if not waiter.future.done():
+                    waiter.future.set_exception(error)
+            return
+        for waiter in ready:
+            if not waiter.future.done():
+                job = jobs.get(waiter.job_id)
+                waiter.future.set_result(None if job is None else Change(job, marks[job.id]))
+        if now >= self._last_moment:
+            _release(self._waiters)
 
 
-def _ended(catalog: Catalog, job_ids: set[UUID]) -> set[UUID]:
-    """Those of the jobs that have ended, or are gone."""
+def _release(waiters: Iterable[_Waiter]) -> None:
+    for waiter in waiters:
+        if not waiter.future.done():
+            waiter.future.set_result(None)
+
+
+def _is_ready(waiter: _Waiter, mark: Mark | None) -> bool:
+    """Has the job ended or changed? `mark` is None for one that is gone."""
+    if mark is None:
+        return True
+    return mark[0] not in UNFINISHED if waiter.mark is None else mark != waiter.mark
+
+
+def _marks(catalog: Catalog, job_ids: set[UUID]) -> dict[UUID, Mark]:
+    """Of the jobs that are there."""
     with catalog.read() as session:
-        unfinished = session.scalars(
-            select(Job.id).where(Job.id.in_(job_ids), Job.state.in_(UNFINISHED))
-        )
-        return job_ids - set(unfinished)
+        rows = session.execute(select(Job.id, *MARKS).where(Job.id.in_(job_ids)))
+        return {row[0]: tuple(row[1:]) for row in rows}
+
+
+def _jobs(catalog: Catalog, job_ids: set[UUID]) -> dict[UUID, Job]:
+    with catalog.read() as session:
+        jobs = session.scalars(select(Job).where(Job.id.in_(job_ids)))
+        return {job.id: job for job in jobs}

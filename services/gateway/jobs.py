@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import asyncio
-import time
 from collections.abc import AsyncIterator
-from typing import Annotated, Any
+from typing import Annotated
 from uuid import UUID
 
-from fastapi import APIRouter, Query, Request
+from fastapi import APIRouter, Depends, Query, Request
 from fastapi.responses import StreamingResponse
 from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.orm import Session
@@ -17,9 +16,9 @@ from starlette.concurrency import run_in_threadpool
 from services.gateway.context import DEFAULT_MAP, Gateway, GatewayDep, JobId, MapName, read_cursor
 from services.gateway.key_check import READ, WRITE
 from services.gateway.once import OnceDep
-from services.gateway.room import ROOM_FOR_JOBS
+from services.gateway.room import ROOM_FOR_JOBS, RoomDep
 from services.gateway.schemas import JobAnswer, JobsAnswer
-from services.gateway.waiting import read_job, wait_for_job
+from services.gateway.waiting import wait_for_job
 from shared.catalog.away import as_unavailable
 from shared.catalog.maps import get_map
 from shared.jobs import Job, JobKind, JobState
@@ -32,7 +31,6 @@ from shared.jobs.table import MODEL_CHANGES, UNFINISHED, get_job, list_jobs
 
 router = APIRouter(tags=["jobs"])
 
-LOOK_SECONDS = 0.25  # of a stream of events
 AWAY_SECONDS = 1.0  # between two looks while the catalog is away
 HEARTBEAT_SECONDS = 15.0  # a comment line, so that proxies keep a silent stream open
 
@@ -73,23 +71,29 @@ async def job(
     return JobAnswer.of(found)
 
 
+async def _event_stream(request: Request, room: RoomDep) -> AsyncIterator[None]:
+    """A place among the event streams, until the answer has ended."""
+    with room.event_streams.hold(request):
+        yield
+
+
 @router.get(
     "/jobs/{job_id}/events",
     operation_id="job_events",
     response_class=StreamingResponse,
     responses={200: {"content": {"text/event-stream": {}}, "description": "`progress` events"}},
-    dependencies=[READ],
+    dependencies=[READ, Depends(_event_stream, scope="request")],
 )
 async def job_events(
-    request: Request,
     gateway: GatewayDep,
     job_id: JobId,
     map_name: MapName = DEFAULT_MAP,
 ) -> StreamingResponse:
-    """Server-sent events: a `progress` event with the job at every change, until it ends."""
-    await run_in_threadpool(_get, gateway, map_name, job_id)
+    """Server-sent events: a `progress` event with the job at every change, until it ends. Where
+    too many are sent already (429, `too_many_event_streams`), poll the job."""
+    found = await run_in_threadpool(_get, gateway, map_name, job_id)
     return StreamingResponse(
-        _events(request, gateway, job_id),
+        _events(gateway, job_id, JobAnswer.of(found)),
         media_type="text/event-stream",
         headers={"Cache-Control": "no-store", "X-Accel-Buffering": "no"},
     )
@@ -152,27 +156,26 @@ def _get(gateway: Gateway, map_name: str, job_id: UUID) -> Job:
         return get_job(session, get_map(session, map_name).id, job_id)
 
 
-async def _events(request: Request, gateway: Gateway, job_id: UUID) -> AsyncIterator[str]:
-    sent: dict[str, Any] | None = None
-    number, spoken = 0, time.monotonic()
-    while not await request.is_disconnected():
-        try:
-            found = await run_in_threadpool(read_job, gateway, job_id)
-        except SQLAlchemyError as error:
-            if as_unavailable(error) is None:
-                raise
-            yield ": the catalog is away\n\n"
-            await asyncio.sleep(AWAY_SECONDS)
-            continue
-        if found is None:
+async def _events(gateway: Gateway, job_id: UUID, job: JobAnswer) -> AsyncIterator[str]:
+    """The stream of a job that is now as `job` says."""
+    number, mark, sent = 0, (), ""
+    while True:
+        if (text := job.model_dump_json()) != sent:
+            sent, number = text, number + 1
+            yield f"id: {number}\nevent: progress\ndata: {text}\n\n"
+        if job.state not in UNFINISHED:
             return
-        answer = JobAnswer.of(found)
-        if (now := answer.model_dump()) != sent:
-            sent, number, spoken = now, number + 1, time.monotonic()
-            yield f"id: {number}\nevent: progress\ndata: {answer.model_dump_json()}\n\n"
-        if answer.state not in UNFINISHED:
+        while True:
+            try:
+                change = await gateway.job_watch.wait_for_change(job_id, mark, HEARTBEAT_SECONDS)
+                break
+            except TimeoutError:
+                yield ": still here\n\n"
+            except SQLAlchemyError as error:
+                if as_unavailable(error) is None:
+                    raise
+                yield ": the catalog is away\n\n"
+                await asyncio.sleep(AWAY_SECONDS)
+        if change is None:
             return
-        if time.monotonic() - spoken > HEARTBEAT_SECONDS:
-            spoken = time.monotonic()
-            yield ": still here\n\n"
-        await asyncio.sleep(LOOK_SECONDS)
+        job, mark = JobAnswer.of(change.job), change.mark

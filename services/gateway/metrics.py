@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 from fastapi import APIRouter, Request, Response
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
-from prometheus_client.core import GaugeMetricFamily
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 from prometheus_client.metrics_core import Metric
 from prometheus_client.registry import Collector
 
@@ -14,6 +14,7 @@ from services.call_log import Call
 from services.gateway.context import Gateway
 from services.gateway.queue_look import QueueLook
 from services.gateway.room import Kind, Room
+from services.http_connections import Connections
 from shared.telemetry.metrics_server import CONTENT_TYPE
 
 router = APIRouter(tags=["operations"])
@@ -53,6 +54,7 @@ class GatewayMetrics:
             registry=registry,
         )
         registry.register(_Fullness(gateway, room))
+        registry.register(_Connections(gateway.connections, room))
 
     def begun(self) -> None:
         self._under_way.inc()
@@ -110,6 +112,30 @@ class _Fullness(Collector):
             oldest.add_metric([group.kind, group.state], group.oldest_seconds)
         yield jobs
         yield oldest
+
+
+class _Connections(Collector):
+    """Read at each scrape: the gateway's open connections, and those that it closed."""
+
+    def __init__(self, connections: Connections, room: Room) -> None:
+        self._connections = connections
+        self._room = room
+
+    def collect(self) -> Iterable[Metric]:
+        yield GaugeMetricFamily(
+            f"{PREFIX}_connections", "Open connections.", self._connections.count
+        )
+        yield GaugeMetricFamily(
+            f"{PREFIX}_event_streams", "Event streams under way.", self._room.event_streams.count
+        )
+        closed = CounterMetricFamily(
+            f"{PREFIX}_connections_closed",
+            "Connections that were refused, or closed because of a limit.",
+            labels=["reason"],
+        )
+        for reason, count in self._connections.closed.items():
+            closed.add_metric([reason], count)
+        yield closed
 
 
 @router.get("/metrics", operation_id="metrics", response_class=Response)

@@ -134,7 +134,7 @@ async def import_vocabulary(
     The extractor checks it; one that does not fit, or that a `.npz` says was learnt from other
     features than the extractor makes, ends the job as `failed` with the reason.
     """
-    with room.receiving(Kind.UPLOAD):
+    with room.receiving(Kind.UPLOAD, request):
         received = await receive_file(
             request,
             gateway.store,

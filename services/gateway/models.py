@@ -126,7 +126,7 @@ async def add_model(
     that its weights are finite and make a descriptor of a photo. One that can't be used ends the
     job as `failed` with the reason, and so does a name that belongs to other weights.
     """
-    with room.receiving(Kind.UPLOAD):
+    with room.receiving(Kind.UPLOAD, request):
         received = await receive_file(
             request,
             gateway.store,

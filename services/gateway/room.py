@@ -4,24 +4,24 @@ A route that makes jobs names what it needs room for, which is asked before its 
 
     @router.post("/evaluations", dependencies=[ROOM_FOR_JOBS])
 
-and one that receives a file does it `with room.receiving(Kind.UPLOAD):`. Query photos have limits
-of their own: however many uploads wait, a query is asked.
+and one that receives a file does it `with room.receiving(Kind.UPLOAD, request):`. Query photos have
+limits of their own: however many uploads wait, a query is asked.
 """
 
 from __future__ import annotations
 
-import contextlib
 import math
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterator
+from contextlib import AbstractContextManager
 from enum import StrEnum
 from typing import Annotated
 from uuid import UUID
 
 from fastapi import Depends, Request
 
+from services.gateway.concurrency import ConcurrencyLimit
 from services.gateway.context import DEFAULT_MAP, GatewayDep, MapName
 from services.gateway.key_check import caller_of
 from services.gateway.keys import Caller
@@ -36,6 +36,7 @@ LOOK_SHARE = 20  # a look that takes long is taken seldom: one part in so many o
 RELIEF = 0.9  # of a limit: come again when the queue has shrunk to this
 MOST_RETRY_SECONDS = 60
 RECEIVING_RETRY_SECONDS = 1
+STREAM_RETRY_SECONDS = 10  # others watch jobs, which may take long: polling is better
 
 
 class Kind(StrEnum):
@@ -54,7 +55,23 @@ class Room:
         self._seen: Waiting | None = None
         self._next_look = 0.0
         self._taken: Counter[str | None] = Counter()  # since the last look; None: queries
-        self._receiving: Counter[Kind] = Counter()
+        self._receiving = {
+            kind: ConcurrencyLimit(
+                f"{kind} (MAX_CONCURRENT_UPLOADS, MAX_CONCURRENT_UPLOADS_PER_CALLER)",
+                "too_many_uploads",
+                total=settings.max_concurrent_uploads,
+                per_caller=settings.max_concurrent_uploads_per_caller,
+                retry_after_seconds=RECEIVING_RETRY_SECONDS,
+            )
+            for kind in Kind
+        }
+        self.event_streams = ConcurrencyLimit(
+            "event streams (MAX_EVENT_STREAMS, MAX_EVENT_STREAMS_PER_CALLER)",
+            "too_many_event_streams",
+            total=settings.max_event_streams,
+            per_caller=settings.max_event_streams_per_caller,
+            retry_after_seconds=STREAM_RETRY_SECONDS,
+        )
 
     def take_job(self, map_name: str) -> None:
         """Room for one more job of the map, and for what it stores.
@@ -86,26 +103,14 @@ class Room:
             raise _queue_full("query photos", waiting, most, seen.finished_per_second)
         self._taken[None] += 1
 
-    @contextlib.contextmanager
-    def receiving(self, kind: Kind) -> Iterator[None]:
-        """While a file is received. TooManyRequests (`too_many_uploads`) when enough are already:
-        each holds a part of its file in memory. On the event loop only."""
-        most = self._settings.max_concurrent_uploads
-        if self._receiving[kind] >= most:
-            raise TooManyRequests(
-                "too_many_uploads",
-                f"{most} {kind} are being received already (MAX_CONCURRENT_UPLOADS). Send this one "
-                "again in a moment.",
-                retry_after_seconds=RECEIVING_RETRY_SECONDS,
-            )
-        self._receiving[kind] += 1
-        try:
-            yield
-        finally:
-            self._receiving[kind] -= 1
+    def receiving(self, kind: Kind, request: Request) -> AbstractContextManager[None]:
+        """While a file is received. TooManyRequests (`too_many_uploads`) when enough are already,
+        in all, of the call's key or of its address: each holds a part of its file in memory. On the
+        event loop only."""
+        return self._receiving[kind].hold(request)
 
     def being_received(self, kind: Kind) -> int:
-        return self._receiving[kind]
+        return self._receiving[kind].count
 
     def look(self) -> Waiting:
         """The queue as it was a moment ago."""

@@ -126,7 +126,7 @@ async def similar_to_upload(
     await run_in_threadpool(check_closely, gateway, map_name, wanted)
     job_id = new_id()
     key = query_key(job_id)
-    with room.receiving(Kind.QUERY):
+    with room.receiving(Kind.QUERY, request):
         received = await receive_file(
             request, gateway.store, key, gateway.settings.max_file_size, check_photo_begin
         )

@@ -75,7 +75,7 @@ async def upload(
     202 with the job to poll; with `Prefer: wait=N`, 201 once the photo is searchable. The same
     bytes again give the existing photo (200), or queue it again after a failed job (202).
     """
-    with room.receiving(Kind.UPLOAD):
+    with room.receiving(Kind.UPLOAD, request):
         received = await receive_file(
             request,
             gateway.store,

@@ -6,11 +6,12 @@ import contextlib
 import socket
 import threading
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import uvicorn
 from prometheus_client import CollectorRegistry
 
+from services.http_connections import ConnectionLimits, Connections
 from services.http_server import http_server, listening, stopped_by_signals, url_of
 from services.parts import start_part
 from services.search.app import create_app
@@ -58,7 +59,9 @@ def search_service(
         worker = SearchWorker(catalog, store, settings, settings.shard)
         url = url_of(host, port)
         presence = Presence(catalog, worker, f"{socket.gethostname()}:{port}", url)
-        server = http_server(create_app(worker, registry))
+        # Its clients are a few gateways, with a connection for each query under way.
+        limits = replace(ConnectionLimits.of(settings), per_address=0)
+        server = http_server(create_app(worker, registry), Connections(limits))
         running = SearchService(url, worker, server, listener, threading.Event())
         stop = threading.Event()
         parts = [

@@ -7,13 +7,14 @@ from pathlib import Path
 from uuid import UUID
 
 import pytest
+from sqlalchemy.exc import OperationalError
 
 from services.gateway import job_watch
-from services.gateway.job_watch import JobWatch
+from services.gateway.job_watch import Change, JobWatch, Mark
 from shared.catalog.schema import migrate
 from shared.catalog.session import Catalog
 from shared.ids import new_id
-from shared.jobs import JobState
+from shared.jobs import Job, JobState
 from tests.support.catalog_rows import add_job, add_map, set_columns
 
 LONG = 30.0
@@ -75,17 +76,21 @@ def test_stopping_server_lets_nobody_wait_for_long(
     asyncio.run(scenario())
 
 
+def count_looks(monkeypatch: pytest.MonkeyPatch, looks: list[set[UUID]]) -> None:
+    real = job_watch._marks
+
+    def counted(catalog: Catalog, job_ids: set[UUID]) -> dict[UUID, Mark]:
+        looks.append(job_ids)
+        return real(catalog, job_ids)
+
+    monkeypatch.setattr(job_watch, "_marks", counted)
+
+
 def test_all_that_wait_share_one_look(
     catalog: Catalog, jobs: list[UUID], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     looks: list[set[UUID]] = []
-    real = job_watch._ended
-
-    def counted(catalog: Catalog, job_ids: set[UUID]) -> set[UUID]:
-        looks.append(job_ids)
-        return real(catalog, job_ids)
-
-    monkeypatch.setattr(job_watch, "_ended", counted)
+    count_looks(monkeypatch, looks)
 
     async def scenario() -> None:
         watch = JobWatch(catalog)
@@ -102,6 +107,65 @@ def test_all_that_wait_share_one_look(
         assert len(looks) == after, "nobody waits, nobody looks"
 
     asyncio.run(scenario())
+
+
+def test_all_event_streams_share_one_look_and_wake_at_their_jobs_change(
+    catalog: Catalog, jobs: list[UUID], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    looks: list[set[UUID]] = []
+    read: list[set[UUID]] = []
+    count_looks(monkeypatch, looks)
+    real = job_watch._jobs
+
+    def counted(catalog: Catalog, job_ids: set[UUID]) -> dict[UUID, Job]:
+        read.append(job_ids)
+        return real(catalog, job_ids)
+
+    monkeypatch.setattr(job_watch, "_jobs", counted)
+    monkeypatch.setattr(job_watch, "CHANGE_LOOK_SECONDS", 0.1)
+
+    async def scenario() -> None:
+        watch = JobWatch(catalog)
+        seen = await asyncio.gather(*(watch.wait_for_change(job, (), LONG) for job in jobs))
+        marks = {change.job.id: change.mark for change in seen if change}
+        looks.clear()
+        read.clear()
+        waits = [
+            asyncio.create_task(watch.wait_for_change(jobs[n % 3], marks[jobs[n % 3]], LONG))
+            for n in range(500)
+        ]
+        await asyncio.sleep(0.5)
+        assert 1 <= len(looks) <= 6, "not one for each stream"
+        assert read == [], "nothing has changed: nothing is read"
+        assert not any(wait.done() for wait in waits)
+        set_columns(catalog, jobs[1], progress_done=7)
+        for change in await asyncio.wait_for(asyncio.gather(*waits[1::3]), LONG):
+            assert change is not None
+            assert change.job.progress_done == 7
+        assert read == [{jobs[1]}]
+        assert not any(wait.done() for wait in waits[0::3])
+        watch.end_soon()
+        ended = await asyncio.wait_for(asyncio.gather(*waits[0::3]), LONG)
+        assert set(ended) == {None}, "a server that stops ends its streams"
+        assert await watch.wait_for_change(jobs[0], (), LONG) is None
+
+    asyncio.run(scenario())
+
+
+def test_who_waits_for_a_change_is_told_when_the_catalog_is_away_and_when_time_is_up(
+    catalog: Catalog, jobs: list[UUID], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(catalog: Catalog, job_ids: set[UUID]) -> dict[UUID, Mark]:
+        raise OperationalError("select", {}, Exception("away"))
+
+    async def wait(seconds: float) -> Change | None:
+        return await JobWatch(catalog).wait_for_change(jobs[0], (), seconds)
+
+    with pytest.raises(TimeoutError):
+        asyncio.run(wait(0.001))
+    monkeypatch.setattr(job_watch, "_marks", fail)
+    with pytest.raises(OperationalError):
+        asyncio.run(wait(LONG))
 
 
 def test_who_goes_away_takes_no_others_answer_along(catalog: Catalog, jobs: list[UUID]) -> None:

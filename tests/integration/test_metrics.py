@@ -105,7 +105,7 @@ def test_every_name_begins_with_its_service_and_no_label_is_anyones_choice(
         assert re.match(r"placewise_(gateway|extractor|search|steward)_", name), name
         assert labels <= {
             *("method", "route", "status", "kind", "state", "stage", "outcome", "duty"),
-            *("certificate", "device", "generation", "le"),
+            *("certificate", "device", "generation", "le", "reason"),
         }, name
 
 

@@ -5,17 +5,22 @@ from __future__ import annotations
 from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
+from uuid import UUID
 
 import httpx2
 import pytest
+from fastapi import Request
 
 from services.extractor.worker import ExtractorWorker
 from services.gateway import room as room_module
+from services.gateway.keys import Caller
 from services.gateway.room import MOST_RETRY_SECONDS, Kind, Room
+from shared.api_keys import EVERYTHING
 from shared.catalog.base import db_now_plus
 from shared.catalog.maps import get_map
 from shared.catalog.session import Catalog
 from shared.errors import TooManyRequests
+from shared.ids import new_id
 from shared.jobs import Job, JobKind, JobState
 from shared.jobs.table import Priority
 from shared.jobs.waiting import RATE_SECONDS, look_at_queue
@@ -281,15 +286,64 @@ def test_the_disk_of_the_originals_counts_too_and_no_disk_where_nothing_lies(
 
 def test_one_gateway_receives_so_many_files_at_once(catalog: Catalog, settings: Settings) -> None:
     room = Room(catalog, settings.model_copy(update={"max_concurrent_uploads": 2}))
-    with room.receiving(Kind.UPLOAD), room.receiving(Kind.UPLOAD):
-        with pytest.raises(TooManyRequests) as caught, room.receiving(Kind.UPLOAD):
+    ours = call_of(new_id(), "192.0.2.1")
+    with room.receiving(Kind.UPLOAD, ours), room.receiving(Kind.UPLOAD, ours):
+        with pytest.raises(TooManyRequests) as caught, room.receiving(Kind.UPLOAD, ours):
             raise AssertionError("it was let in")
         assert caught.value.code == "too_many_uploads"
-        with room.receiving(Kind.QUERY):
+        with room.receiving(Kind.QUERY, ours):
             assert room.being_received(Kind.QUERY) == 1
-    with pytest.raises(ZeroDivisionError), room.receiving(Kind.UPLOAD):
+    with pytest.raises(ZeroDivisionError), room.receiving(Kind.UPLOAD, ours):
         raise ZeroDivisionError
     assert room.being_received(Kind.UPLOAD) == 0
+
+
+def call_of(key_id: UUID | None, address: str) -> Request:
+    caller = Caller("whoever", EVERYTHING, key_id)
+    return Request({"type": "http", "client": (address, 1), "state": {"caller": caller}})
+
+
+def test_one_key_and_one_address_leave_places_to_others(
+    catalog: Catalog, settings: Settings
+) -> None:
+    room = Room(catalog, settings.model_copy(update={"max_concurrent_uploads_per_caller": 2}))
+    key, other_key = new_id(), new_id()
+    with (
+        room.receiving(Kind.UPLOAD, call_of(key, "2001:db8::1")),
+        room.receiving(Kind.UPLOAD, call_of(key, "192.0.2.1")),
+    ):
+        with (
+            pytest.raises(TooManyRequests, match="of this key"),
+            room.receiving(Kind.UPLOAD, call_of(key, "192.0.2.9")),
+        ):
+            raise AssertionError("one key was let in three times")
+        with (
+            room.receiving(Kind.UPLOAD, call_of(other_key, "2001:db8::2")),
+            pytest.raises(TooManyRequests, match="of this address"),
+            room.receiving(Kind.UPLOAD, call_of(None, "2001:db8::ffff")),
+        ):
+            raise AssertionError("one /64 was let in three times")
+        with room.receiving(Kind.UPLOAD, call_of(None, "192.0.2.9")):
+            assert room.being_received(Kind.UPLOAD) == 3
+    with room.receiving(Kind.UPLOAD, call_of(key, "192.0.2.1")):
+        assert room.being_received(Kind.UPLOAD) == 1, "places are given back"
+
+
+def test_an_event_stream_too_many_is_refused_and_one_that_ended_makes_room(
+    make_service: Make, catalog: Catalog
+) -> None:
+    with catalog.write() as session:
+        ended = add_job(session, get_map(session, "city").id, state=JobState.FAILED).id
+    events = f"/jobs/{ended}/events?map=city"
+    service = make_service(max_event_streams=1)
+    for _ in range(2):
+        assert service("GET", events).text.startswith("id: 1\nevent: progress\n")
+    refused = make_service(max_event_streams=0)("GET", events)
+    problem(refused, 429, "too_many_event_streams")
+    assert int(refused.headers["retry-after"]) >= 1
+    problem(
+        make_service(max_event_streams_per_caller=0)("GET", events), 429, "too_many_event_streams"
+    )
 
 
 @pytest.mark.usefixtures("always_look")

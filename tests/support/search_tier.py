@@ -11,6 +11,7 @@ from typing import Self
 
 import uvicorn
 
+from services.http_connections import ConnectionLimits, Connections
 from services.http_server import http_server, listening, url_of
 from services.search.app import create_app
 from services.search.worker import SearchWorker
@@ -45,7 +46,8 @@ class SearchServer:
         listener = held.enter_context(listening("127.0.0.1", self._port))
         self._port = listener.getsockname()[1]
         self.url = url_of("127.0.0.1", self._port)
-        server = http_server(create_app(self.worker))
+        limits = ConnectionLimits.of(self._of[2])
+        server = http_server(create_app(self.worker), Connections(limits))
         thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
         thread.start()
         self._running = server, thread, held

@@ -1,0 +1,276 @@
+"""How long do `GET /maps` and an upload take while other clients are slow on purpose?
+
+Three attacks, one after the other and then at once: connections that send nothing, uploads that
+send a byte a second, and event streams. Server and clients are on this machine. The idle
+connections come from the address of the calls that are timed, the others from addresses of their
+own (127.0.0.0/8); all are opened again when the server closes them.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import multiprocessing
+import os
+import random
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Awaitable, Callable, Iterator
+from dataclasses import dataclass, field
+from http.client import HTTPConnection, HTTPException
+from multiprocessing.synchronize import Event
+from pathlib import Path
+from typing import TYPE_CHECKING
+from urllib.parse import urlsplit
+
+from benchmarks.report import Report, Spread
+from benchmarks.traffic import BOUNDARY, CONTENT_TYPE, form_of, photos_of
+from shared.client import Client
+from shared.errors import Unavailable
+from shared.home import RunningServer, running_server
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
+
+WANTED_RATIO = 5.0  # of the p95 without an attack
+WANTED_LOG_BYTES_PER_MINUTE = 1_000_000
+START_SECONDS = 60.0
+SETTLE_SECONDS = 10.0  # until the attack has opened what it can
+CALL_SECONDS = 30.0  # a call that takes longer has failed
+REOPEN_SECONDS = 5.0  # until a client comes back whose connection was closed
+WATCHED_JOBS = 50
+CALLERS = 5  # keys and addresses of the event streams: one key may have only a part of all
+OPEN_FILES = 1024
+BODY_BYTES = 5_000_000
+EXTRACTOR = "test-tiny-vlad"  # its jobs wait for a vocabulary, and so streams of them go on
+SLOW_ADDRESS, STREAM_ADDRESS = "127.0.1.1", "127.0.2.{}"  # of the clients
+ADDRESS = "127.0.0.1"  # of the idle connections and of the calls that are timed
+
+
+@dataclass(slots=True)
+class Calls:
+    """What was timed during one phase."""
+
+    maps: list[float] = field(default_factory=list)
+    uploads: list[float] = field(default_factory=list)
+    failed: list[str] = field(default_factory=list)
+    log_bytes_per_minute: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Attack:
+    """What a process of its own does to the server."""
+
+    port: int
+    idle: int
+    bodies: int
+    streams: int
+    body_key: str
+    stream_keys: tuple[str, ...]
+    jobs: tuple[str, ...]
+
+
+def measure(progress: Progress, *, seconds: float, idle: int, bodies: int, streams: int) -> Report:
+    """Each phase lasts `seconds`. The server may open 1,024 files, and has the default settings but
+    for its extractor."""
+    report = Report(f"While {idle:,} clients are idle, {bodies} bodies slow, {streams} watch jobs")
+    photo = photos_of(1, (640, 480), 60_000)[0]
+    phases = {
+        "no attack": (0, 0, 0),
+        "idle connections": (idle, 0, 0),
+        "slow bodies": (0, bodies, 0),
+        "event streams": (0, 0, streams),
+        "all at once": (idle, bodies, streams),
+    }
+    found: dict[str, Calls] = {}
+    with tempfile.TemporaryDirectory() as folder:
+        log = Path(folder, "server.log")
+        with _server(Path(folder, "home"), log) as running:
+            port = urlsplit(running.url).port
+            assert port is not None
+            with Client(running.url, key=running.key, patience_seconds=START_SECONDS) as client:
+                ours, slow, *watching = (
+                    client.create_key(f"{number}", ["read", "write"])["key"]
+                    for number in range(2 + CALLERS)
+                )
+            jobs = tuple(_upload(port, ours, photo) for _ in range(WATCHED_JOBS))
+            bar = progress.add_task("phases", total=len(phases))
+            for name, (idle_now, bodies_now, streams_now) in phases.items():
+                attack = Attack(
+                    port, idle_now, bodies_now, streams_now, slow, tuple(watching), jobs
+                )
+                with _under(attack):
+                    found[name] = _timed(port, ours, photo, seconds, log)
+                progress.advance(bar)
+    least = found["no attack"]
+    for name, calls in found.items():
+        for what, mine, theirs in (
+            ("GET /maps", calls.maps, least.maps),
+            ("upload", calls.uploads, least.uploads),
+        ):
+            bound = None if calls is least else WANTED_RATIO * Spread.of(theirs).p95 * 1000
+            report.add(f"{name}: {what}, median", Spread.of(mine).median * 1000, "ms")
+            report.add(f"{name}: {what}, p95", Spread.of(mine).p95 * 1000, "ms", at_most=bound)
+        report.add(f"{name}: calls that failed", len(calls.failed), at_most=0)
+        report.add(
+            f"{name}: log",
+            calls.log_bytes_per_minute / 1000,
+            "kB a minute",
+            at_most=WANTED_LOG_BYTES_PER_MINUTE / 1000,
+        )
+    report.details = {
+        "failed": {name: calls.failed[:10] for name, calls in found.items()},
+        "calls": {name: len(calls.maps) + len(calls.uploads) for name, calls in found.items()},
+        "load_average": os.getloadavg(),
+    }
+    report.add("load average at the end", os.getloadavg()[0])
+    return report
+
+
+@contextlib.contextmanager
+def _server(home: Path, log: Path) -> Iterator[RunningServer]:
+    command = [str(Path(sys.executable).with_name("placewise")), "serve"]
+    environment = {
+        **os.environ,
+        "PLACEWISE_HOME": str(home),
+        "HOST": ADDRESS,
+        "PORT": "0",
+        "ADMIN_KEY": "the-admin-key-of-the-measurement",
+        "EXTRACTOR": EXTRACTOR,
+        "ALLOW_TEST_EXTRACTORS": "true",
+    }
+
+    def limit_files() -> None:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (OPEN_FILES, OPEN_FILES))
+
+    with (
+        log.open("wb") as out,
+        subprocess.Popen(  # noqa: S603
+            command, env=environment, stderr=out, cwd=home.parent, preexec_fn=limit_files
+        ) as server,
+    ):
+        try:
+            deadline = time.monotonic() + START_SECONDS
+            while (running := running_server(home)) is None:
+                if server.poll() is not None or time.monotonic() > deadline:
+                    raise Unavailable("server_unreachable", "The server did not start.")
+                time.sleep(0.1)
+            yield running
+        finally:
+            server.terminate()
+
+
+def _timed(port: int, key: str, photo: bytes, seconds: float, log: Path) -> Calls:
+    """Both calls in turn, each over a connection of its own."""
+    calls = Calls()
+    size, began = log.stat().st_size, time.monotonic()
+    while (now := time.monotonic()) < began + seconds or not calls.uploads:
+        try:
+            if len(calls.maps) <= len(calls.uploads):
+                _call(port, key, "GET", "/api/v1/maps")
+                calls.maps.append(time.monotonic() - now)
+            else:
+                _upload(port, key, photo)
+                calls.uploads.append(time.monotonic() - now)
+        except (OSError, HTTPException, Unavailable) as error:
+            calls.failed.append(repr(error))
+            (calls.maps if len(calls.maps) <= len(calls.uploads) else calls.uploads).append(
+                time.monotonic() - now
+            )
+    calls.log_bytes_per_minute = (log.stat().st_size - size) / (time.monotonic() - began) * 60
+    return calls
+
+
+def _upload(port: int, key: str, photo: bytes) -> str:
+    """The id of the photo's job."""
+    answer = _call(port, key, "POST", "/api/v1/upload", form_of(photo), **CONTENT_TYPE)
+    job_id: str = answer["job_id"]
+    return job_id
+
+
+def _call(
+    port: int, key: str, method: str, path: str, body: bytes | None = None, **headers: str
+) -> dict[str, str]:
+    connection = HTTPConnection(ADDRESS, port, timeout=CALL_SECONDS)
+    with contextlib.closing(connection):
+        connection.request(method, path, body, {"Authorization": f"Bearer {key}", **headers})
+        answer = connection.getresponse()
+        data = answer.read()
+        if answer.status >= 300:
+            raise Unavailable("refused", f"{method} {path}: {answer.status} {data!r}")
+        found: dict[str, str] = json.loads(data)
+        return found
+
+
+@contextlib.contextmanager
+def _under(attack: Attack) -> Iterator[None]:
+    """The attack in a process of its own, begun SETTLE_SECONDS ago."""
+    context = multiprocessing.get_context("spawn")
+    begun = context.Event()
+    process = context.Process(target=_attack, args=(attack, begun))
+    process.start()
+    try:
+        if not begun.wait(START_SECONDS):
+            raise Unavailable("attack_not_begun", "The process of the slow clients did not start.")
+        time.sleep(SETTLE_SECONDS)
+        yield
+    finally:
+        process.kill()
+        process.join()
+
+
+def _attack(attack: Attack, begun: Event) -> None:
+    hard = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
+    resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
+    begun.set()
+    asyncio.run(_attack_together(attack))
+
+
+async def _attack_together(attack: Attack) -> None:
+    clients: list[Callable[[], Awaitable[None]]] = []
+    clients += [lambda: _hold(attack.port, ADDRESS, b"")] * attack.idle
+    head = (
+        b"POST /api/v1/upload HTTP/1.1\r\nHost: localhost\r\n"
+        + f"Authorization: Bearer {attack.body_key}\r\n".encode()
+        + f"Content-Type: multipart/form-data; boundary={BOUNDARY}\r\n".encode()
+        + f"Content-Length: {BODY_BYTES}\r\n\r\n--{BOUNDARY}\r\n".encode()
+    )
+    clients += [lambda: _hold(attack.port, SLOW_ADDRESS, head, drips=True)] * attack.bodies
+    for number in range(attack.streams):
+        clients.append(_stream(attack, number))
+    await asyncio.gather(*(_again(client) for client in clients))
+
+
+def _stream(attack: Attack, number: int) -> Callable[[], Awaitable[None]]:
+    caller = number % CALLERS
+    head = (
+        f"GET /api/v1/jobs/{attack.jobs[number % len(attack.jobs)]}/events HTTP/1.1\r\n"
+        f"Host: localhost\r\nAuthorization: Bearer {attack.stream_keys[caller]}\r\n\r\n"
+    ).encode()
+    return lambda: _hold(attack.port, STREAM_ADDRESS.format(caller + 1), head)
+
+
+async def _again(client: Callable[[], Awaitable[None]]) -> None:
+    while True:
+        with contextlib.suppress(OSError):
+            await client()
+        await asyncio.sleep(REOPEN_SECONDS * random.uniform(0.5, 1.5))
+
+
+async def _hold(port: int, address: str, head: bytes, *, drips: bool = False) -> None:
+    """Until the server closes the connection."""
+    reader, writer = await asyncio.open_connection(ADDRESS, port, local_addr=(address, 0))
+    try:
+        writer.write(head)
+        while True:
+            try:
+                if not await asyncio.wait_for(reader.read(65536), 1.0 if drips else None):
+                    return
+            except TimeoutError:
+                writer.write(b"-")
+    finally:
+        writer.close()
