@@ -36,7 +36,7 @@ from services.gateway.key_check import WRITE, caller_of
 from services.gateway.once import OnceDep, Replay
 from services.gateway.photos import PhotoPatch
 from services.gateway.room import ROOM_FOR_JOBS, ROOM_FOR_PHOTOS, Kind, RoomDep
-from services.gateway.schemas import Answer, UploadAnswer
+from services.gateway.schemas import Answer, UploadAnswer, url_in_map
 from services.gateway.upload import UPLOAD_ANSWERS, Said, answer_upload
 from shared.catalog.base import db_now_plus
 from shared.catalog.direct_uploads import DirectUpload, get_direct_upload
@@ -134,7 +134,7 @@ def presign(
             method="PUT",
             url=put.url,
             headers=put.headers,
-            complete_url=f"/api/v1/uploads/presign/{upload_id}/complete",
+            complete_url=url_in_map(f"/uploads/presign/{upload_id}/complete", map_name),
             expires_at=upload.expires_at,
         )
         once.keep(session, 201, answer)
@@ -170,7 +170,7 @@ async def complete(
             if upload is not None:  # its map may have been deleted during the wait
                 upload.status, upload.answer = said.status, said.answer.model_dump_json()
 
-    return await answer_upload(request, response, gateway, stored, key, replace)
+    return await answer_upload(request, response, gateway, map_name, stored, key, replace)
 
 
 def _complete(
@@ -195,7 +195,7 @@ def _complete(
     def keep(session: Session, stored: Stored) -> Stored:
         locked = get_direct_upload(session, upload.map_id, upload_id, lock=True)
         _raise_if_completed(locked)
-        said = Said.of(stored, stored.job, key)
+        said = Said.of(stored, stored.job, key, map_name)
         locked.status, locked.answer = said.status, said.answer.model_dump_json()
         return stored
 

@@ -53,7 +53,7 @@ def jobs(
         found = list_jobs(session, map_id, state or [], kind or [], limit + 1, before)
     page = found[:limit]
     return JobsAnswer(
-        jobs=[JobAnswer.of(job) for job in page],
+        jobs=[JobAnswer.of(job, map_name) for job in page],
         next_cursor=str(page[-1].id) if len(found) > limit else None,
     )
 
@@ -70,7 +70,7 @@ async def job(
     if wait and found.state in UNFINISHED:
         seconds = min(wait, gateway.settings.max_wait_seconds)
         found = await wait_for_job(gateway, job_id, seconds) or found
-    return JobAnswer.of(found)
+    return JobAnswer.of(found, map_name)
 
 
 @router.get(
@@ -89,7 +89,7 @@ async def job_events(
     """Server-sent events: a `progress` event with the job at every change, until it ends."""
     await run_in_threadpool(_get, gateway, map_name, job_id)
     return StreamingResponse(
-        _events(request, gateway, job_id),
+        _events(request, gateway, map_name, job_id),
         media_type="text/event-stream",
         headers={"Cache-Control": "no-store", "X-Accel-Buffering": "no"},
     )
@@ -116,7 +116,7 @@ def cancel_job(
             cancel(found)
         session.flush()
         session.refresh(found)
-        answer = JobAnswer.of(found)
+        answer = JobAnswer.of(found, map_name)
         once.keep(session, 200, answer)
         return answer
 
@@ -141,7 +141,7 @@ def retry_job(
             retry(session, found)
         session.flush()
         session.refresh(found)
-        answer = JobAnswer.of(found)
+        answer = JobAnswer.of(found, map_name)
         once.keep(session, 200, answer)
     gateway.hints.send(lane_of(found.priority))
     return answer
@@ -152,7 +152,9 @@ def _get(gateway: Gateway, map_name: str, job_id: UUID) -> Job:
         return get_job(session, get_map(session, map_name).id, job_id)
 
 
-async def _events(request: Request, gateway: Gateway, job_id: UUID) -> AsyncIterator[str]:
+async def _events(
+    request: Request, gateway: Gateway, map_name: str, job_id: UUID
+) -> AsyncIterator[str]:
     sent: dict[str, Any] | None = None
     number, spoken = 0, time.monotonic()
     while not await request.is_disconnected():
@@ -166,7 +168,7 @@ async def _events(request: Request, gateway: Gateway, job_id: UUID) -> AsyncIter
             continue
         if found is None:
             return
-        answer = JobAnswer.of(found)
+        answer = JobAnswer.of(found, map_name)
         if (now := answer.model_dump()) != sent:
             sent, number, spoken = now, number + 1, time.monotonic()
             yield f"id: {number}\nevent: progress\ndata: {answer.model_dump_json()}\n\n"

@@ -16,7 +16,7 @@ from services.gateway.key_check import WRITE, caller_of
 from services.gateway.once import OnceFormDep
 from services.gateway.receive import describe_form, receive_file
 from services.gateway.room import ROOM_FOR_JOBS, ROOM_FOR_PHOTOS, Kind, RoomDep
-from services.gateway.schemas import UploadAnswer, job_url
+from services.gateway.schemas import UploadAnswer, url_in_map
 from services.gateway.waiting import preferred_wait, wait_for_job
 from shared.catalog.photos import PhotoRole
 from shared.errors import PlacewiseError
@@ -86,7 +86,7 @@ async def upload(
     await once.begin_form(gateway.store, received)
 
     def keep(session: Session, stored: Stored) -> Stored:
-        said = Said.of(stored, stored.job, received.key)
+        said = Said.of(stored, stored.job, received.key, map_name)
         once.keep(session, said.status, said.answer, said.headers)
         return stored
 
@@ -96,7 +96,7 @@ async def upload(
     def replace(said: Said) -> None:
         once.replace(said.status, said.answer, said.headers)
 
-    return await answer_upload(request, response, gateway, stored, received.key, replace)
+    return await answer_upload(request, response, gateway, map_name, stored, received.key, replace)
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,9 +108,11 @@ class Said:
     answer: UploadAnswer
 
     @classmethod
-    def of(cls, stored: Stored, job: Job | None, key: str) -> Said:
+    def of(cls, stored: Stored, job: Job | None, key: str, map_name: str) -> Said:
         """`job` as it is now, and the `key` of the bytes that came."""
-        status_url = job_url(job.id) if job else f"/api/v1/uploads/{stored.photo.id}"
+        status_url = url_in_map(
+            f"/jobs/{job.id}" if job else f"/uploads/{stored.photo.id}", map_name
+        )
         answer = UploadAnswer(
             file_id=stored.photo.id,
             job_id=job.id if job else None,
@@ -133,6 +135,7 @@ async def answer_upload(
     request: Request,
     response: Response,
     gateway: Gateway,
+    map_name: str,
     stored: Stored,
     key: str,
     replace: Callable[[Said], None],
@@ -147,7 +150,7 @@ async def answer_upload(
     if wait and stored.queued and job is not None:
         response.headers["Preference-Applied"] = f"wait={wait:g}"
         job = await wait_for_job(gateway, job.id, wait)
-    said = Said.of(stored, job, key)
+    said = Said.of(stored, job, key, map_name)
     if said.status == 201:
         await run_in_threadpool(replace, said)
     response.status_code = said.status

@@ -69,11 +69,8 @@ class WebhookSender:
             # At random: webhooks with a backlog must not keep the others from the last places.
             for webhook_id in random.sample(due, min(len(due), MAX_WEBHOOKS - len(tasks))):
                 tasks[webhook_id] = asyncio.create_task(self._serve(webhook_id))
-            await asyncio.wait(
-                {stopped, *tasks.values()},
-                timeout=LOOK_SECONDS,
-                return_when=asyncio.FIRST_COMPLETED,
-            )
+            awaited: set[asyncio.Future[Any]] = {stopped, *tasks.values()}
+            await asyncio.wait(awaited, timeout=LOOK_SECONDS, return_when=asyncio.FIRST_COMPLETED)
             for webhook_id in [one for one, task in tasks.items() if task.done()]:
                 tasks.pop(webhook_id).result()  # raises what nobody has foreseen
 

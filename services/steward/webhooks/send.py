@@ -89,7 +89,7 @@ async def _post(
     """The response's status. Its body is not read: nothing in it is of use."""
     target = parse_target(webhook.url, allow_private=allow_private)
     address = await in_daemon_thread(lambda: resolve(target, allow_private=allow_private))
-    headers = {
+    headers: dict[bytes | str, bytes | str] = {
         **signed_headers(
             webhook.secret, f"msg_{delivery.event_id}", int(time.time()), delivery.body
         ),
