@@ -89,15 +89,16 @@ async def _post(
     """The response's status. Its body is not read: nothing in it is of use."""
     target = parse_target(webhook.url, allow_private=allow_private)
     address = await in_daemon_thread(lambda: resolve(target, allow_private=allow_private))
-    headers: dict[bytes | str, bytes | str] = {
-        **signed_headers(
-            webhook.secret, f"msg_{delivery.event_id}", int(time.time()), delivery.body
-        ),
-        "Content-Type": "application/json",
-        "Host": target.host_header,
-        "User-Agent": USER_AGENT,
-        "Connection": "close",
-    }
+    signed = signed_headers(
+        webhook.secret, f"msg_{delivery.event_id}", int(time.time()), delivery.body
+    )
+    headers = [
+        *signed.items(),
+        ("Content-Type", "application/json"),
+        ("Host", target.host_header),
+        ("User-Agent", USER_AGENT),
+        ("Connection", "close"),
+    ]
     url = httpcore2.URL(
         scheme=target.scheme, host=target.host, port=target.port, target=target.path
     )
