@@ -14,6 +14,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+from contextlib import AbstractContextManager
 from datetime import datetime
 from typing import Annotated, Any
 from uuid import UUID
@@ -35,7 +36,13 @@ from services.gateway.context import (
 from services.gateway.key_check import WRITE, caller_of
 from services.gateway.once import OnceDep, Replay
 from services.gateway.photos import PhotoPatch
-from services.gateway.room import ROOM_FOR_JOBS, ROOM_FOR_PHOTOS, Kind, RoomDep
+from services.gateway.room import (
+    ROOM_FOR_JOBS,
+    ROOM_FOR_PHOTOS,
+    Kind,
+    RoomDep,
+    place_for_photo,
+)
 from services.gateway.schemas import Answer, UploadAnswer, url_in_map
 from services.gateway.upload import UPLOAD_ANSWERS, Said, answer_upload
 from shared.catalog.base import db_now_plus
@@ -162,7 +169,10 @@ async def complete(
     key = new_original_key()
     with room.receiving(Kind.UPLOAD):
         key_id = caller_of(request).key_id
-        stored = await run_in_threadpool(_complete, gateway, map_name, upload_id, key, key_id)
+        place = place_for_photo(request, gateway.settings)
+        stored = await run_in_threadpool(
+            _complete, gateway, map_name, upload_id, key, key_id, place
+        )
 
     def replace(said: Said) -> None:
         with gateway.catalog.write() as session:
@@ -174,7 +184,12 @@ async def complete(
 
 
 def _complete(
-    gateway: Gateway, map_name: str, upload_id: UUID, key: str, key_id: UUID | None
+    gateway: Gateway,
+    map_name: str,
+    upload_id: UUID,
+    key: str,
+    key_id: UUID | None,
+    place: AbstractContextManager[None],
 ) -> Stored:
     """The photo, whose bytes lie under `key` unless the map had them. Raises Replay for an upload
     that was completed before."""
@@ -206,7 +221,8 @@ def _complete(
         with store.open(key) as file:
             header = read_photo_header(file, gateway.settings.max_image_pixels)
         incoming = Incoming(received, media_type, header, _fields(upload.said), key_id)
-        stored = store_photo(gateway.catalog, gateway.hints, map_name, incoming, keep)
+        with place:
+            stored = store_photo(gateway.catalog, gateway.hints, map_name, incoming, keep)
     except (PlacewiseError, Replay):
         store.delete(key)
         raise

@@ -85,7 +85,7 @@ class NoKeys:
             raise Forbidden(
                 "foreign_page",
                 "Without a key only calls to localhost are answered; this one is to "
-                f"{host[:100]!r} (its Host header). Set ADMIN_KEY to answer calls under other names.",
+                f"{host[:100]!r} (its Host header). Set ADMIN_KEY to answer under other names.",
             )
         origin = headers.get("origin", f"http://{host}")
         if origin.partition("://")[2] != host and origin not in self._trusted:

@@ -17,6 +17,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import AbstractContextManager
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -29,6 +30,7 @@ from services.gateway.key_check import caller_of
 from services.gateway.keys import Caller
 from shared.catalog.session import Catalog
 from shared.errors import StorageFull, TooManyRequests
+from shared.intake.photo_quota import PhotoQuota
 from shared.jobs.waiting import Waiting, look_at_queue
 from shared.settings import Settings
 
@@ -167,7 +169,14 @@ def _room_for_queries(room: RoomDep) -> None:
 def _room_for_photos(request: Request, gateway: GatewayDep) -> None:
     limited = max_photos(caller_of(request), gateway.settings)
     if limited is not None:
-        request.app.state.photo_quota.take(*limited)
+        request.app.state.photo_quota.check(*limited)
+
+
+def place_for_photo(request: Request, settings: Settings) -> AbstractContextManager[None]:
+    """In which the caller's photo is stored. TooManyRequests (`photo_quota_reached`)."""
+    quota: PhotoQuota = request.app.state.photo_quota
+    limited = max_photos(caller_of(request), settings)
+    return contextlib.nullcontext() if limited is None else quota.place(*limited)
 
 
 def max_photos(caller: Caller, settings: Settings) -> tuple[UUID, int] | None:

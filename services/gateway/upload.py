@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Any
 from uuid import UUID
@@ -15,7 +16,13 @@ from services.gateway.context import DEFAULT_MAP, Gateway, GatewayDep, MapName
 from services.gateway.key_check import WRITE, caller_of
 from services.gateway.once import OnceFormDep
 from services.gateway.receive import describe_form, receive_file
-from services.gateway.room import ROOM_FOR_JOBS, ROOM_FOR_PHOTOS, Kind, RoomDep
+from services.gateway.room import (
+    ROOM_FOR_JOBS,
+    ROOM_FOR_PHOTOS,
+    Kind,
+    RoomDep,
+    place_for_photo,
+)
 from services.gateway.schemas import UploadAnswer, url_in_map
 from services.gateway.waiting import preferred_wait, wait_for_job
 from shared.catalog.photos import PhotoRole
@@ -91,7 +98,8 @@ async def upload(
         return stored
 
     key_id = caller_of(request).key_id
-    stored = await run_in_threadpool(_store, gateway, map_name, received, key_id, keep)
+    place = place_for_photo(request, gateway.settings)
+    stored = await run_in_threadpool(_store, gateway, map_name, received, key_id, place, keep)
 
     def replace(said: Said) -> None:
         once.replace(said.status, said.answer, said.headers)
@@ -159,12 +167,18 @@ async def answer_upload(
 
 
 def _store(
-    gateway: Gateway, map_name: str, received: Received, key_id: UUID | None, keep: Keep
+    gateway: Gateway,
+    map_name: str,
+    received: Received,
+    key_id: UUID | None,
+    place: AbstractContextManager[None],
+    keep: Keep,
 ) -> Stored:
     """Check what came and acknowledge it; whatever is not kept leaves no bytes behind."""
     try:
         incoming = examine(gateway.store, received, gateway.settings.max_image_pixels, key_id)
-        stored = store_photo(gateway.catalog, gateway.hints, map_name, incoming, keep)
+        with place:
+            stored = store_photo(gateway.catalog, gateway.hints, map_name, incoming, keep)
     except PlacewiseError:
         # Only what is certainly refused: after a lost connection the row may be committed.
         gateway.store.delete(received.key)
