@@ -18,6 +18,7 @@ from services.gateway import upload as upload_module
 from services.steward.batches.worker import BatchWorker
 from shared.catalog.photos import Photo
 from shared.catalog.session import Catalog
+from shared.intake import incoming as incoming_module
 from shared.intake import photo_quota
 from shared.intake.incoming import Incoming
 from shared.jobs import InProcessHints
@@ -150,7 +151,7 @@ def test_parallel_uploads_store_exactly_as_many_photos_as_the_key_may(
 ) -> None:
     most, uploads = 3, 8
     all_received = Barrier(uploads)
-    real = upload_module.examine
+    real = incoming_module.examine
 
     def examine_together(*said: Any) -> Incoming:
         all_received.wait(60)
