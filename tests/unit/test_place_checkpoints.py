@@ -12,8 +12,14 @@ from typing import Any
 import pytest
 import torch
 
+from services.extractor.add_model import about
 from shared.errors import NotFound, Unprocessable
-from shared.vision.place_models.checkpoint import checkpoint_state, fingerprint, load_checkpoint
+from shared.vision.place_models.checkpoint import (
+    Checkpoint,
+    checkpoint_state,
+    fingerprint,
+    load_checkpoint,
+)
 from shared.vision.place_models.config import ModelConfig
 from shared.vision.place_models.model import PlaceModel, build_model
 from tests.support.fit_memory import forget_peak_memory, memory_bytes
@@ -315,3 +321,11 @@ def test_a_refusal_names_what_is_refused_and_gives_no_unsafe_advice(tmp_path: Pa
     detail = refusal(saved(tmp_path / "bomb.ckpt", {"a": Bomb(tmp_path / "executed")})).detail
     assert "Unsupported global: GLOBAL getattr" in detail  # the way to Path.touch
     assert "weights_only" not in detail
+
+
+def test_a_long_value_that_is_named_many_times_is_not_copied_as_often(model: PlaceModel) -> None:
+    rows = ["x" * 10_000] * 100_000
+    hostile = Checkpoint(model, model.config, "0", {"epoch": 3, "rows": [rows] * 100_000})
+    assert about(hostile) == {"epoch": 3, "left_out": "the hyperparameters, which are too long"}
+    plain = Checkpoint(model, model.config, "0", {"lr": 0.1, "steps": 1 << 100, "cities": ["Oslo"]})
+    assert about(plain) == {"lr": 0.1, "steps": "<int>", "cities": ["Oslo"]}
