@@ -93,7 +93,10 @@ class Settings(BaseSettings):
         None, ge=1, description="calls of one key; unset: any number"
     )
     key_upload_bytes_per_day: int | None = Field(
-        None, ge=1, description="bytes that one key sends; unset: any number"
+        None,
+        ge=1,
+        description="bytes of request bodies that one key may send in 24 hours, whether or not "
+        "they are stored; unset: any number",
     )
     key_max_photos: int | None = Field(
         None, ge=1, description="photos that are stored through one key; unset: any number"

@@ -127,23 +127,54 @@ def about(checkpoint: Checkpoint) -> dict[str, Any]:
     What is no JSON becomes text; of more than MOST_ABOUT_CHARACTERS only how long it was trained
     is left.
     """
-    said = {str(name): _plain(value) for name, value in checkpoint.about.items()}
-    if len(json.dumps(said)) > MOST_ABOUT_CHARACTERS:
-        said = {name: said[name] for name in ("epoch", "global_step") if name in said}
-        said["left_out"] = "the hyperparameters, which are too long"
-    return said
+    try:
+        said: dict[str, Any] = _Plain().of(checkpoint.about)
+        if len(json.dumps(said)) <= MOST_ABOUT_CHARACTERS:
+            return said
+    except _TooLong:
+        pass
+    lengths = {name: checkpoint.about.get(name) for name in ("epoch", "global_step")}
+    said = {name: value for name, value in lengths.items() if _is_short(value)}
+    return {**said, "left_out": "the hyperparameters, which are too long"}
 
 
-def _plain(value: Any, depth: int = 0) -> Any:
-    if isinstance(value, bool | int) or value is None:
-        return value
-    if isinstance(value, float):
-        return value if math.isfinite(value) else str(value)
-    if depth < 4 and isinstance(value, dict):
-        return {_text(name): _plain(member, depth + 1) for name, member in value.items()}
-    if depth < 4 and isinstance(value, list | tuple):
-        return [_plain(member, depth + 1) for member in value]
-    return _text(value)
+class _TooLong(Exception):
+    pass
+
+
+class _Plain:
+    """Makes values JSON. Raises _TooLong before it has made much more than MOST_ABOUT_CHARACTERS:
+    a few bytes of a pickle can name the same long value any number of times."""
+
+    def __init__(self) -> None:
+        self._left = MOST_ABOUT_CHARACTERS
+
+    def of(self, value: Any, depth: int = -1) -> Any:
+        self._take(1)
+        if isinstance(value, bool) or value is None or _is_short(value):
+            return value
+        if isinstance(value, float):
+            return value if math.isfinite(value) else str(value)
+        if depth < 4 and isinstance(value, dict):
+            return {self._text(name): self.of(one, depth + 1) for name, one in value.items()}
+        if depth < 4 and isinstance(value, list | tuple):
+            return [self.of(member, depth + 1) for member in value]
+        return self._text(value)
+
+    def _text(self, value: Any) -> str:
+        if isinstance(value, str):
+            self._take(len(value))
+        return _text(value)
+
+    def _take(self, characters: int) -> None:
+        self._left -= characters
+        if self._left < 0:
+            raise _TooLong
+
+
+def _is_short(value: Any) -> bool:
+    """Is it a number that every database keeps as one?"""
+    return isinstance(value, int) and value.bit_length() < 64
 
 
 def _text(value: Any) -> str:

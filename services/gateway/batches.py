@@ -188,8 +188,9 @@ def _queue(
                 list_batch(session, job, rows)
             session.flush()
             session.refresh(job)
-            answer = job_started(job)
-            started = BatchStarted(**answer.model_dump(), items_url=f"{job_url(job.id)}/items")
+            answer = job_started(job, map_name)
+            items_url = job_url(job.id, map_name, "/items")
+            started = BatchStarted(**answer.model_dump(), items_url=items_url)
             headers = {"Location": started.status_url, "Retry-After": "1"}
             once.keep(session, 202, started, headers)
             return started

@@ -100,7 +100,7 @@ def compare_described(gateway: Gateway, described: Job, query: Query, wanted: Wa
     return job
 
 
-def compared_answer(gateway: Gateway, job: Job) -> SimilarityAnswer:
+def compared_answer(gateway: Gateway, job: Job, map_name: str) -> SimilarityAnswer:
     """The answer of a compare job that has succeeded; Gone (`query_expired`) once it has gone."""
     params = Params.model_validate(job.params)
     try:
@@ -122,7 +122,7 @@ def compared_answer(gateway: Gateway, job: Job) -> SimilarityAnswer:
             weighted_score=scores[one.photo_id].weighted_score,
             rerank_score=one.rerank_score,
             explanation=_explanation(one),
-            **PhotoAnswer.fields_of(photos[one.photo_id]),
+            **PhotoAnswer.fields_of(photos[one.photo_id], map_name),
         )
         for one in live[: params.top_k]
     )

@@ -14,6 +14,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+from contextlib import AbstractContextManager
 from datetime import datetime
 from typing import Annotated, Any
 from uuid import UUID
@@ -35,8 +36,14 @@ from services.gateway.context import (
 from services.gateway.key_check import WRITE, caller_of
 from services.gateway.once import OnceDep, Replay
 from services.gateway.photos import PhotoPatch
-from services.gateway.room import ROOM_FOR_JOBS, ROOM_FOR_PHOTOS, Kind, RoomDep
-from services.gateway.schemas import Answer, UploadAnswer
+from services.gateway.room import (
+    ROOM_FOR_JOBS,
+    ROOM_FOR_PHOTOS,
+    Kind,
+    RoomDep,
+    place_for_photo,
+)
+from services.gateway.schemas import Answer, UploadAnswer, url_in_map
 from services.gateway.upload import UPLOAD_ANSWERS, Said, answer_upload
 from shared.catalog.base import db_now_plus
 from shared.catalog.direct_uploads import DirectUpload, get_direct_upload
@@ -134,7 +141,7 @@ def presign(
             method="PUT",
             url=put.url,
             headers=put.headers,
-            complete_url=f"/api/v1/uploads/presign/{upload_id}/complete",
+            complete_url=url_in_map(f"/uploads/presign/{upload_id}/complete", map_name),
             expires_at=upload.expires_at,
         )
         once.keep(session, 201, answer)
@@ -162,7 +169,10 @@ async def complete(
     key = new_original_key()
     with room.receiving(Kind.UPLOAD, request):
         key_id = caller_of(request).key_id
-        stored = await run_in_threadpool(_complete, gateway, map_name, upload_id, key, key_id)
+        place = place_for_photo(request, gateway.settings)
+        stored = await run_in_threadpool(
+            _complete, gateway, map_name, upload_id, key, key_id, place
+        )
 
     def replace(said: Said) -> None:
         with gateway.catalog.write() as session:
@@ -170,11 +180,16 @@ async def complete(
             if upload is not None:  # its map may have been deleted during the wait
                 upload.status, upload.answer = said.status, said.answer.model_dump_json()
 
-    return await answer_upload(request, response, gateway, stored, key, replace)
+    return await answer_upload(request, response, gateway, map_name, stored, key, replace)
 
 
 def _complete(
-    gateway: Gateway, map_name: str, upload_id: UUID, key: str, key_id: UUID | None
+    gateway: Gateway,
+    map_name: str,
+    upload_id: UUID,
+    key: str,
+    key_id: UUID | None,
+    place: AbstractContextManager[None],
 ) -> Stored:
     """The photo, whose bytes lie under `key` unless the map had them. Raises Replay for an upload
     that was completed before."""
@@ -195,7 +210,7 @@ def _complete(
     def keep(session: Session, stored: Stored) -> Stored:
         locked = get_direct_upload(session, upload.map_id, upload_id, lock=True)
         _raise_if_completed(locked)
-        said = Said.of(stored, stored.job, key)
+        said = Said.of(stored, stored.job, key, map_name)
         locked.status, locked.answer = said.status, said.answer.model_dump_json()
         return stored
 
@@ -206,7 +221,8 @@ def _complete(
         with store.open(key) as file:
             header = read_photo_header(file, gateway.settings.max_image_pixels)
         incoming = Incoming(received, media_type, header, _fields(upload.said), key_id)
-        stored = store_photo(gateway.catalog, gateway.hints, map_name, incoming, keep)
+        with place:
+            stored = store_photo(gateway.catalog, gateway.hints, map_name, incoming, keep)
     except (PlacewiseError, Replay):
         store.delete(key)
         raise

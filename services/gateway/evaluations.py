@@ -91,7 +91,7 @@ def evaluate(
         job = queue_asking(
             session, once, map_.id, generation, JobKind.EVALUATE, {**params, "automatic": False}
         )
-    return started_job(response, job)
+    return started_job(response, job, map_name)
 
 
 @router.get(

@@ -48,6 +48,7 @@ class Query:
     """What is compared, with what, and what the answer says about it."""
 
     map_id: UUID
+    map_name: str
     min_version: int
     generation: Generation
     vocabulary: str
@@ -80,10 +81,11 @@ def query_by_photo(gateway: Gateway, map_name: str, photo_id: UUID) -> Query:
         generation = active_generation(session, map_.id)
         found = descriptor_of(session, generation.id, photo.id) if generation else None
         if generation is None or found is None:
-            raise _not_searchable(session, photo)
+            raise _not_searchable(session, photo, map_name)
         descriptor, chunk = found
         return Query(
             map_id=map_.id,
+            map_name=map_.name,
             min_version=map_.version,
             generation=generation,
             vocabulary=standing_of(session, generation),
@@ -107,6 +109,7 @@ def query_by_job(gateway: Gateway, job: Job) -> Query:
             )
         return Query(
             map_id=map_.id,
+            map_name=map_.name,
             min_version=map_.version,
             generation=generation,
             vocabulary=standing_of(session, generation),
@@ -132,7 +135,7 @@ def find_similar(gateway: Gateway, query: Query, wanted: Wanted) -> SimilarityAn
         SimilarPhoto(
             similarity_score=hit.score,
             weighted_score=hit.weighted_score,
-            **PhotoAnswer.fields_of(found.photos[hit.photo_id]),
+            **PhotoAnswer.fields_of(found.photos[hit.photo_id], query.map_name),
         )
         for hit in found.hits
     )
@@ -237,18 +240,19 @@ def _search_live(
         k *= 2
 
 
-def _not_searchable(session: Session, photo: Photo) -> Conflict:
+def _not_searchable(session: Session, photo: Photo, map_name: str) -> Conflict:
     """Why the photo can't be asked with, and what to wait for."""
     job = session.get(Job, photo.job_id) if photo.job_id else None
     extra: dict[str, Any] = {"file_id": str(photo.id)}
     if job is None:
         return Conflict("not_searchable", "The photo is not described yet.", **extra)
-    extra |= {"job_id": str(job.id), "status_url": job_url(job.id), "state": job.state}
+    status_url = job_url(job.id, map_name)
+    extra |= {"job_id": str(job.id), "status_url": status_url, "state": job.state}
     if job.state == JobState.FAILED:
         reason = (job.error or {}).get("detail", "no reason is stored")
         detail = f"The photo could not be described: {reason}"
     elif job.waiting_for:
         detail = f"The photo is not searchable yet: its job waits for a {job.waiting_for}."
     else:
-        detail = f"The photo is not searchable yet: its job is {job.state}. Poll {job_url(job.id)}."
+        detail = f"The photo is not searchable yet: its job is {job.state}. Poll {status_url}."
     return Conflict("not_searchable", detail, **extra)

@@ -51,7 +51,7 @@ def jobs(
         found = list_jobs(session, map_id, state or [], kind or [], limit + 1, before)
     page = found[:limit]
     return JobsAnswer(
-        jobs=[JobAnswer.of(job) for job in page],
+        jobs=[JobAnswer.of(job, map_name) for job in page],
         next_cursor=str(page[-1].id) if len(found) > limit else None,
     )
 
@@ -68,7 +68,7 @@ async def job(
     if wait and found.state in UNFINISHED:
         seconds = min(wait, gateway.settings.max_wait_seconds)
         found = await wait_for_job(gateway, job_id, seconds) or found
-    return JobAnswer.of(found)
+    return JobAnswer.of(found, map_name)
 
 
 async def _event_stream(request: Request, room: RoomDep) -> AsyncIterator[None]:
@@ -93,7 +93,7 @@ async def job_events(
     too many are sent already (429, `too_many_event_streams`), poll the job."""
     found = await run_in_threadpool(_get, gateway, map_name, job_id)
     return StreamingResponse(
-        _events(gateway, job_id, JobAnswer.of(found)),
+        _events(gateway, job_id, JobAnswer.of(found, map_name), map_name),
         media_type="text/event-stream",
         headers={"Cache-Control": "no-store", "X-Accel-Buffering": "no"},
     )
@@ -120,7 +120,7 @@ def cancel_job(
             cancel(found)
         session.flush()
         session.refresh(found)
-        answer = JobAnswer.of(found)
+        answer = JobAnswer.of(found, map_name)
         once.keep(session, 200, answer)
         return answer
 
@@ -145,7 +145,7 @@ def retry_job(
             retry(session, found)
         session.flush()
         session.refresh(found)
-        answer = JobAnswer.of(found)
+        answer = JobAnswer.of(found, map_name)
         once.keep(session, 200, answer)
     gateway.hints.send(lane_of(found.priority))
     return answer
@@ -156,7 +156,9 @@ def _get(gateway: Gateway, map_name: str, job_id: UUID) -> Job:
         return get_job(session, get_map(session, map_name).id, job_id)
 
 
-async def _events(gateway: Gateway, job_id: UUID, job: JobAnswer) -> AsyncIterator[str]:
+async def _events(
+    gateway: Gateway, job_id: UUID, job: JobAnswer, map_name: str
+) -> AsyncIterator[str]:
     """The stream of a job that is now as `job` says."""
     number, mark, sent = 0, (), ""
     while True:
@@ -178,4 +180,4 @@ async def _events(gateway: Gateway, job_id: UUID, job: JobAnswer) -> AsyncIterat
                 await asyncio.sleep(AWAY_SECONDS)
         if change is None:
             return
-        job, mark = JobAnswer.of(change.job), change.mark
+        job, mark = JobAnswer.of(change.job, map_name), change.mark

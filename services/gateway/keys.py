@@ -28,6 +28,8 @@ log = logging.getLogger(__name__)
 # RFC 6750 in one line; a scheme's name is written in any case (RFC 9110).
 BEARER = re.compile(r"bearer +(?P<key>[!-~]+) *", re.IGNORECASE)
 HOW = "send the header `Authorization: Bearer KEY` (the commands: PLACEWISE_KEY=KEY)"
+# What proxies add (RFC 9110, RFC 7239, and the usual ones before them).
+FORWARDED = ("Forwarded", "Via", "X-Forwarded-For", "X-Forwarded-Host", "X-Real-IP")
 USES_REMEMBERED = 10_000  # keys whose last use this process knows; above that it forgets all
 
 
@@ -48,8 +50,9 @@ class Keys(Protocol):
 
     async def check(self, headers: Headers) -> Caller:
         """Raise Unauthorized (`key_missing`, `key_unknown`, `key_revoked`, `key_expired`) unless
-        `Authorization` holds a key, Forbidden (`foreign_page`) where none is asked for and a
-        browser's page of elsewhere calls, and Unavailable while the catalog can't be asked.
+        `Authorization` holds a key, Forbidden (`foreign_page`, `forwarded_request`) where none is
+        asked for and a browser's page of elsewhere or a proxy calls, and Unavailable while the
+        catalog can't be asked.
         """
 
     async def note_use(self, caller: Caller) -> None:
@@ -60,7 +63,8 @@ class NoKeys:
     """This machine's users may call: only they reach the server, and pages in their browsers.
 
     A page of elsewhere must not. What it sends names it in `Origin`; where it has its own name lead
-    to this machine, that name is in `Host`.
+    to this machine (DNS rebinding), that name is in `Host`. Nor must whoever is behind a proxy on
+    this machine: to the server, everyone behind it comes from loopback.
     """
 
     def __init__(self, trusted_origins: Container[str] = ()) -> None:
@@ -68,14 +72,27 @@ class NoKeys:
         self._trusted = trusted_origins
 
     async def check(self, headers: Headers) -> Caller:
+        for name in FORWARDED:
+            if name in headers:
+                raise Forbidden(
+                    "forwarded_request",
+                    f"A proxy has forwarded this call (it has the header {name}). Without a key "
+                    "only calls of this machine are answered, and nobody can tell who is behind a "
+                    "proxy. Set ADMIN_KEY and restart Placewise; then every call needs a key.",
+                )
         host = headers.get("host", "")
-        origin = headers.get("origin", f"http://{host}")
-        ours = origin.partition("://")[2] == host or origin in self._trusted
-        if not is_loopback(_name(host)) or not ours:
+        if not is_loopback(_name(host)):
             raise Forbidden(
                 "foreign_page",
-                "Without a key only calls to localhost are answered, and no page of elsewhere may "
-                "make them in a browser. Set ADMIN_KEY to let others in.",
+                "Without a key only calls to localhost are answered; this one is to "
+                f"{host[:100]!r} (its Host header). Set ADMIN_KEY to answer under other names.",
+            )
+        origin = headers.get("origin", f"http://{host}")
+        if origin.partition("://")[2] != host and origin not in self._trusted:
+            raise Forbidden(
+                "foreign_page",
+                f"Without a key no page of another site may call; this one is of {origin[:100]!r} "
+                "(its Origin header). Name the page in CORS_ORIGINS, or set ADMIN_KEY.",
             )
         return Caller("this machine", EVERYTHING)
 

@@ -107,7 +107,7 @@ def fit_vocabulary(
             raise Conflict("no_photos", "The map has no photos to learn from. Upload some first.")
         job = start_model_change(session, map_id, JobKind.FIT, params)
         once.keep_job(session, job)
-    return _started(gateway, response, job)
+    return _started(gateway, response, job, map_name)
 
 
 @router.post(
@@ -144,7 +144,7 @@ async def import_vocabulary(
     await once.begin_form(gateway.store, received)
     params = {"object_key": received.key, "filename": received.filename}
     job = await run_in_threadpool(_queue_import, gateway, map_name, params, once)
-    return _started(gateway, response, job)
+    return _started(gateway, response, job, map_name)
 
 
 @router.get(
@@ -235,7 +235,7 @@ def start_generation(
         else:
             job = _queue_switch(session, map_id, recipe, wanted.vocabulary_id)
         once.keep_job(session, job)
-    return _started(gateway, response, job)
+    return _started(gateway, response, job, map_name)
 
 
 def _other_extractor(settings: Settings, wanted: SwitchRequest) -> Recipe | None:
@@ -299,6 +299,6 @@ def _queue_import(gateway: Gateway, map_name: str, params: dict[str, Any], once:
         raise
 
 
-def _started(gateway: Gateway, response: Response, job: Job) -> JobStarted:
+def _started(gateway: Gateway, response: Response, job: Job, map_name: str) -> JobStarted:
     gateway.hints.send()
-    return started_job(response, job)
+    return started_job(response, job, map_name)

@@ -20,7 +20,7 @@ from services.gateway.key_check import ADMIN, READ
 from services.gateway.once import Once, OnceFormDep
 from services.gateway.receive import describe_form, receive_file
 from services.gateway.room import ROOM_FOR_JOBS, Kind, RoomDep
-from services.gateway.schemas import Answer, JobStarted, job_started
+from services.gateway.schemas import Answer, JobStarted, started_job
 from shared.catalog.added_models import get_model, list_models, maps_using, remove_model
 from shared.catalog.maps import get_map
 from shared.catalog.models import Model
@@ -148,10 +148,7 @@ async def add_model(
     }
     job = await run_in_threadpool(_queue, gateway, map_name, params, once)
     gateway.hints.send()
-    answer = job_started(job)
-    response.headers["Location"] = answer.status_url
-    response.headers["Retry-After"] = "1"
-    return answer
+    return started_job(response, job, map_name)
 
 
 @router.get("/models", operation_id="list_models", response_model=ModelsAnswer, dependencies=[READ])

@@ -148,7 +148,7 @@ class Once:
 
     def keep_job(self, session: Session, job: Job) -> None:
         """The 202 of a job that this transaction queues."""
-        started = job_started(job)
+        started = job_started(job, _map_name(self._request))
         self.keep(session, 202, started, {"Location": started.status_url, "Retry-After": "1"})
 
     def replace(
@@ -200,8 +200,12 @@ async def once_of_body(request: Request, once: Annotated[Once, Depends(once_of_f
 
 def _scope(request: Request) -> str:
     """Whose key it is: the caller's, in one map."""
-    whose = [caller_of(request).who, request.query_params.get("map", DEFAULT_MAP)]
+    whose = [caller_of(request).who, _map_name(request)]
     return hashlib.sha256(json.dumps(whose).encode()).hexdigest()
+
+
+def _map_name(request: Request) -> str:
+    return request.query_params.get("map", DEFAULT_MAP)
 
 
 OnceDep = Annotated[Once, Depends(once_of_body)]

@@ -58,7 +58,8 @@ PICTURE: dict[int | str, dict[str, Any]] = {
 def photo(gateway: GatewayDep, file_id: FileId, map_name: MapName = DEFAULT_MAP) -> OnePhotoAnswer:
     """What is known of one photo."""
     with gateway.catalog.read() as session:
-        return _one(session, get_photo(session, get_map(session, map_name).id, file_id))
+        found = get_photo(session, get_map(session, map_name).id, file_id)
+        return _one(session, found, map_name)
 
 
 class PhotoPatch(BaseModel):
@@ -116,7 +117,7 @@ def patch_photo(
         check_pair(found.latitude, found.longitude)
         found.changed_version = bump_version(session, map_.id)
         session.flush()
-        return _one(session, found)
+        return _one(session, found, map_name)
 
 
 @router.delete(
@@ -232,17 +233,17 @@ def search(
     return MetadataAnswer(
         total_found=total,
         total_is_exact=total < COUNTED_AT_MOST,
-        images=[PhotoAnswer(**PhotoAnswer.fields_of(item)) for item in page],
+        images=[PhotoAnswer(**PhotoAnswer.fields_of(item, map_name)) for item in page],
         next_cursor=_cursor(page[-1]) if len(found) > limit else None,
         query_time_ms=(time.perf_counter() - started) * 1000,
     )
 
 
-def _one(session: Session, found: Photo) -> OnePhotoAnswer:
+def _one(session: Session, found: Photo, map_name: str) -> OnePhotoAnswer:
     generation = active_generation(session, found.map_id)
     searchable = generation is not None and descriptor_of(session, generation.id, found.id)
     return OnePhotoAnswer(
-        **PhotoAnswer.fields_of(found),
+        **PhotoAnswer.fields_of(found, map_name),
         job_id=found.job_id,
         media_type=found.media_type,
         sha256=found.sha256,

@@ -10,6 +10,7 @@ limits of their own: however many uploads wait, a query is asked.
 
 from __future__ import annotations
 
+import contextlib
 import math
 import threading
 import time
@@ -28,6 +29,7 @@ from services.gateway.keys import Caller
 from shared.catalog.session import Catalog
 from shared.disk_space import QUERY_SHARE, DiskSpace
 from shared.errors import TooManyRequests
+from shared.intake.photo_quota import PhotoQuota
 from shared.jobs.waiting import Waiting, look_at_queue
 from shared.settings import Settings
 
@@ -155,7 +157,14 @@ def _room_for_queries(room: RoomDep) -> None:
 def _room_for_photos(request: Request, gateway: GatewayDep) -> None:
     limited = max_photos(caller_of(request), gateway.settings)
     if limited is not None:
-        request.app.state.photo_quota.take(*limited)
+        request.app.state.photo_quota.check(*limited)
+
+
+def place_for_photo(request: Request, settings: Settings) -> AbstractContextManager[None]:
+    """In which the caller's photo is stored. TooManyRequests (`photo_quota_reached`)."""
+    quota: PhotoQuota = request.app.state.photo_quota
+    limited = max_photos(caller_of(request), settings)
+    return contextlib.nullcontext() if limited is None else quota.place(*limited)
 
 
 def max_photos(caller: Caller, settings: Settings) -> tuple[UUID, int] | None:

@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable
 from datetime import datetime
 from typing import Any
+from urllib.parse import urlencode
 from uuid import UUID
 
 from fastapi import Response
 from pydantic import BaseModel, ConfigDict, Field
 
-from services.gateway.context import API
+from services.gateway.context import API, DEFAULT_MAP
 from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.photos import Photo, PhotoRole
 from shared.catalog.vocabularies import Vocabulary, VocabularyOrigin
@@ -44,11 +45,11 @@ class PhotoAnswer(Answer):
     thumbnail_url: str
 
     @classmethod
-    def fields_of(cls, photo: Photo) -> dict[str, Any]:
-        here = f"{API}/uploads/{photo.id}"
+    def fields_of(cls, photo: Photo, map_name: str) -> dict[str, Any]:
+        image_url = url_in_map(f"/uploads/{photo.id}/image", map_name)
         return {
             "image_id": photo.id,
-            "image_path": f"{here}/image",
+            "image_path": image_url,
             "original_filename": photo.filename,
             "upload_time": photo.uploaded_at,
             "file_size": photo.size_bytes,
@@ -62,8 +63,8 @@ class PhotoAnswer(Answer):
             "captured_at": photo.captured_at,
             "place": photo.place,
             "role": photo.role,
-            "image_url": f"{here}/image",
-            "thumbnail_url": f"{here}/thumbnail",
+            "image_url": image_url,
+            "thumbnail_url": url_in_map(f"/uploads/{photo.id}/thumbnail", map_name),
         }
 
 
@@ -225,7 +226,7 @@ class JobAnswer(Answer):
     )
 
     @classmethod
-    def of(cls, job: Job) -> JobAnswer:
+    def of(cls, job: Job, map_name: str) -> JobAnswer:
         query = job.kind in QUERY_JOBS
         return cls(
             job_id=job.id,
@@ -246,8 +247,8 @@ class JobAnswer(Answer):
             created_at=job.created_at,
             started_at=job.started_at,
             finished_at=job.finished_at,
-            status_url=job_url(job.id),
-            result_url=f"{job_url(job.id)}/result" if query else None,
+            status_url=job_url(job.id, map_name),
+            result_url=job_url(job.id, map_name, "/result") if query else None,
             request_id=job.request_id,
         )
 
@@ -340,22 +341,28 @@ class GenerationAnswer(Answer):
         )
 
 
-def job_url(job_id: UUID) -> str:
-    return f"{API}/jobs/{job_id}"
+def url_in_map(path: str, map_name: str) -> str:
+    """URL of a call of the API that finds what belongs to the map: with `?map=` unless the map is
+    the default one."""
+    return f"{API}{path}" + ("" if map_name == DEFAULT_MAP else f"?{urlencode({'map': map_name})}")
 
 
-def job_started(job: Job) -> JobStarted:
+def job_url(job_id: UUID, map_name: str, part: str = "") -> str:
+    return url_in_map(f"/jobs/{job_id}{part}", map_name)
+
+
+def job_started(job: Job, map_name: str) -> JobStarted:
     return JobStarted(
         job_id=job.id,
         status=JobState(job.state),
-        status_url=job_url(job.id),
-        result_url=f"{job_url(job.id)}/result" if job.kind in QUERY_JOBS else None,
+        status_url=job_url(job.id, map_name),
+        result_url=job_url(job.id, map_name, "/result") if job.kind in QUERY_JOBS else None,
     )
 
 
-def started_job(response: Response, job: Job) -> JobStarted:
+def started_job(response: Response, job: Job, map_name: str) -> JobStarted:
     """What a 202 says of its job, in the body and in the headers of `response`."""
-    started = job_started(job)
+    started = job_started(job, map_name)
     response.headers["Location"] = started.status_url
     response.headers["Retry-After"] = "1"
     return started

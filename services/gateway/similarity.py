@@ -97,7 +97,7 @@ async def similar_to_stored(
         return asked
     settings = gateway.settings
     wait = preferred_wait(request, settings.max_wait_seconds) or settings.compare_wait_seconds
-    return await _when_it_ends(gateway, response, asked, wait)
+    return await _when_it_ends(gateway, response, asked, map_name, wait)
 
 
 @router.post(
@@ -136,7 +136,7 @@ async def similar_to_upload(
     wait = preferred_wait(request, gateway.settings.max_wait_seconds)
     if wait:
         response.headers["Preference-Applied"] = f"wait={wait:g}"
-    return await _when_it_ends(gateway, response, job, wait)
+    return await _when_it_ends(gateway, response, job, map_name, wait)
 
 
 @router.get(
@@ -170,11 +170,11 @@ async def similarity_result(
             state=job.state,
         )
     wait = gateway.settings.compare_wait_seconds
-    return await _when_it_ends(gateway, response, job, wait)
+    return await _when_it_ends(gateway, response, job, map_name, wait)
 
 
 async def _when_it_ends(
-    gateway: Gateway, response: Response, job: Job, wait_seconds: float
+    gateway: Gateway, response: Response, job: Job, map_name: str, wait_seconds: float
 ) -> SimilarityAnswer | JSONResponse:
     """What the query's job and the one that follows it come to within the time; else a 202."""
     deadline = time.monotonic() + wait_seconds
@@ -186,10 +186,10 @@ async def _when_it_ends(
                 raise query_expired()
             job = waited
         if job.state in UNFINISHED:
-            started = started_job(response, job)
+            started = started_job(response, job, map_name)
             # As a response of its own: the route's model is that of the 200.
             return JSONResponse(started.model_dump(mode="json"), 202, dict(response.headers))
-        result = await run_in_threadpool(_result, gateway, job)
+        result = await run_in_threadpool(_result, gateway, job, map_name)
         if isinstance(result, SimilarityAnswer):
             return result
         job = result
@@ -227,11 +227,11 @@ def _queue(
     return job
 
 
-def _result(gateway: Gateway, job: Job) -> SimilarityAnswer | Job:
+def _result(gateway: Gateway, job: Job, map_name: str) -> SimilarityAnswer | Job:
     """The answer of an ended job, or the job that goes on with it."""
     if job.state == JobState.SUCCEEDED:
         if job.kind == JobKind.COMPARE:
-            return compared_answer(gateway, job)
+            return compared_answer(gateway, job, map_name)
         wanted = Wanted.model_validate(job.params["wanted"])
         query = query_by_job(gateway, job)
         if wanted.closely:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Any
 from uuid import UUID
@@ -15,8 +16,14 @@ from services.gateway.context import DEFAULT_MAP, Gateway, GatewayDep, MapName
 from services.gateway.key_check import WRITE, caller_of
 from services.gateway.once import OnceFormDep
 from services.gateway.receive import describe_form, receive_file
-from services.gateway.room import ROOM_FOR_JOBS, ROOM_FOR_PHOTOS, Kind, RoomDep
-from services.gateway.schemas import UploadAnswer, job_url
+from services.gateway.room import (
+    ROOM_FOR_JOBS,
+    ROOM_FOR_PHOTOS,
+    Kind,
+    RoomDep,
+    place_for_photo,
+)
+from services.gateway.schemas import UploadAnswer, url_in_map
 from services.gateway.waiting import preferred_wait, wait_for_job
 from shared.catalog.photos import PhotoRole
 from shared.errors import PlacewiseError
@@ -86,17 +93,18 @@ async def upload(
     await once.begin_form(gateway.store, received)
 
     def keep(session: Session, stored: Stored) -> Stored:
-        said = Said.of(stored, stored.job, received.key)
+        said = Said.of(stored, stored.job, received.key, map_name)
         once.keep(session, said.status, said.answer, said.headers)
         return stored
 
     key_id = caller_of(request).key_id
-    stored = await run_in_threadpool(_store, gateway, map_name, received, key_id, keep)
+    place = place_for_photo(request, gateway.settings)
+    stored = await run_in_threadpool(_store, gateway, map_name, received, key_id, place, keep)
 
     def replace(said: Said) -> None:
         once.replace(said.status, said.answer, said.headers)
 
-    return await answer_upload(request, response, gateway, stored, received.key, replace)
+    return await answer_upload(request, response, gateway, map_name, stored, received.key, replace)
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,9 +116,11 @@ class Said:
     answer: UploadAnswer
 
     @classmethod
-    def of(cls, stored: Stored, job: Job | None, key: str) -> Said:
+    def of(cls, stored: Stored, job: Job | None, key: str, map_name: str) -> Said:
         """`job` as it is now, and the `key` of the bytes that came."""
-        status_url = job_url(job.id) if job else f"/api/v1/uploads/{stored.photo.id}"
+        status_url = url_in_map(
+            f"/jobs/{job.id}" if job else f"/uploads/{stored.photo.id}", map_name
+        )
         answer = UploadAnswer(
             file_id=stored.photo.id,
             job_id=job.id if job else None,
@@ -133,6 +143,7 @@ async def answer_upload(
     request: Request,
     response: Response,
     gateway: Gateway,
+    map_name: str,
     stored: Stored,
     key: str,
     replace: Callable[[Said], None],
@@ -147,7 +158,7 @@ async def answer_upload(
     if wait and stored.queued and job is not None:
         response.headers["Preference-Applied"] = f"wait={wait:g}"
         job = await wait_for_job(gateway, job.id, wait)
-    said = Said.of(stored, job, key)
+    said = Said.of(stored, job, key, map_name)
     if said.status == 201:
         await run_in_threadpool(replace, said)
     response.status_code = said.status
@@ -156,12 +167,18 @@ async def answer_upload(
 
 
 def _store(
-    gateway: Gateway, map_name: str, received: Received, key_id: UUID | None, keep: Keep
+    gateway: Gateway,
+    map_name: str,
+    received: Received,
+    key_id: UUID | None,
+    place: AbstractContextManager[None],
+    keep: Keep,
 ) -> Stored:
     """Check what came and acknowledge it; whatever is not kept leaves no bytes behind."""
     try:
         incoming = examine(gateway.store, received, gateway.settings.max_image_pixels, key_id)
-        stored = store_photo(gateway.catalog, gateway.hints, map_name, incoming, keep)
+        with place:
+            stored = store_photo(gateway.catalog, gateway.hints, map_name, incoming, keep)
     except PlacewiseError:
         # Only what is certainly refused: after a lost connection the row may be committed.
         gateway.store.delete(received.key)

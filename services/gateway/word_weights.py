@@ -94,7 +94,7 @@ def learn_word_weights(
             raise Conflict("no_word_weights", f"This generation gets no word weights: {reason}.")
         params["generation_id"] = str(generation.id)
         job = queue_asking(session, once, map_.id, generation, JobKind.WORD_WEIGHTS, params)
-    return started_job(response, job)
+    return started_job(response, job, map_name)
 
 
 @router.get(

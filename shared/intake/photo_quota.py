@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+import threading
 import time
-from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
 from uuid import UUID
 
 from shared.catalog.keys import count_photos_of
@@ -13,27 +16,56 @@ from shared.errors import TooManyRequests
 LOOK_SECONDS = 10.0
 FULL_LOOK_SECONDS = 1.0  # once the limit is reached
 RETRY_SECONDS = 3600
-KEYS_REMEMBERED = 1000
+
+
+@dataclass(slots=True)
+class KeyPhotos:
+    """The photos of one key as this process knows them, under `lock`."""
+
+    lock: threading.Lock = field(default_factory=threading.Lock)
+    counted_at: float = -LOOK_SECONDS
+    counted: int = 0
+    """In the catalog, at `counted_at` (monotonic seconds)."""
+    stored: int = 0
+    """By this process since then, at most: bytes that were there already are no further photo."""
 
 
 class PhotoQuota:
-    """Counts by looking, and what was taken since: a limit may be passed by what is being received
-    at that moment, and by what other processes take within LOOK_SECONDS. Thread-safe."""
+    """Counts the photos of each key. Thread-safe.
+
+    One process never passes a limit: it stores the photos of a limited key one after the other.
+    What other processes store is known after LOOK_SECONDS at the latest.
+    """
 
     def __init__(self, catalog: Catalog) -> None:
         self._catalog = catalog
-        self._seen: dict[UUID, tuple[float, int]] = {}
-        self._taken: Counter[UUID] = Counter()
+        self._keys: dict[UUID, KeyPhotos] = {}
 
-    def take(self, key_id: UUID, most: int) -> None:
-        """Room for one more photo. TooManyRequests (`photo_quota_reached`)."""
-        looked_at, stored = self._seen.get(key_id, (-LOOK_SECONDS, 0))
-        age_seconds = time.monotonic() - looked_at
-        # What was taken may have been refused since, or was there already: full is who looks full.
-        seems_full = stored < most <= stored + self._taken[key_id]
-        if seems_full or age_seconds >= (LOOK_SECONDS if stored < most else FULL_LOOK_SECONDS):
-            stored = self._look(key_id, most)
-        if stored >= most:
+    def check(self, key_id: UUID, most: int) -> None:
+        """Refuse early, before a photo is received. TooManyRequests (`photo_quota_reached`)."""
+        photos = self._keys.setdefault(key_id, KeyPhotos())
+        with photos.lock:
+            self._check(photos, key_id, most)
+
+    @contextlib.contextmanager
+    def place(self, key_id: UUID, most: int) -> Iterator[None]:
+        """Room for one photo, which the block stores. TooManyRequests (`photo_quota_reached`)."""
+        photos = self._keys.setdefault(key_id, KeyPhotos())
+        with photos.lock:
+            self._check(photos, key_id, most)
+            photos.stored += 1  # also where the block raises: its transaction may be committed
+            yield
+
+    def _check(self, photos: KeyPhotos, key_id: UUID, most: int) -> None:
+        age_seconds = time.monotonic() - photos.counted_at
+        seems_full = photos.counted < most <= photos.counted + photos.stored
+        if seems_full or age_seconds >= (
+            LOOK_SECONDS if photos.counted < most else FULL_LOOK_SECONDS
+        ):
+            with self._catalog.read() as session:
+                photos.counted = count_photos_of(session, key_id, most)
+            photos.counted_at, photos.stored = time.monotonic(), 0
+        if photos.counted >= most:
             raise TooManyRequests(
                 "photo_quota_reached",
                 f"{most} photos are stored through this key, and no more may be. Delete some, or "
@@ -41,13 +73,3 @@ class PhotoQuota:
                 retry_after_seconds=RETRY_SECONDS,
                 limit=most,
             )
-        self._taken[key_id] += 1
-
-    def _look(self, key_id: UUID, most: int) -> int:
-        if len(self._seen) >= KEYS_REMEMBERED:
-            self._seen.clear()
-        self._taken[key_id] = 0
-        with self._catalog.read() as session:
-            stored = count_photos_of(session, key_id, most)
-        self._seen[key_id] = (time.monotonic(), stored)
-        return stored

@@ -2,12 +2,16 @@
 
 `text` is for people, `json` one object a line for programs. What a call passes as `extra` becomes
 members of the object, or `name=value` behind the message.
+
+Values from callers can neither start a line nor control a terminal: both formats escape control
+characters, line breaks of every kind and bidirectional overrides.
 """
 
 from __future__ import annotations
 
 import json
 import logging
+import re
 from datetime import UTC, datetime
 from typing import Any
 
@@ -19,6 +23,9 @@ TEXT = "%(asctime)s %(levelname)s %(name)s: %(message)s"
 OURS = ("services", "shared")
 # Of others, never each statement, call or message.
 QUIET = ("alembic", "celery", "httpx2", "kombu", "opentelemetry", "sqlalchemy", "urllib3")
+
+# C0 and C1 controls, DEL, Unicode's line breaks and bidirectional controls, halves of characters.
+UNSAFE = re.compile("[\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
 
 # What every record has; the rest came as `extra`. `taskName` is asyncio's.
 USUAL = frozenset(logging.makeLogRecord({}).__dict__) | {
@@ -67,21 +74,32 @@ class JsonLines(logging.Formatter):
         line |= _extra(record)
         if record.exc_info:
             line["error"] = self.formatException(record.exc_info)
-        return json.dumps(line, ensure_ascii=False, default=str)
+        text = json.dumps(line, ensure_ascii=False, default=str)
+        return UNSAFE.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
 
 
 class TextLines(logging.Formatter):
-    """A line for people; the request's id and what came as `extra` stand at its end."""
+    """A line for people; the request's id and what came as `extra` stand at its end. The lines of a
+    traceback are indented: whatever an error says, no line of it can look like one of the log."""
 
     def __init__(self) -> None:
         super().__init__(TEXT)
+
+    def format(self, record: logging.LogRecord) -> str:
+        line, *trace = super().format(record).split("\n")
+        return "\n".join([line, *(f"  {_escaped(one)}" for one in trace)])
 
     def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802  (logging's name)
         said = super().formatMessage(record)
         facts = _extra(record)
         if (request_id := getattr(record, "request_id", None)) is not None:
             facts["request_id"] = request_id
-        return " ".join([said, *(f"{name}={value}" for name, value in facts.items())])
+        return _escaped(" ".join([said, *(f"{name}={value}" for name, value in facts.items())]))
+
+
+def _escaped(text: str) -> str:
+    """The text with unsafe characters as Python writes them: `\\n`, `\\x1b`, `\\u2028`."""
+    return UNSAFE.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
 
 
 def _extra(record: logging.LogRecord) -> dict[str, Any]:

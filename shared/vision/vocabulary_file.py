@@ -57,11 +57,13 @@ def decode_vocabulary(data: bytes) -> VocabularyFile:
         return VocabularyFile(decode_centres(data), UNKNOWN)
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            members = {info.filename: _read(archive, info) for info in archive.infolist()}
+            infos = archive.infolist()
+            # Before one is read: many may lie over the same bytes.
+            if sorted(info.filename for info in infos) != sorted(MEMBERS):
+                raise _refuse(f"it holds {_some([info.filename for info in infos]) or 'nothing'}")
+            members = {info.filename: _read(archive, info) for info in infos}
     except (*NO_ARRAY, NotImplementedError, RuntimeError) as error:
         raise _refuse(f"it can't be read ({error})") from error
-    if set(members) != MEMBERS:
-        raise _refuse(f"it holds {', '.join(sorted(members)) or 'nothing'}")
     centres = decode_centres(members[f"{CENTRES}.npy"])
     provenance = _decode_provenance(members[f"{PROVENANCE}.npy"])
     if provenance.get("sha256") != centres.sha256:
@@ -96,6 +98,11 @@ def _decode_provenance(data: bytes) -> Provenance:
     return found
 
 
+def _some(names: list[str]) -> str:
+    more = f" and {len(names) - 3} more" if len(names) > 3 else ""
+    return ", ".join(sorted(names)[:3]) + more
+
+
 def _refuse(reason: str) -> Unprocessable:
     return Unprocessable(
         "vocabulary_unfit",
@@ -105,13 +112,15 @@ def _refuse(reason: str) -> Unprocessable:
 
 
 def _read_tensor(path: Path) -> Centres:
-    import pickle
-
     import torch
 
+    from shared.vision.tensor_files import UNREADABLE, check_promise, load_tensors
+
     try:
-        tensor = torch.load(path, map_location="cpu", weights_only=True)
-    except (pickle.UnpicklingError, RuntimeError, AssertionError, *NO_ARRAY) as error:
+        tensor = load_tensors(path)
+        if isinstance(tensor, torch.Tensor):
+            check_promise([tensor], path)
+    except UNREADABLE as error:
         raise Unprocessable(
             "vocabulary_unfit", f"{path.name} is not a file of tensors: {error}"
         ) from error
@@ -120,7 +129,7 @@ def _read_tensor(path: Path) -> Centres:
             "vocabulary_unfit",
             f"{path.name} holds a {type(tensor).__name__}, not one tensor.",
         )
-    tensor = tensor.detach().to_dense()
+    tensor = tensor.detach().to_dense().clone()  # else mapped from the file, which may change
     if tensor.is_floating_point():
         tensor = tensor.to(torch.float32)  # NumPy has no bfloat16
     return check_centres(tensor.numpy())

@@ -79,7 +79,7 @@ def test_an_entry_has_no_vocabulary_to_fit(server: ServerProcess, allowed: str) 
     assert answer.status_code == 201, answer.text
     fit = server.client.post("/api/v1/vocabularies", params={"map": "nofit"})
     assert fit.status_code == 202, fit.text
-    job = server.client.get(f"{fit.json()['status_url']}?wait=30&map=nofit").json()
+    job = server.client.get(f"{fit.json()['status_url']}&wait=30").json()
     assert (job["state"], job["error"]["code"]) == ("failed", "vocabulary_unfit")
 
 

@@ -51,14 +51,18 @@ lenient = pytest.mark.parametrize("store", ["moto"], indirect=True)
 strict = pytest.mark.parametrize("store", ["s3"], indirect=True)
 
 
-def presign(service: Service, photo: bytes = PHOTO, **said: Any) -> dict[str, Any]:
+def presign(
+    service: Service, photo: bytes = PHOTO, map_name: str = "default", **said: Any
+) -> dict[str, Any]:
     """An announced upload."""
     file = {
         "filename": "street.jpg",
         "file_size": len(photo),
         "sha256": hashlib.sha256(photo).hexdigest(),
     }
-    answer: dict[str, Any] = service.json("POST", "/uploads/presign", 201, json={**file, **said})
+    answer: dict[str, Any] = service.json(
+        "POST", "/uploads/presign", 201, params={"map": map_name}, json={**file, **said}
+    )
     assert answer["method"] == "PUT"
     return answer
 
@@ -84,6 +88,19 @@ def photos(catalog: Catalog) -> int:
 def expire(catalog: Catalog, seconds_ago: float = 1) -> None:
     with catalog.write() as session:
         session.execute(update(DirectUpload).values(expires_at=db_now_plus(-seconds_ago)))
+
+
+@lenient
+def test_the_urls_of_a_direct_upload_lead_to_its_map(service: Service) -> None:
+    service.json("POST", "/maps", 201, json={"name": "other", "extractor": "test-tiny-avg"})
+    upload = presign(service, map_name="other")
+    assert put(upload) == 200
+    answer = complete(service, upload)
+    again = complete(service, upload)
+    for one in (answer, again):
+        assert one.status_code == 202, one.text
+        assert one.headers["location"] == one.json()["status_url"]
+        service.json("GET", one.headers["location"].removeprefix("/api/v1"))
 
 
 def test_a_photo_sent_straight_to_the_bucket_is_stored_described_and_found(
@@ -297,7 +314,9 @@ def test_a_deleted_maps_uploads_go_with_it(
     file = {"filename": "a.jpg", "file_size": 10, "sha256": "0" * 64}
     upload = service.json("POST", "/uploads/presign", 201, params={"map": "city"}, json=file)
     store.put(f"incoming/{upload['upload_id']}", b"x" * 10)
-    problem(complete(service, upload), 404, "upload_not_found")  # of another map
+    problem(
+        complete(service, upload, params={"map": "default"}), 404, "upload_not_found"
+    )  # of another map
     service.json("DELETE", "/maps/city")
     problem(complete(service, upload, params={"map": "city"}), 404, "map_not_found")
     for _ in range(5):

@@ -3,15 +3,24 @@
 from __future__ import annotations
 
 import logging
-from threading import Event
+from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from threading import Barrier, Event
+from typing import Any
 
 import pytest
 from pydantic import SecretStr
+from sqlalchemy import func, select
 
 from services.gateway import quotas as quotas_module
+from services.gateway import upload as upload_module
 from services.steward.batches.worker import BatchWorker
+from shared.catalog.photos import Photo
 from shared.catalog.session import Catalog
+from shared.intake import incoming as incoming_module
 from shared.intake import photo_quota
+from shared.intake.incoming import Incoming
 from shared.jobs import InProcessHints
 from shared.objects import FolderStore
 from shared.settings import Settings
@@ -135,6 +144,31 @@ def test_a_key_stores_so_many_photos_and_a_deleted_one_makes_room(
     assert door.put(ADMIN, 4).status_code == 202
     assert door(key, "DELETE", f"/uploads/{stored[0]}").status_code == 200
     assert door.put(key, 3).status_code == 202
+
+
+def test_parallel_uploads_store_exactly_as_many_photos_as_the_key_may(
+    door: Door, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    most, uploads = 3, 8
+    all_received = Barrier(uploads)
+    real = incoming_module.examine
+
+    def examine_together(*said: Any) -> Incoming:
+        all_received.wait(60)
+        return real(*said)
+
+    monkeypatch.setattr(upload_module, "examine", examine_together)
+    door.app.openapi()  # a route is worked out at its first call, which no two threads may do
+    key = door.key("write", max_photos=most)["key"]
+    with ThreadPoolExecutor(uploads) as pool:
+        answers = list(pool.map(partial(door.put, key), range(uploads)))
+    codes = Counter(answer.status_code for answer in answers)
+    assert codes == {202: most, 429: uploads - most}
+    with door.catalog.read() as session:
+        assert session.scalar(select(func.count()).select_from(Photo)) == most
+    refused = next(answer for answer in answers if answer.status_code == 429)
+    problem(refused, 429, "photo_quota_reached")
+    assert len(list(door.store.list("originals/"))) == most, "what is refused leaves no bytes"
 
 
 def test_photos_of_a_batch_count_too(

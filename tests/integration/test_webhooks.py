@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import socket
 import ssl
 import threading
+import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
+from uuid import UUID
 
 import pytest
 from sqlalchemy import update
@@ -17,10 +19,15 @@ from sqlalchemy import update
 from services.extractor.worker import ExtractorWorker
 from services.steward.batches.worker import BatchWorker
 from services.steward.webhooks import send as send_module
-from services.steward.webhooks.deliver import PAUSES_SECONDS, WebhookSender, pause_seconds
+from services.steward.webhooks.deliver import (
+    MAX_IN_FLIGHT,
+    PAUSES_SECONDS,
+    WebhookSender,
+    pause_seconds,
+)
 from shared.catalog.base import db_now
 from shared.catalog.session import Catalog
-from shared.catalog.webhooks import Delivery, Webhook
+from shared.catalog.webhooks import Delivery, EventKind, Webhook, announce
 from shared.jobs import InProcessHints, Job, JobState
 from shared.objects import FolderStore
 from shared.settings import Settings
@@ -31,7 +38,7 @@ from tests.support.archives import zip_of
 from tests.support.certificate import certificate
 from tests.support.photos import photo_bytes
 from tests.support.problems import field_refused, problem
-from tests.support.receiver import Receiver, receiving
+from tests.support.receiver import Receiver, hanging_receiver, receiving
 
 PHOTOS = 6
 
@@ -68,9 +75,23 @@ class Told:
         answer: dict[str, Any] = made.json()
         return answer
 
-    def send(self) -> int:
-        with ThreadPoolExecutor(2) as pool:
-            return self.sender.send_due(pool)
+    def send(self, sender: WebhookSender | None = None) -> int:
+        """Attempt what is due; how many deliveries that were."""
+        one = sender or self.sender
+        return sum(asyncio.run(one.send_due(webhook)) for webhook in one.due_webhooks())
+
+    def trust(self, folder: Path, name: str) -> ssl.SSLContext:
+        """For a server of that name, whose certificate our sender takes for a good one."""
+        pem = certificate(folder, name)
+        self.sender._tls.load_verify_locations(pem)
+        server = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+        server.load_cert_chain(pem)
+        return server
+
+    def announce(self, event: EventKind) -> None:
+        """An event that nothing but webhooks hears of."""
+        with self.door.catalog.write() as session:
+            announce(session, event, {})
 
     def photo(self, number: int = 1) -> dict[str, Any]:
         """One that was put in and described."""
@@ -94,6 +115,11 @@ def told(
     door: Door, settings: Settings, receiver: Receiver, make_worker: Callable[[], ExtractorWorker]
 ) -> Told:
     return Told(door, settings, receiver, make_worker)
+
+
+@pytest.fixture
+def localhost_tls(told: Told, tmp_path: Path) -> ssl.SSLContext:
+    return told.trust(tmp_path, "localhost")
 
 
 def test_a_described_photo_is_told_of_and_signed(told: Told) -> None:
@@ -166,7 +192,7 @@ def test_pauses_grow_for_three_days_and_then_it_is_given_up(told: Told) -> None:
 
 def test_a_try_whose_steward_died_is_made_again(told: Told) -> None:
     told.photo()
-    claimed = told.sender._claim()  # and then it dies
+    _, claimed = told.sender._claim(UUID(told.webhook["id"]))  # and then it dies
     assert len(claimed) == 1
     assert told.send() == 0, "another steward leaves it alone for a while"
     told.come_due()
@@ -197,8 +223,7 @@ def test_a_name_that_has_become_private_since_is_not_called(
     monkeypatch.setattr(
         send_module, "parse_target", lambda url, allow_private: _target_of(told.receiver.url)
     )
-    with ThreadPoolExecutor(1) as pool:
-        assert strict.send_due(pool) == 1
+    assert told.send(strict) == 1
     assert told.receiver.messages == []
     (delivery,) = told.log()
     assert delivery["state"] == "failed"
@@ -230,47 +255,76 @@ def test_the_connection_goes_to_the_address_that_was_checked(
     assert looked_up.count("localhost") == 1, "once to check it; never again"
 
 
-def test_a_receiver_that_drips_is_not_waited_for(
-    told: Told, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("hangs", ["handshake", "head", "body"])
+def test_a_receiver_that_hangs_is_not_waited_for(
+    told: Told, localhost_tls: ssl.SSLContext, monkeypatch: pytest.MonkeyPatch, hangs: str
 ) -> None:
-    monkeypatch.setattr(send_module, "WHOLE_SECONDS", 0.5)
-    stop = threading.Event()
-    with socket.create_server(("127.0.0.1", 0)) as listener:
-
-        def drip() -> None:
-            connection, _ = listener.accept()
-            with connection:
-                for byte in b"HTTP/1.1 200 OK\r\n" + b"X: y\r\n" * 1000:
-                    if stop.wait(0.05):
-                        return
-                    try:
-                        connection.send(bytes([byte]))
-                    except OSError:
-                        return
-
-        thread = threading.Thread(target=drip)
-        thread.start()
-        told.receiver.url = f"http://127.0.0.1:{listener.getsockname()[1]}/"
-        slow = told.add("job.succeeded")
-        told.door(ADMIN, "DELETE", f"/webhooks/{told.webhook['id']}")
-        told.photo()
+    monkeypatch.setattr(send_module, "ATTEMPT_SECONDS", 60.0 if hangs == "body" else 0.5)
+    with hanging_receiver(localhost_tls, hangs) as told.receiver.url:
+        webhook = told.add("batch.finished")
+        told.announce(EventKind.BATCH_FINISHED)
         assert told.send() == 1
-        stop.set()
-        thread.join()
-    (delivery,) = told.log(slow)
-    assert delivery["state"] == "pending"
-    assert delivery["last_status"] is None
+    (delivery,) = told.log(webhook)
+    if hangs == "body":  # of which nothing is read
+        assert (delivery["state"], delivery["last_status"]) == ("delivered", 200)
+    else:
+        assert (delivery["state"], delivery["last_status"]) == ("pending", None)
+        assert delivery["last_error"] == "no answer within 0.5 seconds"
+
+
+def test_receivers_that_hang_delay_neither_other_webhooks_nor_the_stop(
+    told: Told, localhost_tls: ssl.SSLContext, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # An attempt has no end of its own here: whoever waited for one would never come back.
+    monkeypatch.setattr(send_module, "ATTEMPT_SECONDS", 3600.0)
+    looked_up, answered = threading.Event(), threading.Event()
+    real = socket.getaddrinfo
+
+    def slow(host: str, *args: Any, **options: Any) -> Any:
+        if host == "slow.example" and threading.current_thread().name == "webhook":
+            looked_up.set()
+            answered.wait()
+        return real("localhost" if host == "slow.example" else host, *args, **options)
+
+    monkeypatch.setattr(socket, "getaddrinfo", slow)
+    good = told.receiver.url
+    stop = threading.Event()
+    with (
+        hanging_receiver(localhost_tls, "handshake") as no_handshake,
+        hanging_receiver(localhost_tls, "head") as no_head,
+    ):
+        stuck = []
+        for told.receiver.url in (no_handshake, no_head, "https://slow.example/"):
+            stuck.append(told.add("batch.finished"))
+        for _ in range(MAX_IN_FLIGHT + 1):
+            told.announce(EventKind.BATCH_FINISHED)
+        running = threading.Thread(target=told.sender.run, args=[stop])
+        running.start()
+        try:
+            assert looked_up.wait(60)
+            told.receiver.url = good
+            late = told.add("generation.switched")
+            told.announce(EventKind.GENERATION_SWITCHED)
+            for _ in range(600):
+                if told.log(late)[0]["state"] == "delivered":
+                    break
+                time.sleep(0.1)
+            assert told.log(late)[0]["state"] == "delivered"
+        finally:
+            stop.set()
+            running.join(60)
+            answered.set()
+        assert not running.is_alive()
+    for webhook in stuck:
+        deliveries = told.log(webhook)
+        assert {delivery["state"] for delivery in deliveries} == {"pending"}, "due again later"
+        tried = sum(delivery["attempts"] for delivery in deliveries)
+        assert tried == MAX_IN_FLIGHT, "not all of them at the same time"
 
 
 @pytest.mark.parametrize("name", ["localhost", "elsewhere.example"])
-def test_over_https_only_the_named_host_is_told(
-    told: Told, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
-) -> None:
-    pem = certificate(tmp_path, name)
-    server = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-    server.load_cert_chain(pem)
-    trusting = ssl.create_default_context(cafile=str(pem))
-    monkeypatch.setattr(ssl, "create_default_context", lambda: trusting)
+def test_over_https_only_the_named_host_is_told(told: Told, tmp_path: Path, name: str) -> None:
+    server = told.trust(tmp_path, name)
     told.door(ADMIN, "DELETE", f"/webhooks/{told.webhook['id']}")
     with receiving(server) as secured:
         told.receiver = secured

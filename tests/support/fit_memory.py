@@ -59,6 +59,11 @@ def memory_bytes(name: str) -> int:
     raise AssertionError(f"/proc/self/status has no {name}")
 
 
+def forget_peak_memory() -> None:
+    """`VmHWM` begins anew, at what the process holds now."""
+    Path("/proc/self/clear_refs").write_text("5")
+
+
 def main(photos: int) -> None:
     torch.set_num_threads(1)
     recipe = get_recipe("anyloc-vits14", allow_test_extractors=False)

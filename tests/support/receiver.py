@@ -7,8 +7,10 @@ import contextlib
 import hashlib
 import hmac
 import json
+import socket
 import ssl
 import threading
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -75,3 +77,45 @@ def receiving(tls: ssl.SSLContext | None = None) -> Iterator[Receiver]:
         finally:
             server.shutdown()
             thread.join()
+
+
+@contextlib.contextmanager
+def hanging_receiver(tls: ssl.SSLContext, kind: str) -> Iterator[str]:
+    """URL of an HTTPS receiver that never comes to an end; it ends when its clients hang up.
+
+    `kind` is where it hangs: in the "handshake", or sending one byte after the other of the
+    response's "head" or "body".
+    """
+    threads: list[threading.Thread] = []
+
+    def hang(connection: socket.socket) -> None:
+        with contextlib.suppress(OSError), connection:
+            if kind == "handshake":
+                while connection.recv(1024):
+                    pass
+                return
+            with tls.wrap_socket(connection, server_side=True) as secured:
+                secured.recv(65_536)
+                head = b"HTTP/1.1 200 OK\r\n"
+                secured.sendall(head + (b"\r\n" if kind == "body" else b""))
+                while True:
+                    secured.sendall(b"x" if kind == "body" else b"X: y\r\n")
+                    time.sleep(0.02)
+
+    def accept() -> None:
+        with contextlib.suppress(OSError):  # the listener was shut down
+            while True:
+                connection, _ = listener.accept()
+                threads.append(threading.Thread(target=hang, args=[connection]))
+                threads[-1].start()
+
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        threads.append(threading.Thread(target=accept))
+        threads[0].start()
+        try:
+            yield f"https://localhost:{listener.getsockname()[1]}/hook"
+        finally:
+            listener.shutdown(socket.SHUT_RDWR)
+            for thread in threads:
+                thread.join(60)
+                assert not thread.is_alive(), "a connection was left open"

@@ -143,6 +143,22 @@ def test_without_keys_no_page_of_elsewhere_may_call(said: dict[str, str]) -> Non
     with pytest.raises(Forbidden) as caught:
         check(NoKeys(), **said)
     assert caught.value.code == "foreign_page"
+    refused = said.get("origin") if is_local(said.get("host", "")) else said.get("host", "")
+    assert repr(refused) in caught.value.detail, "what was refused is named"
+
+
+def is_local(host: str) -> bool:
+    return host.startswith("localhost:")
+
+
+@pytest.mark.parametrize(
+    "header", ["Forwarded", "Via", "X-Forwarded-For", "x-forwarded-host", "X-Real-Ip"]
+)
+def test_without_keys_what_a_proxy_forwards_is_refused(header: str) -> None:
+    with pytest.raises(Forbidden, match="ADMIN_KEY") as caught:
+        check(NoKeys(), **{"host": "localhost:8000", header: "127.0.0.1"})
+    assert caught.value.code == "forwarded_request"
+    assert header.lower() in caught.value.detail.lower()
 
 
 def test_without_keys_a_page_that_is_trusted_may_call_this_machine() -> None:

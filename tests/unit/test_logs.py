@@ -80,6 +80,49 @@ def test_text_lines_end_with_the_facts(set_up: Set, capsys: pytest.CaptureFixtur
     assert "only with DEBUG" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("log_format", ["text", "json"])
+@pytest.mark.parametrize(
+    "control",
+    [
+        "\n",
+        "\r\n",
+        "\x00",
+        "\x0c",
+        "\x1b[2J",
+        "\x7f",
+        "\x85",
+        "\x9b2J",
+        "\u2028",
+        "\u202e",
+        "\ud800",
+    ],
+)
+def test_no_value_of_a_caller_starts_a_line_or_controls_a_terminal(
+    set_up: Set, capsys: pytest.CaptureFixture[str], log_format: str, control: str
+) -> None:
+    forged = "2026-11-21 12:00:00,000 INFO services.call_log: DELETE /api/v1/maps/a: 200"
+    said = f"/a{control}{forged}"
+    set_up(LOG_FORMAT=log_format)
+    log = logging.getLogger("services.call_log")
+    log.info("GET %s: 404", said, extra={"file": said})
+    try:
+        raise ValueError(said)
+    except ValueError:
+        log.exception("it failed with %s", said)
+    text = capsys.readouterr().err
+    assert all(0x20 <= ord(one) < 0x7F for one in text.replace("\n", ""))
+    lines = text.split("\n")
+    assert not [line for line in lines if line.startswith(forged)]
+    if log_format == "json":
+        called, failed, end = lines
+        assert (json.loads(called)["file"], end) == (said, "")
+        assert said in json.loads(failed)["error"]
+    else:
+        assert lines[0].count("INFO services.call_log") == 3, "in one line"
+        assert "  Traceback (most recent call last):" in lines
+        assert all(line.startswith("  ") for line in lines[2:-1])
+
+
 @pytest.mark.parametrize("sent", [None, "", "a b", "a\nb", "x" * 129, "é", "{{7*7}}"])
 def test_an_id_that_no_header_or_log_should_hold_is_replaced(sent: str | None) -> None:
     made = accept_request_id(sent)

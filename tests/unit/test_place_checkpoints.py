@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import copy
+import io
+import zipfile
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -9,10 +12,20 @@ from typing import Any
 import pytest
 import torch
 
+from services.extractor.add_model import about
 from shared.errors import NotFound, Unprocessable
-from shared.vision.place_models.checkpoint import checkpoint_state, fingerprint, load_checkpoint
+from shared.vision.place_models.checkpoint import (
+    Checkpoint,
+    checkpoint_state,
+    fingerprint,
+    load_checkpoint,
+)
 from shared.vision.place_models.config import ModelConfig
 from shared.vision.place_models.model import PlaceModel, build_model
+from tests.support.fit_memory import forget_peak_memory, memory_bytes
+
+SWOLLEN_BYTES = 256 << 20
+ZEROS = bytes(4 << 20)
 
 
 def some_model(seed: int = 0, **changes: Any) -> PlaceModel:
@@ -150,6 +163,66 @@ def test_a_checkpoint_can_not_ask_for_more_memory_than_it_has_bytes(
     assert refusal(saved(tmp_path / "large.ckpt", state)).code == "checkpoint_unfit"
 
 
+def deflated(data: bytes, path: Path, swollen: str) -> Path:
+    """The archive with the entry of that name replaced by 256 MB of zeros, compressed."""
+    with zipfile.ZipFile(io.BytesIO(data)) as old, zipfile.ZipFile(path, "w") as new:
+        for info in old.infolist():
+            if not info.filename.endswith(swollen):
+                new.writestr(info.filename, old.read(info))
+                continue
+            info.compress_type = zipfile.ZIP_DEFLATED
+            with new.open(info, "w", force_zip64=True) as entry:
+                for _ in range(SWOLLEN_BYTES // len(ZEROS)):
+                    entry.write(ZEROS)
+    return path
+
+
+def overlapping(data: bytes, path: Path) -> Path:
+    """The archive with each storage listed a hundred times."""
+    path.write_bytes(data)
+    with zipfile.ZipFile(path, "a") as archive:
+        for info in list(archive.infolist()):
+            for number in range(100 if "/data/" in info.filename else 0):
+                again = copy.copy(info)
+                again.filename = f"{info.filename}-{number}"
+                archive.filelist.append(again)
+        archive._didModify = True  # type: ignore[attr-defined]
+    return path
+
+
+def repeated_views(path: Path) -> Path:
+    """Tensors with the shapes of a large network, each of one number."""
+    head = {"agg_arch": "ConvAP", "agg_config": {"out_channels": 1 << 14, "s1": 2, "s2": 2}}
+    values: dict[str, Any] = {"pretrained": False, "image_size": (32, 48), **head}
+    with torch.device("meta"):
+        large = build_model(ModelConfig.read(values))
+    state = checkpoint_state(large)
+    for name, tensor in state["state_dict"].items():
+        state["state_dict"][name] = torch.ones((), dtype=tensor.dtype).expand(tensor.shape)
+    return saved(path, state)
+
+
+@pytest.mark.parametrize("kind", ["storage", "pickle", "overlapping", "repeated views"])
+def test_a_hostile_checkpoint_is_refused_before_it_swells(
+    model: PlaceModel, tmp_path: Path, kind: str
+) -> None:
+    buffer = io.BytesIO()
+    torch.save(checkpoint_state(model), buffer)
+    data, path = buffer.getvalue(), tmp_path / "hostile.ckpt"
+    if kind == "repeated views":
+        file, why = repeated_views(path), "bytes by their shapes"
+    elif kind == "overlapping":
+        file, why = overlapping(data, path), "compressed or overlap"
+    else:
+        swollen = "data/0" if kind == "storage" else "data.pkl"
+        file, why = deflated(data, path, swollen), "compressed or overlap"
+    assert file.stat().st_size < len(data) + 1_000_000
+    forget_peak_memory()
+    before = memory_bytes("VmHWM")
+    assert why in refusal(file).detail
+    assert memory_bytes("VmHWM") - before < SWOLLEN_BYTES / 4
+
+
 def test_an_unknown_network_in_a_checkpoint_is_named(model: PlaceModel, tmp_path: Path) -> None:
     state = checkpoint_state(model)
     state["hyper_parameters"]["model"] |= {"backbone_arch": "vgg16"}
@@ -248,3 +321,11 @@ def test_a_refusal_names_what_is_refused_and_gives_no_unsafe_advice(tmp_path: Pa
     detail = refusal(saved(tmp_path / "bomb.ckpt", {"a": Bomb(tmp_path / "executed")})).detail
     assert "Unsupported global: GLOBAL getattr" in detail  # the way to Path.touch
     assert "weights_only" not in detail
+
+
+def test_a_long_value_that_is_named_many_times_is_not_copied_as_often(model: PlaceModel) -> None:
+    rows = ["x" * 10_000] * 100_000
+    hostile = Checkpoint(model, model.config, "0", {"epoch": 3, "rows": [rows] * 100_000})
+    assert about(hostile) == {"epoch": 3, "left_out": "the hyperparameters, which are too long"}
+    plain = Checkpoint(model, model.config, "0", {"lr": 0.1, "steps": 1 << 100, "cities": ["Oslo"]})
+    assert about(plain) == {"lr": 0.1, "steps": "<int>", "cities": ["Oslo"]}

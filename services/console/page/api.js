@@ -28,7 +28,8 @@ export function idempotencyKey() {
 
 function address(path, query) {
   const url = new URL(path.startsWith("/api/") ? path : ROOT + path, location.origin);
-  for (const [name, value] of Object.entries({ map: currentMap(), ...query })) {
+  const map = url.searchParams.has("map") ? {} : { map: currentMap() };
+  for (const [name, value] of Object.entries({ ...map, ...query })) {
     for (const one of [value].flat()) {
       if (one !== null && one !== undefined && one !== "") url.searchParams.append(name, one);
     }

@@ -6,8 +6,10 @@ refused leaves no bytes; what a kill leaves is an orphan that no row knows.
 
 from __future__ import annotations
 
+import contextlib
 from collections import OrderedDict
 from collections.abc import Iterator
+from contextlib import AbstractContextManager
 from typing import Any
 from uuid import UUID
 
@@ -71,10 +73,10 @@ class BringIn:
         key = item.object_key if uploaded and item.object_key else new_original_key()
         try:
             received = self._uploaded(item) if uploaded else self._copy(job, item, key)
-            incoming = examine(
-                self._store, received, self._settings.max_image_pixels, self._take_for(job)
-            )
-            stored = try_again_once(lambda: self._commit(job, item, incoming))
+            key_id = UUID(job.params["key_id"]) if "key_id" in job.params else None
+            incoming = examine(self._store, received, self._settings.max_image_pixels, key_id)
+            with self._place_for(job, key_id):
+                stored = try_again_once(lambda: self._commit(job, item, incoming))
         except Unavailable:
             raise
         except Stopped:
@@ -91,14 +93,12 @@ class BringIn:
         if stored.photo.object_key != key:
             self._store.delete(key)
 
-    def _take_for(self, job: Job) -> UUID | None:
-        """The key that the batch came in with. TooManyRequests (`photo_quota_reached`)."""
-        if "key_id" not in job.params:
-            return None
-        key_id = UUID(job.params["key_id"])
-        if job.params["max_photos"] is not None:
-            self._quota.take(key_id, job.params["max_photos"])
-        return key_id
+    def _place_for(self, job: Job, key_id: UUID | None) -> AbstractContextManager[None]:
+        """In which a photo is stored through the key that the batch came in with.
+        TooManyRequests (`photo_quota_reached`)."""
+        if key_id is None or job.params["max_photos"] is None:
+            return contextlib.nullcontext()
+        return self._quota.place(key_id, job.params["max_photos"])
 
     def _uploaded(self, item: BatchItem) -> Received:
         """The file that the gateway has stored."""

@@ -7,17 +7,19 @@ which he has had already.
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import random
+import ssl
 import threading
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Collection
 from typing import Any
 from uuid import UUID
 
-from sqlalchemy import select, update
+from sqlalchemy import ColumnElement, select, update
 from sqlalchemy.exc import SQLAlchemyError
 
-from services.steward.webhooks.send import WHOLE_SECONDS, Outcome, send
+from services.steward.webhooks.send import ATTEMPT_SECONDS, Outcome, in_daemon_thread, send
 from shared.catalog.away import Outage
 from shared.catalog.base import db_now, db_now_plus
 from shared.catalog.session import Catalog
@@ -27,55 +29,82 @@ from shared.settings import Settings
 log = logging.getLogger(__name__)
 
 LOOK_SECONDS = 1.0
-AT_ONCE = 8  # tries at a time: one slow receiver must not keep the others waiting
-CLAIM_SECONDS = 4 * WHOLE_SECONDS  # after which a try whose steward died is due again
+MAX_WEBHOOKS = 32  # served at the same time
+MAX_IN_FLIGHT = 4  # attempts for one webhook
+CLAIM_SECONDS = 4 * ATTEMPT_SECONDS  # after which a try whose steward died is due again
 # Between tries, as the Standard Webhooks specification recommends: 10 tries within some three days.
 PAUSES_SECONDS = (5, 300, 1800, 7200, 18_000, 36_000, 50_400, 72_000, 86_400)
 SPREAD = 0.2  # of a pause, at random: receivers that come back are not met by everyone at once
 
 
 class WebhookSender:
-    """Sends what is due; `run` until stopped. Any number of stewards may have one."""
+    """Sends what is due; `run` until stopped. Any number of stewards may have one.
+
+    Each webhook with due deliveries has a task of its own, so a receiver that hangs delays only
+    its own deliveries, and at most MAX_IN_FLIGHT of them are in flight.
+    """
 
     def __init__(self, catalog: Catalog, settings: Settings) -> None:
         self._catalog = catalog
         self._allow_private = settings.webhook_private_addresses
+        self._tls = ssl.create_default_context()
         self._outage = Outage("sender of webhooks")
 
     def run(self, stop: threading.Event) -> None:
-        """Send until `stop` is set."""
-        with ThreadPoolExecutor(AT_ONCE, thread_name_prefix="webhook") as pool:
-            while not stop.is_set():
-                try:
-                    sent = self.send_due(pool)
-                    self._outage.over()
-                except SQLAlchemyError as error:
-                    sent = 0
-                    self._outage.met(error)
-                if sent < AT_ONCE:
-                    stop.wait(LOOK_SECONDS)
+        """Send until `stop` is set. Attempts in flight are then cut off, not waited for: they
+        come due again after CLAIM_SECONDS."""
+        asyncio.run(self._run(stop))  # which cancels the tasks that are left
 
-    def send_due(self, pool: ThreadPoolExecutor) -> int:
-        """Try what is due, AT_ONCE at most; how many that were."""
-        claimed = self._claim()
-        for _ in pool.map(self._try, claimed):
-            pass
+    async def _run(self, stop: threading.Event) -> None:
+        stopped = in_daemon_thread(stop.wait)
+        tasks: dict[UUID, asyncio.Task[None]] = {}
+        while not stopped.done():
+            try:
+                due = await asyncio.to_thread(self.due_webhooks, list(tasks))
+                if not due:
+                    self._outage.over()
+            except SQLAlchemyError as error:
+                due = []
+                self._outage.met(error)
+            # At random: webhooks with a backlog must not keep the others from the last places.
+            for webhook_id in random.sample(due, min(len(due), MAX_WEBHOOKS - len(tasks))):
+                tasks[webhook_id] = asyncio.create_task(self._serve(webhook_id))
+            awaited: set[asyncio.Future[Any]] = {stopped, *tasks.values()}
+            await asyncio.wait(awaited, timeout=LOOK_SECONDS, return_when=asyncio.FIRST_COMPLETED)
+            for webhook_id in [one for one, task in tasks.items() if task.done()]:
+                tasks.pop(webhook_id).result()  # raises what nobody has foreseen
+
+    async def _serve(self, webhook_id: UUID) -> None:
+        try:
+            await self.send_due(webhook_id)
+            self._outage.over()
+        except SQLAlchemyError as error:
+            self._outage.met(error)
+            await asyncio.sleep(LOOK_SECONDS)
+
+    def due_webhooks(self, besides: Collection[UUID] = ()) -> list[UUID]:
+        """Ids of webhooks with due deliveries, but for those in `besides`."""
+        due = select(Delivery.webhook_id).where(*_is_due(), Delivery.webhook_id.not_in(besides))
+        with self._catalog.read() as session:
+            return list(session.scalars(due.distinct()))
+
+    async def send_due(self, webhook_id: UUID) -> int:
+        """Attempt what is due for one webhook, MAX_IN_FLIGHT at most; how many that were."""
+        webhook, claimed = await asyncio.to_thread(self._claim, webhook_id)
+        ends = await asyncio.gather(
+            *(self._try(webhook, delivery) for delivery in claimed), return_exceptions=True
+        )
+        for error in ends:  # only now: one that can't be noted must not cut off the others
+            if error is not None:
+                raise error
         return len(claimed)
 
-    def _claim(self) -> list[Delivery]:
-        is_due = (
-            Delivery.state == DeliveryState.PENDING,
-            Delivery.next_attempt_at <= db_now(),
-        )
-        with self._catalog.read() as session:
-            # SQLite has one writer: it is not troubled each second for nothing.
-            if session.scalar(select(Delivery.id).where(*is_due).limit(1)) is None:
-                return []
+    def _claim(self, webhook_id: UUID) -> tuple[Webhook | None, list[Delivery]]:
         due = (
             select(Delivery)
-            .where(*is_due)
+            .where(*_is_due(), Delivery.webhook_id == webhook_id)
             .order_by(Delivery.next_attempt_at)
-            .limit(AT_ONCE)
+            .limit(MAX_IN_FLIGHT)
             .with_for_update(skip_locked=True)
         )
         with self._catalog.write() as session:
@@ -86,16 +115,14 @@ class WebhookSender:
             session.flush()
             for delivery in claimed:
                 session.refresh(delivery)
-            return claimed
+            return session.get(Webhook, webhook_id), claimed
 
-    def _try(self, delivery: Delivery) -> None:
-        with self._catalog.read() as session:
-            webhook = session.get(Webhook, delivery.webhook_id)
+    async def _try(self, webhook: Webhook | None, delivery: Delivery) -> None:
         if webhook is None:  # deleted while the event was being written
             outcome = Outcome(None, "the webhook was deleted", forbidden=True)
         else:
-            outcome = send(webhook, delivery, allow_private=self._allow_private)
-        self._note(delivery.id, delivery.attempts, outcome)
+            outcome = await send(webhook, delivery, self._tls, allow_private=self._allow_private)
+        await asyncio.to_thread(self._note, delivery.id, delivery.attempts, outcome)
 
     def _note(self, delivery_id: UUID, attempts: int, outcome: Outcome) -> None:
         values: dict[str, Any] = {"last_status": outcome.status, "last_error": outcome.error}
@@ -115,6 +142,10 @@ class WebhookSender:
                 .values(**values)
                 .execution_options(synchronize_session=False)
             )
+
+
+def _is_due() -> tuple[ColumnElement[bool], ...]:
+    return (Delivery.state == DeliveryState.PENDING, Delivery.next_attempt_at <= db_now())
 
 
 def pause_seconds(attempts: int) -> float | None:

@@ -2,22 +2,29 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
-import socket
 import ssl
 import threading
 import time
+from collections.abc import Callable
+from concurrent.futures import Future
 from dataclasses import dataclass
-from http.client import HTTPConnection, HTTPException
+from typing import Any, TypeVar
+
+import httpcore2
 
 from services.steward.webhooks.sign import signed_headers
 from shared.catalog.webhooks import Delivery, Webhook
 from shared.errors import PlacewiseError
-from shared.webhook_address import Target, parse_target, resolve
+from shared.webhook_address import parse_target, resolve
 
-CONNECT_SECONDS = 5.0
-WHOLE_SECONDS = 15.0  # of one try: a receiver that drips its answer is not waited for
+# Deadline of one attempt: name lookup, connection, TLS handshake, request and response head.
+ATTEMPT_SECONDS = 15.0
 USER_AGENT = "Placewise-Webhooks/1"
+HTTP_ERRORS = (httpcore2.NetworkError, httpcore2.ProtocolError, httpcore2.TimeoutException)
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,25 +39,42 @@ class Outcome:
     """The address may not be called: another try would find the same."""
 
 
-def send(webhook: Webhook, delivery: Delivery, *, allow_private: bool) -> Outcome:
-    """Try it once. Never raises for what the network or the receiver does."""
+class PinnedBackend(httpcore2.AnyIOBackend):
+    """Connects to one address, whichever host is named; TLS still verifies the host name."""
+
+    def __init__(self, address: str) -> None:
+        super().__init__()
+        self._address = address
+        self._stream: httpcore2.AsyncNetworkStream | None = None
+
+    async def connect_tcp(
+        self, host: str, port: int, *args: Any, **options: Any
+    ) -> httpcore2.AsyncNetworkStream:
+        self._stream = await super().connect_tcp(self._address, port, *args, **options)
+        return self._stream
+
+    async def aclose(self) -> None:
+        """Close the connection: the pool forgets one that was cancelled in its TLS handshake."""
+        if self._stream is not None:
+            await self._stream.aclose()
+
+
+async def send(
+    webhook: Webhook, delivery: Delivery, tls: ssl.SSLContext, *, allow_private: bool
+) -> Outcome:
+    """Attempt the delivery once, for ATTEMPT_SECONDS at most.
+
+    Never raises for what the network or the receiver does. `tls` verifies the receiver's
+    certificate. Redirects are not followed, and proxies of the environment are not used.
+    """
     try:
-        target = parse_target(webhook.url, allow_private=allow_private)
-        address = resolve(target, allow_private=allow_private)
+        async with asyncio.timeout(ATTEMPT_SECONDS):
+            status = await _post(webhook, delivery, tls, allow_private)
     except PlacewiseError as error:
         return Outcome(None, error.detail, forbidden=error.code != "webhook_name_unknown")
-    headers = {
-        **signed_headers(
-            webhook.secret, f"msg_{delivery.event_id}", int(time.time()), delivery.body
-        ),
-        "Content-Type": "application/json",
-        "Host": target.host_header,
-        "User-Agent": USER_AGENT,
-        "Connection": "close",
-    }
-    try:
-        status = _post(target, address, headers, delivery.body.encode())
-    except (OSError, HTTPException, ValueError) as error:
+    except TimeoutError:
+        return Outcome(None, f"no answer within {ATTEMPT_SECONDS:g} seconds")
+    except (OSError, ValueError, *HTTP_ERRORS) as error:
         return Outcome(None, f"{type(error).__name__}: {error}"[:500])
     if 200 <= status < 300:
         return Outcome(status, None)
@@ -59,30 +83,49 @@ def send(webhook: Webhook, delivery: Delivery, *, allow_private: bool) -> Outcom
     return Outcome(status, f"answered HTTP {status}")
 
 
-def _post(target: Target, address: str, headers: dict[str, str], body: bytes) -> int:
-    """The answer's status. Its body is not read: nothing that it says is of use."""
-    deadline = time.monotonic() + WHOLE_SECONDS
-    connection = HTTPConnection(target.host, target.port, timeout=WHOLE_SECONDS)
-    with contextlib.closing(connection):
-        connected = socket.create_connection((address, target.port), CONNECT_SECONDS)
-        connection.sock = connected
-        # Each read has a time limit of its own; this one is for all of them together.
-        end = threading.Timer(deadline - time.monotonic(), _cut, [connected])
-        end.daemon = True
-        end.start()
+async def _post(
+    webhook: Webhook, delivery: Delivery, tls: ssl.SSLContext, allow_private: bool
+) -> int:
+    """The response's status. Its body is not read: nothing in it is of use."""
+    target = parse_target(webhook.url, allow_private=allow_private)
+    address = await in_daemon_thread(lambda: resolve(target, allow_private=allow_private))
+    signed = signed_headers(
+        webhook.secret, f"msg_{delivery.event_id}", int(time.time()), delivery.body
+    )
+    headers = [
+        *signed.items(),
+        ("Content-Type", "application/json"),
+        ("Host", target.host_header),
+        ("User-Agent", USER_AGENT),
+        ("Connection", "close"),
+    ]
+    url = httpcore2.URL(
+        scheme=target.scheme, host=target.host, port=target.port, target=target.path
+    )
+    backend = PinnedBackend(address)
+    async with (
+        contextlib.aclosing(backend),
+        httpcore2.AsyncConnectionPool(ssl_context=tls, network_backend=backend) as pool,
+        pool.stream("POST", url, headers=headers, content=delivery.body.encode()) as response,
+    ):
+        return response.status
+
+
+def in_daemon_thread(call: Callable[[], T]) -> asyncio.Future[T]:
+    """Run a blocking call that cannot be interrupted, such as a name lookup.
+
+    Returns:
+        Its result. Whoever gives up waiting for it leaves it behind: no event loop and no exiting
+        process waits for a daemon thread, as they do for the threads of an executor.
+    """
+    result: Future[T] = Future()
+    result.set_running_or_notify_cancel()
+
+    def run() -> None:
         try:
-            connected.settimeout(max(0.1, deadline - time.monotonic()))
-            if target.scheme == "https":
-                # The certificate has to be the name's, though the connection went to an address.
-                connection.sock = ssl.create_default_context().wrap_socket(
-                    connected, server_hostname=target.host
-                )
-            connection.request("POST", target.path, body=body, headers=headers)
-            return connection.getresponse().status
-        finally:
-            end.cancel()
+            result.set_result(call())
+        except BaseException as error:
+            result.set_exception(error)
 
-
-def _cut(connected: socket.socket) -> None:
-    with contextlib.suppress(OSError):
-        connected.shutdown(socket.SHUT_RDWR)
+    threading.Thread(target=run, name="webhook", daemon=True).start()
+    return asyncio.wrap_future(result)

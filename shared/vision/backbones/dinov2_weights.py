@@ -25,7 +25,7 @@ import torch
 
 from shared.errors import Misconfigured
 from shared.vision.download import OnProgress
-from shared.vision.tensor_files import UNREADABLE, first_line
+from shared.vision.tensor_files import UNREADABLE, first_line, load_tensors
 
 HUB_FILE = "model.safetensors"
 META_URL = "https://dl.fbaipublicfiles.com/dinov2/dinov2_{size}/dinov2_{size}_pretrain.pth"
@@ -190,13 +190,7 @@ def _open_safetensors(path: Path) -> WeightsFile:
 
 def _open_torch(path: Path) -> WeightsFile:
     """Mapped into memory, so that only what is asked for is read; weights only, no code."""
-    try:
-        state = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
-    except RuntimeError as error:
-        if "mmap" not in str(error):
-            raise
-        # Files of PyTorch before 1.6 can't be mapped.
-        state = torch.load(path, map_location="cpu", weights_only=True)
+    state = load_tensors(path)
     if not isinstance(state, dict):
         raise ValueError(f"it holds a {type(state).__name__}, not named tensors")
     tensors = {str(n): t for n, t in state.items() if isinstance(t, torch.Tensor)}

@@ -4,9 +4,9 @@
     hyper_parameters   {"model": ModelConfig.model_dump(), ...}
     epoch, global_step, callbacks, ...     as Lightning writes them
 
-They are read with `weights_only=True`: tensors and plain values; nothing in them is executed. The
-network is laid out without memory first and then takes the file's own tensors, so that a
-checkpoint can't ask for more memory than it has bytes.
+They are read as `load_tensors` does: tensors and plain values; nothing in them is executed. The
+network is laid out without memory first and then takes the file's own tensors, whose shapes are
+compared with the file's size, so that a checkpoint can't ask for memory beyond its own bytes.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from shared.vision.place_models.predecessor import (
     read_config,
     rename,
 )
-from shared.vision.tensor_files import UNREADABLE, first_line
+from shared.vision.tensor_files import UNREADABLE, check_promise, first_line, load_tensors
 
 PREFIX = "model."
 WITHOUT_EFFECT = {"pretrained", "layers_to_freeze"}  # on the descriptors of given weights
@@ -99,7 +99,7 @@ def _read(path: Path) -> dict[str, Any]:
     if not path.is_file():
         raise NotFound("checkpoint_not_found", f"There is no checkpoint {path}.")
     try:
-        stored = torch.load(path, map_location="cpu", weights_only=True)
+        stored = load_tensors(path)
     except UNREADABLE as error:
         raise Unprocessable(
             "checkpoint_unreadable",
@@ -126,13 +126,20 @@ def _fill(model: PlaceModel, tensors: dict[str, Any], path: Path) -> None:
         tensor, shape = tensors[name], tuple(wanted[name].shape)
         if not isinstance(tensor, torch.Tensor):
             faults.append(f"{name} is no tensor")
+        elif tensor.is_meta or tensor.layout != torch.strided:
+            faults.append(f"{name} is no dense tensor with numbers")
         elif tensor.shape != shape:
             faults.append(f"{name} is {tuple(tensor.shape)}, expected {shape}")
     if faults:
         more = f" and {len(faults) - 3} more" if len(faults) > 3 else ""
         raise _unfit(path, "; ".join(faults[:3]) + more)
+    try:
+        check_promise((tensors[name] for name in wanted), path)
+    except ValueError as error:
+        raise _unfit(path, str(error)) from error
+    # Copied, because they are mapped from the file, which may change.
     model.load_state_dict(
-        {name: tensors[name].to(wanted[name].dtype) for name in wanted}, assign=True
+        {name: tensors[name].to(wanted[name].dtype, copy=True) for name in wanted}, assign=True
     )
 
 

@@ -13,7 +13,7 @@ import torch
 
 from shared.errors import Misconfigured
 from shared.vision.download import download
-from shared.vision.tensor_files import UNREADABLE, first_line
+from shared.vision.tensor_files import UNREADABLE, first_line, load_tensors
 
 
 def torchvision_network(name: str, pretrained: bool, weights: Path | None) -> Any:
@@ -73,7 +73,7 @@ def read_tensors(path: Path, name: str) -> dict[str, torch.Tensor]:
             begin = file.read(9)
         if begin[8:] == b"{":
             return load_file(path)
-        state = torch.load(path, map_location="cpu", weights_only=True)
+        state = load_tensors(path)
     except UNREADABLE as error:
         reason = f"it can't be read as a file of tensors: {first_line(error)}"
         raise unfit(path, name, reason) from error
