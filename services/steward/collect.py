@@ -15,10 +15,12 @@ from uuid import UUID
 from sqlalchemy import and_, delete, exists, or_, select, update
 from sqlalchemy.orm import Session
 
+from services.steward.journal import deletion_is_journaled, journal_deletions
 from shared.catalog.base import db_now, db_now_plus
 from shared.catalog.chunks import Chunk, Descriptor
 from shared.catalog.direct_uploads import DirectUpload
 from shared.catalog.generations import Generation, GenerationState
+from shared.catalog.journaled import is_journaled
 from shared.catalog.maps import bump_version, lock_map
 from shared.catalog.models import Model
 from shared.catalog.photos import Photo
@@ -28,6 +30,7 @@ from shared.catalog.whitenings import StoredWhitening
 from shared.chunks import codes_key, delete_chunk, manifest_key
 from shared.jobs.batches import BatchItem
 from shared.jobs.table import MODEL_CHANGES, QUERY_JOBS, UNFINISHED, Job, JobKind, JobState
+from shared.journal.lag import catalog_lag
 from shared.objects import ObjectStore
 from shared.objects.keys import (
     ARCHIVES,
@@ -134,12 +137,16 @@ def collect_whitenings(catalog: Catalog, store: ObjectStore, grace_seconds: floa
 
 
 def collect_deleted_photos(catalog: Catalog, store: ObjectStore, grace_seconds: float) -> None:
-    """The bytes and local features of deleted photos at once; their rows after the grace, when
-    every search worker has seen the deletion and merging has dropped their descriptors."""
+    """The bytes and local features of deleted photos, once the journal tells of the deletion; their
+    rows after the grace, when every search worker has seen the deletion and merging has dropped
+    their descriptors."""
+    journal_deletions(catalog, store, Photo)
     with catalog.read() as session:
         photos = session.scalars(
             select(Photo)
-            .where(Photo.deleted_at.is_not(None), Photo.object_key != "")
+            .where(
+                Photo.deleted_at.is_not(None), Photo.object_key != "", deletion_is_journaled(Photo)
+            )
             .limit(AT_ONCE)
         ).all()
         described_in = _generations_with_rows(session, {photo.map_id for photo in photos})
@@ -151,7 +158,12 @@ def collect_deleted_photos(catalog: Catalog, store: ObjectStore, grace_seconds: 
     photo_ids = [photo.id for photo in photos]
     with catalog.write() as session:
         if photo_ids:
-            session.execute(update(Photo).where(Photo.id.in_(photo_ids)).values(object_key=""))
+            session.execute(
+                update(Photo)
+                .where(Photo.id.in_(photo_ids))
+                # The revision is named, or this would count as a change for the journal.
+                .values(object_key="", revision=Photo.revision)
+            )
         _forget_photos(session, grace_seconds)
 
 
@@ -171,7 +183,11 @@ def _generations_with_rows(session: Session, map_ids: set[UUID]) -> dict[UUID, l
 def _forget_photos(session: Session, grace_seconds: float) -> None:
     gone = session.execute(
         select(Photo.id, Photo.map_id)
-        .where(Photo.deleted_at < db_now_plus(-grace_seconds), Photo.object_key == "")
+        .where(
+            Photo.deleted_at < db_now_plus(-grace_seconds),
+            Photo.object_key == "",
+            is_journaled(Photo),
+        )
         .limit(AT_ONCE)
     ).all()
     photo_ids = [photo_id for photo_id, _ in gone]
@@ -258,7 +274,12 @@ def collect_brought(catalog: Catalog, store: ObjectStore, prefix: str, kind: Job
 
 
 def collect_orphans(catalog: Catalog, store: ObjectStore, age_seconds: float) -> int:
-    """Remove objects older than `age_seconds` that no row knows; how many."""
+    """Remove objects older than `age_seconds` that no row knows; how many. Nothing is removed while
+    the catalog is older than the store: it may not know yet what others refer to."""
+    lag = catalog_lag(catalog, store)
+    if lag is not None:
+        log.warning("orphaned objects are not collected: %s", lag.detail)
+        return 0
     removed = 0
     for info in orphans(catalog, store, age_seconds):
         store.delete(info.key)

@@ -17,6 +17,7 @@ from services.steward.compact import compact
 from services.steward.count_maps import count_large_maps
 from services.steward.counted_store import CountedStore
 from services.steward.delete_maps import delete_maps
+from services.steward.journal import JournalDuty
 from services.steward.metrics import StewardMetrics
 from services.steward.model_changes import advance_model_changes, fit_maps_that_wait
 from services.steward.queue import free_leases, resend_hints
@@ -91,6 +92,7 @@ class Steward:
                 5.0,
                 lambda: metrics.slots_merged.inc(compact(catalog, store, settings.compact_chunks)),
             ),
+            Duty("write journal", 2.0, JournalDuty(catalog, store, metrics)),
             Duty("delete maps", 1.0, lambda: delete_maps(catalog, counted("delete_maps"))),
             Duty("collect", 10.0, lambda: collect(catalog, counted("collect"), settings)),
             Duty(

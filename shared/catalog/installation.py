@@ -10,7 +10,7 @@ from __future__ import annotations
 from datetime import datetime
 from uuid import UUID
 
-from sqlalchemy import CheckConstraint, Integer, Uuid, select
+from sqlalchemy import BigInteger, CheckConstraint, Integer, Uuid, select
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
@@ -23,6 +23,8 @@ from shared.objects.open_store import open_store
 from shared.objects.s3 import S3Store
 from shared.settings import Settings
 
+REBUILDING = -1  # of `Installation.journal_sequence`
+
 
 class Installation(Base):
     """The one row: `id` is made at the first start and never changes."""
@@ -33,6 +35,9 @@ class Installation(Base):
     id: Mapped[UUID] = mapped_column(Uuid, default=new_id)
     # The endpoint and the name of the bucket that holds the objects; null: they lie in a folder.
     bucket: Mapped[Place | None] = mapped_column(JsonValue)
+    # The number of the last journal segment that this catalog has written (`shared.journal`), or
+    # REBUILDING while `placewise rebuild-catalog` has not finished.
+    journal_sequence: Mapped[int] = mapped_column(BigInteger, default=0, server_default="0")
     created_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())
 
     __table_args__ = (CheckConstraint("number = 1", name="there_is_one"),)

@@ -6,12 +6,14 @@ catalog does not know; and a bucket that is not the one of before holds none of 
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 from typing import TypedDict
 from uuid import UUID
 
 from shared.errors import Misconfigured, NotFound
-from shared.objects.folder import MARK, PARTIAL
+from shared.objects.folder import MARK, PARTIAL, FolderStore
+from shared.objects.port import ObjectStore
 from shared.objects.s3 import S3Store
 
 
@@ -60,6 +62,20 @@ def claim_bucket(store: S3Store, owner: UUID, before: Place | None, folder: Path
             "in it.",
         )
     return Place(endpoint=bucket.endpoint, bucket=bucket.name)
+
+
+def read_owner(store: ObjectStore) -> UUID | None:
+    """The id of the catalog that the store is marked with; None for one without a mark."""
+    found = None
+    if isinstance(store, S3Store):
+        found = _mark_of(store)
+    elif isinstance(store, FolderStore):
+        with contextlib.suppress(FileNotFoundError):
+            found = (store.root / MARK).read_text().strip()
+    try:
+        return None if found is None else UUID(found)
+    except ValueError:
+        return None
 
 
 def check_no_bucket(before: Place | None) -> None:

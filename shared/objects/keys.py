@@ -11,6 +11,7 @@ INCOMING = "incoming/"
 ARCHIVES = "archives/"
 CHECKPOINTS = "checkpoints/"
 FEATURES = "features/"
+JOURNAL = "journal/"
 MODELS = "models/"
 ORIGINALS = "originals/"
 QUERIES = "queries/"
@@ -24,6 +25,7 @@ OWN = (
     CHECKPOINTS,
     "chunks/",
     FEATURES,
+    JOURNAL,
     MODELS,
     ORIGINALS,
     QUERIES,
