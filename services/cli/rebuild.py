@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from dataclasses import asdict
+from typing import TYPE_CHECKING
 
 from rich.markup import escape
 
@@ -16,8 +17,9 @@ from shared.catalog.open_catalog import open_catalog
 from shared.catalog.schema import migrate
 from shared.home import lock_home
 from shared.objects.open_store import open_store
-from shared.rebuild.begin import begin_rebuild
-from shared.rebuild.take_in import TakenIn, take_in
+
+if TYPE_CHECKING:
+    from shared.rebuild.take_in import TakenIn
 
 SHOWN = 10
 NEVER_IN_THE_JOURNAL = (
@@ -30,6 +32,10 @@ def rebuild_catalog(as_json: JsonOption = False) -> None:
     """Rebuild a lost catalog from the object store: photos with all that was said of them, maps,
     generations, vocabularies. Stop the services first. Interrupted, it goes on when run again."""
     with explained(as_json), told() as progress, contextlib.ExitStack() as held:
+        # Imported only here: it reads photos, which not every image can.
+        from shared.rebuild.begin import begin_rebuild
+        from shared.rebuild.take_in import take_in
+
         settings = read_settings()
         alone = settings.database_url is None
         if alone:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.markup import escape
@@ -23,8 +23,10 @@ from shared.integrity.report import Report, Wrong
 from shared.jobs import InProcessHints
 from shared.journal.lag import Lag, catalog_lag
 from shared.objects import ObjectStore
-from shared.rebuild.take_in import TakenIn, take_in
 from shared.settings import Settings
+
+if TYPE_CHECKING:
+    from shared.rebuild.take_in import TakenIn
 
 SHOWN = 20
 UPLOAD_SECONDS = 3600.0  # an original of this age belongs to no upload that is under way
@@ -89,6 +91,8 @@ def _take_in(
 ) -> TakenIn:
     if lag.since is None:
         raise Conflict("rebuild_unfinished", lag.detail)
+    from shared.rebuild.take_in import take_in  # it reads photos, which not every image can
+
     served = settings.database_url is not None or running_server(settings.placewise_home)
     age_seconds = UPLOAD_SECONDS if served else 0.0
     return take_in(catalog, store, settings, unnamed_age_seconds=age_seconds, progress=progress)

@@ -13,7 +13,7 @@ from shared.catalog.maps import Map
 from shared.catalog.photos import Photo
 from shared.catalog.session import Catalog
 from shared.errors import Unavailable
-from shared.journal.lag import Lag
+from shared.journal.lag import Lag, catalog_lag
 from shared.journal.outbox import write_journal
 from shared.objects import ObjectStore
 
@@ -25,19 +25,23 @@ PATIENCE_SECONDS = 60.0
 
 
 class JournalDuty:
-    """Writes what is pending; logs when the catalog is found to be behind its store, and when not
-    any more."""
+    """Writes what is pending. Compares the catalog with the store at the first round and while it
+    is behind; logs when that begins and ends."""
 
     def __init__(self, catalog: Catalog, store: ObjectStore, metrics: StewardMetrics) -> None:
         self._catalog = catalog
         self._store = store
         self._metrics = metrics
         self._lag: Lag | None = None
+        self._compared = False
 
     def __call__(self) -> None:
         written = write_journal(self._catalog, self._store)
         self._metrics.journal_lines.inc(written.lines)
         lag = written.lag
+        if lag is None and (self._lag is not None or not self._compared):
+            lag = catalog_lag(self._catalog, self._store)
+        self._compared = True
         self._metrics.catalog_lag_segments.set(lag.segments if lag else 0)
         if lag is not None and self._lag is None:
             log.error("the journal is not written: %s", lag.detail)

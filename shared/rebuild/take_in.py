@@ -7,11 +7,15 @@ killed is repeated. Of two states of one row the higher revision counts, and a d
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import partial
+from uuid import UUID
 
-from sqlalchemy import exists, func, select, update
+from sqlalchemy import exists, func, insert, select, update
 from sqlalchemy.orm import Session
 
+from shared.catalog.base import Condition
 from shared.catalog.chunks import Descriptor
 from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.installation import ensure_installation
@@ -96,25 +100,32 @@ def _queue_photos(catalog: Catalog, progress: Progress) -> int:
     )
     with catalog.read() as session:
         total = session.scalar(select(func.count()).select_from(Photo).where(*missing)) or 0
-    done = 0
-
-    def queue(session: Session) -> int:
-        photos = session.execute(
-            select(Photo.id, Photo.map_id).where(*missing).order_by(Photo.id).limit(AT_ONCE)
-        ).all()
-        for photo_id, map_id in photos:
-            job = Job(
-                id=new_id(),
-                map_id=map_id,
-                kind=JobKind.INDEX,
-                priority=Priority.UPLOAD,
-                photo_id=photo_id,
-            )
-            session.add(job)
-            session.execute(update(Photo).where(Photo.id == photo_id).values(job_id=job.id))
-        return len(photos)
-
-    while some := catalog.run(queue):
-        done += some
+    done, last = 0, UUID(int=0)
+    while True:
+        queued = catalog.run(partial(_queue_some, missing=(*missing, Photo.id > last)))
+        if not queued:
+            return done
+        done, last = done + len(queued), queued[-1]
         progress("photos to describe", done, total)
-    return done
+
+
+def _queue_some(session: Session, missing: Sequence[Condition]) -> list[UUID]:
+    """Queue the first of these photos by id; their ids."""
+    photos = session.execute(
+        select(Photo.id, Photo.map_id).where(*missing).order_by(Photo.id).limit(AT_ONCE)
+    ).all()
+    if not photos:
+        return []
+    jobs = [
+        {
+            "id": new_id(),
+            "map_id": photo.map_id,
+            "kind": JobKind.INDEX,
+            "priority": Priority.UPLOAD,
+            "photo_id": photo.id,
+        }
+        for photo in photos
+    ]
+    session.execute(insert(Job), jobs)
+    session.execute(update(Photo), [{"id": job["photo_id"], "job_id": job["id"]} for job in jobs])
+    return [photo.id for photo in photos]

@@ -126,7 +126,7 @@ def test_what_changes_while_it_is_written_is_written_again(
     catalog: Catalog, store: ObjectStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     _, photo_id = filled(catalog)
-    real = outbox.put_segment
+    real = segments.put_segment
 
     def change_meanwhile(*arguments: Any) -> str:
         monkeypatch.setattr(outbox, "put_segment", real)
@@ -146,7 +146,7 @@ def test_two_stewards_at_once_lose_no_state(
 ) -> None:
     """The slower one has read an older state of the photo, and writes it last."""
     _, photo_id = filled(catalog)
-    real = outbox.put_segment
+    real = segments.put_segment
 
     def overtaken(*arguments: Any) -> str:
         monkeypatch.setattr(outbox, "put_segment", real)

@@ -39,7 +39,7 @@ from shared.settings import Settings
 from tests.integration.gateway import Service
 from tests.support.photos import photo_bytes
 
-SAID = {
+SAID: dict[str, Any] = {
     "latitude": 45.5,
     "longitude": 7.25,
     "heading": 90,
