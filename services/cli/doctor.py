@@ -27,12 +27,15 @@ from services.cli.service_checks import (
     steward_check,
 )
 from services.cli.store_checks import collection_check, permissions_check
+from shared.catalog.away import as_unavailable
 from shared.catalog.open_catalog import open_catalog
 from shared.catalog.photos import Photo
+from shared.catalog.schema import check_schema
 from shared.catalog.unusable import check_pages
 from shared.client import Client
 from shared.errors import Misconfigured, PlacewiseError
 from shared.home import running_server
+from shared.journal.lag import catalog_lag
 from shared.settings import Settings
 
 LOW_DISK_BYTES = 1_000_000_000
@@ -66,6 +69,7 @@ def doctor(server: ServerOption = None, key: KeyOption = None, as_json: JsonOpti
     else:
         checks.append(("objects", objects_check))
     checks.append(("collection", collection_check))
+    checks.append(("journal", _journal))
     if settings.database_url is None:
         checks += [("server", _server), ("vocabulary", _vocabulary)]
     else:
@@ -150,6 +154,29 @@ def _uploads(settings: Settings) -> str:
     if not os.access(there, os.W_OK | os.X_OK):
         raise OSError(errno.EACCES, "UPLOAD_DIR: this user may not write there", str(there))
     return f"UPLOAD_DIR {folder} is writable"
+
+
+def _journal(settings: Settings) -> str:
+    """Does the catalog know all that the object store's journal tells of?"""
+    if settings.database_url is None and not (settings.placewise_home / "catalog.sqlite").exists():
+        return "nothing is stored yet"
+    from shared.objects.open_store import open_store  # the minio client takes its time
+
+    catalog = open_catalog(settings, "doctor")
+    try:
+        check_schema(catalog)
+        lag = catalog_lag(catalog, open_store(settings, alone=False))
+    except SQLAlchemyError as error:
+        raise as_unavailable(error) or Misconfigured(
+            "catalog_unreadable",
+            f"The catalog can't be read ({type(error).__name__}). Check its permissions, or "
+            "restore it from a backup.",
+        ) from error
+    finally:
+        catalog.close()
+    if lag is not None:
+        raise Misconfigured("catalog_behind", lag.detail)
+    return "the catalog is as new as the object store"
 
 
 def _vocabulary(settings: Settings) -> str:

@@ -38,6 +38,7 @@ COMMANDS = {
     "backup": ("backup", "backup"),
     "restore": ("backup", "restore"),
     "verify": ("verify", "verify"),
+    "rebuild-catalog": ("rebuild", "rebuild_catalog"),
     "bench": ("bench", "app"),
 }
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.markup import escape
@@ -11,14 +11,26 @@ from rich.markup import escape
 from services.cli.backup import told
 from services.cli.configuration import read_settings
 from services.cli.output import JsonOption, answers, explained, messages, print_json
+from services.cli.rebuild import print_taken_in
 from services.cli.stored import what_is_stored
+from shared.backup.rows import Progress
+from shared.catalog.session import Catalog
+from shared.errors import Conflict
+from shared.home import running_server
 from shared.integrity.check import check
 from shared.integrity.repair import repair
 from shared.integrity.report import Report, Wrong
 from shared.jobs import InProcessHints
+from shared.journal.lag import Lag, catalog_lag
+from shared.objects import ObjectStore
 from shared.objects.trash import measure_trash
+from shared.settings import Settings
+
+if TYPE_CHECKING:
+    from shared.rebuild.take_in import TakenIn
 
 SHOWN = 20
+UPLOAD_SECONDS = 3600.0  # an original of this age belongs to no upload that is under way
 WHAT_TO_DO = {
     "chunk": "placewise verify --repair describes their photos again",
     "manifest": "placewise verify --repair describes the photos of their chunks again",
@@ -41,13 +53,17 @@ def verify(
     as_json: JsonOption = False,
 ) -> None:
     """Read every chunk against its hash and the catalog, while the service runs; exit code 1 when
-    something is wrong, also when it was repaired."""
+    something is wrong, also when it was repaired. Where the catalog is older than the object store,
+    --repair takes in what is missing."""
     with explained(as_json), told() as progress:
         # Imported only here: it is the steward's.
         from services.steward.collect import orphans
 
         settings = read_settings()
         with what_is_stored(settings, "verify") as (catalog, store):
+            lag, taken = catalog_lag(catalog, store), None
+            if lag is not None and mend:
+                taken = _take_in(catalog, store, settings, lag, progress)
             report = check(catalog, store, originals=originals, progress=progress)
             for info in orphans(catalog, store, age_seconds=0.0):
                 report.orphans += 1
@@ -58,11 +74,31 @@ def verify(
             # Workers look every second, and the steward sends hints.
             queued = repair(catalog, InProcessHints(), report) if mend else None
     if as_json:
-        print_json(_as_dict(report, queued))
+        found = {
+            "lag": lag.detail if lag else None,
+            "taken_in": asdict(taken) if taken else None,
+        }
+        print_json(_as_dict(report, queued) | found)
     else:
+        if taken is not None:
+            print_taken_in(taken)
+        elif lag is not None:
+            messages.print(f"[red]behind[/red] {escape(lag.detail)}", soft_wrap=True)
         _print(report, queued)
-    if report.faults:
+    if report.faults or lag is not None:
         raise typer.Exit(1)
+
+
+def _take_in(
+    catalog: Catalog, store: ObjectStore, settings: Settings, lag: Lag, progress: Progress
+) -> TakenIn:
+    if lag.since is None:
+        raise Conflict("rebuild_unfinished", lag.detail)
+    from shared.rebuild.take_in import take_in  # it reads photos, which not every image can
+
+    served = settings.database_url is not None or running_server(settings.placewise_home)
+    age_seconds = UPLOAD_SECONDS if served else 0.0
+    return take_in(catalog, store, settings, unnamed_age_seconds=age_seconds, progress=progress)
 
 
 def _as_dict(report: Report, queued: int | None) -> dict[str, Any]:

@@ -18,10 +18,12 @@ from uuid import UUID
 from sqlalchemy import and_, delete, exists, or_, select, update
 from sqlalchemy.orm import Session
 
+from services.steward.journal import deletion_is_journaled, journal_deletions
 from shared.catalog.base import db_now, db_now_plus
 from shared.catalog.chunks import Chunk, Descriptor
 from shared.catalog.direct_uploads import DirectUpload
 from shared.catalog.generations import Generation, GenerationState
+from shared.catalog.journaled import is_journaled
 from shared.catalog.maps import bump_version, lock_map
 from shared.catalog.models import Model
 from shared.catalog.photos import Photo
@@ -32,6 +34,8 @@ from shared.chunks import codes_key, delete_chunk, manifest_key
 from shared.errors import Conflict
 from shared.jobs.batches import BatchItem
 from shared.jobs.table import MODEL_CHANGES, QUERY_JOBS, UNFINISHED, Job, JobKind, JobState
+from shared.journal.lag import catalog_lag
+from shared.journal.outbox import accept_segments
 from shared.objects import ObjectStore, OwnedStore
 from shared.objects.collection_hold import Hold, HoldReason, end_hold, read_hold, write_hold
 from shared.objects.keys import (
@@ -142,12 +146,16 @@ def collect_whitenings(catalog: Catalog, store: ObjectStore, grace_seconds: floa
 
 
 def collect_deleted_photos(catalog: Catalog, store: ObjectStore, grace_seconds: float) -> None:
-    """The bytes and local features of deleted photos at once; their rows after the grace, when
-    every search worker has seen the deletion and merging has dropped their descriptors."""
+    """The bytes and local features of deleted photos, once the journal tells of the deletion; their
+    rows after the grace, when every search worker has seen the deletion and merging has dropped
+    their descriptors."""
+    journal_deletions(catalog, store, Photo)
     with catalog.read() as session:
         photos = session.scalars(
             select(Photo)
-            .where(Photo.deleted_at.is_not(None), Photo.object_key != "")
+            .where(
+                Photo.deleted_at.is_not(None), Photo.object_key != "", deletion_is_journaled(Photo)
+            )
             .limit(AT_ONCE)
         ).all()
         described_in = _generations_with_rows(session, {photo.map_id for photo in photos})
@@ -159,7 +167,12 @@ def collect_deleted_photos(catalog: Catalog, store: ObjectStore, grace_seconds: 
     photo_ids = [photo.id for photo in photos]
     with catalog.write() as session:
         if photo_ids:
-            session.execute(update(Photo).where(Photo.id.in_(photo_ids)).values(object_key=""))
+            session.execute(
+                update(Photo)
+                .where(Photo.id.in_(photo_ids))
+                # The revision is named, or this would count as a change for the journal.
+                .values(object_key="", revision=Photo.revision)
+            )
         _forget_photos(session, grace_seconds)
 
 
@@ -179,7 +192,11 @@ def _generations_with_rows(session: Session, map_ids: set[UUID]) -> dict[UUID, l
 def _forget_photos(session: Session, grace_seconds: float) -> None:
     gone = session.execute(
         select(Photo.id, Photo.map_id)
-        .where(Photo.deleted_at < db_now_plus(-grace_seconds), Photo.object_key == "")
+        .where(
+            Photo.deleted_at < db_now_plus(-grace_seconds),
+            Photo.object_key == "",
+            is_journaled(Photo),
+        )
         .limit(AT_ONCE)
     ).all()
     photo_ids = [photo_id for photo_id, _ in gone]
@@ -291,13 +308,14 @@ def collect_orphans(
     *,
     max_share: float = 1.0,
     confirmed: bool = False,
-    catalog_is_behind: Callable[[Catalog, OwnedStore], bool] = lambda catalog, store: False,
 ) -> int:
     """Move objects older than `age_seconds` that no row knows to the trash; how many.
 
     Raises CollectionHeld before anything is moved, unless `confirmed`: where the catalog is behind
     its store, where it adopted the store without knowing them, and where they are more than
-    `max_share` of all objects and more than ALWAYS_COLLECTED. The store then has a note of it.
+    `max_share` of all objects and more than ALWAYS_COLLECTED. The store then has a note of it. A
+    `confirmed` run also ends the lag of a catalog that is behind: what only later catalogs knew
+    lies in the trash then, and the journal goes on.
     """
     count, first = StoreCount(), list[ObjectInfo]()
     for info in orphans(catalog, store, age_seconds, count):
@@ -306,7 +324,7 @@ def collect_orphans(
     found, before = count.orphans.total(), read_hold(store)
     if found and not confirmed:
         reason = None
-        if catalog_is_behind(catalog, store):
+        if catalog_lag(catalog, store) is not None:
             reason = HoldReason.CATALOG_BEHIND
         elif before is not None and before.reason == HoldReason.ADOPTED:
             reason = HoldReason.ADOPTED
@@ -320,6 +338,8 @@ def collect_orphans(
     moved = _move_orphans(catalog, store, first)
     if found > len(first):
         moved += _move_orphans(catalog, store, orphans(catalog, store, age_seconds))
+    if confirmed:
+        accept_segments(catalog, store)
     if before is not None and (confirmed or before.reason != HoldReason.ADOPTED):
         end_hold(store)
     if moved:

@@ -13,11 +13,14 @@ from uuid import UUID
 
 from sqlalchemy import delete, select
 
+from services.steward.journal import deletion_is_journaled, journal_deletions
+from shared.catalog.base import rowcount
 from shared.catalog.chunks import Chunk, Descriptor
 from shared.catalog.direct_uploads import DirectUpload
 from shared.catalog.evaluations import Evaluation
 from shared.catalog.figures import MapFigures
 from shared.catalog.generations import Generation
+from shared.catalog.journaled import is_journaled
 from shared.catalog.maps import Map
 from shared.catalog.photos import Photo
 from shared.catalog.searches import Search
@@ -45,8 +48,11 @@ SLICE_SECONDS = 2.0  # then the steward's other duties have their turn
 
 def delete_maps(catalog: Catalog, store: ObjectStore) -> None:
     """Go on removing every deleted map, for a few seconds."""
+    journal_deletions(catalog, store, Map)
     with catalog.read() as session:
-        gone = session.scalars(select(Map.id).where(Map.deleted_at.is_not(None))).all()
+        gone = session.scalars(
+            select(Map.id).where(Map.deleted_at.is_not(None), deletion_is_journaled(Map))
+        ).all()
     until = time.monotonic() + SLICE_SECONDS
     for map_id in gone:
         while not _step(catalog, store, map_id):
@@ -55,7 +61,7 @@ def delete_maps(catalog: Catalog, store: ObjectStore) -> None:
 
 
 def _step(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
-    """Remove the next rows of the map with their objects; True when the map is gone."""
+    """Remove the next rows of the map with their objects; True when nothing more can be removed."""
     with catalog.write() as session:
         cancel_all(session, Job.map_id == map_id)
     for some_were_left in (
@@ -77,8 +83,10 @@ def _step(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
         session.execute(delete(Generation).where(Generation.map_id == map_id))
         session.execute(delete(Vocabulary).where(Vocabulary.map_id == map_id))
         session.execute(delete(StoredWhitening).where(StoredWhitening.map_id == map_id))
-        session.execute(delete(Map).where(Map.id == map_id))
-    log.info("the deleted map %s is gone", map_id)
+        # Without a word in the journal the map would come back when the catalog is rebuilt.
+        gone = session.execute(delete(Map).where(Map.id == map_id, is_journaled(Map)))
+    if rowcount(gone):
+        log.info("the deleted map %s is gone", map_id)
     return True
 
 

@@ -23,6 +23,7 @@ from services.steward.compact import compact
 from services.steward.count_maps import count_large_maps
 from services.steward.counted_store import CountedStore
 from services.steward.delete_maps import delete_maps
+from services.steward.journal import JournalDuty
 from services.steward.mend_generations import mend_generations
 from services.steward.metrics import StewardMetrics
 from services.steward.model_changes import advance_model_changes, fit_maps_that_wait
@@ -112,6 +113,7 @@ class Steward:
                     compact(catalog, store, settings.compact_chunks, merge_retries)
                 ),
             ),
+            Duty("write journal", 2.0, JournalDuty(catalog, store, metrics)),
             Duty("delete maps", 1.0, lambda: delete_maps(catalog, counted("delete_maps"))),
             Duty("collect", 10.0, lambda: collect(catalog, counted("collect"), settings)),
             Duty(

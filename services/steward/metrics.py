@@ -45,6 +45,17 @@ class StewardMetrics:
         self.slots_merged = Counter(
             f"{PREFIX}_slots_merged", "Slots whose chunks became one.", registry=registry
         )
+        self.journal_lines = Counter(
+            f"{PREFIX}_journal_lines",
+            "Rows of the catalog that were written to the journal.",
+            registry=registry,
+        )
+        self.catalog_lag_segments = Gauge(
+            f"{PREFIX}_catalog_lag_segments",
+            "Journal segments of the object store that the catalog does not know: 0, unless an "
+            "older catalog was restored.",
+            registry=registry,
+        )
         self.objects_deleted = Counter(
             f"{PREFIX}_objects_deleted",
             "Objects that nothing refers to any more.",

@@ -59,6 +59,8 @@ class About:
     """Objects that the catalog names and the store did not have."""
     damaged: list[str] = field(default_factory=list)
     """Objects whose bytes are not those that the catalog knows."""
+    journal_sequence: int = 0
+    """Of the last journal segment that the catalog had written."""
     format: int = FORMAT
 
 

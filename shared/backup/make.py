@@ -15,10 +15,12 @@ from shared.backup.folder import About, BackupFolder
 from shared.backup.rows import Progress, dump_rows
 from shared.catalog.base import db_now
 from shared.catalog.connections import UNLIMITED
+from shared.catalog.installation import Installation
 from shared.catalog.session import Catalog
 from shared.errors import Misconfigured, NotFound, Unavailable
-from shared.integrity.named_objects import NamedObject, named_objects
+from shared.integrity.named_objects import named_objects
 from shared.objects import ObjectStore
+from shared.objects.keys import JOURNAL
 
 ROUNDS = 5  # of reading the catalog anew because something it named went away meanwhile
 
@@ -58,7 +60,10 @@ def make_backup(
                 counts = dump_rows(session, path / name, progress)
                 schema = _revision(session)
                 named = {found.key: found for found in named_objects(session)}
-            gone = _copy_rest(store, folder, named, progress)
+                sequence = session.scalar(select(Installation.journal_sequence)) or 0
+            # Read after the catalog: it holds all that the catalog's rows are marked as journaled.
+            journal = {info.key for info in store.list(JOURNAL)}
+            gone = _copy_rest(store, folder, [*named, *journal], progress)
             missing = _still_named(unlimited, gone)
             if missing == gone:
                 break
@@ -75,7 +80,7 @@ def make_backup(
             and key in folder.index
             and folder.index[key].sha256 != found.sha256
         )
-        keep = (seen | named.keys()) & folder.index.keys()
+        keep = (seen | named.keys() | journal) & folder.index.keys()
         about = About(
             installation_id=str(installation_id),
             schema=schema,
@@ -87,6 +92,7 @@ def make_backup(
             object_bytes=sum(folder.index[key].size_bytes for key in keep),
             missing=sorted(missing),
             damaged=damaged,
+            journal_sequence=sequence,
         )
         folder.finish(about, keep)
         return about
@@ -106,7 +112,7 @@ def _copy_all(
 
 
 def _copy_rest(
-    store: ObjectStore, folder: BackupFolder, named: dict[str, NamedObject], progress: Progress
+    store: ObjectStore, folder: BackupFolder, named: list[str], progress: Progress
 ) -> set[str]:
     """What is named and not there yet; the keys of those that the store does not have."""
     rest = [key for key in named if key not in folder.index]

@@ -78,6 +78,8 @@ def restore_backup(
         session.execute(delete(Map))
         load_rows(session, folder.path / about.catalog, about.rows, progress)
         session.flush()
+        # Else the restored catalog would take the journal's segments for a later catalog's.
+        ensure_installation(session).journal_sequence = about.journal_sequence
         cancelled = _settle(session)
     rows = sum(count for name, count in about.rows.items() if name not in NOT_LOADED)
     return Restored(rows, len(folder.index), copied, cancelled)

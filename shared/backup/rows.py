@@ -5,19 +5,18 @@ from __future__ import annotations
 import gzip
 import json
 from collections.abc import Callable, Iterator
-from datetime import datetime
 from pathlib import Path
 from typing import Any
-from uuid import UUID
 
-from sqlalchemy import Column, Table, Uuid, func, insert, select
+from sqlalchemy import Table, func, insert, select
 from sqlalchemy.orm import Session
 
 import shared.catalog.tables  # noqa: F401  (every table has to be known)
-from shared.catalog.base import Base, UtcDateTime
+from shared.catalog.base import Base
 from shared.catalog.direct_uploads import DirectUpload
 from shared.catalog.installation import Installation
 from shared.catalog.live_processes import LiveProcess
+from shared.catalog.row_json import from_json, to_json
 from shared.catalog.schema_compatibility import SchemaCompatibility
 from shared.catalog.search_workers import RegisteredWorker
 from shared.errors import Misconfigured
@@ -55,7 +54,7 @@ def dump_rows(session: Session, folder: Path, progress: Progress) -> dict[str, i
         file.touch(FILE_MODE)
         with gzip.open(file, "wt", compresslevel=LEVEL) as lines:
             for row in rows.mappings():
-                values = {name: _as_json(value) for name, value in row.items()}
+                values = {name: to_json(value) for name, value in row.items()}
                 lines.write(json.dumps(values, ensure_ascii=False) + "\n")
                 done += 1
                 if done % ROWS_AT_ONCE == 0:
@@ -88,30 +87,12 @@ def _read(file: Path, table: Table) -> Iterator[list[dict[str, Any]]]:
     with gzip.open(file, "rt") as lines:
         for line in lines:
             values = json.loads(line)
-            some.append({c.name: _from_json(c, values[c.name]) for c in table.columns})
+            some.append({c.name: from_json(c, values[c.name]) for c in table.columns})
             if len(some) == ROWS_AT_ONCE:
                 yield some
                 some = []
     if some:
         yield some
-
-
-def _as_json(value: Any) -> Any:
-    if isinstance(value, UUID):
-        return str(value)
-    if isinstance(value, datetime):
-        return value.isoformat()
-    return value
-
-
-def _from_json(column: Column[Any], value: Any) -> Any:
-    if value is None:
-        return None
-    if isinstance(column.type, Uuid):
-        return UUID(value)
-    if isinstance(column.type, UtcDateTime):
-        return datetime.fromisoformat(value)
-    return value
 
 
 def _damaged(table: Table, why: str) -> Misconfigured:

@@ -15,6 +15,7 @@ from sqlalchemy import BigInteger, ForeignKey, Index, Integer, String, Uuid, sel
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
 from shared.catalog.base import Base, JsonValue, UtcDateTime, db_now
+from shared.catalog.journaled import Journaled
 from shared.errors import NotFound
 from shared.ids import new_id
 
@@ -26,7 +27,7 @@ class GenerationState(StrEnum):
     ABANDONED = "abandoned"  # never became complete; removed after a grace period
 
 
-class Generation(Base):
+class Generation(Journaled, Base):
     """`spec` is everything that decides a descriptor's value; rows of two specs never mix.
 
     `calibration` is what its evaluations have learnt of its scores (`shared.estimate`),

@@ -11,7 +11,7 @@ from datetime import datetime
 from pathlib import Path
 from uuid import UUID
 
-from sqlalchemy import CheckConstraint, Integer, Uuid, select
+from sqlalchemy import BigInteger, CheckConstraint, Integer, Uuid, select
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
@@ -30,6 +30,7 @@ from shared.objects.store_owner import Place, check_free, claim_store, place_of
 from shared.settings import Settings
 
 SAMPLE_KEYS = 20  # of each table
+REBUILDING = -1  # of `Installation.journal_sequence`
 
 
 class Installation(Base):
@@ -41,6 +42,9 @@ class Installation(Base):
     id: Mapped[UUID] = mapped_column(Uuid, default=new_id)
     # The endpoint and the name of the bucket that holds the objects; null: they lie in a folder.
     bucket: Mapped[Place | None] = mapped_column(JsonValue)
+    # The number of the last journal segment that this catalog has written (`shared.journal`), or
+    # REBUILDING while `placewise rebuild-catalog` has not finished.
+    journal_sequence: Mapped[int] = mapped_column(BigInteger, default=0, server_default="0")
     created_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())
 
     __table_args__ = (CheckConstraint("number = 1", name="there_is_one"),)

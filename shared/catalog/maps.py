@@ -14,6 +14,7 @@ from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
 from shared.catalog.base import Base, UtcDateTime, db_now
+from shared.catalog.journaled import Journaled
 from shared.errors import Conflict, NotFound
 from shared.ids import new_id
 
@@ -22,7 +23,7 @@ MAP_NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$"
 DELETED = "deleted/"  # no name that people can give holds a slash
 
 
-class Map(Base):
+class Map(Journaled, Base):
     """`version` grows with every transaction that changes what can be found in the map."""
 
     __tablename__ = "maps"

@@ -13,10 +13,11 @@ from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
 from shared.catalog.base import Base, JsonValue, UtcDateTime, db_now
+from shared.catalog.journaled import Journaled
 from shared.ids import new_id
 
 
-class Model(Base):
+class Model(Journaled, Base):
     """One set of weights. `card` says where they come from and under which licence.
 
     The columns from `added_name` on are those of a model that was added: its weights are a file of

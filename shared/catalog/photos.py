@@ -20,6 +20,7 @@ from sqlalchemy import (
     Text,
     Uuid,
     and_,
+    column,
     func,
     or_,
     select,
@@ -37,6 +38,7 @@ from shared.catalog.base import (
     filename_trigrams,
     partial_index,
 )
+from shared.catalog.journaled import Journaled
 from shared.errors import NotFound
 from shared.ids import new_id
 
@@ -46,7 +48,7 @@ class PhotoRole(StrEnum):
     QUERY = "query"  # a labelled query: described, never found; evaluations ask with it
 
 
-class Photo(Base):
+class Photo(Journaled, Base):
     """One live or deleted photo. `sha256` is unique among a map's live photos.
 
     `job_id` is the job that describes the photo; whether it is searchable is told by its row in
@@ -96,6 +98,9 @@ class Photo(Base):
         Index("ix_photos_map_changed", "map_id", "changed_version"),
         Index("ix_photos_map_position", "map_id", "latitude", "longitude"),
         Index("ix_photos_object_key", "object_key"),
+        partial_index(
+            "ix_photos_not_journaled", "id", only=column("revision") != column("journaled_revision")
+        ),
         partial_index(
             "ix_photos_key", "key_id", only=and_(deleted_at.is_(None), key_id.is_not(None))
         ),

@@ -12,6 +12,7 @@ from sqlalchemy.orm import Mapped, Session, mapped_column
 
 from shared.catalog.base import Base, JsonValue, UtcDateTime, db_now
 from shared.catalog.generations import Generation
+from shared.catalog.journaled import Journaled
 from shared.errors import NotFound
 from shared.ids import new_id
 from shared.recipes import PARITY_PREPROCESSINGS
@@ -23,7 +24,7 @@ class VocabularyOrigin(StrEnum):
     IMPORTED = "imported"  # brought by the user
 
 
-class Vocabulary(Base):
+class Vocabulary(Journaled, Base):
     """(clusters, dimension) float32 centres under `object_key`, as a `.npy` file.
 
     `provenance` is what `shared.vision.provenance` says of them.

@@ -11,11 +11,12 @@ from sqlalchemy.orm import Mapped, Session, mapped_column
 
 from shared.catalog.base import Base, UtcDateTime, db_now
 from shared.catalog.generations import Generation, active_generation
+from shared.catalog.journaled import Journaled
 from shared.errors import Conflict
 from shared.ids import new_id
 
 
-class StoredWhitening(Base):
+class StoredWhitening(Journaled, Base):
     """From `dimension` numbers to `kept`: a file of `shared.vision.pca_file` under `object_key`.
 
     It goes when none of its generations answers or is built any more, some time after.

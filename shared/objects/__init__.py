@@ -11,6 +11,7 @@
 | `models/<sha256>/<uuid>.safetensors` | a model that was added: its configuration and weights |
 | `thumbnails/<photo>` | its thumbnail, JPEG |
 | `chunks/<generation>/<chunk>.npy`, `.json`, `.codes` | descriptor rows, what they are, codes |
+| `journal/<first>-<last>-<uuid>.jsonl.gz` | rows of the catalog (`shared.journal`) |
 | `vocabularies/<uuid>.npy` | VLAD centres |
 | `whitenings/<uuid>.safetensors` | PCA whitenings |
 | `queries/<job>`, `queries/<job>.npy` | a query photo that is not stored, and its descriptor |

@@ -12,6 +12,7 @@ INCOMING = "incoming/"
 ARCHIVES = "archives/"
 CHECKPOINTS = "checkpoints/"
 FEATURES = "features/"
+JOURNAL = "journal/"
 MODELS = "models/"
 ORIGINALS = "originals/"
 QUERIES = "queries/"
@@ -26,6 +27,7 @@ OWN = (
     CHECKPOINTS,
     "chunks/",
     FEATURES,
+    JOURNAL,
     MODELS,
     ORIGINALS,
     QUERIES,

@@ -29,6 +29,7 @@ from shared.catalog.chunks import Chunk, Descriptor
 from shared.catalog.direct_uploads import DirectUpload
 from shared.catalog.figures import keep_figures
 from shared.catalog.generations import Generation
+from shared.catalog.installation import Installation
 from shared.catalog.maps import Map
 from shared.catalog.models import Model
 from shared.catalog.photos import Photo
@@ -39,7 +40,7 @@ from shared.intake.store_photo import store_photo
 from shared.jobs import InProcessHints, Job, JobKind, JobState
 from shared.jobs.batches import BatchItem
 from shared.objects import FolderStore
-from shared.objects.keys import TRASH
+from shared.objects.keys import JOURNAL, TRASH
 from shared.settings import Settings
 from tests.integration.gateway import Service
 from tests.support.added import none_added
@@ -54,7 +55,9 @@ class Away(Exception):
     pass
 
 
-OF_NO_MAP = {kind.__tablename__ for kind in (Model, RegisteredWorker, SchemaCompatibility)}
+OF_NO_MAP = {
+    kind.__tablename__ for kind in (Installation, Model, RegisteredWorker, SchemaCompatibility)
+}
 
 
 def rows(catalog: Catalog) -> Counter[str]:
@@ -70,7 +73,8 @@ def rows(catalog: Catalog) -> Counter[str]:
 
 
 def objects(store: FolderStore) -> set[str]:
-    return {info.key for info in store.list("") if not info.key.startswith(TRASH)}
+    """All but the trash, and the journal, which tells of the deletion."""
+    return {info.key for info in store.list("") if not info.key.startswith((JOURNAL, TRASH))}
 
 
 def id_of(service: Service, name: str) -> UUID:

@@ -1,0 +1,191 @@
+"""Chunks that lie in the store, back into the generations that answer."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
+from uuid import UUID
+
+from sqlalchemy import insert, select
+from sqlalchemy.orm import Session
+
+from shared.catalog.chunks import Chunk, Descriptor, take_slot
+from shared.catalog.generations import Generation, GenerationState, lock_generation
+from shared.catalog.maps import bump_version, lock_map
+from shared.catalog.photos import live_photos
+from shared.catalog.session import Catalog
+from shared.chunks import are_whole, decode_rows, manifest_key
+from shared.errors import NotFound
+from shared.objects import ObjectStore
+from shared.rebuild.states import AT_ONCE, Progress
+
+CHUNKS = "chunks/"
+
+
+@dataclass(slots=True)
+class ChunksTakenIn:
+    chunks: int = 0
+    descriptors: int = 0
+    damaged: list[str] = field(default_factory=list)
+    """Keys of chunks that are not what their manifests say."""
+    unnamed_rows: int = 0
+    newest_extractor: str | None = None
+    """That of the newest chunk of a generation that the catalog does not know."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Manifest:
+    chunk_id: UUID
+    generation_id: UUID
+    sha256: str
+    photo_ids: list[UUID]
+    extractor: str
+
+
+def take_in_chunks(
+    catalog: Catalog, store: ObjectStore, slot_rows: int, progress: Progress
+) -> ChunksTakenIn:
+    """Register the chunks that hold rows of photos which have none in their active generation.
+
+    Newest first: merging writes a new chunk beside the older ones, and a row is the same in each.
+    Every chunk is read against the hash of its manifest.
+    """
+    found = ChunksTakenIn()
+    with catalog.read() as session:
+        states: dict[UUID, GenerationState] = {
+            row.id: row.state for row in session.execute(select(Generation.id, Generation.state))
+        }
+    keys = sorted(
+        (info.key for info in store.list(CHUNKS) if info.key.endswith(".npy")),
+        key=lambda key: key.rpartition("/")[2],
+        reverse=True,
+    )
+    for done, key in enumerate(keys, start=1):
+        manifest = _read_manifest(store, key)
+        if manifest is None:
+            found.damaged.append(key)
+        elif manifest.generation_id not in states:
+            found.unnamed_rows += len(manifest.photo_ids)
+            found.newest_extractor = found.newest_extractor or manifest.extractor
+        elif states[manifest.generation_id] == GenerationState.ACTIVE:
+            _take_in(catalog, store, key, manifest, slot_rows, found)
+        progress("chunks", done, len(keys))
+    return found
+
+
+def _take_in(
+    catalog: Catalog,
+    store: ObjectStore,
+    key: str,
+    manifest: _Manifest,
+    slot_rows: int,
+    found: ChunksTakenIn,
+) -> None:
+    with catalog.read() as session:
+        known = session.scalar(select(Chunk.id).where(Chunk.object_key == key))
+        if known is not None or not _without_row(session, manifest):
+            return
+    try:
+        data = store.get(key)
+    except NotFound:
+        return  # superseded, and collected meanwhile
+    if hashlib.sha256(data).hexdigest() != manifest.sha256:
+        found.damaged.append(key)
+        return
+    rows = decode_rows(data)
+    if len(rows) != len(manifest.photo_ids) or not are_whole(rows).all():
+        found.damaged.append(key)
+        return
+    descriptors = catalog.run(
+        partial(
+            _commit,
+            manifest=manifest,
+            object_key=key,
+            rows=len(rows),
+            size_bytes=len(data),
+            slot_rows=slot_rows,
+        )
+    )
+    found.chunks += bool(descriptors)
+    found.descriptors += descriptors
+
+
+def _commit(
+    session: Session,
+    *,
+    manifest: _Manifest,
+    object_key: str,
+    rows: int,
+    size_bytes: int,
+    slot_rows: int,
+) -> int:
+    """Chunk and descriptors; how many of these."""
+    map_id = session.get_one(Generation, manifest.generation_id).map_id
+    lock_map(session, map_id)
+    generation = lock_generation(session, manifest.generation_id)
+    missing = _without_row(session, manifest)
+    if not missing:
+        return 0
+    chunk = Chunk(
+        id=manifest.chunk_id,
+        generation_id=generation.id,
+        slot=take_slot(generation, rows, slot_rows),
+        object_key=object_key,
+        rows=rows,
+        size_bytes=size_bytes,
+        sha256=manifest.sha256,
+    )
+    session.add(chunk)
+    session.flush()
+    descriptors: list[dict[str, Any]] = [
+        {
+            "generation_id": generation.id,
+            "photo_id": photo_id,
+            "chunk_id": chunk.id,
+            "row": row,
+        }
+        for row, photo_id in missing
+    ]
+    session.execute(insert(Descriptor), descriptors)
+    bump_version(session, map_id)
+    return len(descriptors)
+
+
+def _without_row(session: Session, manifest: _Manifest) -> list[tuple[int, UUID]]:
+    """(row, photo) of the chunk's photos that are live and have no descriptor in the generation."""
+    map_id = session.get_one(Generation, manifest.generation_id).map_id
+    described: set[UUID] = set()
+    live: set[UUID] = set()
+    for begin in range(0, len(manifest.photo_ids), AT_ONCE):
+        some = manifest.photo_ids[begin : begin + AT_ONCE]
+        live |= {p.id for p in live_photos(session, some).values() if p.map_id == map_id}
+        described |= set(
+            session.scalars(
+                select(Descriptor.photo_id).where(
+                    Descriptor.generation_id == manifest.generation_id,
+                    Descriptor.photo_id.in_(some),
+                )
+            )
+        )
+    wanted = live - described
+    # A photo may have two rows in a chunk that was merged while it was described again.
+    rows = {photo_id: row for row, photo_id in enumerate(manifest.photo_ids) if photo_id in wanted}
+    return [(row, photo_id) for photo_id, row in rows.items()]
+
+
+def _read_manifest(store: ObjectStore, key: str) -> _Manifest | None:
+    """None for one that is missing, or none."""
+    try:
+        said = json.loads(store.get(manifest_key(key)))
+        return _Manifest(
+            UUID(said["chunk_id"]),
+            UUID(said["generation_id"]),
+            str(said["sha256"]),
+            [UUID(photo_id) for photo_id in said["photo_ids"]],
+            str(said["spec"]["extractor"]),
+        )
+    except (NotFound, ValueError, KeyError, TypeError, AttributeError):
+        return None

@@ -1,0 +1,235 @@
+"""The journal's rows into the catalog."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+from uuid import UUID
+
+from sqlalchemy import insert, select, update
+from sqlalchemy.orm import Session
+
+from shared.catalog.base import db_now
+from shared.catalog.generations import Generation, GenerationState
+from shared.catalog.maps import DELETED, Map, bump_version
+from shared.catalog.models import Model
+from shared.catalog.photos import Photo
+from shared.catalog.session import Catalog
+from shared.catalog.vocabularies import Vocabulary
+from shared.catalog.whitenings import StoredWhitening
+from shared.journal.lag import unknown_lines
+from shared.journal.segments import Line
+from shared.journal.tables import columns_of, table_of
+from shared.objects import ObjectStore
+from shared.rebuild.states import LastStates, Progress
+
+Columns = dict[str, Any]
+
+
+@dataclass(slots=True)
+class RowsTakenIn:
+    maps: int = 0
+    renamed_maps: dict[str, str] = field(default_factory=dict)
+    """New name by the one that another map of the catalog has."""
+    photos: int = 0
+    changed_photos: int = 0
+    """Photos that the catalog knew in an older state."""
+    deleted_photos: int = 0
+    """Photos that the catalog knew, and that were deleted later."""
+    lost_originals: int = 0
+    """Photos of the journal whose original is gone: they stay out."""
+    doubled_photos: int = 0
+    """Photos whose bytes the map has under another id: they stay out."""
+    generations: int = 0
+    vocabularies: int = 0
+
+
+def take_in_rows(
+    catalog: Catalog,
+    store: ObjectStore,
+    states: LastStates,
+    taken: RowsTakenIn,
+    progress: Progress,
+) -> None:
+    """Insert and update the rows of every journaled table."""
+    rows = _Rows(store, states, taken)
+    for name, take_in in (
+        ("models", rows.model),
+        ("maps", rows.map),
+        ("vocabularies", rows.vocabulary),
+        ("whitenings", rows.whitening),
+        ("generations", rows.ended_generation),
+        ("generations", rows.active_generation),
+        ("photos", rows.photo),
+    ):
+        done, total = 0, states.count(name)
+        for lines in states.lines(name):
+            with catalog.write() as session:
+                rows.begin(session, lines)
+                _write(session, name, lines, take_in)
+            done += len(lines)
+            progress(f"{name} of the journal", done, total)
+
+
+TakeIn = Callable[[Session, Line, Line | None, Columns], bool]
+"""Whether the line is to be written; it may change the columns."""
+
+
+def _write(session: Session, name: str, lines: list[Line], take_in: TakeIn) -> None:
+    table = table_of(name)
+    new: dict[frozenset[str], list[Columns]] = defaultdict(list)
+    for line, known in unknown_lines(session, lines):
+        columns = {**columns_of(line), "revision": line.revision}
+        columns["journaled_revision"] = line.revision
+        if not take_in(session, line, known, columns):
+            continue
+        if known is None:
+            new[frozenset(columns)].append(columns)
+        else:
+            session.connection().execute(
+                update(table).where(table.c.id == line.id).values(**columns)
+            )
+    for rows in new.values():
+        session.connection().execute(insert(table), rows)
+
+
+class _Rows:
+    """Decides of each line what becomes of it."""
+
+    def __init__(self, store: ObjectStore, states: LastStates, taken: RowsTakenIn) -> None:
+        self._store = store
+        self._states = states
+        self._taken = taken
+        self._same_model: dict[UUID, UUID] = {}
+        self._live_maps: set[UUID] = set()
+        self._stored: set[str] = set()
+        self._live_bytes: dict[tuple[UUID, str], UUID] = {}
+        self._versions: dict[UUID, int] = {}
+
+    def begin(self, session: Session, lines: list[Line]) -> None:
+        """Look up what the lines of one transaction need."""
+        self._live_maps = set(session.scalars(select(Map.id).where(Map.deleted_at.is_(None))))
+        self._versions = {}
+        if lines[0].table == "photos":
+            self._stored = self._states.stored(line.row["object_key"] for line in lines)
+            live = session.execute(
+                select(Photo.map_id, Photo.sha256, Photo.id).where(
+                    Photo.sha256.in_([line.row["sha256"] for line in lines]),
+                    Photo.deleted_at.is_(None),
+                )
+            )
+            self._live_bytes = {(row.map_id, row.sha256): row.id for row in live}
+
+    def model(self, session: Session, line: Line, known: Line | None, columns: Columns) -> bool:
+        if known is None:
+            same = session.scalar(
+                select(Model.id).where(
+                    Model.name == columns["name"], Model.fingerprint == columns["fingerprint"]
+                )
+            )
+            if same is not None:
+                self._same_model[line.id] = same
+                return False
+        return True
+
+    def map(self, session: Session, line: Line, known: Line | None, columns: Columns) -> bool:
+        if columns["deleted_at"] is not None:
+            if known is None:
+                return False  # what is left of it belongs to no row
+            columns["name"] = f"{DELETED}{line.id}"
+        elif known is not None and known.row["deleted_at"] is not None:
+            return False
+        taken_name = session.scalar(
+            select(Map.id).where(Map.name == columns["name"], Map.id != line.id)
+        )
+        if taken_name is not None:
+            name = f"{columns['name'][:80]}-{line.id.hex[-8:]}"
+            self._taken.renamed_maps[columns["name"]] = name
+            columns |= {"name": name, "revision": line.revision + 1}
+        if known is None:
+            self._taken.maps += 1
+        return True
+
+    def vocabulary(
+        self, session: Session, line: Line, known: Line | None, columns: Columns
+    ) -> bool:
+        if columns["map_id"] not in self._live_maps:
+            return False
+        self._taken.vocabularies += known is None
+        return True
+
+    def whitening(self, session: Session, line: Line, known: Line | None, columns: Columns) -> bool:
+        return (
+            columns["map_id"] in self._live_maps
+            and self._store.head(columns["object_key"]) is not None
+        )
+
+    def ended_generation(
+        self, session: Session, line: Line, known: Line | None, columns: Columns
+    ) -> bool:
+        if columns["state"] == GenerationState.ACTIVE:
+            return False
+        if columns["state"] == GenerationState.BUILDING:
+            if known is not None:
+                return False
+            # The job that built it is not in the journal.
+            columns |= {"state": GenerationState.ABANDONED, "revision": line.revision + 1}
+            columns["ended_at"] = session.scalar(select(db_now()))
+        return self._generation(session, columns, known)
+
+    def active_generation(
+        self, session: Session, line: Line, known: Line | None, columns: Columns
+    ) -> bool:
+        if columns["state"] != GenerationState.ACTIVE:
+            return False
+        other = session.scalar(
+            select(Generation.id).where(
+                Generation.map_id == columns["map_id"],
+                Generation.state == GenerationState.ACTIVE,
+                Generation.id != line.id,
+            )
+        )
+        if other is not None:  # the catalog has gone another way since
+            return False
+        return self._generation(session, columns, known)
+
+    def _generation(self, session: Session, columns: Columns, known: Line | None) -> bool:
+        if columns["map_id"] not in self._live_maps:
+            return False
+        columns["model_id"] = self._same_model.get(columns["model_id"], columns["model_id"])
+        for table, name in ((Vocabulary, "vocabulary_id"), (Model, "model_id")):
+            if columns[name] is not None and session.get(table, columns[name]) is None:
+                return False  # in a damaged segment
+        whitening_id = columns["whitening_id"]
+        if whitening_id is not None and session.get(StoredWhitening, whitening_id) is None:
+            columns["whitening_id"] = None
+        self._taken.generations += known is None
+        return True
+
+    def photo(self, session: Session, line: Line, known: Line | None, columns: Columns) -> bool:
+        if columns["map_id"] not in self._live_maps:
+            return False
+        if columns["deleted_at"] is not None:
+            if known is None:
+                return False
+            self._taken.deleted_photos += known.row["deleted_at"] is None
+        elif known is not None and known.row["deleted_at"] is not None:
+            return False
+        elif known is None:
+            if columns["object_key"] not in self._stored:
+                self._taken.lost_originals += 1
+                return False
+            bytes_ = (columns["map_id"], columns["sha256"])
+            if self._live_bytes.setdefault(bytes_, line.id) != line.id:
+                self._taken.doubled_photos += 1
+                return False
+            self._taken.photos += 1
+        else:
+            self._taken.changed_photos += 1
+        map_id = columns["map_id"]
+        if map_id not in self._versions:
+            self._versions[map_id] = bump_version(session, map_id)
+        columns["changed_version"] = self._versions[map_id]
+        return True
