@@ -324,10 +324,10 @@ def collect_orphans(
     found, before = count.orphans.total(), read_hold(store)
     if found and not confirmed:
         reason = None
-        if catalog_lag(catalog, store) is not None:
-            reason = HoldReason.CATALOG_BEHIND
-        elif before is not None and before.reason == HoldReason.ADOPTED:
+        if before is not None and before.reason == HoldReason.ADOPTED:
             reason = HoldReason.ADOPTED
+        elif catalog_lag(catalog, store) is not None:
+            reason = HoldReason.CATALOG_BEHIND
         elif found > max(ALWAYS_COLLECTED, max_share * count.objects):
             reason = HoldReason.SHARE
         if reason is not None:

@@ -82,6 +82,7 @@ class Steward:
         # Of the catalog's own disk, where it is a file.
         catalog_file = sqlite_file(catalog)
         reserve = catalog_file and DiskReserve(catalog_file.parent, settings.min_free_bytes)
+        self._journal = Duty("write journal", 2.0, JournalDuty(catalog, store, metrics))
         self.duties = [
             *([Duty("keep disk reserve", 5.0, reserve.keep)] if reserve else []),
             Duty(
@@ -113,7 +114,7 @@ class Steward:
                     compact(catalog, store, settings.compact_chunks, merge_retries)
                 ),
             ),
-            Duty("write journal", 2.0, JournalDuty(catalog, store, metrics)),
+            self._journal,
             Duty("delete maps", 1.0, lambda: delete_maps(catalog, counted("delete_maps"))),
             Duty("collect", 10.0, lambda: collect(catalog, counted("collect"), settings)),
             Duty(
@@ -152,13 +153,14 @@ class Steward:
         ]
 
     def run(self, stop: threading.Event) -> None:
-        """Do what is due until `stop` is set."""
+        """Do what is due until `stop` is set; then write what the journal does not have yet."""
         while not stop.is_set():
             for duty in self.duties:
                 if time.monotonic() >= duty.due and not stop.is_set():
                     self._do(duty)
                     self._heartbeat.beat()
             stop.wait(TICK_SECONDS)
+        self._do(self._journal)
 
     def _do(self, duty: Duty) -> None:
         started, outcome = time.monotonic(), "done"

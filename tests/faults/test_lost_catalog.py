@@ -18,7 +18,7 @@ from typing import Any
 import pytest
 
 from shared.objects import OwnedStore
-from shared.objects.keys import ORIGINALS, TRASH, key_before_trash
+from shared.objects.keys import JOURNAL, ORIGINALS, TRASH, key_before_trash
 from shared.objects.open_store import open_store
 from shared.settings import Settings
 from tests.support.metrics import read
@@ -52,8 +52,9 @@ class Filled:
         return {info.key for info in self.store.list(ORIGINALS)}
 
     def kept(self) -> set[str]:
-        """The keys of all objects, those in the trash by the keys that they had before."""
-        keys = {info.key for info in self.store.list("")}
+        """The keys of all objects but notes and the journal, those in the trash by the keys that they had
+        before."""
+        keys = {i.key for i in self.store.list("") if not i.key.startswith((JOURNAL, "."))}
         return {key_before_trash(key) if key.startswith(TRASH) else key for key in keys}
 
     def remove_catalog(self) -> None:

@@ -36,6 +36,7 @@ from shared.catalog.chunks import Chunk, Descriptor, count_searchable, live_chun
 from shared.catalog.direct_uploads import DirectUpload
 from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.idempotency import CallMade, KeyedCall, claim_key
+from shared.catalog.installation import REBUILDING, ensure_installation
 from shared.catalog.maps import Map
 from shared.catalog.photos import Photo, get_photo
 from shared.catalog.session import Catalog
@@ -618,9 +619,13 @@ def test_single_orphan_is_held_where_the_catalog_is_behind_or_adopted_the_store(
 ) -> None:
     house.store.put(orphan := new_original_key(), b"orphan")
     house.age({orphan}, 2 * DAY_SECONDS)
+    with house.catalog.write() as session:
+        ensure_installation(session).journal_sequence = REBUILDING
     with pytest.raises(CollectionHeld) as caught:
-        collect_orphans(house.catalog, house.store, DAY_SECONDS, catalog_is_behind=lambda *_: True)
+        collect_orphans(house.catalog, house.store, DAY_SECONDS)
     assert caught.value.hold.reason == HoldReason.CATALOG_BEHIND
+    with house.catalog.write() as session:
+        ensure_installation(session).journal_sequence = 0
     write_hold(house.store, Hold(HoldReason.ADOPTED, 1, 6, 1))
     assert collect_orphans(house.catalog, house.store, 3 * DAY_SECONDS) == 0  # it is too young
     with pytest.raises(CollectionHeld) as caught:
