@@ -52,8 +52,7 @@ class Filled:
         return {info.key for info in self.store.list(ORIGINALS)}
 
     def kept(self) -> set[str]:
-        """The keys of all objects but notes and the journal, those in the trash by the keys that they had
-        before."""
+        """The keys of all objects but notes and the journal; of the trash, those from before."""
         keys = {i.key for i in self.store.list("") if not i.key.startswith((JOURNAL, "."))}
         return {key_before_trash(key) if key.startswith(TRASH) else key for key in keys}
 
@@ -168,7 +167,7 @@ def test_older_catalog_deletes_no_original(filled: Filled) -> None:
 
 
 def test_adopted_store_keeps_what_its_new_catalog_does_not_know(filled: Filled) -> None:
-    originals, before = filled.originals(), {info.key for info in filled.store.list("")}
+    originals, before = filled.originals(), filled.kept()
     owner = filled.store.read_note(".placewise")
     assert owner is not None
     filled.remove_catalog()
@@ -201,4 +200,4 @@ def test_adopted_store_keeps_what_its_new_catalog_does_not_know(filled: Filled) 
         assert back == {"restored": confirmed["moved"], "kept_in_trash": 0}
     assert filled.originals() == originals
     filled.store.write_note(".placewise", owner)  # of the bucket, for the other tests
-    assert {info.key for info in filled.store.list("")} >= before
+    assert filled.kept() >= before
