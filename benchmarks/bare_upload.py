@@ -39,4 +39,6 @@ def create_app(bucket: Bucket) -> FastAPI:
 
 
 if __name__ == "__main__":
-    uvicorn.run(create_app(Bucket.of(Settings())), port=int(sys.argv[1]), log_level="warning")
+    uvicorn.run(
+        create_app(Bucket.from_settings(Settings())), port=int(sys.argv[1]), log_level="warning"
+    )

@@ -17,8 +17,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from benchmarks.asked import Asked, ask, figures_of
-from benchmarks.picture import draw_answers
+from benchmarks.asked import QueryOutcome, query_with_photo, summarise_outcomes
+from benchmarks.picture import draw_outcomes
 from shared.client import Client
 from shared.datasets.city.plan import CityOptions, make_plan
 from shared.datasets.city.write import NOT_COMPARABLE, write_city
@@ -38,12 +38,12 @@ def main() -> None:
         os.environ["PLACEWISE_HOME"] = str(Path(folder, "home"))
         os.environ["AUTO_EVALUATE_PHOTOS"] = "0"  # the demo evaluates when it wants to print
         city = Path(folder, "city")
-        _draw(options, city, progress)
+        _draw_city(options, city, progress)
         with connect(None, None) as client:
-            asked = _live(client, city, progress)
-        _print_unseen(asked)
+            asked = _run_demo(client, city, progress)
+        _print_outcomes(asked)
         if options.picture:
-            draw_answers(asked, city / "database", options.picture)
+            draw_outcomes(asked, city / "database", options.picture)
             print(f"Queries and their matches: {options.picture}")
 
 
@@ -58,7 +58,7 @@ def _arguments() -> argparse.Namespace:
     return parser.parse_args()
 
 
-def _draw(options: argparse.Namespace, city: Path, progress: Progress) -> None:
+def _draw_city(options: argparse.Namespace, city: Path, progress: Progress) -> None:
     plan = make_plan(
         CityOptions(
             places=options.places,
@@ -72,45 +72,49 @@ def _draw(options: argparse.Namespace, city: Path, progress: Progress) -> None:
             train=False,
         )
     )
-    bar = progress.add_task("drawing the city", total=len(plan.shots))
+    bar = progress.add_task("drawing the city", total=len(plan.photos))
     write_city(plan, city, lambda count: progress.advance(bar, count))
 
 
-def _live(client: Client, city: Path, progress: Progress) -> list[Asked]:
+def _run_demo(client: Client, city: Path, progress: Progress) -> list[QueryOutcome]:
     """Index, evaluate, fit, evaluate, ask; prints recall before and after the fit."""
     from services.cli.photo_places import find_photos
-    from services.cli.upload_many import upload_many
+    from services.cli.upload_many import upload_photos
     from services.cli.vocabulary import fit_and_wait
-    from services.cli.wait import wait_with_bar
+    from services.cli.wait import wait_for_job
 
     database = find_photos(city / "database", None, None)
     queries = find_photos(city / "queries", None, None)
     labelled = [replace(q, fields={**q.fields, "role": "query"}) for q in queries[::2]]
-    indexed = upload_many(client, database + labelled, fit=False, progress=progress)
+    indexed = upload_photos(client, database + labelled, fit=False, progress=progress)
     print(NOT_COMPARABLE)
     print(f"{indexed['searchable']} photos indexed; R@1 / R@5 / R@10 of the labelled queries:")
     for vocabulary in ("foreign", "own"):
         if vocabulary == "own":
             fit_and_wait(client, {}, progress)
-        job = wait_with_bar(client, client.evaluate()["job_id"], progress, "evaluating")
+        job = wait_for_job(client, client.evaluate()["job_id"], progress, "evaluating")
         found = job["result"]["labelled_queries"]
         shares = " / ".join(f"{found[f'R@{k}']:.1%}" for k in (1, 5, 10))
         print(f"  {vocabulary:7s} vocabulary  {shares}  ({found['queries']} queries)")
     bar = progress.add_task("asking", total=len(queries[1::2]))
     asked = []
     for query in queries[1::2]:
-        asked.append(ask(client, query, database))
+        asked.append(query_with_photo(client, query, database))
         progress.advance(bar)
     return asked
 
 
-def _print_unseen(asked: list[Asked]) -> None:
-    found = figures_of(asked)
+def _print_outcomes(outcomes: list[QueryOutcome]) -> None:
+    found = summarise_outcomes(outcomes)
     print(f"{found['queries']} photos that it had never seen, {found['out_of_map']} out of map:")
     print(f"  right place first, of those in the map    {found['R@1']:.1%}")
-    print(f"  of the estimates that it gave, right      {_percent(found['right_of_accepted'])}")
-    print(f"  places in the map that it gave            {_percent(found['accepted_in_map'])}")
-    print(f"  false accepts of photos out of map        {_percent(found['false_accepts'])}")
+    print(
+        f"  of the estimates that it gave, right      {_format_percent(found['right_of_accepted'])}"
+    )
+    print(
+        f"  places in the map that it gave            {_format_percent(found['accepted_in_map'])}"
+    )
+    print(f"  false accepts of photos out of map        {_format_percent(found['false_accepts'])}")
     print(f"  median error of the right ones            {found['median_error_m']:.1f} m")
     if found["calibration_error"] is not None:
         print(f"  calibration error of the confidence       {found['calibration_error']:.3f}")
@@ -118,7 +122,7 @@ def _print_unseen(asked: list[Asked]) -> None:
         print(f"  recall at 99 % precision                  {found['recall_at_99_precision']:.1%}")
 
 
-def _percent(share: float | None) -> str:
+def _format_percent(share: float | None) -> str:
     return "-" if share is None else f"{share:.1%}"
 
 

@@ -12,14 +12,14 @@ from sqlalchemy import func, select
 
 from shared.catalog.session import Catalog
 from shared.jobs import Job, JobKind, JobState
-from shared.jobs.table import UNFINISHED
+from shared.jobs.table import UNFINISHED_STATES
 from shared.objects import ObjectStore
 
-LOOK_SECONDS = 0.2
-MANIFEST = ".json"
+POLL_SECONDS = 0.2
+MANIFEST_SUFFIX = ".json"
 
 
-def described(store: ObjectStore) -> Counter[UUID]:
+def count_descriptions(store: ObjectStore) -> Counter[UUID]:
     """How often each photo was described.
 
     A worker writes its chunk, with a manifest that names the photos, before it asks whether it may
@@ -28,7 +28,7 @@ def described(store: ObjectStore) -> Counter[UUID]:
     """
     found: Counter[UUID] = Counter()
     for info in store.list("chunks/"):
-        if info.key.endswith(MANIFEST):
+        if info.key.endswith(MANIFEST_SUFFIX):
             found.update(UUID(name) for name in json.loads(store.get(info.key))["photo_ids"])
     return found
 
@@ -49,15 +49,15 @@ def wait_for_jobs(
                 ).all()
             )
         assert not counts.get(JobState.FAILED), f"{counts[JobState.FAILED]} photos have failed"
-        left = sum(counts.get(state, 0) for state in UNFINISHED)
+        left = sum(counts.get(state, 0) for state in UNFINISHED_STATES)
         on_left(left)
         if not left:
             return
         assert time.monotonic() < deadline, f"{left} photos wait after {seconds:g} s"
-        time.sleep(LOOK_SECONDS)
+        time.sleep(POLL_SECONDS)
 
 
-def jobs_of(catalog: Catalog, job_ids: Collection[UUID]) -> list[Job]:
+def load_jobs(catalog: Catalog, job_ids: Collection[UUID]) -> list[Job]:
     """These jobs, as they are now."""
     with catalog.read() as session:
         return list(session.scalars(select(Job).where(Job.id.in_(job_ids))))

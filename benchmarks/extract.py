@@ -25,26 +25,26 @@ from numpy.typing import NDArray
 from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.utils.flop_counter import FlopCounterMode
 
-from benchmarks.networks import Measured, centres_for
+from benchmarks.networks import BenchmarkedExtractor, fit_or_load_centres
 from benchmarks.reference_anyloc import ReferenceAnyLoc
 from benchmarks.report import Report
-from benchmarks.traffic import photos_of
+from benchmarks.traffic import make_jpegs
 from services.extractor.decoding import DecoderPool
 from shared.errors import PlacewiseError
 from shared.vision.extractors import Extractor
-from shared.vision.precision import Precision, choose_precision, computing_in
+from shared.vision.precision import Precision, autocast, choose_precision
 from shared.vision.resample import Pixels
-from shared.vision.vocabulary import Centres
+from shared.vision.vocabulary import ClusterCentres
 from tests.support.fit_memory import memory_bytes
 
 if TYPE_CHECKING:
     from rich.progress import Progress
 
-WANTED_TIMES = 2.0
+TARGET_SPEEDUP = 2.0
 SIZE, SIZE_BYTES = (1024, 768), 100_000
 TEXTURES = 32
-LEARNT_FROM = 16  # further ones, enough for 64 centres: to be one's own centre leaves only rounding
-MATRIX = {"cpu": 2048, "cuda": 8192}  # rows and columns
+FIT_PHOTOS = 16  # further ones, enough for 64 centres: to be one's own centre leaves only rounding
+MATRIX_SIZE = {"cpu": 2048, "cuda": 8192}  # rows and columns
 MATRIX_ROUNDS = 5
 
 Rows = NDArray[np.float32]
@@ -63,15 +63,15 @@ def measure(
     """`rounds` of `photos` by either way. Only `anyloc-` extractors with hard VLAD are published,
     and compared; of others our own figures are told.
     """
-    made = photos_of(LEARNT_FROM + min(TEXTURES, photos), SIZE, SIZE_BYTES)
-    textures = made[LEARNT_FROM:]
+    made = make_jpegs(FIT_PHOTOS + min(TEXTURES, photos), SIZE, SIZE_BYTES)
+    textures = made[FIT_PHOTOS:]
     files = [textures[number % len(textures)] for number in range(photos)]
     with tempfile.TemporaryDirectory() as folder:
-        measured = Measured.of(extractor, device, Path(folder))
+        measured = BenchmarkedExtractor.of(extractor, device, Path(folder))
         chosen = choose_precision(precision, measured.recipe, measured.device)
         report = Report(f"{measured.title}, {chosen}")
-        with _pipeline(measured, chosen, batch, made[:LEARNT_FROM]) as pipeline:
-            _measure(report, progress, measured, pipeline, files, rounds)
+        with _open_pipeline(measured, chosen, batch, made[:FIT_PHOTOS]) as pipeline:
+            _run_rounds(report, progress, measured, pipeline, files, rounds)
     report.details = {
         "random_weights": measured.random,
         "precision": chosen,
@@ -83,21 +83,21 @@ def measure(
     return report
 
 
-def _measure(
+def _run_rounds(
     report: Report,
     progress: Progress,
-    measured: Measured,
-    pipeline: Pipeline,
+    measured: BenchmarkedExtractor,
+    pipeline: ExtractionPipeline,
     files: Sequence[bytes],
     rounds: int,
 ) -> None:
     published = measured.recipe.depth is not None and measured.recipe.aggregator == "vlad"
     bar = progress.add_task("rounds", total=rounds)
     pipeline.describe(files[: 2 * pipeline.batch])  # kernels are chosen, the decoders are there
-    ours, theirs = Times(), Times()
-    _forget_peak(measured.device)
+    ours, theirs = RoundTimings(), RoundTimings()
+    _reset_peak_memory(measured.device)
     rows = ours.take(lambda: pipeline.describe(files))
-    peak_bytes = _peak(measured.device)
+    peak_bytes = _peak_memory_bytes(measured.device)
     reference, wanted = None, rows
     if published:
         assert pipeline.centres is not None
@@ -120,24 +120,24 @@ def _measure(
             published_ms = theirs.cpu_milliseconds(len(files))
             report.add("CPU time of a photo as published", published_ms, "ms")
         ratios = [slow / quick for slow, quick in zip(theirs.seconds, ours.seconds, strict=True)]
-        report.add("times as fast", statistics.median(ratios), at_least=WANTED_TIMES)
+        report.add("times as fast", statistics.median(ratios), at_least=TARGET_SPEEDUP)
         report.add("largest difference of two numbers", float(np.abs(rows - wanted).max()))
         report.add("least cosine of two descriptors", float((rows * wanted).sum(axis=1).min()))
-    flop = _flop(pipeline.made, pipeline.pixels(files[:1])[0])
-    ceiling = _matrix_flops(measured.device, pipeline.made.precision)
+    flop = _count_flops(pipeline.made, pipeline.pixels(files[:1])[0])
+    ceiling = _matmul_flops_per_second(measured.device, pipeline.made.precision)
     report.add("forward pass of a photo", flop / 1e9, "GFLOP")
     report.add("matrix products on this device", ceiling / 1e9, "GFLOP/s")
     report.add("of them, this pipeline", rate * flop / ceiling)
     report.add("peak memory", peak_bytes / 1e6, "MB")
 
 
-class Pipeline:
+class ExtractionPipeline:
     """As the extractor does it: decoding children are a batch ahead of the network."""
 
     def __init__(self, made: Extractor, decoders: DecoderPool, batch: int) -> None:
         self.made = made
         self.batch = batch
-        self.centres: Centres | None = None
+        self.centres: ClusterCentres | None = None
         self._decoders = decoders
 
     def pixels(self, files: Sequence[bytes]) -> list[Pixels]:
@@ -163,17 +163,17 @@ class Pipeline:
 
 
 @contextlib.contextmanager
-def _pipeline(
-    measured: Measured, precision: Precision, batch: int, learnt_from: Sequence[bytes]
-) -> Iterator[Pipeline]:
+def _open_pipeline(
+    measured: BenchmarkedExtractor, precision: Precision, batch: int, learnt_from: Sequence[bytes]
+) -> Iterator[ExtractionPipeline]:
     with contextlib.closing(DecoderPool(measured.settings)) as decoders:
-        pipeline = Pipeline(measured.load(precision), decoders, batch)
-        pipeline.centres = centres_for(pipeline.made, pipeline.pixels(learnt_from))
+        pipeline = ExtractionPipeline(measured.load(precision), decoders, batch)
+        pipeline.centres = fit_or_load_centres(pipeline.made, pipeline.pixels(learnt_from))
         yield pipeline
 
 
 @dataclass(slots=True)
-class Times:
+class RoundTimings:
     """Of one way, a round after the other."""
 
     seconds: list[float] = field(default_factory=list)
@@ -198,7 +198,7 @@ def _cpu_seconds() -> float:
     return sum(sum(process.cpu_times()[:2]) for process in processes)
 
 
-def _flop(made: Extractor, photo: Pixels) -> float:
+def _count_flops(made: Extractor, photo: Pixels) -> float:
     """Floating-point operations of the backbone for one photo; a product and its sum are two."""
     # Fused attention is not counted on every device; written out, it always is.
     with sdpa_kernel(SDPBackend.MATH), FlopCounterMode(display=False) as counter:
@@ -206,13 +206,13 @@ def _flop(made: Extractor, photo: Pixels) -> float:
     return float(counter.get_total_flops())
 
 
-def _matrix_flops(device: torch.device, precision: Precision) -> float:
+def _matmul_flops_per_second(device: torch.device, precision: Precision) -> float:
     """The best of some products of two square matrices, in operations per second."""
-    side = MATRIX[device.type]
+    side = MATRIX_SIZE[device.type]
     kind = torch.float32 if precision == "float32" else torch.bfloat16
     one = torch.rand(side, side, device=device, dtype=kind)
     best = 0.0
-    with computing_in("float32", device):
+    with autocast("float32", device):
         for _ in range(MATRIX_ROUNDS):
             begun = time.perf_counter()
             (one @ one)[0, 0].item()  # waits for the device
@@ -220,14 +220,14 @@ def _matrix_flops(device: torch.device, precision: Precision) -> float:
     return best
 
 
-def _forget_peak(device: torch.device) -> None:
+def _reset_peak_memory(device: torch.device) -> None:
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)
     else:
         Path(f"/proc/{os.getpid()}/clear_refs").write_text("5")  # proc(5): VmHWM starts anew
 
 
-def _peak(device: torch.device) -> float:
+def _peak_memory_bytes(device: torch.device) -> float:
     """Bytes: of the GPU's memory, or of this process without its decoders."""
     if device.type == "cuda":
         return torch.cuda.max_memory_allocated(device)

@@ -13,30 +13,30 @@ import torch
 
 from services.cli.configuration import read_settings
 from shared.errors import Misconfigured
-from shared.recipes import Recipe
+from shared.recipes import ExtractorConfig
 from shared.settings import Settings
 from shared.vision.backbones.dinov2 import SHAPES
-from shared.vision.backbones.dinov2_weights import weights_at_hand
+from shared.vision.backbones.dinov2_weights import find_local_weights
 from shared.vision.extractors import Extractor, choose_device
-from shared.vision.fit_photos import fit_photos
+from shared.vision.fit_photos import fit_vocabulary
 from shared.vision.precision import Precision
 from shared.vision.resample import Pixels
-from shared.vision.vocabulary import Centres
+from shared.vision.vocabulary import ClusterCentres
 from tests.support.vit import random_weights, save
 
 
 @dataclass(frozen=True, slots=True)
-class Measured:
+class BenchmarkedExtractor:
     """What is measured, and with which weights."""
 
-    recipe: Recipe
+    recipe: ExtractorConfig
     device: torch.device
     settings: Settings
     dino_weights: Path | None
     random: bool
 
     @classmethod
-    def of(cls, extractor: str, device: str, folder: Path) -> Measured:
+    def of(cls, extractor: str, device: str, folder: Path) -> BenchmarkedExtractor:
         """`folder` takes random weights, where there are no others. Raises Misconfigured for an
         extractor or a device that can't be had.
         """
@@ -46,7 +46,7 @@ class Measured:
         if recipe.depth is not None:
             size = recipe.backbone.removeprefix("dinov2-")
             try:
-                weights = weights_at_hand(size, weights)
+                weights = find_local_weights(size, weights)
             except Misconfigured as error:
                 if error.code != "weights_missing":
                     raise
@@ -69,7 +69,7 @@ class Measured:
         return f"{self.recipe.name}{', random weights' if self.random else ''}, {name}"
 
 
-def centres_for(extractor: Extractor, photos: list[Pixels]) -> Centres | None:
+def fit_or_load_centres(extractor: Extractor, photos: list[Pixels]) -> ClusterCentres | None:
     """The shipped ones, or learnt from the photos where some are needed and none are shipped."""
     if not extractor.recipe.needs_vocabulary:
         return None
@@ -77,4 +77,4 @@ def centres_for(extractor: Extractor, photos: list[Pixels]) -> Centres | None:
     if shipped is not None:
         return shipped[0]
     clusters = extractor.recipe.clusters
-    return fit_photos(extractor, [photos], len(photos), clusters=clusters, seed=0).centres
+    return fit_vocabulary(extractor, [photos], len(photos), clusters=clusters, seed=0).centres

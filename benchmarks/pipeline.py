@@ -19,24 +19,24 @@ import torch
 from sqlalchemy import select
 
 from benchmarks.described import wait_for_jobs
-from benchmarks.fleet import Fleet, Servers, Service, start_servers
+from benchmarks.fleet import Fleet, Servers, ServiceProcess, start_servers
 from benchmarks.report import Report
-from benchmarks.traffic import form_of, photos_of, upload_all
+from benchmarks.traffic import make_jpegs, multipart_form, upload_all
 from shared.catalog.maps import Map
-from shared.recipes import get_recipe
-from shared.search_http import HttpSearch
+from shared.recipes import get_extractor_config
+from shared.search_http import HttpSearchClient
 from shared.vision.extractors import Extractor
 from tests.support.servers.daemon import free_ports
 
 if TYPE_CHECKING:
     from rich.progress import Progress
 
-WANTED_MILLISECONDS = 30.0
-WANTED_OF_BARE = 0.5
+TARGET_MILLISECONDS = 30.0
+TARGET_SHARE_OF_BARE = 0.5
 SIZE, SIZE_BYTES = (1024, 768), 100_000
 TEXTURES = 32
 CLIENTS = 4
-SECONDS = 900.0
+TIMEOUT_SECONDS = 900.0
 SERVICES = ("gateway", "extractor", "search", "steward")
 
 
@@ -46,17 +46,17 @@ def measure(
     """`photos` of 100 kB at each width of descriptors, `batch` at once; then `rounds` of uploads
     to the gateway and to the bare one in turn."""
     report = Report("Around the model, for each photo")
-    made = photos_of(TEXTURES, SIZE, SIZE_BYTES)
+    made = make_jpegs(TEXTURES, SIZE, SIZE_BYTES)
     with start_servers() as servers:
         for width in widths:
-            with _fleet(servers, width, batch) as fleet:
+            with _open_fleet(servers, width, batch) as fleet:
                 fleet.start()
                 bar = progress.add_task(f"{width:,} dimensions", total=photos)
-                _cpu(report, fleet, made, width, photos, batch, progress, bar)
-        with _fleet(servers, widths[0], batch) as fleet:
+                _measure_cpu(report, fleet, made, width, photos, batch, progress, bar)
+        with _open_fleet(servers, widths[0], batch) as fleet:
             bar = progress.add_task("gateway beside a bare one", total=2 * rounds * photos)
             fleet.start("search-0-0", "gateway-0")
-            _uploads(report, fleet, made, photos, rounds, lambda: progress.advance(bar))
+            _measure_uploads(report, fleet, made, photos, rounds, lambda: progress.advance(bar))
     report.details = {
         "photo_bytes": statistics.mean(len(photo) for photo in made),
         "photos": photos,
@@ -66,24 +66,24 @@ def measure(
 
 
 @contextlib.contextmanager
-def _fleet(servers: Servers, width: int, batch: int) -> Iterator[Fleet]:
+def _open_fleet(servers: Servers, width: int, batch: int) -> Iterator[Fleet]:
     with (
         tempfile.TemporaryDirectory() as folder,
         Fleet(
             Path(folder),
             servers,
-            extractor=_recipe(width),
+            extractor=_test_extractor(width),
             batch_photos=batch,
         ) as fleet,
     ):
         yield fleet
 
 
-def _recipe(width: int) -> str:
+def _test_extractor(width: int) -> str:
     return f"test-slow-avg:milliseconds=0,width={width}"
 
 
-def _cpu(
+def _measure_cpu(
     report: Report,
     fleet: Fleet,
     made: Sequence[bytes],
@@ -93,11 +93,13 @@ def _cpu(
     progress: Progress,
     bar: object,
 ) -> None:
-    _index(fleet, made, 2 * batch, lambda left: None)  # models, decoders, connections
+    _upload_and_wait(fleet, made, 2 * batch, lambda left: None)  # models, decoders, connections
     before, servers_before = fleet.cpu_seconds(), fleet.server_cpu_seconds()
-    _index(fleet, made, photos, lambda left: progress.update(bar, completed=photos - left))  # type: ignore[arg-type]
+    _upload_and_wait(
+        fleet, made, photos, lambda left: progress.update(bar, completed=photos - left)
+    )  # type: ignore[arg-type]
     after, servers_after = fleet.cpu_seconds(), fleet.server_cpu_seconds()
-    assert not fleet.fell, fleet.logs()
+    assert not fleet.crashed, fleet.logs()
     ours = {
         service: sum(
             1000 * (after[name] - before[name]) / photos
@@ -111,21 +113,21 @@ def _cpu(
     at = f"at {width:,} dimensions"
     for service, milliseconds in ours.items():
         report.add(f"{service} {at}", milliseconds, "ms")
-    report.add(f"ours {at}", sum(ours.values()), "ms", at_most=WANTED_MILLISECONDS)
+    report.add(f"ours {at}", sum(ours.values()), "ms", at_most=TARGET_MILLISECONDS)
     report.add(f"(the model's own, taken off) {at}", model, "ms")
     for name, seconds in servers_after.items():
         used = 1000 * (seconds - servers_before[name]) / photos
         report.add(f"{name} {at}", used, "ms")
 
 
-def _index(fleet: Fleet, made: Sequence[bytes], photos: int, on_left: object) -> None:
+def _upload_and_wait(fleet: Fleet, made: Sequence[bytes], photos: int, on_left: object) -> None:
     """Upload, and wait until all of it can be found."""
-    forms = [form_of(made[number % len(made)]) for number in range(photos)]
+    forms = [multipart_form(made[number % len(made)]) for number in range(photos)]
     upload_all(fleet.gateway_urls[0], forms, CLIENTS)
-    wait_for_jobs(fleet.catalog, SECONDS, on_left)  # type: ignore[arg-type]
+    wait_for_jobs(fleet.catalog, TIMEOUT_SECONDS, on_left)  # type: ignore[arg-type]
     with fleet.catalog.read() as session:
         wanted = session.scalars(select(Map.version)).one()
-    with HttpSearch(fleet.search_urls, timeout_seconds=10) as search:
+    with HttpSearchClient(fleet.search_urls, timeout_seconds=10) as search:
         while min(search.status().versions.values(), default=0) < wanted:
             time.sleep(0.2)
 
@@ -133,7 +135,7 @@ def _index(fleet: Fleet, made: Sequence[bytes], photos: int, on_left: object) ->
 def _model_milliseconds(width: int, batch: int) -> float:
     """CPU time that the backbone itself takes of a photo: it only picks pixels, but not for
     nothing."""
-    recipe = get_recipe(_recipe(width), allow_test_extractors=True)
+    recipe = get_extractor_config(_test_extractor(width), allow_test_extractors=True)
     extractor = Extractor(recipe, torch.device("cpu"))
     pixels = np.zeros((batch, 224, 224, 3), np.uint8)
     extractor.describe(pixels, None)
@@ -143,7 +145,7 @@ def _model_milliseconds(width: int, batch: int) -> float:
     return 1000 * (time.process_time() - begun) / 10 / batch
 
 
-def _uploads(
+def _measure_uploads(
     report: Report,
     fleet: Fleet,
     made: Sequence[bytes],
@@ -153,16 +155,16 @@ def _uploads(
 ) -> None:
     """No extractor runs: each server has the machine, the store and the clients to itself."""
     rates: dict[str, list[float]] = {"gateway": [], "bare": []}
-    with _bare(fleet) as bare:
+    with _start_bare_server(fleet) as bare:
         targets = {
             "gateway": (fleet.gateway_urls[0], "/api/v1/upload"),
             "bare": (bare, "/upload"),
         }
         for url, path in targets.values():
-            upload_all(url, [form_of(made[0]) for _ in range(20)], CLIENTS, path=path)
+            upload_all(url, [multipart_form(made[0]) for _ in range(20)], CLIENTS, path=path)
         for _ in range(rounds):
             for name, (url, path) in targets.items():
-                forms = [form_of(made[number % len(made)]) for number in range(photos)]
+                forms = [multipart_form(made[number % len(made)]) for number in range(photos)]
                 begun = time.perf_counter()
                 upload_all(url, forms, CLIENTS, path=path, on_done=on_done)  # type: ignore[arg-type]
                 rates[name].append(photos / (time.perf_counter() - begun))
@@ -173,13 +175,13 @@ def _uploads(
             "/s",
         )
     ratios = [ours / theirs for ours, theirs in zip(rates["gateway"], rates["bare"], strict=True)]
-    report.add("gateway, of bare", statistics.median(ratios), at_least=WANTED_OF_BARE)
+    report.add("gateway, of bare", statistics.median(ratios), at_least=TARGET_SHARE_OF_BARE)
 
 
 @contextlib.contextmanager
-def _bare(fleet: Fleet) -> Iterator[str]:
+def _start_bare_server(fleet: Fleet) -> Iterator[str]:
     port = free_ports(1)[0]
-    service = Service(
+    service = ServiceProcess(
         "bare",
         [sys.executable, "-m", "benchmarks.bare_upload", str(port)],
         fleet["gateway-0"].environment | {"PYTHONPATH": str(Path(__file__).parents[1])},

@@ -17,24 +17,24 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 
-from benchmarks.networks import Measured, centres_for
+from benchmarks.networks import BenchmarkedExtractor, fit_or_load_centres
 from benchmarks.report import Report
-from shared.datasets.city.plan import CityOptions, Shot, make_plan
+from shared.datasets.city.plan import CityOptions, PlannedPhoto, make_plan
 from shared.datasets.city.write import write_city
-from shared.datasets.recall import rank, recall_at, true_positives
+from shared.datasets.recall import positives_within, rank_by_similarity, recall_at_k
 from shared.vision.extractors import Extractor
 from shared.vision.precision import PRECISIONS, Precision
 from shared.vision.resample import Pixels
-from shared.vision.vocabulary import Centres
+from shared.vision.vocabulary import ClusterCentres
 
 if TYPE_CHECKING:
     from rich.progress import Progress
 
-WANTED_PATCH_COSINE = 0.999
-WANTED_QUERIES = 1
+TARGET_PATCH_COSINE = 0.999
+MAX_QUERY_DIFFERENCE = 1
 SIZE = 320, 240
 VIEWS = 2
-LEARNT_FROM = 32  # photos, where no vocabulary is shipped
+FIT_PHOTOS = 32  # photos, where no vocabulary is shipped
 
 Rows = NDArray[np.float32]
 
@@ -44,15 +44,16 @@ def measure(
 ) -> Report:
     """A city of so many places, two views of each; the vocabulary is that of float32 for both."""
     with tempfile.TemporaryDirectory() as folder:
-        measured = Measured.of(extractor, device, Path(folder))
+        measured = BenchmarkedExtractor.of(extractor, device, Path(folder))
         single = measured.load("float32")
-        shots, files = _draw(progress, Path(folder, "city"), places, queries)
-        found = _Found(
-            single, centres_for(single, [_pixels(single, f) for f in files[:LEARNT_FROM]])
+        shots, files = _draw_city(progress, Path(folder, "city"), places, queries)
+        found = _PrecisionComparison(
+            single,
+            fit_or_load_centres(single, [_load_pixels(single, f) for f in files[:FIT_PHOTOS]]),
         )
         bar = progress.add_task("describing in both precisions", total=len(files))
         for begin in range(0, len(files), batch):
-            chosen = [_pixels(single, file) for file in files[begin : begin + batch]]
+            chosen = [_load_pixels(single, file) for file in files[begin : begin + batch]]
             found.add(chosen)
             progress.advance(bar, len(chosen))
     report = Report(f"{measured.title}: bfloat16 against float32")
@@ -66,11 +67,11 @@ def measure(
 
 
 @dataclass(slots=True)
-class _Found:
+class _PrecisionComparison:
     """What has been described so far, in both precisions."""
 
     single: Extractor
-    centres: Centres | None
+    centres: ClusterCentres | None
     patch_cosines: list[Rows] = field(default_factory=list)
     rows: dict[Precision, list[Rows]] = field(
         default_factory=lambda: {precision: [] for precision in PRECISIONS}
@@ -84,12 +85,12 @@ class _Found:
             self.rows[precision].append(made.describe(photos, self.centres))
         self.patch_cosines.append((local[0] * local[1]).sum(dim=-1).flatten().numpy())
 
-    def tell(self, report: Report, shots: Sequence[Shot]) -> None:
+    def tell(self, report: Report, shots: Sequence[PlannedPhoto]) -> None:
         patches = np.concatenate(self.patch_cosines)
         report.add(
             "patches, mean cosine",
             float(patches.mean()),
-            at_least=WANTED_PATCH_COSINE,
+            at_least=TARGET_PATCH_COSINE,
         )
         report.add("patches, least cosine", float(patches.min()))
         rows = {precision: np.concatenate(found) for precision, found in self.rows.items()}
@@ -98,19 +99,19 @@ class _Found:
         report.add("descriptors, least cosine", float(cosines.min()))
         database = np.array([shot.role == "database" for shot in shots])
         positions = np.array([(shot.camera.x, shot.camera.y) for shot in shots])
-        positives = true_positives(positions[~database], positions[database])
+        positives = positives_within(positions[~database], positions[database])
         right = {}
         for precision, found in rows.items():
-            ranked = rank(found[~database], found[database], 1)
-            right[precision] = round(recall_at(ranked, positives, (1,))[1] * len(positives))
+            ranked = rank_by_similarity(found[~database], found[database], 1)
+            right[precision] = round(recall_at_k(ranked, positives, (1,))[1] * len(positives))
             report.add(f"queries found first in {precision}, of {len(positives)}", right[precision])
         apart = abs(right["float32"] - right["bfloat16"])
-        report.add("queries apart", apart, at_most=WANTED_QUERIES)
+        report.add("queries apart", apart, at_most=MAX_QUERY_DIFFERENCE)
 
 
-def _draw(
+def _draw_city(
     progress: Progress, out: Path, places: int, queries: int
-) -> tuple[list[Shot], list[Path]]:
+) -> tuple[list[PlannedPhoto], list[Path]]:
     """The shots of the database and the queries, and their files."""
     width, height = SIZE
     plan = make_plan(
@@ -126,11 +127,11 @@ def _draw(
             train=False,
         )
     )
-    bar = progress.add_task("drawing the city", total=len(plan.shots))
+    bar = progress.add_task("drawing the city", total=len(plan.photos))
     write_city(plan, out, lambda count: progress.advance(bar, count))
-    return list(plan.shots), [out / shot.folder / shot.name for shot in plan.shots]
+    return list(plan.photos), [out / shot.folder / shot.name for shot in plan.photos]
 
 
-def _pixels(extractor: Extractor, file: Path) -> Pixels:
+def _load_pixels(extractor: Extractor, file: Path) -> Pixels:
     with Image.open(file) as image:
         return extractor.preprocessing.apply(image.convert("RGB"))

@@ -21,22 +21,22 @@ from sqlalchemy import func, insert, select
 
 from benchmarks.described import wait_for_jobs
 from benchmarks.fleet import Fleet, start_servers
-from benchmarks.report import Report, Spread
-from benchmarks.traffic import Caller, form_of, photos_of, upload_all
+from benchmarks.report import LatencySummary, Report
+from benchmarks.traffic import HttpCaller, make_jpegs, multipart_form, upload_all
 from shared.catalog.chunks import Chunk
 from shared.catalog.photos import Photo
 from shared.ids import new_id
 from shared.jobs import Job, JobKind, JobState, Priority
-from shared.jobs.table import UNFINISHED
+from shared.jobs.table import UNFINISHED_STATES
 
 if TYPE_CHECKING:
     from rich.progress import Progress
 
-WANTED_ABOVE_A_BATCH_MS = 100.0
+TARGET_MS_ABOVE_BATCH = 100.0
 SIZE, SIZE_BYTES = (1024, 768), 100_000
-WIDTH = 7168
+DESCRIPTOR_DIMENSION = 7168
 TEXTURES = 64  # so that few of the rows that are found are equal
-SECONDS = 120.0
+TIMEOUT_SECONDS = 120.0
 SEED = 20_261_121
 
 
@@ -46,24 +46,24 @@ def measure(
     """Queries one after the other at random moments for `seconds`, while of `backlog` photos
     `batch` at once are described in `milliseconds` each."""
     report = Report(f"Query photos while {backlog:,} uploads wait")
-    photos = photos_of(TEXTURES, SIZE, SIZE_BYTES)
+    photos = make_jpegs(TEXTURES, SIZE, SIZE_BYTES)
     with (
         tempfile.TemporaryDirectory() as folder,
         start_servers() as servers,
         Fleet(
             Path(folder),
             servers,
-            extractor=f"test-slow-avg:milliseconds={milliseconds},width={WIDTH}",
+            extractor=f"test-slow-avg:milliseconds={milliseconds},width={DESCRIPTOR_DIMENSION}",
             batch_photos=batch,
         ) as fleet,
         contextlib.ExitStack() as stack,
     ):
         fleet.start()
-        caller = stack.enter_context(Caller(fleet.gateway_urls[0]))
-        first = upload_all(caller.url, [form_of(photo) for photo in photos], 4)
-        wait_for_jobs(fleet.catalog, SECONDS)
-        _ask(caller, photos[0])  # connections, and the query's own way
-        _queue(fleet, [UUID(answer["file_id"]) for answer in first], backlog)
+        caller = stack.enter_context(HttpCaller(fleet.gateway_urls[0]))
+        first = upload_all(caller.url, [multipart_form(photo) for photo in photos], 4)
+        wait_for_jobs(fleet.catalog, TIMEOUT_SECONDS)
+        _time_query(caller, photos[0])  # connections, and the query's own way
+        _insert_backlog(fleet, [UUID(answer["file_id"]) for answer in first], backlog)
         begun = _wait_for_chunks(fleet, 3)
         bar = progress.add_task("asking", total=seconds)
         moments = random.Random(SEED)
@@ -73,30 +73,28 @@ def measure(
         while (left := until - time.monotonic()) > 0:
             progress.update(bar, completed=seconds - left)
             time.sleep(moments.uniform(0, pause))
-            took.append(_ask(caller, moments.choice(photos)))
-        stages = _stages(fleet, took)
+            took.append(_time_query(caller, moments.choice(photos)))
+        stages = _stage_seconds(fleet, took)
         periods = _batch_seconds(fleet, begun, batch)
-        report.add("uploads still waiting at the end", _waiting(fleet), at_least=1)
-        report.add("services that fell", len(fleet.fell), at_most=0)
-    spread, batch_ms = Spread.of(took), 1000 * statistics.median(periods)
+        report.add("uploads still waiting at the end", _count_waiting_jobs(fleet), at_least=1)
+        report.add("services that fell", len(fleet.crashed), at_most=0)
+    spread, batch_ms = LatencySummary.of(took), 1000 * statistics.median(periods)
     report.add("queries", len(took))
     report.add("a batch, median", batch_ms, "ms")
     report.add("query, median", 1000 * spread.median, "ms")
     report.add("query, p95", 1000 * spread.p95, "ms")
-    report.add(
-        "query, worst", 1000 * spread.worst, "ms", at_most=batch_ms + WANTED_ABOVE_A_BATCH_MS
-    )
+    report.add("query, worst", 1000 * spread.worst, "ms", at_most=batch_ms + TARGET_MS_ABOVE_BATCH)
     for stage, found in stages.items():
-        spread = Spread.of(found)
+        spread = LatencySummary.of(found)
         report.add(f"{stage}, median", 1000 * spread.median, "ms")
         report.add(f"{stage}, worst", 1000 * spread.worst, "ms")
     report.details = {"seconds": took, "stages": stages, "batch_seconds": periods}
     return report
 
 
-def _ask(caller: Caller, photo: bytes) -> float:
+def _time_query(caller: HttpCaller, photo: bytes) -> float:
     """Seconds until the answer; AssertionError where there is none."""
-    form = form_of(photo)
+    form = multipart_form(photo)
     begun = time.perf_counter()
     answer = caller.post_form("/api/v1/similarity?top_k=1", form, Prefer="wait=30")
     took = time.perf_counter() - begun
@@ -104,7 +102,7 @@ def _ask(caller: Caller, photo: bytes) -> float:
     return took
 
 
-def _queue(fleet: Fleet, photo_ids: Sequence[UUID], count: int) -> None:
+def _insert_backlog(fleet: Fleet, photo_ids: Sequence[UUID], count: int) -> None:
     """Uploads with the bytes of these photos: sending thousands takes long and shows nothing
     more."""
     with fleet.catalog.write() as session:
@@ -148,7 +146,7 @@ def _queue(fleet: Fleet, photo_ids: Sequence[UUID], count: int) -> None:
 
 def _wait_for_chunks(fleet: Fleet, count: int) -> datetime:
     """Until the extractor is in its stride; the database's time then."""
-    deadline = time.monotonic() + SECONDS
+    deadline = time.monotonic() + TIMEOUT_SECONDS
     with fleet.catalog.read() as session:
         before = session.scalar(select(func.count()).select_from(Chunk)) or 0
     while True:
@@ -183,7 +181,7 @@ def _batch_seconds(fleet: Fleet, begun: datetime, batch: int) -> list[float]:
     return found
 
 
-def _stages(fleet: Fleet, took: Sequence[float]) -> dict[str, list[float]]:
+def _stage_seconds(fleet: Fleet, took: Sequence[float]) -> dict[str, list[float]]:
     """Where the time of each query went, by the job table."""
     with fleet.catalog.read() as session:
         jobs = session.scalars(
@@ -201,13 +199,13 @@ def _stages(fleet: Fleet, took: Sequence[float]) -> dict[str, list[float]]:
     return found
 
 
-def _waiting(fleet: Fleet) -> int:
+def _count_waiting_jobs(fleet: Fleet) -> int:
     with fleet.catalog.read() as session:
         return (
             session.scalar(
                 select(func.count())
                 .select_from(Job)
-                .where(Job.kind == JobKind.INDEX, Job.state.in_(UNFINISHED))
+                .where(Job.kind == JobKind.INDEX, Job.state.in_(UNFINISHED_STATES))
             )
             or 0
         )

@@ -19,15 +19,15 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch.nn.functional import normalize
 
-from benchmarks.networks import Measured
+from benchmarks.networks import BenchmarkedExtractor
 from shared.recipes import FACETS
 from shared.vision.backbones.dinov2 import SHAPES, Dinov2
-from shared.vision.precision import computing_in
+from shared.vision.precision import autocast
 from shared.vision.preprocessing import get_preprocessing
 
 
 class ReferenceAnyLoc:
-    def __init__(self, measured: Measured, centres: NDArray[np.float32]) -> None:
+    def __init__(self, measured: BenchmarkedExtractor, centres: NDArray[np.float32]) -> None:
         """(K, width) centres. The recipe is one of the `anyloc-` ones, with hard VLAD."""
         recipe, device = measured.recipe, measured.device
         assert recipe.layer is not None
@@ -54,7 +54,7 @@ class ReferenceAnyLoc:
     def _describe(self, photo: bytes) -> NDArray[np.float32]:
         with Image.open(io.BytesIO(photo)) as image:
             pixels = self._preprocessing.apply(image.convert("RGB"))
-        with computing_in("float32", self._device):
+        with autocast("float32", self._device):
             self._network.features(torch.from_numpy(np.array(pixels))[None])
             found = self._kept[0, 1:]
             if self._third is not None:

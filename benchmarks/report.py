@@ -30,9 +30,7 @@ class Figure:
     def bound(self) -> str:
         if self.wanted is None:
             return ""
-        return (
-            f"at {'least' if self.at_least else 'most'} {_number(self.wanted)} {self.unit}".strip()
-        )
+        return f"at {'least' if self.at_least else 'most'} {_format_number(self.wanted)} {self.unit}".strip()
 
 
 @dataclass(slots=True)
@@ -84,7 +82,7 @@ class Report:
         table = Table("what", "measured", "wanted", "", title=self.title)
         for figure in self.figures:
             verdict = "" if figure.wanted is None else "missed" if figure.missed else "met"
-            measured = f"{_number(figure.measured)} {figure.unit}".strip()
+            measured = f"{_format_number(figure.measured)} {figure.unit}".strip()
             table.add_row(
                 figure.what, measured, figure.bound, verdict, style="red" if figure.missed else None
             )
@@ -92,7 +90,7 @@ class Report:
 
 
 @dataclass(frozen=True, slots=True)
-class Spread:
+class LatencySummary:
     """Seconds of many calls."""
 
     median: float
@@ -100,7 +98,7 @@ class Spread:
     worst: float
 
     @classmethod
-    def of(cls, seconds: list[float]) -> Spread:
+    def of(cls, seconds: list[float]) -> LatencySummary:
         """ValueError for none."""
         if not seconds:
             raise ValueError("nothing was timed")
@@ -109,7 +107,7 @@ class Spread:
         return cls(median(ordered), ordered[min(last, int(0.95 * len(ordered)))], ordered[-1])
 
 
-def _number(value: float) -> str:
+def _format_number(value: float) -> str:
     if value == int(value) and abs(value) < 1e9:
         return f"{value:,.0f}"
     return f"{value:,.1f}" if abs(value) >= 10 else f"{value:.3g}"

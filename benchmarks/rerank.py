@@ -22,15 +22,15 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from benchmarks.report import Report
-from shared.datasets.city.plan import CityOptions, Shot, make_plan
+from shared.datasets.city.plan import CityOptions, PlannedPhoto, make_plan
 from shared.datasets.city.write import write_city
-from shared.datasets.recall import rank, recall_at, true_positives
-from shared.recipes import RECIPES
+from shared.datasets.recall import positives_within, rank_by_similarity, recall_at_k
+from shared.recipes import EXTRACTOR_CONFIGS
 from shared.vision.extractors import Extractor, choose_device
-from shared.vision.fit_photos import fit_photos
+from shared.vision.fit_photos import fit_vocabulary
 from shared.vision.local_features import LocalFeatures
 from shared.vision.matching import rerank_score
-from shared.vision.patches import choose_photos
+from shared.vision.patches import sample_photos
 from shared.vision.resample import Pixels
 from shared.vision.vlad import vlad
 from tests.e2e.test_real_photos import TRUE_MATCH
@@ -39,19 +39,19 @@ if TYPE_CHECKING:
     from rich.progress import Progress
 
 EXTRACTOR = "efficientnet-lite0-vlad"
-RERANKED = (10, 25, 50)
+RERANK_DEPTHS = (10, 25, 50)
 KS = (1, 5, 10)
 BATCH = 16
 FIT_PHOTOS = 300
 SEED = 0
-TIMED_QUERIES = 5  # whose candidates' features are made again, to time it
+TIMING_ROUNDS = 5  # whose candidates' features are made again, to time it
 
 Rows = NDArray[np.float32]
 Indices = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True)
-class Described:
+class DescribedPhotos:
     """Photos with what the extractor makes of them."""
 
     features: list[LocalFeatures]
@@ -61,57 +61,59 @@ class Described:
 
 def measure(progress: Progress, *, places: int, seed: int) -> Report:
     """`places` of the city `seed`, four photos of each; half as many queries."""
-    extractor = Extractor(RECIPES[EXTRACTOR], choose_device("auto"))
+    extractor = Extractor(EXTRACTOR_CONFIGS[EXTRACTOR], choose_device("auto"))
     report = Report(f"Reranking {places} generated places, seed {seed}")
     with tempfile.TemporaryDirectory() as folder:
-        database, queries, positives = _city(Path(folder), places, seed, progress)
+        database, queries, positives = _draw_city(Path(folder), places, seed, progress)
         bar = progress.add_task("describing", total=len(database) + len(queries))
-        described = _describe(extractor, database, queries, lambda n: progress.advance(bar, n))
-        recompute = _time_features(extractor, database[: max(RERANKED)])
+        described = _describe_city(extractor, database, queries, lambda n: progress.advance(bar, n))
+        recompute = _time_features(extractor, database[: max(RERANK_DEPTHS)])
     bar = progress.add_task("reranking", total=len(queries) * 2)
     for vocabulary in ("shipped", "fitted"):
         _report_city(
             report, extractor, described, vocabulary, positives, lambda: progress.advance(bar)
         )
-    for depth in RERANKED:
+    for depth in RERANK_DEPTHS:
         report.add(f"local features of {depth} photos, made anew", recompute * depth, "s of a core")
     if "PLACEWISE_TEST_DATA" in os.environ:
-        _report_real(report, extractor, Path(os.environ["PLACEWISE_TEST_DATA"]) / "toy-places")
+        _report_real_photos(
+            report, extractor, Path(os.environ["PLACEWISE_TEST_DATA"]) / "toy-places"
+        )
     return report
 
 
-def _city(
+def _draw_city(
     folder: Path, places: int, seed: int, progress: Progress
 ) -> tuple[list[Path], list[Path], list[Indices]]:
     """Paths of the database and of the queries in the map, and the positives of each query."""
     plan = make_plan(CityOptions(places, 4, max(1, places // 2), seed, 0, 0.1, 320, 240, False))
-    bar = progress.add_task("drawing", total=len(plan.shots))
+    bar = progress.add_task("drawing", total=len(plan.photos))
     write_city(plan, folder, lambda count: progress.advance(bar, count))
-    database = [shot for shot in plan.shots if shot.role == "database"]
-    queries = [s for s in plan.shots if s.role == "query" and s.kind != "out_of_map"]
+    database = [shot for shot in plan.photos if shot.role == "database"]
+    queries = [s for s in plan.photos if s.role == "query" and s.kind != "out_of_map"]
 
-    def paths(shots: Sequence[Shot]) -> list[Path]:
+    def paths(shots: Sequence[PlannedPhoto]) -> list[Path]:
         return [folder / shot.folder / shot.name for shot in shots]
 
-    def positions(shots: Sequence[Shot]) -> NDArray[np.float64]:
+    def positions(shots: Sequence[PlannedPhoto]) -> NDArray[np.float64]:
         return np.array([(shot.camera.x, shot.camera.y) for shot in shots])
 
     return (
         paths(database),
         paths(queries),
-        true_positives(positions(queries), positions(database)),
+        positives_within(positions(queries), positions(database)),
     )
 
 
-def _describe(
+def _describe_city(
     extractor: Extractor,
     database: Sequence[Path],
     queries: Sequence[Path],
     advance: Callable[[int], None],
-) -> tuple[Described, Described]:
+) -> tuple[DescribedPhotos, DescribedPhotos]:
     """Database and queries, with the shipped vocabulary and with one learnt on the database."""
-    chosen = choose_photos(len(database), FIT_PHOTOS, extractor.backbone.width, SEED)
-    fitted = fit_photos(
+    chosen = sample_photos(len(database), FIT_PHOTOS, extractor.backbone.width, SEED)
+    fitted = fit_vocabulary(
         extractor,
         _batches(extractor, [database[number] for number in chosen]),
         len(chosen),
@@ -135,52 +137,58 @@ def _describe_photos(
     paths: Sequence[Path],
     centres: dict[str, torch.Tensor],
     advance: Callable[[int], None],
-) -> Described:
+) -> DescribedPhotos:
     features: list[LocalFeatures] = []
     rows: dict[str, list[Rows]] = {name: [] for name in centres}
     for pixels in _batches(extractor, paths):
         made = extractor.local_features(pixels)
         for photo, one in zip(pixels, made, strict=True):
-            features.append(LocalFeatures.of(one, extractor.backbone.grid(*photo.shape[:2])))
+            features.append(
+                LocalFeatures.from_features(one, extractor.backbone.grid(*photo.shape[:2]))
+            )
         for name, of_vocabulary in centres.items():
             rows[name].append(vlad(torch.stack(made), of_vocabulary).numpy())
         advance(len(pixels))
-    return Described(features, {name: np.concatenate(parts) for name, parts in rows.items()})
+    return DescribedPhotos(features, {name: np.concatenate(parts) for name, parts in rows.items()})
 
 
 def _report_city(
     report: Report,
     extractor: Extractor,
-    described: tuple[Described, Described],
+    described: tuple[DescribedPhotos, DescribedPhotos],
     vocabulary: str,
     positives: list[Indices],
     advance: Callable[[], object],
 ) -> None:
     database, queries = described
-    ranked = rank(queries.rows[vocabulary], database.rows[vocabulary], max(RERANKED))
+    ranked = rank_by_similarity(
+        queries.rows[vocabulary], database.rows[vocabulary], max(RERANK_DEPTHS)
+    )
     scores = np.empty(ranked.shape)
     took = []
     for query in range(len(ranked)):
         started = time.process_time()
-        scores[query] = _scores(extractor, queries, query, database, ranked[query], vocabulary)
+        scores[query] = _rerank_scores(
+            extractor, queries, query, database, ranked[query], vocabulary
+        )
         took.append((time.process_time() - started) / ranked.shape[1])
         advance()
-    for depth in (0, *RERANKED):
-        shares = recall_at(_reordered(ranked, scores, depth), positives, KS)
+    for depth in (0, *RERANK_DEPTHS):
+        shares = recall_at_k(_apply_rerank(ranked, scores, depth), positives, KS)
         how = f"rerank={depth}" if depth else "without rerank"
         for k, share in shares.items():
             report.add(f"R@{k}, {vocabulary} vocabulary, {how}", 100 * share, "%")
-    for depth in RERANKED:
+    for depth in RERANK_DEPTHS:
         report.add(
             f"comparing {depth} photos, {vocabulary}, median", median(took) * depth, "s of a core"
         )
 
 
-def _scores(
+def _rerank_scores(
     extractor: Extractor,
-    queries: Described,
+    queries: DescribedPhotos,
     query: int,
-    database: Described,
+    database: DescribedPhotos,
     candidates: Indices,
     vocabulary: str,
 ) -> list[float]:
@@ -192,7 +200,7 @@ def _scores(
     ]
 
 
-def _reordered(ranked: Indices, scores: NDArray[np.float64], depth: int) -> Indices:
+def _apply_rerank(ranked: Indices, scores: NDArray[np.float64], depth: int) -> Indices:
     """The rankings with their first `depth` in the order of their scores."""
     order = np.argsort(-scores[:, :depth], axis=1, kind="stable")
     first = np.take_along_axis(ranked[:, :depth], order, axis=1)
@@ -202,7 +210,7 @@ def _reordered(ranked: Indices, scores: NDArray[np.float64], depth: int) -> Indi
 def _time_features(extractor: Extractor, paths: Sequence[Path]) -> float:
     """Seconds of one core for reading, decoding and the network of one photo."""
     took = []
-    for _ in range(TIMED_QUERIES):
+    for _ in range(TIMING_ROUNDS):
         started = time.process_time()
         for pixels in _batches(extractor, paths):
             extractor.local_features(pixels)
@@ -210,23 +218,23 @@ def _time_features(extractor: Extractor, paths: Sequence[Path]) -> float:
     return median(took)
 
 
-def _report_real(report: Report, extractor: Extractor, folder: Path) -> None:
+def _report_real_photos(report: Report, extractor: Extractor, folder: Path) -> None:
     """The ranks of the true matches among all photos, before and after reranking all of them."""
     database = sorted((folder / "database").glob("*.jpg"))
     queries = [folder / "queries" / name for name in TRUE_MATCH]
-    photos, asked = _describe(extractor, database, queries, lambda count: None)
+    photos, asked = _describe_city(extractor, database, queries, lambda count: None)
     truth = [[path.name for path in database].index(match) for match in TRUE_MATCH.values()]
     for vocabulary in ("shipped", "fitted"):
-        ranked = rank(asked.rows[vocabulary], photos.rows[vocabulary], len(database))
+        ranked = rank_by_similarity(asked.rows[vocabulary], photos.rows[vocabulary], len(database))
         scores = np.array(
             [
-                _scores(extractor, asked, query, photos, ranked[query], vocabulary)
+                _rerank_scores(extractor, asked, query, photos, ranked[query], vocabulary)
                 for query in range(len(queries))
             ]
         )
         for name, order in (
             ("without rerank", ranked),
-            ("reranked", _reordered(ranked, scores, len(database))),
+            ("reranked", _apply_rerank(ranked, scores, len(database))),
         ):
             for query, path in enumerate(queries):
                 place = int(np.flatnonzero(order[query] == truth[query])[0]) + 1

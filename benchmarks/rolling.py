@@ -23,28 +23,28 @@ from sqlalchemy import select
 from benchmarks.described import wait_for_jobs
 from benchmarks.fleet import Fleet, Servers, start_servers
 from benchmarks.report import Report
-from benchmarks.traffic import CONTENT_TYPE, Answer, Caller, form_of, photos_of
+from benchmarks.traffic import CONTENT_TYPE, HttpCaller, HttpResponse, make_jpegs, multipart_form
 from shared.catalog.chunks import Descriptor
 
 if TYPE_CHECKING:
     from rich.progress import Progress
 
-EVERYTHING = (
+ALL_SERVICES = (
     *("gateway-0", "gateway-1", "extractor-0", "extractor-1"),
     *("search-0-0", "search-0-1", "steward-0", "steward-1"),
 )
 PAUSE_SECONDS = 0.1  # of a client between two requests: a load, not a race for the processors
-SECONDS = 120.0
+TIMEOUT_SECONDS = 120.0
 BATCH = 4
 TEXTURES = 16
-FIRST_PHOTOS = 12
+INITIAL_PHOTOS = 12
 
 
-class Clients:
+class LoadClients:
     """Threads that use two gateways, and count what they were refused."""
 
     def __init__(self, urls: Sequence[str], photos: Sequence[bytes]) -> None:
-        self._callers = [Caller(url) for url in urls]
+        self._callers = [HttpCaller(url) for url in urls]
         self._photos = photos
         self._stop = threading.Event()
         self._lock = threading.Lock()
@@ -57,7 +57,7 @@ class Clients:
         """What was tried a second time, and why."""
         self.failed: list[str] = []
         works: list[Callable[[random.Random], None]] = [
-            *(self._upload, self._ask_with_new, self._ask_with_stored, self._read),
+            *(self._upload, self._query_new_photo, self._query_stored_photo, self._read),
         ]
         self._threads = [
             threading.Thread(target=self._run, args=(work, number), name=work.__name__)
@@ -89,7 +89,7 @@ class Clients:
             work(chance)
 
     def _upload(self, chance: random.Random) -> None:
-        form = form_of(chance.choice(self._photos))
+        form = multipart_form(chance.choice(self._photos))
         answer = self._call(
             chance.randrange(2), "upload", "POST", "/api/v1/upload", form, **CONTENT_TYPE
         )
@@ -97,8 +97,8 @@ class Clients:
             body = answer.json()
             self.uploaded.append((body["file_id"], body["job_id"]))
 
-    def _ask_with_new(self, chance: random.Random) -> None:
-        form = form_of(chance.choice(self._photos))
+    def _query_new_photo(self, chance: random.Random) -> None:
+        form = multipart_form(chance.choice(self._photos))
         answer = self._call(
             chance.randrange(2),
             "query by new photo",
@@ -114,9 +114,9 @@ class Clients:
             self._call(chance.randrange(2), "job", "GET", f"{body['status_url']}?wait=30")
             answer = self._call(chance.randrange(2), "result", "GET", body["result_url"])
         if answer is not None and answer.json()["missing"]:
-            self._fails(f"query by new photo: {answer.body!r}")
+            self._record_failure(f"query by new photo: {answer.body!r}")
 
-    def _ask_with_stored(self, chance: random.Random) -> None:
+    def _query_stored_photo(self, chance: random.Random) -> None:
         photo_id = chance.choice(self.findable)
         answer = self._call(
             chance.randrange(2),
@@ -125,7 +125,7 @@ class Clients:
             f"/api/v1/similarity/{photo_id}?top_k=3",
         )
         if answer is not None and answer.json()["missing"]:
-            self._fails(f"query by stored photo: {answer.body!r}")
+            self._record_failure(f"query by stored photo: {answer.body!r}")
 
     def _read(self, chance: random.Random) -> None:
         photo_id, job_id = chance.choice(self.uploaded)
@@ -142,7 +142,7 @@ class Clients:
 
     def _call(
         self, first: int, what: str, method: str, path: str, body: bytes | None = None, **head: str
-    ) -> Answer | None:
+    ) -> HttpResponse | None:
         """The answer, if it is a success; None, and noted, where even the second try is none."""
         self.requests[what] += 1
         at, other_left, wait_left = first, True, True
@@ -166,10 +166,10 @@ class Clients:
                     self.again[f"{what}: {answer.status}, Retry-After {pause}"] += 1
                     time.sleep(float(pause))
                     continue
-            self._fails(f"{what}: {method} {path}: {why}")
+            self._record_failure(f"{what}: {method} {path}: {why}")
             return None
 
-    def _fails(self, reason: str) -> None:
+    def _record_failure(self, reason: str) -> None:
         with self._lock:
             self.failed.append(reason)
 
@@ -177,8 +177,10 @@ class Clients:
 def measure(progress: Progress) -> Report:
     """Restart everything once."""
     with tempfile.TemporaryDirectory() as folder, start_servers() as servers:
-        bar = progress.add_task("restarting", total=len(EVERYTHING))
-        return restart_under_load(Path(folder), servers, EVERYTHING, lambda: progress.advance(bar))
+        bar = progress.add_task("restarting", total=len(ALL_SERVICES))
+        return restart_under_load(
+            Path(folder), servers, ALL_SERVICES, lambda: progress.advance(bar)
+        )
 
 
 def restart_under_load(
@@ -203,11 +205,11 @@ def restart_under_load(
         batch_photos=BATCH,
     ) as fleet:
         fleet.start()
-        clients = Clients(fleet.gateway_urls, photos_of(TEXTURES, (320, 240), 20_000))
+        clients = LoadClients(fleet.gateway_urls, make_jpegs(TEXTURES, (320, 240), 20_000))
         codes: dict[str, int] = {}
         stopping: dict[str, float] = {}
         try:
-            clients.begin(FIRST_PHOTOS)
+            clients.begin(INITIAL_PHOTOS)
             for name in names:
                 begun = time.monotonic()
                 codes[name] = fleet[name].stop()
@@ -216,10 +218,10 @@ def restart_under_load(
                 on_restarted()
         finally:
             clients.end()
-        wait_for_jobs(fleet.catalog, SECONDS)
-        lost = _not_described(fleet, [UUID(photo_id) for photo_id, _ in clients.uploaded])
+        wait_for_jobs(fleet.catalog, TIMEOUT_SECONDS)
+        lost = _count_undescribed(fleet, [UUID(photo_id) for photo_id, _ in clients.uploaded])
         logs = fleet.logs()
-        fell = list(fleet.fell)
+        fell = list(fleet.crashed)
     for what, count in clients.requests.items():
         report.add(f"requests: {what}", count)
     for why, count in clients.again.items():
@@ -238,7 +240,7 @@ def restart_under_load(
     return report
 
 
-def _not_described(fleet: Fleet, acknowledged: Sequence[UUID]) -> int:
+def _count_undescribed(fleet: Fleet, acknowledged: Sequence[UUID]) -> int:
     with fleet.catalog.read() as session:
         found = set(session.scalars(select(Descriptor.photo_id)))
     return len(set(acknowledged) - found)

@@ -12,19 +12,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from uuid import UUID
 
-from benchmarks.described import described, jobs_of, wait_for_jobs
-from benchmarks.fleet import Fleet, Service, start_servers
+from benchmarks.described import count_descriptions, load_jobs, wait_for_jobs
+from benchmarks.fleet import Fleet, ServiceProcess, start_servers
 from benchmarks.report import Report
-from benchmarks.traffic import form_of, photos_of, upload_all
+from benchmarks.traffic import make_jpegs, multipart_form, upload_all
 
 if TYPE_CHECKING:
     from rich.progress import Progress
 
-WANTED_OF_LINEAR = 0.9
+TARGET_EFFICIENCY = 0.9
 CLIENTS = 4
-WARM_UPS = 10
-NO_MERGING = 1_000_000  # chunks stay as the extractors wrote them
-SECONDS = 900.0  # for one round
+MAX_WARM_UP_ROUNDS = 10
+COMPACTION_DISABLED = 1_000_000  # chunks stay as the extractors wrote them
+TIMEOUT_SECONDS = 900.0  # for one round
 
 
 def measure(
@@ -47,8 +47,8 @@ def measure(
             extractors=max(workers),
             extractor=f"test-slow-avg:milliseconds={milliseconds},width=16",
             batch_photos=batch,
-            compact_chunks=NO_MERGING,
-            slot_rows=NO_MERGING,
+            compact_chunks=COMPACTION_DISABLED,
+            slot_rows=COMPACTION_DISABLED,
         ) as fleet,
     ):
         fleet.start("search-0-0", "gateway-0", "steward-0")
@@ -59,7 +59,7 @@ def measure(
             fleet.start(*(one.name for one in extractors if not one.running))
             sent += _warm_up(fleet, extractors, 2 * count * batch)
             bar = progress.add_task(f"{count} extractors", total=photos * count)
-            rates[count] = _rate(
+            rates[count] = _measure_throughput(
                 fleet,
                 extractors,
                 photos * count,
@@ -76,37 +76,39 @@ def measure(
                 report.add(
                     f"{count} extractors, of linear",
                     rate / (rates[least] * count / least),
-                    at_least=WANTED_OF_LINEAR,
+                    at_least=TARGET_EFFICIENCY,
                 )
-        times = described(fleet.store)
+        times = count_descriptions(fleet.store)
         report.add("photos described more than once", sum(n > 1 for n in times.values()), at_most=0)
         report.add("photos stored and not described", sent - len(times), at_most=0)
-        report.add("services that fell", len(fleet.fell), at_most=0)
+        report.add("services that fell", len(fleet.crashed), at_most=0)
     report.details = {"milliseconds": milliseconds, "batch": batch, "photos_each": photos}
     return report
 
 
-def _warm_up(fleet: Fleet, extractors: Sequence[Service], photos: int) -> int:
+def _warm_up(fleet: Fleet, extractors: Sequence[ServiceProcess], photos: int) -> int:
     """Until every extractor has described a batch, and has its decoders; how many it took."""
     wanted = {str(extractor.process.pid) for extractor in extractors}
     served: set[str] = set()
-    for round_ in range(WARM_UPS):
-        answers = _upload(fleet, photos)
-        wait_for_jobs(fleet.catalog, SECONDS)
-        jobs = jobs_of(fleet.catalog, [UUID(answer["job_id"]) for answer in answers])
+    for round_ in range(MAX_WARM_UP_ROUNDS):
+        answers = _upload_photos(fleet, photos)
+        wait_for_jobs(fleet.catalog, TIMEOUT_SECONDS)
+        jobs = load_jobs(fleet.catalog, [UUID(answer["job_id"]) for answer in answers])
         served |= {(job.worker or "").rpartition("-")[2] for job in jobs}
         if wanted <= served:
             return photos * (round_ + 1)
     raise AssertionError(f"{len(wanted - served)} extractors take no work: {fleet.logs()}")
 
 
-def _upload(fleet: Fleet, photos: int) -> list[Any]:
-    small = photos_of(8, (64, 48), 1500)
-    forms = [form_of(small[number % len(small)]) for number in range(photos)]
+def _upload_photos(fleet: Fleet, photos: int) -> list[Any]:
+    small = make_jpegs(8, (64, 48), 1500)
+    forms = [multipart_form(small[number % len(small)]) for number in range(photos)]
     return upload_all(fleet.gateway_urls[0], forms, CLIENTS)
 
 
-def _rate(fleet: Fleet, extractors: Sequence[Service], photos: int, on_left: Any) -> float:
+def _measure_throughput(
+    fleet: Fleet, extractors: Sequence[ServiceProcess], photos: int, on_left: Any
+) -> float:
     """Photos per second, from the first claim to the last commit by the database's clock.
 
     All photos wait before the first is claimed: the extractors stand still meanwhile.
@@ -114,12 +116,12 @@ def _rate(fleet: Fleet, extractors: Sequence[Service], photos: int, on_left: Any
     for extractor in extractors:
         extractor.pause()
     try:
-        answers = _upload(fleet, photos)
+        answers = _upload_photos(fleet, photos)
     finally:
         for extractor in extractors:
             extractor.resume()
-    wait_for_jobs(fleet.catalog, SECONDS, on_left)
-    jobs = jobs_of(fleet.catalog, [UUID(answer["job_id"]) for answer in answers])
+    wait_for_jobs(fleet.catalog, TIMEOUT_SECONDS, on_left)
+    jobs = load_jobs(fleet.catalog, [UUID(answer["job_id"]) for answer in answers])
     started = [job.started_at for job in jobs if job.started_at]
     finished = [job.finished_at for job in jobs if job.finished_at]
     assert len(jobs) == len(started) == len(finished) == photos

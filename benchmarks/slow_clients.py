@@ -27,11 +27,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
-from benchmarks.report import Report, Spread
-from benchmarks.traffic import BOUNDARY, CONTENT_TYPE, form_of, photos_of
+from benchmarks.report import LatencySummary, Report
+from benchmarks.traffic import BOUNDARY, CONTENT_TYPE, make_jpegs, multipart_form
 from shared.client import Client
 from shared.errors import Unavailable
-from shared.home import RunningServer, running_server
+from shared.home import RunningServer, find_running_server
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -78,7 +78,7 @@ def measure(progress: Progress, *, seconds: float, idle: int, bodies: int, strea
     """Each phase lasts `seconds`. The server may open 1,024 files, and has the default settings but
     for its extractor."""
     report = Report(f"While {idle:,} clients are idle, {bodies} bodies slow, {streams} watch jobs")
-    photo = photos_of(1, (640, 480), 60_000)[0]
+    photo = make_jpegs(1, (640, 480), 60_000)[0]
     phases = {
         "no attack": (0, 0, 0),
         "idle connections": (idle, 0, 0),
@@ -112,9 +112,11 @@ def measure(progress: Progress, *, seconds: float, idle: int, bodies: int, strea
             ("GET /maps", calls.maps, least.maps),
             ("upload", calls.uploads, least.uploads),
         ):
-            bound = None if calls is least else WANTED_RATIO * Spread.of(theirs).p95 * 1000
-            report.add(f"{name}: {what}, median", Spread.of(mine).median * 1000, "ms")
-            report.add(f"{name}: {what}, p95", Spread.of(mine).p95 * 1000, "ms", at_most=bound)
+            bound = None if calls is least else WANTED_RATIO * LatencySummary.of(theirs).p95 * 1000
+            report.add(f"{name}: {what}, median", LatencySummary.of(mine).median * 1000, "ms")
+            report.add(
+                f"{name}: {what}, p95", LatencySummary.of(mine).p95 * 1000, "ms", at_most=bound
+            )
         report.add(f"{name}: calls that failed", len(calls.failed), at_most=0)
         report.add(
             f"{name}: log",
@@ -155,7 +157,7 @@ def _server(home: Path, log: Path) -> Iterator[RunningServer]:
     ):
         try:
             deadline = time.monotonic() + START_SECONDS
-            while (running := running_server(home)) is None:
+            while (running := find_running_server(home)) is None:
                 if server.poll() is not None or time.monotonic() > deadline:
                     raise Unavailable("server_unreachable", "The server did not start.")
                 time.sleep(0.1)
@@ -187,7 +189,7 @@ def _timed(port: int, key: str, photo: bytes, seconds: float, log: Path) -> Call
 
 def _upload(port: int, key: str, photo: bytes) -> str:
     """The id of the photo's job."""
-    answer = _call(port, key, "POST", "/api/v1/upload", form_of(photo), **CONTENT_TYPE)
+    answer = _call(port, key, "POST", "/api/v1/upload", multipart_form(photo), **CONTENT_TYPE)
     job_id: str = answer["job_id"]
     return job_id
 

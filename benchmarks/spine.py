@@ -21,24 +21,24 @@ from PIL import Image
 from benchmarks.report import Report
 from shared.client import Client, Json
 from shared.errors import Unavailable
-from shared.home import RunningServer, running_server
+from shared.home import RunningServer, find_running_server
 
 if TYPE_CHECKING:
     from rich.progress import Progress
 
-START_SECONDS = 60.0
+START_TIMEOUT_SECONDS = 60.0
 
 
 def measure(progress: Progress, *, photos: int, queries: int) -> Report:
     """On an empty embedded server. The photos are random textures of 320 x 240 pixels: timings need
     no places."""
     with tempfile.TemporaryDirectory() as folder:
-        made = _make_photos(Path(folder, "photos"), photos)
+        made = _draw_photos(Path(folder, "photos"), photos)
         with (
-            _server(Path(folder, "home")) as running,
+            _start_server(Path(folder, "home")) as running,
             Client(running.url, key=running.key) as client,
         ):
-            figures = _measure(client, made, queries, progress)
+            figures = _run_timed_calls(client, made, queries, progress)
     report = Report("The main job, embedded", details=figures)
     for name, timing in figures["timings"].items():
         report.add(f"{name}, median", timing["median_ms"], "ms")
@@ -49,25 +49,27 @@ def measure(progress: Progress, *, photos: int, queries: int) -> Report:
 
 
 @contextlib.contextmanager
-def _server(home: Path) -> Iterator[RunningServer]:
+def _start_server(home: Path) -> Iterator[RunningServer]:
     """A server in a process of its own: in ours it would share the interpreter with the client."""
     command = [str(Path(sys.executable).with_name("placewise")), "serve"]
     environment = {**os.environ, "PLACEWISE_HOME": str(home), "HOST": "127.0.0.1", "PORT": "0"}
     with subprocess.Popen(command, env=environment, stderr=subprocess.DEVNULL) as server:  # noqa: S603
         try:
-            deadline = time.monotonic() + START_SECONDS
-            while (running := running_server(home)) is None:
+            deadline = time.monotonic() + START_TIMEOUT_SECONDS
+            while (running := find_running_server(home)) is None:
                 if server.poll() is not None or time.monotonic() > deadline:
                     raise Unavailable("server_unreachable", "The server did not start.")
                 time.sleep(0.1)
-            with Client(running.url, key=running.key, patience_seconds=START_SECONDS) as client:
+            with Client(
+                running.url, key=running.key, patience_seconds=START_TIMEOUT_SECONDS
+            ) as client:
                 client.stats()
             yield running
         finally:
             server.terminate()
 
 
-def _measure(client: Client, photos: list[Path], queries: int, progress: Progress) -> Json:
+def _run_timed_calls(client: Client, photos: list[Path], queries: int, progress: Progress) -> Json:
     bar = progress.add_task("photos", total=len(photos) + 2 * queries)
 
     def timed(call) -> tuple[float, Json]:  # type: ignore[no-untyped-def]
@@ -91,14 +93,14 @@ def _measure(client: Client, photos: list[Path], queries: int, progress: Progres
         "photos": len(photos),
         "searchable_after_seconds": searchable,
         "timings": {
-            "upload, 4 at once": _figures([s for s, _ in uploads], uploaded),
-            "query by stored photo": _figures([s for s, _ in stored]),
-            "query by new photo": _figures([s for s, _ in new]),
+            "upload, 4 at once": _timing_summary([s for s, _ in uploads], uploaded),
+            "query by stored photo": _timing_summary([s for s, _ in stored]),
+            "query by new photo": _timing_summary([s for s, _ in new]),
         },
     }
 
 
-def _figures(seconds: list[float], wall_seconds: float | None = None) -> Json:
+def _timing_summary(seconds: list[float], wall_seconds: float | None = None) -> Json:
     ordered = sorted(seconds)
     return {
         "median_ms": statistics.median(ordered) * 1000,
@@ -107,7 +109,7 @@ def _figures(seconds: list[float], wall_seconds: float | None = None) -> Json:
     }
 
 
-def _make_photos(folder: Path, count: int) -> list[Path]:
+def _draw_photos(folder: Path, count: int) -> list[Path]:
     folder.mkdir()
     rng = np.random.default_rng(0)
     made = []

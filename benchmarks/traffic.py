@@ -25,15 +25,15 @@ from tests.support.server import SERVICES_KEY
 
 BOUNDARY = "placewise-bench"
 CONTENT_TYPE = {"Content-Type": f"multipart/form-data; boundary={BOUNDARY}"}
-KEY = {"Authorization": f"Bearer {SERVICES_KEY}"}
+AUTH_HEADER = {"Authorization": f"Bearer {SERVICES_KEY}"}
 TIMEOUT_SECONDS = 60.0
-SHARPEST, ROUGHEST = 95, 5  # JPEG qualities
+MAX_JPEG_QUALITY, MIN_JPEG_QUALITY = 95, 5  # JPEG qualities
 
 _numbers = itertools.count()
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
+class HttpResponse:
     status: int
     headers: dict[str, str]
     body: bytes
@@ -42,7 +42,7 @@ class Answer:
         return json.loads(self.body)
 
 
-class Caller:
+class HttpCaller:
     """Calls one server over a connection of each thread's own; a context manager."""
 
     def __init__(self, url: str) -> None:
@@ -69,7 +69,9 @@ class Caller:
         for connection in self._connections:
             connection.close()
 
-    def call(self, method: str, path: str, body: bytes | None = None, **headers: str) -> Answer:
+    def call(
+        self, method: str, path: str, body: bytes | None = None, **headers: str
+    ) -> HttpResponse:
         """The answer, whatever its status; OSError or HTTPException when there is none."""
         connection: HTTPConnection | None = getattr(self._own, "connection", None)
         if connection is None:
@@ -77,24 +79,24 @@ class Caller:
             self._own.connection = connection
             self._connections.append(connection)
         try:
-            connection.request(method, path, body, KEY | headers)
+            connection.request(method, path, body, AUTH_HEADER | headers)
             answer = connection.getresponse()
-            return Answer(answer.status, dict(answer.getheaders()), answer.read())
+            return HttpResponse(answer.status, dict(answer.getheaders()), answer.read())
         except (OSError, HTTPException):
             connection.close()
             raise
 
-    def post_form(self, path: str, form: bytes, **headers: str) -> Answer:
+    def post_form(self, path: str, form: bytes, **headers: str) -> HttpResponse:
         return self.call("POST", path, form, **CONTENT_TYPE, **headers)
 
 
-def photos_of(count: int, size: tuple[int, int], size_bytes: int) -> list[bytes]:
+def make_jpegs(count: int, size: tuple[int, int], size_bytes: int) -> list[bytes]:
     """JPEGs of about `size_bytes`, each of another texture."""
     rng = np.random.default_rng(0)
-    return [_photo(rng, size, size_bytes) for _ in range(count)]
+    return [_make_jpeg(rng, size, size_bytes) for _ in range(count)]
 
 
-def _photo(rng: np.random.Generator, size: tuple[int, int], size_bytes: int) -> bytes:
+def _make_jpeg(rng: np.random.Generator, size: tuple[int, int], size_bytes: int) -> bytes:
     """The coarse half makes photos differ, the fine half fills the file as a street does."""
     width, height = size
     coarse = Image.fromarray(rng.integers(0, 256, (12, 16, 3), dtype=np.uint8))
@@ -104,22 +106,22 @@ def _photo(rng: np.random.Generator, size: tuple[int, int], size_bytes: int) -> 
         fine.resize(size, Image.Resampling.BICUBIC),
         0.35,
     )
-    rough, sharp = ROUGHEST, SHARPEST
+    rough, sharp = MIN_JPEG_QUALITY, MAX_JPEG_QUALITY
     while sharp - rough > 1:
         middle = (rough + sharp) // 2
         rough, sharp = (
-            (middle, sharp) if len(_jpeg(image, middle)) <= size_bytes else (rough, middle)
+            (middle, sharp) if len(_encode_jpeg(image, middle)) <= size_bytes else (rough, middle)
         )
-    return _jpeg(image, rough)
+    return _encode_jpeg(image, rough)
 
 
-def _jpeg(image: Image.Image, quality: int) -> bytes:
+def _encode_jpeg(image: Image.Image, quality: int) -> bytes:
     buffer = io.BytesIO()
     image.save(buffer, "JPEG", quality=quality)
     return buffer.getvalue()
 
 
-def form_of(photo: bytes, filename: str = "photo.jpg") -> bytes:
+def multipart_form(photo: bytes, filename: str = "photo.jpg") -> bytes:
     """A multipart form with the photo, as a file that was never sent before: what follows a JPEG's
     end changes its hash and no pixel."""
     head = (
@@ -146,7 +148,7 @@ def upload_all(
 ) -> list[Any]:
     """Upload each from one of `clients` threads; the answers' JSON. AssertionError when one is
     not accepted."""
-    with Caller(url) as caller:
+    with HttpCaller(url) as caller:
 
         def upload(form: bytes) -> Any:
             answer = caller.post_form(path, form)

@@ -11,19 +11,19 @@ from typing import Any
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from shared.problems import CLIENT_GONE, CLOSED_WITH, REQUEST_ID
-from shared.telemetry.request_id import HEADER, accept_request_id, under_request_id
+from shared.problems import CLIENT_GONE, CLOSED_WITH, REQUEST_ID_SCOPE_KEY
+from shared.telemetry.request_id import REQUEST_ID_HEADER, request_id_context, request_id_or_new
 from shared.telemetry.traces import span
 
 log = logging.getLogger(__name__)
 
 NO_ROUTE = "none"  # of a call that no route takes: its path is anyone's choice
-METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"})
-READS = frozenset({"GET", "HEAD", "OPTIONS"})
+KNOWN_METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"})
+SAFE_METHODS = frozenset({"GET", "HEAD", "OPTIONS"})
 
 
 @dataclass(slots=True)
-class Call:
+class RequestRecord:
     """One call. `method` and `route` are of a few: they may become labels."""
 
     method: str
@@ -32,11 +32,11 @@ class Call:
     status: int = 500
     """What is answered when no answer has begun: the error handler's."""
     received_bytes: int = 0
-    begun_seconds: float | None = None
+    first_byte_seconds: float | None = None
     """Until the answer's first byte; None while there is none."""
 
 
-class CallLog:
+class RequestLogMiddleware:
     """The outermost middleware. A call's id is the caller's `X-Request-ID`, or a fresh one; the
     answer carries it. `on_begin` and `on_end` are for the service's figures.
 
@@ -49,12 +49,12 @@ class CallLog:
         app: ASGIApp,
         *,
         quiet: bool = False,
-        on_begin: Callable[[], object] = lambda: None,
-        on_end: Callable[[Call], object] = lambda call: None,
+        on_start: Callable[[], object] = lambda: None,
+        on_end: Callable[[RequestRecord], object] = lambda call: None,
     ) -> None:
         self._app = app
         self._quiet = quiet
-        self._on_begin = on_begin
+        self._on_start = on_start
         self._on_end = on_end
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -62,11 +62,11 @@ class CallLog:
             await self._app(scope, receive, send)
             return
         headers = Headers(scope=scope)
-        method = scope["method"] if scope["method"] in METHODS else "OTHER"
-        call, started = Call(method), time.perf_counter()
-        request_id = accept_request_id(headers.get(HEADER))
+        method = scope["method"] if scope["method"] in KNOWN_METHODS else "OTHER"
+        call, started = RequestRecord(method), time.perf_counter()
+        request_id = request_id_or_new(headers.get(REQUEST_ID_HEADER))
         # For the handler of unforeseen errors, which stands outside of every middleware.
-        scope[REQUEST_ID] = request_id
+        scope[REQUEST_ID_SCOPE_KEY] = request_id
 
         gone = False
 
@@ -74,20 +74,22 @@ class CallLog:
             nonlocal gone
             message = await receive()
             # Whatever is answered from now on, the client does not get it.
-            gone = gone or (message["type"] == "http.disconnect" and call.begun_seconds is None)
+            gone = gone or (
+                message["type"] == "http.disconnect" and call.first_byte_seconds is None
+            )
             call.received_bytes += len(message.get("body", b""))
             return message
 
         async def marked(message: Message) -> None:
             if message["type"] == "http.response.start":
                 call.status = message["status"]
-                call.begun_seconds = time.perf_counter() - started
-                MutableHeaders(scope=message)[HEADER] = request_id
+                call.first_byte_seconds = time.perf_counter() - started
+                MutableHeaders(scope=message)[REQUEST_ID_HEADER] = request_id
             await send(message)
 
-        self._on_begin()
+        self._on_start()
         with (
-            under_request_id(request_id),
+            request_id_context(request_id),
             span(method, [headers.get("traceparent")], request_id=request_id) as describe,
         ):
             try:
@@ -95,13 +97,13 @@ class CallLog:
             finally:
                 if gone or CLOSED_WITH in scope:
                     call.status = scope.get(CLOSED_WITH, CLIENT_GONE)
-                call.route = _template(scope)
+                call.route = _route_template(scope)
                 describe(f"{method} {call.route}", status=call.status)
                 self._on_end(call)
                 self._write(call, scope, time.perf_counter() - started)
 
-    def _write(self, call: Call, scope: Scope, seconds: float) -> None:
-        worth = call.status >= 500 or not (self._quiet or call.method in READS)
+    def _write(self, call: RequestRecord, scope: Scope, seconds: float) -> None:
+        worth = call.status >= 500 or not (self._quiet or call.method in SAFE_METHODS)
         facts: dict[str, Any] = {
             "route": call.route,
             "status": call.status,
@@ -118,7 +120,7 @@ class CallLog:
         )
 
 
-def _template(scope: Scope) -> str:
+def _route_template(scope: Scope) -> str:
     """The path of the route that took the call, with its router's prefix: that is not in the route,
     and is the same in every path."""
     template: str | None = getattr(scope.get("route"), "path", None)

@@ -22,10 +22,10 @@ ACCEPTED_AT_ONCE = 16
 # Of a connection without a request. Longer than clients and balancers keep theirs (mostly 60 s):
 # who closes first must not be the one that may be sent a request at the same moment.
 KEEP_ALIVE_SECONDS = 75
-GRACEFUL_SECONDS = 10  # for requests under way when the server is asked to stop
+SHUTDOWN_GRACE_SECONDS = 10  # for requests under way when the server is asked to stop
 
 
-class Server(uvicorn.Server):
+class NotifyingServer(uvicorn.Server):
     """uvicorn's, with limits for connections, that says when it begins to stop: requests under way
     may then come to an end."""
 
@@ -50,12 +50,12 @@ class Server(uvicorn.Server):
 
 def http_server(
     app: FastAPI, connections: Connections, *, on_stop: Callable[[], object] = lambda: None
-) -> Server:
+) -> NotifyingServer:
     """A server of the application, not started yet, within the limits of `connections`. `on_stop`
     is called on its event loop when it takes no more requests; it answers those that it has for
     GRACEFUL_SECONDS."""
     proxies = [str(network) for network in connections.limits.trusted_proxies]
-    server = Server(
+    server = NotifyingServer(
         uvicorn.Config(
             app,
             loop="asyncio",
@@ -65,7 +65,7 @@ def http_server(
             log_config=None,
             access_log=False,  # `call_log` writes them
             timeout_keep_alive=KEEP_ALIVE_SECONDS,
-            timeout_graceful_shutdown=GRACEFUL_SECONDS,
+            timeout_graceful_shutdown=SHUTDOWN_GRACE_SECONDS,
         )
     )
     server.on_stop = on_stop
@@ -74,7 +74,7 @@ def http_server(
 
 
 @contextlib.contextmanager
-def stopped_by_signals(server: uvicorn.Server) -> Iterator[None]:
+def stop_on_signals(server: uvicorn.Server) -> Iterator[None]:
     """SIGTERM and Ctrl-C end the block in good order, not the process.
 
     uvicorn raises the signal that stopped it once more. By Python's own handlers that would end
@@ -96,7 +96,7 @@ def stopped_by_signals(server: uvicorn.Server) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def listening(host: str, port: int) -> Iterator[socket.socket]:
+def listen(host: str, port: int) -> Iterator[socket.socket]:
     """The listening socket; port 0 takes a free one. Misconfigured: `address_in_use`."""
     try:
         family, kind, protocol, _, address = socket.getaddrinfo(
@@ -119,7 +119,7 @@ def listening(host: str, port: int) -> Iterator[socket.socket]:
         yield listener
 
 
-def url_of(host: str, port: int) -> str:
+def reachable_url(host: str, port: int) -> str:
     """An address that this machine reaches; "every address" is none that can be called."""
     host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)  # noqa: S104
     return f"http://{f'[{host}]' if ':' in host else host}:{port}"

@@ -8,21 +8,21 @@ from collections.abc import Callable
 
 log = logging.getLogger(__name__)
 
-Run = Callable[[threading.Event], None]
+RunUntilStopped = Callable[[threading.Event], None]
 """Works until the event is set."""
 
 
-def start_part(
-    name: str, run: Run, stop: threading.Event, on_death: Callable[[], None]
+def start_service_thread(
+    name: str, run: RunUntilStopped, stop: threading.Event, on_crash: Callable[[], None]
 ) -> threading.Thread:
-    """The part at work in a thread; `on_death` is called when it raises."""
+    """The part at work in a thread; `on_crash` is called when it raises."""
 
     def guarded() -> None:
         try:
             run(stop)
         except BaseException:
             log.exception("the %s died", name)
-            on_death()
+            on_crash()
 
     part = threading.Thread(target=guarded, name=name)
     part.start()

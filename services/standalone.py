@@ -26,35 +26,35 @@ from prometheus_client import CollectorRegistry
 
 from services.extractor.worker import ExtractorWorker
 from services.gateway.app import create_app
-from services.gateway.context import Gateway
-from services.gateway.keys import CatalogKeys, Keys, NoKeys
-from services.http_server import http_server, listening, stopped_by_signals, url_of
-from services.parts import start_part
-from services.search.metrics import SearchMetrics
-from services.search.presence import Presence
+from services.gateway.context import GatewayContext
+from services.gateway.keys import ApiKeyAuthenticator, Authenticator, LocalhostAuthenticator
+from services.http_server import http_server, listen, reachable_url, stop_on_signals
+from services.parts import start_service_thread
+from services.search.metrics import MeteredSearch
+from services.search.presence import WorkerHeartbeat
 from services.search.worker import SearchWorker
 from services.steward.batches.worker import BatchWorker
-from services.steward.evaluate import Evaluator
-from services.steward.loop import Steward
+from services.steward.evaluate import EvaluationWorker
+from services.steward.loop import Scheduler
 from services.steward.metrics import StewardMetrics
-from services.steward.queue import free_leases
-from services.steward.webhooks.deliver import WebhookSender
-from shared.api_keys import Scope, hash_key, is_loopback, new_local_key
-from shared.catalog.connections import Limits
-from shared.catalog.installation import check_before_new_catalog, open_own_store
-from shared.catalog.keys import has_admin_key, make_key
-from shared.catalog.maps import ensure_default_map
+from services.steward.queue import release_expired_leases
+from services.steward.webhooks.deliver import WebhookDispatcher
+from shared.api_keys import Scope, generate_local_key, hash_api_key, is_loopback
+from shared.catalog.connections import TransactionTimeouts
+from shared.catalog.installation import check_before_new_catalog, open_installation_store
+from shared.catalog.keys import create_api_key, has_admin_key
+from shared.catalog.maps import get_or_create_default_map
 from shared.catalog.open_catalog import open_catalog
 from shared.catalog.schema import migrate
-from shared.catalog.search_workers import forget_dead_workers
+from shared.catalog.search_workers import delete_dead_search_workers
 from shared.catalog.session import Catalog
 from shared.catalog.unusable import sqlite_file
 from shared.disk_reserve import DiskReserve
 from shared.errors import Misconfigured
-from shared.home import announced, lock_home
-from shared.jobs import InProcessHints
+from shared.home import announce_server, lock_home
+from shared.jobs import InProcessWakeups
 from shared.settings import Settings
-from shared.telemetry.metrics_server import serving_metrics
+from shared.telemetry.metrics_server import serve_metrics
 
 log = logging.getLogger(__name__)
 
@@ -67,36 +67,36 @@ class Standalone:
     """An address of it that this machine reaches."""
     server: uvicorn.Server
     listener: socket.socket
-    made_key: str | None
+    first_admin_key: str | None
     """The first admin key, where this start has made it: to be shown now or never."""
     local_key: str | None
     """A key for the commands of this user; None on loopback without ADMIN_KEY: none is needed."""
     failed: threading.Event
     """Set when one of the parts has died: the process should end and say so."""
 
-    def end(self) -> None:
+    def stop(self) -> None:
         """A part has died: stop the others."""
         self.failed.set()
         self.server.should_exit = True
 
     def serve(self) -> None:
         """Answer HTTP until the process is asked to stop."""
-        with stopped_by_signals(self.server):
+        with stop_on_signals(self.server):
             self.server.run(sockets=[self.listener])
         if self.failed.is_set():
             raise Misconfigured("part_died", "A part of Placewise died; the log above says why.")
 
 
 @contextlib.contextmanager
-def standalone(settings: Settings) -> Iterator[Standalone]:
+def run_standalone(settings: Settings) -> Iterator[Standalone]:
     """Lock the folder, recover what a killed process left, and start every part.
 
     Beyond loopback, or with an ADMIN_KEY, every call needs a key; where there is no admin's yet,
     the first one is made. Raises Misconfigured: `home_in_use` for a folder that another server has,
-    `address_in_use`, `separate_services` where SEARCH_URLS is set, and those of `open_own_store`;
+    `address_in_use`, `separate_services` where SEARCH_URLS is set, and those of `open_installation_store`;
     Unavailable for a bucket that can't be used.
     """
-    if settings.search_addresses:
+    if settings.search_worker_urls:
         raise Misconfigured(
             "separate_services",
             "SEARCH_URLS names search workers, and the embedded Placewise asks none: it searches "
@@ -106,50 +106,50 @@ def standalone(settings: Settings) -> Iterator[Standalone]:
     home = settings.placewise_home
     with contextlib.ExitStack() as held:
         held.enter_context(lock_home(home))
-        listener = held.enter_context(listening(settings.host, settings.port))
+        listener = held.enter_context(listen(settings.host, settings.port))
         catalog = open_catalog(settings, "embedded")
         held.callback(catalog.close)
         if (file := sqlite_file(catalog)) is not None:
             DiskReserve(file.parent, settings.min_free_bytes).release()
         check_before_new_catalog(catalog, settings)
         migrate(catalog)
-        store = open_own_store(catalog, settings, alone=True)
-        hints = InProcessHints()
+        store = open_installation_store(catalog, settings, exclusive=True)
+        hints = InProcessWakeups()
         with catalog.write() as session:
-            ensure_default_map(session, settings.new_map_extractor)
+            get_or_create_default_map(session, settings.new_map_extractor)
             # The lock says that no other worker lives: what is there is left by a killed process.
-            forget_dead_workers(session, everyone=True)
-        free_leases(catalog, settings.max_attempts, everyone=True)
+            delete_dead_search_workers(session, all_workers=True)
+        release_expired_leases(catalog, settings.max_attempts, all_leases=True)
 
         # After all that can be refused: a key that no start gets to show would be lost.
         host, port = listener.getsockname()[:2]
-        requests = catalog.limited(Limits.of_requests(settings))
-        keys, made_key, local_key = _make_keys(settings, host, requests)
-        url = url_of(host, port)
-        held.enter_context(announced(home, url, local_key))
+        requests = catalog.with_timeouts(TransactionTimeouts.for_requests(settings))
+        keys, made_key, local_key = _create_authenticator(settings, host, requests)
+        url = reachable_url(host, port)
+        held.enter_context(announce_server(home, url, local_key))
 
         registry = CollectorRegistry()  # of all parts: one /metrics tells of everything
         search = SearchWorker(catalog, store, settings)
         name = f"embedded-{os.getpid()}"
-        presence = Presence(catalog, search, name)
+        presence = WorkerHeartbeat(catalog, search, name)
         extractor = ExtractorWorker(
             catalog, store, settings, name=name, only_worker=True, registry=registry
         )
         stewards = StewardMetrics(registry)
-        steward = Steward(catalog, store, hints, settings, stewards)
-        evaluator = Evaluator(catalog, store, search, settings, name, stewards)
-        webhooks = WebhookSender(catalog, settings)
+        steward = Scheduler(catalog, store, hints, settings, stewards)
+        evaluator = EvaluationWorker(catalog, store, search, settings, name, stewards)
+        webhooks = WebhookDispatcher(catalog, settings)
         batches = BatchWorker(catalog, store, hints, settings, name, stewards)
-        counted = SearchMetrics(search, registry)
-        gateway = Gateway(requests, store, hints, counted, settings, keys, registry)
+        counted = MeteredSearch(search, registry)
+        gateway = GatewayContext(requests, store, hints, counted, settings, keys, registry)
         server = http_server(
-            create_app(gateway), gateway.connections, on_stop=gateway.job_watch.end_soon
+            create_app(gateway), gateway.connections, on_stop=gateway.job_notifier.begin_shutdown
         )
-        held.enter_context(serving_metrics(settings, registry))
+        held.enter_context(serve_metrics(settings, registry))
         running = Standalone(url, server, listener, made_key, local_key, threading.Event())
         stop = threading.Event()
         parts = [
-            start_part(name, part, stop, running.end)
+            start_service_thread(name, part, stop, running.stop)
             for name, part in (
                 ("search", search.run),
                 ("search of what is built", search.run_building),
@@ -171,20 +171,20 @@ def standalone(settings: Settings) -> Iterator[Standalone]:
             extractor.close()
 
 
-def _make_keys(
+def _create_authenticator(
     settings: Settings, host: str, catalog: Catalog
-) -> tuple[Keys, str | None, str | None]:
+) -> tuple[Authenticator, str | None, str | None]:
     """What the gateway asks, the first admin key if it is made now, and a key for this user's
     commands."""
     # The name as well as what it means today: what a name leads to can change.
     if settings.admin_key is None and is_loopback(settings.host) and is_loopback(host):
-        return NoKeys(settings.trusted_origins), None, None
-    local_key, made_key = new_local_key(), None
-    admins = [hash_key(local_key)]
+        return LocalhostAuthenticator(settings.allowed_origins), None, None
+    local_key, made_key = generate_local_key(), None
+    admins = [hash_api_key(local_key)]
     if settings.admin_key is not None:
-        admins.append(hash_key(settings.admin_key.get_secret_value()))
+        admins.append(hash_api_key(settings.admin_key.get_secret_value()))
     else:
         with catalog.write() as session:
             if not has_admin_key(session):
-                _, made_key = make_key(session, "made at the first start", [Scope.ADMIN])
-    return CatalogKeys(catalog, *admins), made_key, local_key
+                _, made_key = create_api_key(session, "made at the first start", [Scope.ADMIN])
+    return ApiKeyAuthenticator(catalog, *admins), made_key, local_key

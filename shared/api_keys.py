@@ -13,9 +13,9 @@ import secrets
 from collections.abc import Collection
 from enum import StrEnum
 
-PREFIX = "pw_"  # so that people and secret scanners know one when they see it
+API_KEY_PREFIX = "pw_"  # so that people and secret scanners know one when they see it
 KEY_BYTES = 32
-SHOWN_CHARACTERS = 11  # of a key, in lists: enough to know it by, and 48 of its 256 bits
+SHOWN_PREFIX_CHARACTERS = 11  # of a key, in lists: enough to know it by, and 48 of its 256 bits
 
 
 class Scope(StrEnum):
@@ -26,29 +26,29 @@ class Scope(StrEnum):
     ADMIN = "admin"  # everything, also keys and webhooks
 
 
-EVERYTHING = frozenset(Scope)
+ALL_SCOPES = frozenset(Scope)
 
 
-def granted(scopes: Collection[Scope]) -> frozenset[Scope]:
+def expand_scopes(scopes: Collection[Scope]) -> frozenset[Scope]:
     """What a key with these scopes may do."""
-    return EVERYTHING if Scope.ADMIN in scopes else frozenset(scopes)
+    return ALL_SCOPES if Scope.ADMIN in scopes else frozenset(scopes)
 
 
-def new_key() -> str:
-    return PREFIX + secrets.token_urlsafe(KEY_BYTES)
+def generate_api_key() -> str:
+    return API_KEY_PREFIX + secrets.token_urlsafe(KEY_BYTES)
 
 
-def new_local_key() -> str:
+def generate_local_key() -> str:
     """A key for the commands of the user who runs the server, good until it ends."""
-    return f"{PREFIX}local_{secrets.token_urlsafe(KEY_BYTES)}"
+    return f"{API_KEY_PREFIX}local_{secrets.token_urlsafe(KEY_BYTES)}"
 
 
-def shown_prefix(key: str) -> str:
+def api_key_prefix(key: str) -> str:
     """The part of a key that lists show."""
-    return key[:SHOWN_CHARACTERS]
+    return key[:SHOWN_PREFIX_CHARACTERS]
 
 
-def hash_key(key: str) -> str:
+def hash_api_key(key: str) -> str:
     """SHA-256, hexadecimal."""
     return hashlib.sha256(key.encode()).hexdigest()
 

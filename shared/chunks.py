@@ -33,13 +33,13 @@ CODED_DIMENSION = 7000
 CODED_BYTES = 8_000_000
 
 # Rows are unit vectors, or zero: with a length further off than this, one is damaged.
-LENGTH_MARGIN = 1e-3
+NORM_TOLERANCE = 1e-3
 
 CORRUPT = "chunk_corrupt"
 
 CORRUPT = "chunk_corrupt"
 
-HEADER_BYTES = 1024  # what is read to find out where the rows begin: NumPy's header has 128
+HEADER_READ_BYTES = 1024  # what is read to find out where the rows begin: NumPy's header has 128
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +77,7 @@ def encode_rows(rows: Rows) -> bytes:
 
 def decode_rows(data: bytes | mmap.mmap) -> Rows:
     """The rows of a `.npy` file, sharing memory with `data`."""
-    shape, offset = _read_header(bytes(memoryview(data)[:HEADER_BYTES]))
+    shape, offset = _read_header(bytes(memoryview(data)[:HEADER_READ_BYTES]))
     return np.frombuffer(data, dtype=np.float32, offset=offset).reshape(shape)
 
 
@@ -125,9 +125,9 @@ def write_chunk(
     }
     store.put(manifest_key(key), json.dumps(manifest).encode())
     if rows.shape[1] >= CODED_DIMENSION and rows.nbytes >= CODED_BYTES:
-        from shared.codes.stored import encode_codes  # numba takes a while to load
+        from shared.codes.stored import encode_sign_codes  # numba takes a while to load
 
-        store.put(codes_key(key), encode_codes(rows, sha256))
+        store.put(codes_key(key), encode_sign_codes(rows, sha256))
     store.put(key, data)
     return WrittenChunk(object_key=key, rows=len(rows), size_bytes=len(data), sha256=sha256)
 
@@ -136,11 +136,11 @@ def read_chunk(store: ObjectStore, object_key: str, sha256: str) -> Rows:
     """The chunk's rows, checked against the catalog's hash; Unavailable when they differ."""
     data = store.get(object_key)
     if hashlib.sha256(data).hexdigest() != sha256:
-        raise corrupt(object_key)
+        raise chunk_corrupt_error(object_key)
     return decode_rows(data)
 
 
-def corrupt(object_key: str) -> Unavailable:
+def chunk_corrupt_error(object_key: str) -> Unavailable:
     """A chunk's bytes are not those of its hash."""
     return Unavailable(
         CORRUPT,
@@ -164,27 +164,27 @@ def read_rows(store: ObjectStore, object_key: str, rows: Sequence[int]) -> Rows:
     ValueError for what is no chunk or ends too early, NotFound when the object is missing.
     """
     with store.open(object_key) as file:
-        (there, dimension), offset = _read_header(_read(file, HEADER_BYTES))
+        (there, dimension), offset = _read_header(_read_up_to(file, HEADER_READ_BYTES))
         size = dimension * np.dtype(np.float32).itemsize
         found = np.empty((len(rows), dimension), dtype=np.float32)
         for place, row in enumerate(rows):
             if row >= there:
                 raise IndexError(row)
             file.seek(offset + row * size)
-            data = _read(file, size)
+            data = _read_up_to(file, size)
             if len(data) < size:
                 raise ValueError(f"the object ends {size - len(data)} bytes too early")
             found[place] = np.frombuffer(data, dtype=np.float32)
     return found
 
 
-def are_whole(rows: Rows) -> NDArray[np.bool_]:
+def rows_are_valid(rows: Rows) -> NDArray[np.bool_]:
     """(n,) which of (n, dimension) rows can be what was written: those of length 1, or zero."""
     lengths = np.linalg.norm(rows, axis=1)
-    return np.asarray((lengths == 0) | (np.abs(lengths - 1) < LENGTH_MARGIN))
+    return np.asarray((lengths == 0) | (np.abs(lengths - 1) < NORM_TOLERANCE))
 
 
-def _read(file: BinaryIO, size: int) -> bytes:
+def _read_up_to(file: BinaryIO, size: int) -> bytes:
     """Up to `size` bytes; fewer only at the end. (A network's file may give less at a time.)"""
     pieces = []
     while size and (piece := file.read(size)):

@@ -1,6 +1,6 @@
 """Looking closely at what a search has found: reranking it by its patches, and explaining it.
 
-A compare job carries a `Comparison` in its params (`request`): the gateway asks, and what an
+A compare job carries a `CompareRequest` in its params (`request`): the gateway asks, and what an
 extractor finds is a `Compared` in the object store (`shared.objects.keys.comparison_key`), for as
 long as the job is kept. Neither holds a vector. Imports no torch: what can be compared, the gateway
 knows before it queues anything.
@@ -15,16 +15,18 @@ from uuid import UUID
 from pydantic import BaseModel, ConfigDict
 
 from shared.errors import Gone, Unprocessable
-from shared.recipes import Recipe
+from shared.recipes import ExtractorConfig
 
-MOST_RERANKED = 50  # candidates: about three batches of photos, and other queries wait so long
+MAX_RERANK_CANDIDATES = (
+    50  # candidates: about three batches of photos, and other queries wait so long
+)
 
 
 class _Message(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
-class Candidate(_Message):
+class RerankCandidate(_Message):
     """A photo that the search has found."""
 
     photo_id: UUID
@@ -39,7 +41,7 @@ class Candidate(_Message):
         return self.score if self.weighted_score is None else self.weighted_score
 
 
-class Comparison(_Message):
+class CompareRequest(_Message):
     """What is to be compared: a query with the photos that a search in one generation found.
 
     The query is a stored photo or the photo of a describe job. Of the `candidates`, most similar
@@ -49,24 +51,24 @@ class Comparison(_Message):
 
     query_photo_id: UUID | None
     query_job_id: UUID | None
-    candidates: tuple[Candidate, ...]
+    candidates: tuple[RerankCandidate, ...]
     rerank: int
     explain: int
     word_weights: tuple[float, ...] = ()
     """By which the search has ranked; () for none. What is explained is the weighted score then."""
 
 
-class ClusterShare(_Message):
+class ClusterContribution(_Message):
     """What one cluster of the vocabulary adds to the similarity."""
 
     cluster: int
     share: float
 
 
-class Explanation(_Message):
+class SimilarityExplanation(_Message):
     """Where a similarity comes from. Both kinds of shares add up to it within float error."""
 
-    clusters: tuple[ClusterShare, ...] | None
+    clusters: tuple[ClusterContribution, ...] | None
     """Of the clusters that both photos use, largest share first; None without a vocabulary."""
     rows: int
     columns: int
@@ -77,22 +79,22 @@ class Explanation(_Message):
     """The share of a patch that is drawn without transparency: the strongest, either way."""
 
 
-class ComparedCandidate(_Message):
+class RerankedCandidate(_Message):
     photo_id: UUID
     rerank_score: float | None
     """None: not among those to be reranked, or its photo could not be read."""
-    explanation: Explanation | None
+    explanation: SimilarityExplanation | None
 
 
-class Compared(_Message):
+class CompareResult(_Message):
     """The candidates in the order that they are to be answered in; deleted ones are left out."""
 
-    candidates: tuple[ComparedCandidate, ...]
+    candidates: tuple[RerankedCandidate, ...]
 
 
-def check_can_rerank(recipe: Recipe) -> None:
+def check_rerankable(recipe: ExtractorConfig) -> None:
     """Unprocessable (`not_rerankable`) for an extractor that makes no local features."""
-    if not recipe.has_patches:
+    if not recipe.has_local_features:
         raise Unprocessable(
             "not_rerankable",
             f"The extractor {recipe.name} makes one feature of a whole photo, and reranking "
@@ -100,13 +102,13 @@ def check_can_rerank(recipe: Recipe) -> None:
         )
 
 
-def check_can_explain(recipe: Recipe, spec: Mapping[str, Any] | None) -> None:
+def check_explainable(recipe: ExtractorConfig, spec: Mapping[str, Any] | None) -> None:
     """Unprocessable (`not_explainable`) where a similarity is no sum over patches.
 
     `spec` is that of the generation that answers; None where the map has none yet.
     """
     why = None
-    if not recipe.has_patches:
+    if not recipe.has_local_features:
         why = "it makes one feature of a whole photo, and no patches"
     elif recipe.aggregator == "gem":
         why = "GeM raises the features to a power, so that no patch has a share of its own"
@@ -120,6 +122,6 @@ def check_can_explain(recipe: Recipe, spec: Mapping[str, Any] | None) -> None:
         )
 
 
-def query_expired() -> Gone:
+def query_expired_error() -> Gone:
     """What a query's job or photo left behind is no longer kept."""
     return Gone("query_expired", "The query is no longer kept (QUERY_TTL_SECONDS). Ask again.")

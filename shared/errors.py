@@ -47,7 +47,7 @@ class PlacewiseError(Exception):
 
     def __reduce__(self) -> tuple[Any, ...]:
         # Keyword arguments don't survive the default pickling, and errors cross processes.
-        return _rebuild, (type(self), self.code, self.detail, self.extra)
+        return _unpickle_error, (type(self), self.code, self.detail, self.extra)
 
     def as_problem(self) -> dict[str, Any]:
         """The RFC 9457 members, without `instance`."""
@@ -61,7 +61,7 @@ class PlacewiseError(Exception):
         }
 
 
-def _rebuild(
+def _unpickle_error(
     kind: type[PlacewiseError], code: str, detail: str, extra: dict[str, Any]
 ) -> PlacewiseError:
     return kind(code, detail, **extra)
@@ -151,7 +151,7 @@ class Misconfigured(PlacewiseError):
     title = "The installation needs attention"
 
 
-def invalid_field(field: str, detail: str) -> Unprocessable:
+def invalid_field_error(field: str, detail: str) -> Unprocessable:
     """The 422 for one value that is out of range or can't be read; it names the field."""
     return Unprocessable(
         "invalid_field",
@@ -160,7 +160,7 @@ def invalid_field(field: str, detail: str) -> Unprocessable:
     )
 
 
-_BY_STATUS: dict[int, type[PlacewiseError]] = {
+_ERRORS_BY_STATUS: dict[int, type[PlacewiseError]] = {
     kind.status: kind
     for kind in (
         InvalidRequest,
@@ -181,13 +181,13 @@ _BY_STATUS: dict[int, type[PlacewiseError]] = {
 }
 
 
-_BY_PROXYS_STATUS: dict[int, type[PlacewiseError]] = {
+_PROXY_ERRORS_BY_STATUS: dict[int, type[PlacewiseError]] = {
     429: TooManyRequests,
     **dict.fromkeys((502, 503, 504, 507), Unavailable),
 }
 
 
-def refusal(status: int, body: str) -> PlacewiseError:
+def error_from_response(status: int, body: str) -> PlacewiseError:
     """The error that a server answered with, made from its problem document.
 
     A code of `bad_answer` for whatever is no problem document: a proxy's page, say. Of the proxy's
@@ -197,8 +197,8 @@ def refusal(status: int, body: str) -> PlacewiseError:
         problem: dict[str, Any] = json.loads(body)
         code, detail = problem.pop("code"), problem.pop("detail")
     except (ValueError, KeyError, TypeError, AttributeError):
-        kind = _BY_PROXYS_STATUS.get(status, PlacewiseError)
+        kind = _PROXY_ERRORS_BY_STATUS.get(status, PlacewiseError)
         return kind("bad_answer", f"HTTP {status}: {body[:200]}")
     for member in ("type", "title", "status", "instance"):
         problem.pop(member, None)
-    return _BY_STATUS.get(status, PlacewiseError)(code, detail, **problem)
+    return _ERRORS_BY_STATUS.get(status, PlacewiseError)(code, detail, **problem)

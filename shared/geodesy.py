@@ -9,15 +9,15 @@ from numpy.typing import NDArray
 
 EARTH_RADIUS_M = 6_371_008.8  # mean radius of the GRS 80 ellipsoid (Moritz 2000)
 
-LEAST_DEGREES = 1e-12  # less than a micrometre on the ground
+ZERO_TOLERANCE_DEGREES = 1e-12  # less than a micrometre on the ground
 
-Degrees = NDArray[np.float64]
+DegreesArray = NDArray[np.float64]
 
 
-def without_dust(degrees: float) -> float:
+def flush_to_zero(degrees: float) -> float:
     """0 for what is next to 0, else the same: PostgreSQL refuses to compute with numbers whose
     squares are too small for a double, and one such photo would end every search."""
-    return 0.0 if abs(degrees) < LEAST_DEGREES else degrees
+    return 0.0 if abs(degrees) < ZERO_TOLERANCE_DEGREES else degrees
 
 
 def distance_m(
@@ -38,37 +38,39 @@ def distance_m(
 
 
 def distances_m(
-    latitude: float, longitude: float, latitudes: Degrees, longitudes: Degrees
-) -> Degrees:
+    latitude: float, longitude: float, latitudes: DegreesArray, longitudes: DegreesArray
+) -> DegreesArray:
     """`distance_m` from one point to (n,) others; NaN where a point has no coordinates."""
     phi, phis = np.radians(latitude), np.radians(latitudes)
     half_lambdas = np.radians(longitudes - longitude) / 2
     shrunk = np.cos(phi) * np.cos(phis)
     h = np.sin((phis - phi) / 2) ** 2 + shrunk * np.sin(half_lambdas) ** 2
     g = np.sin((phis + phi) / 2) ** 2 + shrunk * np.cos(half_lambdas) ** 2
-    metres: Degrees = 2 * EARTH_RADIUS_M * np.arctan2(np.sqrt(h), np.sqrt(g))
+    metres: DegreesArray = 2 * EARTH_RADIUS_M * np.arctan2(np.sqrt(h), np.sqrt(g))
     return metres
 
 
-def latitude_band(latitude: float, radius_m: float) -> tuple[float, float]:
+def latitude_bounds(latitude: float, radius_m: float) -> tuple[float, float]:
     """Latitudes outside of which nothing lies within `radius_m`: what an index can sort out."""
     reach = math.degrees(radius_m / EARTH_RADIUS_M) * (1 + 1e-9) + 1e-9
     return latitude - reach, latitude + reach
 
 
-def longitude_reach(latitude: float, radius_m: float) -> float | None:
+def longitude_half_width(latitude: float, radius_m: float) -> float | None:
     """Degrees of longitude to both sides, outside of which nothing lies within `radius_m` of a
     point at this latitude; None where that is every longitude, or nearly so (around a pole)."""
     angle = radius_m / EARTH_RADIUS_M
     if angle >= math.pi / 2:
         return None
-    sine = math.sin(angle) / max(math.cos(math.radians(latitude)), LEAST_DEGREES)
+    sine = math.sin(angle) / max(math.cos(math.radians(latitude)), ZERO_TOLERANCE_DEGREES)
     if sine > 0.999:  # from here on the arc's own rounding grows
         return None
     return math.degrees(math.asin(sine)) * (1 + 1e-9) + 1e-9
 
 
-def centre_of(latitudes: Degrees, longitudes: Degrees, weights: Degrees) -> tuple[float, float]:
+def weighted_centroid(
+    latitudes: DegreesArray, longitudes: DegreesArray, weights: DegreesArray
+) -> tuple[float, float]:
     """The weighted centre of (n,) points as latitude and longitude: the mean of their vectors.
 
     So that points on both sides of the antimeridian or around a pole meet between each other.

@@ -23,7 +23,7 @@ class Heartbeat:
             self._file.touch()
 
 
-def silence_seconds(file: Path) -> float:
+def seconds_since_heartbeat(file: Path) -> float:
     """Seconds since the last beat; infinite when there was none."""
     try:
         return time.time() - file.stat().st_mtime
@@ -34,7 +34,7 @@ def silence_seconds(file: Path) -> float:
 def main(arguments: list[str]) -> int:
     """The check, with a line for whoever reads the orchestrator's log."""
     file, most_seconds = Path(arguments[0]), float(arguments[1])
-    silent = silence_seconds(file)
+    silent = seconds_since_heartbeat(file)
     print(f"last beat {silent:.0f} s ago, {most_seconds:g} s are allowed")  # noqa: T201
     return 0 if silent <= most_seconds else 1
 

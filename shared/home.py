@@ -28,26 +28,26 @@ class RunningServer:
     """Good until that server ends; None where no key is needed."""
 
 
-def address_file(home: Path) -> Path:
+def server_address_file(home: Path) -> Path:
     """Says where the server that holds the lock listens, and a key for this user's commands."""
     return home / "server.json"
 
 
-def running_server(home: Path) -> RunningServer | None:
+def find_running_server(home: Path) -> RunningServer | None:
     """The server that serves the folder now, or None."""
     if not _lock_file(home).exists():
         return None
     with contextlib.suppress(Timeout), FileLock(_lock_file(home), timeout=0, mode=FILE_MODE):
         return None
     with contextlib.suppress(FileNotFoundError, ValueError, KeyError):
-        said = json.loads(address_file(home).read_text())
+        said = json.loads(server_address_file(home).read_text())
         return RunningServer(said["url"], said.get("key"))
     return None
 
 
-def address_of_running(home: Path) -> str | None:
+def running_server_url(home: Path) -> str | None:
     """The address of the server that serves the folder now, or None."""
-    running = running_server(home)
+    running = find_running_server(home)
     return running.url if running else None
 
 
@@ -59,7 +59,7 @@ def lock_home(home: Path) -> Iterator[None]:
         lock = FileLock(_lock_file(home), timeout=0, mode=FILE_MODE)
         lock.acquire()
     except Timeout:
-        where = address_of_running(home) or "another process"
+        where = running_server_url(home) or "another process"
         raise Misconfigured(
             "home_in_use",
             f"The folder {home} is served already, by {where}. Use that server, stop it, or give "
@@ -78,15 +78,15 @@ def lock_home(home: Path) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def announced(home: Path, url: str, key: str | None = None) -> Iterator[None]:
+def announce_server(home: Path, url: str, key: str | None = None) -> Iterator[None]:
     """While the block runs, this user's commands find the server at `url` through its folder."""
     said = {"url": url, "pid": os.getpid()} | ({"key": key} if key else {})
     try:
-        write_private(address_file(home), json.dumps(said))
+        write_private(server_address_file(home), json.dumps(said))
     except OSError as error:
         if error.errno not in DISK_FULL:
             raise
-        address_file(home).unlink(missing_ok=True)  # of a killed server
+        server_address_file(home).unlink(missing_ok=True)  # of a killed server
         log.warning(
             "the disk of %s is full: commands don't find this server by its folder, and need "
             "--server %s",
@@ -96,7 +96,7 @@ def announced(home: Path, url: str, key: str | None = None) -> Iterator[None]:
     try:
         yield
     finally:
-        address_file(home).unlink(missing_ok=True)
+        server_address_file(home).unlink(missing_ok=True)
 
 
 def _lock_file(home: Path) -> Path:

@@ -13,17 +13,17 @@ from dataclasses import dataclass
 
 from shared.errors import Misconfigured
 
-PREFIX = "gsv:"
-MODEL_NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$"
+TRAINED_MODEL_PREFIX = "gsv:"
+MODEL_NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$"
 MODEL_NAME_RULE = (
     "a model's name has up to 100 letters, digits, `.`, `_` and `-`, and begins with a letter or "
     "digit"
 )
-MOST_PATH_CHARACTERS = 190  # columns of the catalog hold names of 200
+MAX_PATH_CHARACTERS = 190  # columns of the catalog hold names of 200
 
 
 @dataclass(frozen=True, slots=True)
-class TrainedName:
+class TrainedModelName:
     """Exactly one of the two is set."""
 
     registered: str | None
@@ -34,27 +34,27 @@ class TrainedName:
     @property
     def extractor(self) -> str:
         """The extractor's canonical name."""
-        return f"{PREFIX}{self.registered or self.file}"
+        return f"{TRAINED_MODEL_PREFIX}{self.registered or self.file}"
 
 
-def read_trained_name(extractor: str) -> TrainedName:
+def parse_trained_model_name(extractor: str) -> TrainedModelName:
     """What an extractor's name that begins with `gsv:` means.
 
     Misconfigured: `bad_model_name`.
     """
-    rest = extractor.removeprefix(PREFIX)
+    rest = extractor.removeprefix(TRAINED_MODEL_PREFIX)
     if rest.startswith("/"):
-        if len(rest) > MOST_PATH_CHARACTERS or "\x00" in rest:
+        if len(rest) > MAX_PATH_CHARACTERS or "\x00" in rest:
             raise Misconfigured(
                 "bad_model_name",
-                f"The path in {extractor!r} has more than {MOST_PATH_CHARACTERS} characters, or "
+                f"The path in {extractor!r} has more than {MAX_PATH_CHARACTERS} characters, or "
                 "one that no path has.",
             )
-        return TrainedName(None, rest)
-    if not re.fullmatch(MODEL_NAME, rest):
+        return TrainedModelName(None, rest)
+    if not re.fullmatch(MODEL_NAME_PATTERN, rest):
         raise Misconfigured(
             "bad_model_name",
             f"The extractor {extractor!r} can't be read: {MODEL_NAME_RULE}. It is written "
-            f"{PREFIX}NAME for a model that was added, or {PREFIX}/FOLDER/FILE for a checkpoint.",
+            f"{TRAINED_MODEL_PREFIX}NAME for a model that was added, or {TRAINED_MODEL_PREFIX}/FOLDER/FILE for a checkpoint.",
         )
-    return TrainedName(rest, None)
+    return TrainedModelName(rest, None)

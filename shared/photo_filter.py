@@ -11,33 +11,33 @@ from uuid import UUID
 
 from pydantic import AfterValidator, BaseModel, ConfigDict
 
-from shared.geodesy import without_dust
+from shared.geodesy import flush_to_zero
 
-Degrees = Annotated[float, AfterValidator(without_dust)]
+Coordinate = Annotated[float, AfterValidator(flush_to_zero)]
 
 
-class _Condition(BaseModel):
+class _FilterModel(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
-class Circle(_Condition):
+class Circle(_FilterModel):
     """Everything within `radius_m` metres (inclusive) of a point in degrees."""
 
-    latitude: Degrees
-    longitude: Degrees
+    latitude: Coordinate
+    longitude: Coordinate
     radius_m: float
 
 
-class Box(_Condition):
+class Box(_FilterModel):
     """Degrees, bounds inclusive. `west` > `east` crosses the antimeridian.
 
     A pole has every longitude: a box that reaches latitude 90 holds whatever lies there.
     """
 
-    south: Degrees
-    west: Degrees
-    north: Degrees
-    east: Degrees
+    south: Coordinate
+    west: Coordinate
+    north: Coordinate
+    east: Coordinate
 
     def longitude_ranges(self) -> list[tuple[float, float]]:
         """The longitudes as ranges that don't cross the antimeridian, in [-180, 180].
@@ -54,7 +54,7 @@ class Box(_Condition):
         return ranges
 
 
-class PhotoFilter(_Condition):
+class PhotoFilter(_FilterModel):
     """What is None or empty filters nothing; a photo without a value passes no filter on it."""
 
     near: Circle | None = None
@@ -69,7 +69,7 @@ class PhotoFilter(_Condition):
 
     @property
     def is_empty(self) -> bool:
-        return self == EVERYTHING
+        return self == NO_FILTER
 
 
-EVERYTHING = PhotoFilter()
+NO_FILTER = PhotoFilter()

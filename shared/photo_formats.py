@@ -11,45 +11,53 @@ from shared.errors import Unprocessable
 
 # MPO, which many phones write under the name JPEG (a JPEG with a second picture behind it), is
 # opened by Pillow as JPEG: naming it here is a KeyError for everything but a JPEG.
-FORMATS = ("JPEG", "PNG", "WEBP", "BMP", "TIFF")
-ACCEPTED = "JPEG, PNG, WebP, BMP, TIFF or HEIC"
-HEIC = "image/heic"
+PILLOW_FORMATS = ("JPEG", "PNG", "WEBP", "BMP", "TIFF")
+ACCEPTED_PHOTOS = "JPEG, PNG, WebP, BMP, TIFF or HEIC"
+HEIC_MEDIA_TYPE = "image/heic"
 # The first brand of files of HEVC pictures: `mif1` may hold others, which their header tells.
 HEIC_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"mif1")
 # What Pillow raises for damaged photos and EXIF; UnidentifiedImageError is an OSError.
-BROKEN = (OSError, SyntaxError, ValueError, TypeError, LookupError, EOFError, struct.error)
+PHOTO_READ_ERRORS = (
+    OSError,
+    SyntaxError,
+    ValueError,
+    TypeError,
+    LookupError,
+    EOFError,
+    struct.error,
+)
 # Of files that are looked for in folders and archives; what they are is told by their content.
 PHOTO_SUFFIXES = {".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff", ".heic", ".heif"}
-SNIFFED_BYTES = 16  # enough to tell every accepted format
+PHOTO_SIGNATURE_BYTES = 16  # enough to tell every accepted format
 
 # Our own limit is checked from the header before anything is decoded.
 Image.MAX_IMAGE_PIXELS = None
 
 
-def sniff_media_type(begin: bytes) -> str | None:
+def detect_media_type(first_bytes: bytes) -> str | None:
     """The media type by the first SNIFFED_BYTES of a file; None for anything not accepted."""
-    if begin.startswith(b"\xff\xd8\xff"):
+    if first_bytes.startswith(b"\xff\xd8\xff"):
         return "image/jpeg"
-    if begin.startswith(b"\x89PNG\r\n\x1a\n"):
+    if first_bytes.startswith(b"\x89PNG\r\n\x1a\n"):
         return "image/png"
-    if begin[:4] == b"RIFF" and begin[8:12] == b"WEBP":
+    if first_bytes[:4] == b"RIFF" and first_bytes[8:12] == b"WEBP":
         return "image/webp"
-    if begin.startswith((b"II*\x00", b"MM\x00*", b"II+\x00", b"MM\x00+")):
+    if first_bytes.startswith((b"II*\x00", b"MM\x00*", b"II+\x00", b"MM\x00+")):
         return "image/tiff"
     # "BM" alone begins many texts: a bitmap has two reserved fields, which are zero.
-    if begin.startswith(b"BM") and begin[6:10] == b"\x00\x00\x00\x00":
+    if first_bytes.startswith(b"BM") and first_bytes[6:10] == b"\x00\x00\x00\x00":
         return "image/bmp"
-    if begin[4:8] == b"ftyp" and begin[8:12] in HEIC_BRANDS:
-        return HEIC
+    if first_bytes[4:8] == b"ftyp" and first_bytes[8:12] in HEIC_BRANDS:
+        return HEIC_MEDIA_TYPE
     return None
 
 
 def open_photo(file: BinaryIO) -> Image.Image:
     """The photo with its header read and its pixels not yet decoded."""
-    return Image.open(file, formats=FORMATS)
+    return Image.open(file, formats=PILLOW_FORMATS)
 
 
-def check_pixels(width: int, height: int, max_pixels: int) -> None:
+def check_pixel_count(width: int, height: int, max_pixels: int) -> None:
     """Unprocessable (`too_many_pixels`) when the header promises more than the limit."""
     if width * height > max_pixels:
         raise Unprocessable(

@@ -8,14 +8,16 @@ means the extractor `anyloc-vitg14:clusters=32`. What contradicts is refused, ne
 from __future__ import annotations
 
 from shared.errors import Misconfigured
-from shared.recipes import RECIPES, get_recipe
+from shared.recipes import EXTRACTOR_CONFIGS, get_extractor_config
 
-DINO_MODELS = {
-    name.replace("anyloc-", "dinov2_"): name for name in RECIPES if name.startswith("anyloc-")
+EXTRACTORS_BY_DINO_MODEL = {
+    name.replace("anyloc-", "dinov2_"): name
+    for name in EXTRACTOR_CONFIGS
+    if name.startswith("anyloc-")
 }
 
 
-def extractor_of(
+def extractor_from_dino_settings(
     dino_model: str,
     *,
     desc_layer: int | None,
@@ -27,9 +29,11 @@ def extractor_of(
 
     ValueError names the variable that can't be used, its value, and what is allowed.
     """
-    base = DINO_MODELS.get(dino_model)
+    base = EXTRACTORS_BY_DINO_MODEL.get(dino_model)
     if base is None:
-        raise ValueError(f"DINO_MODEL={dino_model} is unknown. Known: {', '.join(DINO_MODELS)}")
+        raise ValueError(
+            f"DINO_MODEL={dino_model} is unknown. Known: {', '.join(EXTRACTORS_BY_DINO_MODEL)}"
+        )
     options = []
     for variable, option, value in (
         ("DESC_LAYER", "layer", desc_layer),
@@ -39,14 +43,14 @@ def extractor_of(
         if value is not None:
             written = f"{option}={value}"
             try:
-                get_recipe(f"{base}:{written}", allow_test_extractors=False)
+                get_extractor_config(f"{base}:{written}", allow_test_extractors=False)
             except Misconfigured as error:
                 raise ValueError(
                     f"{variable}={value} with DINO_MODEL={dino_model}: {error.detail}"
                 ) from error
             options.append(written)
     name = f"{base}:{','.join(options)}" if options else base
-    recipe = get_recipe(name, allow_test_extractors=False)
+    recipe = get_extractor_config(name, allow_test_extractors=False)
     if vlad_desc_dim not in (None, recipe.width):
         raise ValueError(
             f"VLAD_DESC_DIM={vlad_desc_dim} contradicts DINO_MODEL={dino_model}, whose features "

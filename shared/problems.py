@@ -14,15 +14,15 @@ from sqlalchemy.exc import SQLAlchemyError
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 
-from shared.catalog.away import as_unavailable
+from shared.catalog.away import to_unavailable
 from shared.errors import InvalidRequest, PlacewiseError, Unprocessable
 from shared.ids import new_id
-from shared.telemetry.request_id import HEADER
+from shared.telemetry.request_id import REQUEST_ID_HEADER
 
 log = logging.getLogger(__name__)
 
 RETRY_AFTER_SECONDS = 2  # of a 503 that knows no better
-REQUEST_ID = "placewise.request_id"
+REQUEST_ID_SCOPE_KEY = "placewise.request_id"
 """Of an ASGI scope: the call's id, where the service gives its calls ids."""
 CLOSED_WITH = "placewise.closed_with"
 """Of an ASGI scope: what the server answered itself before it closed the connection."""
@@ -56,7 +56,7 @@ PROBLEM_RESPONSES: dict[int | str, dict[str, Any]] = {
 }
 
 # The same for whoever calls without a key, with too little of one, or too often.
-KEY_RESPONSES: dict[int | str, dict[str, Any]] = {
+AUTHENTICATION_RESPONSES: dict[int | str, dict[str, Any]] = {
     401: {**PROBLEM_RESPONSES["4XX"], "description": "No key, or one that is no longer good."},
     403: {**PROBLEM_RESPONSES["4XX"], "description": "The key lacks the scope of this call."},
     429: {
@@ -66,21 +66,21 @@ KEY_RESPONSES: dict[int | str, dict[str, Any]] = {
 }
 
 
-def install_problem_handlers(app: FastAPI) -> None:
+def install_exception_handlers(app: FastAPI) -> None:
     """Turn whatever is raised in a route into a problem document."""
-    app.add_exception_handler(PlacewiseError, _on_placewise_error)
-    app.add_exception_handler(RequestValidationError, _on_validation_error)
-    app.add_exception_handler(HTTPException, _on_http_exception)
-    app.add_exception_handler(SQLAlchemyError, _on_database_error)
+    app.add_exception_handler(PlacewiseError, _handle_placewise_error)
+    app.add_exception_handler(RequestValidationError, _handle_validation_error)
+    app.add_exception_handler(HTTPException, _handle_http_exception)
+    app.add_exception_handler(SQLAlchemyError, _handle_database_error)
     app.add_exception_handler(ClientDisconnect, _on_client_gone)
-    app.add_exception_handler(Exception, on_any_error)
+    app.add_exception_handler(Exception, handle_unexpected_error)
 
 
 def problem_response(error: PlacewiseError, request: Request) -> JSONResponse:
     headers = {}
     # Where the call's log does not reach: the handler of what nobody foresaw.
-    if (request_id := request.scope.get(REQUEST_ID)) is not None:
-        headers[HEADER] = request_id
+    if (request_id := request.scope.get(REQUEST_ID_SCOPE_KEY)) is not None:
+        headers[REQUEST_ID_HEADER] = request_id
     if error.status == 401:
         headers["WWW-Authenticate"] = "Bearer"
     wait = error.extra.get("retry_after_seconds")
@@ -98,7 +98,7 @@ def problem_response(error: PlacewiseError, request: Request) -> JSONResponse:
     )
 
 
-async def _on_placewise_error(request: Request, error: Exception) -> JSONResponse:
+async def _handle_placewise_error(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, PlacewiseError)
     if error.status >= 500:
         log.error("%s %s: %s", request.method, request.url.path, error.detail)
@@ -107,7 +107,7 @@ async def _on_placewise_error(request: Request, error: Exception) -> JSONRespons
     return problem_response(error, request)
 
 
-async def _on_validation_error(request: Request, error: Exception) -> JSONResponse:
+async def _handle_validation_error(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, RequestValidationError)
     faults = error.errors()
     if any(fault["type"] == "json_invalid" for fault in faults):
@@ -125,7 +125,7 @@ async def _on_validation_error(request: Request, error: Exception) -> JSONRespon
     return problem_response(problem, request)
 
 
-async def _on_http_exception(request: Request, error: Exception) -> JSONResponse:
+async def _handle_http_exception(request: Request, error: Exception) -> JSONResponse:
     """Unknown paths and methods, as Starlette raises them."""
     assert isinstance(error, HTTPException)
     code = HTTP_CODES.get(error.status_code, "http_error")
@@ -144,20 +144,20 @@ async def _on_http_exception(request: Request, error: Exception) -> JSONResponse
     )
 
 
-async def _on_database_error(request: Request, error: Exception) -> JSONResponse:
-    unavailable = as_unavailable(error)
+async def _handle_database_error(request: Request, error: Exception) -> JSONResponse:
+    unavailable = to_unavailable(error)
     if unavailable is None:  # a bug: another try would meet it again
-        return await on_any_error(request, error)
-    return await _on_placewise_error(request, unavailable)
+        return await handle_unexpected_error(request, error)
+    return await _handle_placewise_error(request, unavailable)
 
 
 async def _on_client_gone(request: Request, error: Exception) -> Response:
     return Response(status_code=CLIENT_GONE)  # nobody gets it
 
 
-async def on_any_error(request: Request, error: Exception) -> JSONResponse:
+async def handle_unexpected_error(request: Request, error: Exception) -> JSONResponse:
     """What is said of a fault of ours: an id, by which the log tells the rest."""
-    request_id = request.scope.get(REQUEST_ID) or str(new_id())
+    request_id = request.scope.get(REQUEST_ID_SCOPE_KEY) or str(new_id())
     log.error(
         "%s %s failed (request %s)",
         request.method,

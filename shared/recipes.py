@@ -21,27 +21,32 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from shared.errors import Misconfigured
-from shared.model_names import PREFIX as TRAINED_PREFIX
-from shared.model_names import TrainedName, read_trained_name
-from shared.torchhub_names import DEFAULT_SIDE, PREFIX, HubEntry, read_hub_name
+from shared.model_names import TRAINED_MODEL_PREFIX as TRAINED_PREFIX
+from shared.model_names import TrainedModelName, parse_trained_model_name
+from shared.torchhub_names import (
+    DEFAULT_INPUT_SIDE_PIXELS,
+    TORCHHUB_PREFIX,
+    TorchHubEntry,
+    parse_torchhub_name,
+)
 
 FACETS = ("query", "key", "value", "token")
-AGGREGATORS = ("vlad", "soft-vlad", "gem", "avg")
+EXTRACTOR_AGGREGATORS = ("vlad", "soft-vlad", "gem", "avg")
 # Of the network's published figures: rankings with them are to be those of its authors.
-PARITY_PREPROCESSINGS = ("demo1024", "paper480x640", "round14")
-PREPROCESSINGS = ("square224", *PARITY_PREPROCESSINGS)
-MOST_CLUSTERS = 4096
-MOST_PCA = 1024  # dimensions after PCA: its time and memory grow with the square
-TORCHHUB = "torchhub"  # the backbone that is a torch.hub entry
-TRAINED = "gsv"  # the backbone that is a model of `placewise train`
-SLOW = "test-slow"  # the backbone whose width and time are options
-MOST_WIDTH = 131_072
-MOST_MILLISECONDS = 60_000
-MOST_TEMPERATURE = 1000
+ANYLOC_PREPROCESSING_NAMES = ("demo1024", "paper480x640", "round14")
+PREPROCESSING_NAMES = ("square224", *ANYLOC_PREPROCESSING_NAMES)
+MAX_CLUSTERS = 4096
+MAX_PCA_DIMENSION = 1024  # dimensions after PCA: its time and memory grow with the square
+TORCHHUB_BACKBONE = "torchhub"  # the backbone that is a torch.hub entry
+TRAINED_BACKBONE = "gsv"  # the backbone that is a model of `placewise train`
+SLOW_TEST_BACKBONE = "test-slow"  # the backbone whose width and time are options
+MAX_WIDTH = 131_072
+MAX_MILLISECONDS = 60_000
+MAX_TEMPERATURE = 1000
 
 
 @dataclass(frozen=True, slots=True)
-class Recipe:
+class ExtractorConfig:
     """How the extractor `name` is put together."""
 
     name: str
@@ -74,9 +79,9 @@ class Recipe:
     """File below `shared/vision/vocabularies/`, learnt on photographs of elsewhere: a new map
     answers with it at once, whatever `clusters` says about later fits.
     """
-    hub: HubEntry | None = None
+    hub: TorchHubEntry | None = None
     """The torch.hub entry that makes the descriptors, for `torchhub:` names."""
-    trained: TrainedName | None = None
+    trained: TrainedModelName | None = None
     """The model that makes the descriptors, for `gsv:` names."""
     for_tests: bool = False
     milliseconds: int = 0
@@ -87,7 +92,7 @@ class Recipe:
         return self.aggregator in ("vlad", "soft-vlad")
 
     @property
-    def has_patches(self) -> bool:
+    def has_local_features(self) -> bool:
         """Whether the backbone makes local features: several of a photo, each of a patch."""
         return self.aggregator != "none"
 
@@ -102,7 +107,7 @@ class Recipe:
         return self.width * (self.clusters if self.needs_vocabulary else 1)
 
     @property
-    def local_features(self) -> tuple[int | str | HubEntry | TrainedName | None, ...]:
+    def local_features(self) -> tuple[int | str | TorchHubEntry | TrainedModelName | None, ...]:
         """Recipes that agree in this can share one loaded backbone."""
         return (
             self.backbone,
@@ -115,12 +120,14 @@ class Recipe:
         )
 
 
-def _anyloc(size: str, *, depth: int, width: int, layer: int, parameters: int) -> Recipe:
+def _anyloc_config(
+    size: str, *, depth: int, width: int, layer: int, parameters: int
+) -> ExtractorConfig:
     """AnyLoc (Keetha et al., RA-L 2023): DINOv2 value features and VLAD.
 
     The layers are those that its authors recommend for each size of the network.
     """
-    return Recipe(
+    return ExtractorConfig(
         name=f"anyloc-{size}",
         backbone=f"dinov2-{size}",
         width=width,
@@ -133,10 +140,10 @@ def _anyloc(size: str, *, depth: int, width: int, layer: int, parameters: int) -
     )
 
 
-RECIPES = {
+EXTRACTOR_CONFIGS = {
     recipe.name: recipe
     for recipe in (
-        Recipe(
+        ExtractorConfig(
             name="efficientnet-lite0-vlad",
             backbone="efficientnet-lite0",
             width=112,
@@ -145,11 +152,11 @@ RECIPES = {
             aggregator="vlad",
             shipped_vocabulary="efficientnet-lite0.npy",
         ),
-        _anyloc("vits14", depth=12, width=384, layer=10, parameters=22_100_000),
-        _anyloc("vitb14", depth=12, width=768, layer=10, parameters=86_600_000),
-        _anyloc("vitl14", depth=24, width=1024, layer=20, parameters=304_400_000),
-        _anyloc("vitg14", depth=40, width=1536, layer=31, parameters=1_136_500_000),
-        Recipe(
+        _anyloc_config("vits14", depth=12, width=384, layer=10, parameters=22_100_000),
+        _anyloc_config("vitb14", depth=12, width=768, layer=10, parameters=86_600_000),
+        _anyloc_config("vitl14", depth=24, width=1024, layer=20, parameters=304_400_000),
+        _anyloc_config("vitg14", depth=40, width=1536, layer=31, parameters=1_136_500_000),
+        ExtractorConfig(
             name="test-tiny-avg",
             backbone="test-tiny",
             width=16,
@@ -158,7 +165,7 @@ RECIPES = {
             aggregator="avg",
             for_tests=True,
         ),
-        Recipe(
+        ExtractorConfig(
             name="test-tiny-vlad",
             backbone="test-tiny",
             width=16,
@@ -168,9 +175,9 @@ RECIPES = {
             clusters=8,
             for_tests=True,
         ),
-        Recipe(
+        ExtractorConfig(
             name="test-slow-avg",
-            backbone=SLOW,
+            backbone=SLOW_TEST_BACKBONE,
             width=7168,
             parameters=1_000,
             preprocessing="square224",  # so that what is around it does its real work
@@ -181,25 +188,25 @@ RECIPES = {
 }
 
 
-def get_recipe(name: str, *, allow_test_extractors: bool) -> Recipe:
+def get_extractor_config(name: str, *, allow_test_extractors: bool) -> ExtractorConfig:
     """The recipe that `name` and its options mean; its own name is the canonical one.
 
     Misconfigured: `unknown_extractor`, `test_extractor` (for tests, and not allowed),
     `bad_extractor_option` (naming the option, its value, and what is allowed), and those of
-    `read_hub_name` and `read_trained_name`. Whether a torch.hub entry may be loaded,
+    `parse_torchhub_name` and `parse_trained_model_name`. Whether a torch.hub entry may be loaded,
     `Settings.recipe` knows; whether a model was added, the catalog.
     """
-    if name.startswith(PREFIX):
-        return _hub_recipe(read_hub_name(name))
+    if name.startswith(TORCHHUB_PREFIX):
+        return _torchhub_config(parse_torchhub_name(name))
     if name.startswith(TRAINED_PREFIX):
-        return _trained_recipe(read_trained_name(name))
+        return _trained_config(parse_trained_model_name(name))
     base, colon, written = name.partition(":")
-    recipe = RECIPES.get(base)
+    recipe = EXTRACTOR_CONFIGS.get(base)
     if recipe is None:
-        known = ", ".join(sorted(r.name for r in RECIPES.values() if not r.for_tests))
+        known = ", ".join(sorted(r.name for r in EXTRACTOR_CONFIGS.values() if not r.for_tests))
         raise Misconfigured(
             "unknown_extractor",
-            f"There is no extractor {base!r}. Known: {known}, {PREFIX}OWNER/NAME@COMMIT:ENTRY, and "
+            f"There is no extractor {base!r}. Known: {known}, {TORCHHUB_PREFIX}OWNER/NAME@COMMIT:ENTRY, and "
             f"{TRAINED_PREFIX}NAME of a model that was added (EXTRACTOR).",
         )
     if recipe.for_tests and not allow_test_extractors:
@@ -208,14 +215,14 @@ def get_recipe(name: str, *, allow_test_extractors: bool) -> Recipe:
             f"The extractor {base!r} exists for tests and knows nothing of places. "
             "Tests set ALLOW_TEST_EXTRACTORS=true.",
         )
-    return _with_options(recipe, written) if colon else recipe
+    return _apply_options(recipe, written) if colon else recipe
 
 
-def _hub_recipe(hub: HubEntry) -> Recipe:
-    usual = hub.height == hub.width == DEFAULT_SIDE
-    return Recipe(
+def _torchhub_config(hub: TorchHubEntry) -> ExtractorConfig:
+    usual = hub.height == hub.width == DEFAULT_INPUT_SIDE_PIXELS
+    return ExtractorConfig(
         name=hub.name,
-        backbone=TORCHHUB,
+        backbone=TORCHHUB_BACKBONE,
         width=None,
         parameters=None,
         preprocessing="square224" if usual else f"resize{hub.height}x{hub.width}",
@@ -224,10 +231,10 @@ def _hub_recipe(hub: HubEntry) -> Recipe:
     )
 
 
-def _trained_recipe(trained: TrainedName) -> Recipe:
-    return Recipe(
+def _trained_config(trained: TrainedModelName) -> ExtractorConfig:
+    return ExtractorConfig(
         name=trained.extractor,
-        backbone=TRAINED,
+        backbone=TRAINED_BACKBONE,
         width=None,
         parameters=None,
         preprocessing=None,
@@ -236,7 +243,7 @@ def _trained_recipe(trained: TrainedName) -> Recipe:
     )
 
 
-def with_options(name: str, options: Mapping[str, object]) -> str:
+def add_extractor_options(name: str, options: Mapping[str, object]) -> str:
     """The name of an extractor, which may carry options, with further ones; None is left out."""
     written = [f"{option}={value}" for option, value in options.items() if value is not None]
     if not written:
@@ -244,7 +251,7 @@ def with_options(name: str, options: Mapping[str, object]) -> str:
     return name + ("," if ":" in name else ":") + ",".join(written)
 
 
-def _with_options(recipe: Recipe, written: str) -> Recipe:
+def _apply_options(recipe: ExtractorConfig, written: str) -> ExtractorConfig:
     """`recipe` with the options of `option=value,option=value`."""
     own = recipe
     values: dict[str, str] = {}
@@ -284,44 +291,47 @@ def _with_options(recipe: Recipe, written: str) -> Recipe:
     )
 
 
-Option = tuple[Callable[[str], Any], str]
+OptionParser = tuple[Callable[[str], Any], str]
 
 
-def _allowed_options(own: Recipe, chosen: Recipe) -> dict[str, Option]:
+def _allowed_options(own: ExtractorConfig, chosen: ExtractorConfig) -> dict[str, OptionParser]:
     """How options are read, and what a refusal says is allowed: those of the recipe `own`, once
     its aggregator is that of `chosen`.
     """
-    allowed: dict[str, Option] = {}
+    allowed: dict[str, OptionParser] = {}
     if own.needs_vocabulary:
-        allowed["aggregator"] = _one_of(AGGREGATORS)
-        allowed["preprocessing"] = _one_of(PREPROCESSINGS)
+        allowed["aggregator"] = _one_of(EXTRACTOR_AGGREGATORS)
+        allowed["preprocessing"] = _one_of(PREPROCESSING_NAMES)
     if chosen.needs_vocabulary:
         allowed["clusters"] = (
-            _whole(1, MOST_CLUSTERS),
-            f"a whole number from 1 to {MOST_CLUSTERS}",
+            _integer_between(1, MAX_CLUSTERS),
+            f"a whole number from 1 to {MAX_CLUSTERS}",
         )
     if chosen.aggregator == "soft-vlad":
         allowed["temperature"] = (
             _temperature,
-            f"a number above 0 and up to {MOST_TEMPERATURE}, such as 0.5",
+            f"a number above 0 and up to {MAX_TEMPERATURE}, such as 0.5",
         )
     if own.depth is not None:
         last = own.depth - 1
         allowed["facet"] = _one_of(FACETS)
         allowed["layer"] = (
-            _whole(0, last),
+            _integer_between(0, last),
             f"a whole number from 0 to {last} ({own.backbone} has {own.depth} blocks)",
         )
-    if own.backbone == SLOW:
+    if own.backbone == SLOW_TEST_BACKBONE:
         allowed["milliseconds"] = (
-            _whole(0, MOST_MILLISECONDS),
-            f"a whole number from 0 to {MOST_MILLISECONDS}, for each photo",
+            _integer_between(0, MAX_MILLISECONDS),
+            f"a whole number from 0 to {MAX_MILLISECONDS}, for each photo",
         )
-        allowed["width"] = (_whole(16, MOST_WIDTH), f"a whole number from 16 to {MOST_WIDTH}")
+        allowed["width"] = (
+            _integer_between(16, MAX_WIDTH),
+            f"a whole number from 16 to {MAX_WIDTH}",
+        )
     return allowed
 
 
-def _whole(least: int, most: int) -> Callable[[str], int]:
+def _integer_between(least: int, most: int) -> Callable[[str], int]:
     def read(value: str) -> int:
         # int() would also take "+9", "1_0" and other scripts' digits.
         if not (value.isascii() and value.isdigit()) or not least <= int(value) <= most:
@@ -331,7 +341,7 @@ def _whole(least: int, most: int) -> Callable[[str], int]:
     return read
 
 
-def _one_of(names: tuple[str, ...]) -> Option:
+def _one_of(names: tuple[str, ...]) -> OptionParser:
     def read(value: str) -> str:
         if value not in names:
             raise ValueError(value)
@@ -344,7 +354,7 @@ def _temperature(value: str) -> float:
     # float() would also take "1e3", "1_0" and "inf"; six digits are written again as they were.
     if not re.fullmatch(r"[0-9]{1,4}(\.[0-9]{1,6})?", value):
         raise ValueError(value)
-    if not 0 < float(value) <= MOST_TEMPERATURE:
+    if not 0 < float(value) <= MAX_TEMPERATURE:
         raise ValueError(value)
     return float(value)
 

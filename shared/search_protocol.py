@@ -16,8 +16,8 @@ from uuid import UUID
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from shared.photo_filter import EVERYTHING, PhotoFilter
-from shared.shards import WHOLE
+from shared.photo_filter import NO_FILTER, PhotoFilter
+from shared.shards import SINGLE_SHARD
 
 EXHAUSTIVE = "exhaustive"  # every row was compared exactly
 BOUND = "bound"  # no row that was left out can reach the answer, whatever it holds
@@ -66,7 +66,7 @@ class SearchRequest(_Message):
     row: int = Field(ge=0)
     min_version: int = Field(ge=0)
     k: int = Field(ge=1)
-    photos: PhotoFilter = EVERYTHING
+    photos: PhotoFilter = NO_FILTER
     min_score: float | None = None
     exclude: tuple[UUID, ...] = ()
     mode: Mode = Mode.AUTO
@@ -77,7 +77,7 @@ class SearchRequest(_Message):
     word_weights: tuple[float, ...] = ()
 
 
-class Hit(_Message):
+class SearchHit(_Message):
     photo_id: UUID
     score: float
     """Cosine similarity in [-1, 1]."""
@@ -94,7 +94,7 @@ class Hit(_Message):
 class SearchResponse(_Message):
     """`hits` are sorted by what ranks them (`Hit.ranked_by`), highest first, ties by photo id."""
 
-    hits: tuple[Hit, ...]
+    hits: tuple[SearchHit, ...]
     certificate: str
     """How the answer was reached, one of CERTIFICATES."""
     certified_k: int = 0
@@ -110,7 +110,7 @@ class SearchResponse(_Message):
     1/3`) of which no worker answered."""
 
 
-class Lag(_Message):
+class ReplicationLag(_Message):
     """How far a snapshot is behind its map. `seconds` since it was last known to be level."""
 
     versions: int
@@ -119,7 +119,7 @@ class Lag(_Message):
     """Whether the generation is the active one; False for one that is only being built."""
 
 
-class Part(_Message):
+class IndexPart(_Message):
     """One part of what a generation is searched by: a level of its codes, or its rows."""
 
     name: str
@@ -128,13 +128,13 @@ class Part(_Message):
     """Held in memory; else mapped from files, of which the system keeps what it has room for."""
 
 
-class Held(_Message):
+class LoadedGeneration(_Message):
     """What is held of one generation."""
 
     rows: int
     """With those of deleted photos."""
     dimension: int
-    parts: tuple[Part, ...]
+    parts: tuple[IndexPart, ...]
 
 
 class DeviceStatus(_Message):
@@ -155,19 +155,19 @@ class SearchStatus(_Message):
     Of several workers together: the sums, and the least version that every shard has.
     """
 
-    shard: str = str(WHOLE)
+    shard: str = str(SINGLE_SHARD)
     rows: int
     resident_bytes: int
     mapped_bytes: int = 0
     """What is not resident."""
     versions: dict[UUID, int]
-    held: dict[UUID, Held] = {}
+    held: dict[UUID, LoadedGeneration] = {}
     """Empty for several workers together."""
     incomplete: tuple[UUID, ...] = ()
     """Generations of which a chunk can't be read."""
     missing: tuple[str, ...]
     """The chunks that can't be read."""
-    lags: dict[UUID, Lag] = {}
+    lags: dict[UUID, ReplicationLag] = {}
     """Empty where no one follows the catalog."""
     devices: tuple[DeviceStatus, ...] = ()
     """Empty where the CPU does all."""
@@ -180,7 +180,7 @@ class SearchStatus(_Message):
         return {key: value for key, value in self.versions.items() if key not in self.incomplete}
 
 
-class SearchPort(Protocol):
+class SearchBackend(Protocol):
     """The gateway's view of the search tier. Raises Unavailable when it can't keep up."""
 
     def search(self, request: SearchRequest) -> SearchResponse: ...

@@ -15,13 +15,13 @@ from pydantic import Field, SecretStr, field_validator, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from shared.errors import Misconfigured
-from shared.machine import ram_bytes
-from shared.predecessor import extractor_of
-from shared.recipes import Recipe, get_recipe
+from shared.machine import memory_limit_bytes
+from shared.predecessor import extractor_from_dino_settings
+from shared.recipes import ExtractorConfig, get_extractor_config
 from shared.shards import Shard
-from shared.torchhub_names import PREFIX, read_hub_name
+from shared.torchhub_names import TORCHHUB_PREFIX, parse_torchhub_name
 
-LEAST_KEY_CHARACTERS = 16
+MIN_ADMIN_KEY_CHARACTERS = 16
 
 
 class Settings(BaseSettings):
@@ -424,20 +424,20 @@ class Settings(BaseSettings):
 
     @field_validator("admin_key")
     @classmethod
-    def _can_be_sent_and_not_guessed(cls, value: SecretStr | None) -> SecretStr | None:
+    def _check_admin_key(cls, value: SecretStr | None) -> SecretStr | None:
         if value is None:
             return None
         key = value.get_secret_value()
-        if len(key) < LEAST_KEY_CHARACTERS or not re.fullmatch(r"[!-~]+", key):
+        if len(key) < MIN_ADMIN_KEY_CHARACTERS or not re.fullmatch(r"[!-~]+", key):
             raise ValueError(
-                f"a key has at least {LEAST_KEY_CHARACTERS} printable ASCII characters and no "
+                f"a key has at least {MIN_ADMIN_KEY_CHARACTERS} printable ASCII characters and no "
                 "blanks; this makes one: openssl rand -hex 24"
             )
         return value
 
     @field_validator("cors_origins")
     @classmethod
-    def _are_origins(cls, value: str | None) -> str | None:
+    def _check_origins(cls, value: str | None) -> str | None:
         for origin in _split(value):
             if not re.fullmatch(r"https?://([a-z0-9.-]+|\[[0-9a-f:]+\])(:\d+)?", origin):
                 raise ValueError(
@@ -458,12 +458,12 @@ class Settings(BaseSettings):
 
     @field_validator("search_shard")
     @classmethod
-    def _names_a_shard(cls, value: str) -> str:
+    def _check_shard(cls, value: str) -> str:
         return str(Shard.parse(value))
 
     @field_validator("search_urls")
     @classmethod
-    def _are_addresses(cls, value: str | None) -> str | None:
+    def _check_urls(cls, value: str | None) -> str | None:
         for url in _split(value):
             if not re.fullmatch(r"https?://[^\s/?#]+/?", url):
                 raise ValueError(
@@ -474,30 +474,30 @@ class Settings(BaseSettings):
 
     @field_validator("torchhub_allowed")
     @classmethod
-    def _are_pinned(cls, value: str | None) -> str | None:
+    def _check_torchhub_entries(cls, value: str | None) -> str | None:
         for name in (value or "").split():
-            if not name.startswith(PREFIX):
-                raise ValueError(f"{name!r} is no torch.hub extractor: {PREFIX}...")
+            if not name.startswith(TORCHHUB_PREFIX):
+                raise ValueError(f"{name!r} is no torch.hub extractor: {TORCHHUB_PREFIX}...")
             try:
-                read_hub_name(name)
+                parse_torchhub_name(name)
             except Misconfigured as error:
                 raise ValueError(error.detail) from error
         return value
 
     @field_validator("placewise_home", "upload_dir")
     @classmethod
-    def _absolute(cls, value: Path | None) -> Path | None:
+    def _resolve_path(cls, value: Path | None) -> Path | None:
         return value and value.expanduser().resolve()
 
     @field_validator("dino_weights")
     @classmethod
-    def _absolute_weights(cls, value: Path | None) -> Path | None:
+    def _resolve_weights_path(cls, value: Path | None) -> Path | None:
         # Not resolved: a link in a Hugging Face cache has a better name than what it points to.
         return None if value is None else value.expanduser().absolute()
 
     @field_validator("s3_endpoint")
     @classmethod
-    def _host_and_port(cls, value: str | None) -> str | None:
+    def _check_host_and_port(cls, value: str | None) -> str | None:
         if value is not None and not re.fullmatch(r"(\[[0-9a-fA-F:]+\]|[\w.-]+)(:\d+)?", value):
             raise ValueError(
                 "is a host and a port without a scheme, such as s3.example.com or 10.0.0.5:8333; "
@@ -507,7 +507,7 @@ class Settings(BaseSettings):
 
     @field_validator("map_tiles")
     @classmethod
-    def _a_pattern_of_tiles(cls, value: str | None) -> str | None:
+    def _check_tile_url(cls, value: str | None) -> str | None:
         # Its host goes into the page's Content-Security-Policy: nothing else may follow it there.
         if value is not None and not (
             re.fullmatch(r"https?://[A-Za-z0-9.-]+(:\d+)?/[^\s]+", value)
@@ -521,14 +521,14 @@ class Settings(BaseSettings):
 
     @field_validator("s3_public_endpoint")
     @classmethod
-    def _an_address_without_a_path(cls, value: str | None) -> str | None:
+    def _check_base_url(cls, value: str | None) -> str | None:
         if value is not None and not re.fullmatch(r"https?://[^\s/?#@]+/?", value):
             raise ValueError("is an address without a path, such as https://photos.example.com")
         return value and value.rstrip("/")
 
     @field_validator("s3_bucket")
     @classmethod
-    def _a_bucket_name(cls, value: str) -> str:
+    def _check_bucket_name(cls, value: str) -> str:
         if not re.fullmatch(r"[a-z0-9][a-z0-9.-]{1,61}[a-z0-9]", value):
             raise ValueError(
                 "a bucket's name has 3 to 63 small letters, digits, hyphens and dots, and begins "
@@ -537,7 +537,7 @@ class Settings(BaseSettings):
         return value
 
     @model_validator(mode="after")
-    def _s3_has_its_keys_and_all_objects(self) -> Self:
+    def _check_s3_settings(self) -> Self:
         if self.s3_endpoint is None:
             return self
         if not (self.s3_access_key and self.s3_secret_key):
@@ -550,7 +550,7 @@ class Settings(BaseSettings):
         return self
 
     @model_validator(mode="after")
-    def _tiles_say_whose_they_are(self) -> Self:
+    def _check_map_attribution(self) -> Self:
         if self.map_tiles is not None and self.map_attribution is None:
             raise ValueError(
                 "MAP_TILES needs MAP_ATTRIBUTION, which stands in the corner of the map: "
@@ -559,7 +559,7 @@ class Settings(BaseSettings):
         return self
 
     @model_validator(mode="after")
-    def _a_batch_fits_into_a_slot(self) -> Self:
+    def _check_batch_fits_slot(self) -> Self:
         if self.batch_photos > self.slot_rows:
             raise ValueError(
                 f"BATCH_PHOTOS ({self.batch_photos}) may not exceed SLOT_ROWS ({self.slot_rows}): "
@@ -568,7 +568,7 @@ class Settings(BaseSettings):
         return self
 
     @model_validator(mode="after")
-    def _dino_model_is_there_if_it_is_spoken_of(self) -> Self:
+    def _check_dino_model(self) -> Self:
         for name in ("desc_layer", "desc_facet", "vlad_clusters", "vlad_desc_dim"):
             value = getattr(self, name)
             if value is not None and self.dino_model is None:
@@ -580,10 +580,12 @@ class Settings(BaseSettings):
         return self
 
     @model_validator(mode="after")
-    def _new_maps_have_one_extractor(self) -> Self:
+    def _check_one_extractor(self) -> Self:
         try:
-            recipe = get_recipe(self.extractor, allow_test_extractors=self.allow_test_extractors)
-            check_served(recipe)
+            recipe = get_extractor_config(
+                self.extractor, allow_test_extractors=self.allow_test_extractors
+            )
+            check_extractor_is_shared(recipe)
         except Misconfigured as error:
             raise ValueError(f"EXTRACTOR={self.extractor}: {error.detail}") from error
         named = recipe.name
@@ -599,8 +601,10 @@ class Settings(BaseSettings):
     def new_map_extractor(self) -> str:
         """The canonical name of the extractor that EXTRACTOR or DINO_MODEL chooses."""
         if self.dino_model is None:
-            return get_recipe(self.extractor, allow_test_extractors=self.allow_test_extractors).name
-        return extractor_of(
+            return get_extractor_config(
+                self.extractor, allow_test_extractors=self.allow_test_extractors
+            ).name
+        return extractor_from_dino_settings(
             self.dino_model,
             desc_layer=self.desc_layer,
             desc_facet=self.desc_facet,
@@ -608,14 +612,14 @@ class Settings(BaseSettings):
             vlad_desc_dim=self.vlad_desc_dim,
         )
 
-    def recipe(self, name: str) -> Recipe:
+    def recipe(self, name: str) -> ExtractorConfig:
         """The recipe of an extractor that this installation may load.
 
-        Misconfigured as `get_recipe`, `torchhub_not_allowed` for code that nobody allowed, and
+        Misconfigured as `get_extractor_config`, `torchhub_not_allowed` for code that nobody allowed, and
         `model_not_added` for a checkpoint that is only a file.
         """
-        recipe = get_recipe(name, allow_test_extractors=self.allow_test_extractors)
-        check_served(recipe)
+        recipe = get_extractor_config(name, allow_test_extractors=self.allow_test_extractors)
+        check_extractor_is_shared(recipe)
         if recipe.hub is not None and recipe.name not in self.allowed_hub_extractors:
             raise Misconfigured(
                 "torchhub_not_allowed",
@@ -628,9 +632,9 @@ class Settings(BaseSettings):
     @property
     def allowed_hub_extractors(self) -> tuple[str, ...]:
         """Canonical names of the torch.hub extractors that may be loaded."""
-        allowed = [read_hub_name(name).name for name in (self.torchhub_allowed or "").split()]
+        allowed = [parse_torchhub_name(name).name for name in (self.torchhub_allowed or "").split()]
         configured = self.new_map_extractor
-        if configured.startswith(PREFIX):
+        if configured.startswith(TORCHHUB_PREFIX):
             allowed.append(configured)
         return tuple(dict.fromkeys(allowed))
 
@@ -639,21 +643,25 @@ class Settings(BaseSettings):
         """The part of every generation that this process's search worker holds."""
         return Shard.parse(self.search_shard)
 
-    def search_cache(self, shard: Shard) -> Path:
+    def search_cache_folder(self, shard: Shard) -> Path:
         """Where the search worker of a shard keeps what it fetches from a bucket."""
         return self.placewise_home / "search-cache" / str(shard).replace("/", "-of-")
 
     @property
     def search_memory_bytes(self) -> int:
-        return ram_bytes() // 2 if self.search_memory_budget is None else self.search_memory_budget
+        return (
+            memory_limit_bytes() // 2
+            if self.search_memory_budget is None
+            else self.search_memory_budget
+        )
 
     @property
-    def search_addresses(self) -> tuple[str, ...]:
+    def search_worker_urls(self) -> tuple[str, ...]:
         """The search workers' addresses, each once; () when search is in this process."""
         return tuple(dict.fromkeys(url.rstrip("/") for url in _split(self.search_urls)))
 
     @property
-    def trusted_origins(self) -> tuple[str, ...]:
+    def allowed_origins(self) -> tuple[str, ...]:
         """Whose pages may call; () for our own alone."""
         return tuple(dict.fromkeys(_split(self.cors_origins)))
 
@@ -669,7 +677,7 @@ class Settings(BaseSettings):
         return f"sqlite:///{self.placewise_home / 'catalog.sqlite'}"
 
 
-def check_served(recipe: Recipe) -> None:
+def check_extractor_is_shared(recipe: ExtractorConfig) -> None:
     """Misconfigured (`model_not_added`) for a checkpoint that other machines would not find."""
     if recipe.trained is not None and recipe.trained.file is not None:
         raise Misconfigured(

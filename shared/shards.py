@@ -42,9 +42,9 @@ class Shard:
         return f"{_PREFIX}{self}"
 
 
-WHOLE = Shard(0, 1)
+SINGLE_SHARD = Shard(0, 1)
 
 
-def names_a_shard(missing: str) -> bool:
+def is_shard_name(missing: str) -> bool:
     """Whether this part of an answer's `missing` is a whole shard, not one object."""
     return missing.startswith(_PREFIX)

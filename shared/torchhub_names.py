@@ -18,18 +18,18 @@ from typing import Any, NoReturn
 
 from shared.errors import Misconfigured
 
-PREFIX = "torchhub:"
-MOST_CHARACTERS = 200  # of a name, which columns of the catalog hold
-SIDES = range(16, 2049)  # pixels
+TORCHHUB_PREFIX = "torchhub:"
+MAX_TORCHHUB_NAME_CHARACTERS = 200  # of a name, which columns of the catalog hold
+INPUT_SIDES_PIXELS = range(16, 2049)  # pixels
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
-DEFAULT_SIDE = 224  # whole patches of 14, 16 and 32 pixels
+DEFAULT_INPUT_SIDE_PIXELS = 224  # whole patches of 14, 16 and 32 pixels
 
-Value = str | int | float | bool | None
-LITERALS: dict[str, Value] = {"true": True, "false": False, "none": None}
+HubArgument = str | int | float | bool | None
+HUB_ARGUMENT_LITERALS: dict[str, HubArgument] = {"true": True, "false": False, "none": None}
 
 
 @dataclass(frozen=True, slots=True)
-class HubEntry:
+class TorchHubEntry:
     """An entry of a `hubconf.py`, its arguments, and the photos that its network wants."""
 
     repository: str | None
@@ -39,11 +39,11 @@ class HubEntry:
     folder: str | None
     """Absolute path; None for a repository."""
     entry: str
-    arguments: tuple[tuple[str, Value], ...] = ()
+    arguments: tuple[tuple[str, HubArgument], ...] = ()
     """Keyword arguments of the entry, by name."""
-    height: int = DEFAULT_SIDE
+    height: int = DEFAULT_INPUT_SIDE_PIXELS
     """pixels"""
-    width: int = DEFAULT_SIDE
+    width: int = DEFAULT_INPUT_SIDE_PIXELS
     """pixels"""
     mean: tuple[float, ...] = IMAGENET_MEAN
     """Of red, green and blue, each from 0 to 1."""
@@ -65,46 +65,48 @@ class HubEntry:
         return _join(self, sorted(_arguments(self) + _input(self)))
 
 
-def read_hub_name(name: str) -> HubEntry:
+def parse_torchhub_name(name: str) -> TorchHubEntry:
     """What a name that begins with `torchhub:` means.
 
     Misconfigured: `torchhub_unpinned` (saying how to pin), `bad_torchhub_name`,
     `bad_extractor_option`.
     """
-    source, _, rest = name.removeprefix(PREFIX).partition(":")
+    source, _, rest = name.removeprefix(TORCHHUB_PREFIX).partition(":")
     entry, colon, written = rest.partition(":")
     if not entry.isidentifier() or not source:
-        _refuse(name, "after the repository comes the entry of its hubconf.py")
-    options = _read_options(name, written) if colon else {}
-    arguments = {o: _value(v) for o, v in sorted(options.items()) if "." not in o}
-    repository, commit, folder = _read_source(name, source)
-    plain = HubEntry(repository, commit, folder, entry, tuple(arguments.items()))
-    made = replace(plain, **_read_input(name, options))
-    if len(made.name) > MOST_CHARACTERS:
-        _refuse(name, f"it may have {MOST_CHARACTERS} characters, and has {len(made.name)}")
+        _raise_bad_name(name, "after the repository comes the entry of its hubconf.py")
+    options = _parse_options(name, written) if colon else {}
+    arguments = {o: _parse_argument(v) for o, v in sorted(options.items()) if "." not in o}
+    repository, commit, folder = _parse_source(name, source)
+    plain = TorchHubEntry(repository, commit, folder, entry, tuple(arguments.items()))
+    made = replace(plain, **_parse_input(name, options))
+    if len(made.name) > MAX_TORCHHUB_NAME_CHARACTERS:
+        _raise_bad_name(
+            name, f"it may have {MAX_TORCHHUB_NAME_CHARACTERS} characters, and has {len(made.name)}"
+        )
     return made
 
 
-def _read_source(name: str, source: str) -> tuple[str | None, str | None, str | None]:
+def _parse_source(name: str, source: str) -> tuple[str | None, str | None, str | None]:
     if source.startswith("/"):
         if not re.fullmatch(r"[^\s\x00-\x1f]+", source):
-            _refuse(name, "the folder's path holds a blank")
+            _raise_bad_name(name, "the folder's path holds a blank")
         return None, None, source.rstrip("/") or "/"
     repository, _, commit = source.partition("@")
     if not re.fullmatch(r"[\w-][\w.-]*/[\w-][\w.-]*", repository, re.ASCII):
-        _refuse(name, "a repository is OWNER/NAME on GitHub, a folder begins with /")
+        _raise_bad_name(name, "a repository is OWNER/NAME on GitHub, a folder begins with /")
     if not re.fullmatch(r"[0-9a-f]{40}", commit.lower()):
         raise Misconfigured(
             "torchhub_unpinned",
             f"The extractor {name!r} would run whatever code {repository} has on GitHub that day. "
-            f"Pin it to a commit that you have looked at: {PREFIX}{repository}@COMMIT:ENTRY with "
+            f"Pin it to a commit that you have looked at: {TORCHHUB_PREFIX}{repository}@COMMIT:ENTRY with "
             "all 40 hexadecimal digits of the commit. "
             f"`git ls-remote https://github.com/{repository} HEAD` prints the newest one.",
         )
     return repository, commit.lower(), None
 
 
-def _read_options(name: str, written: str) -> dict[str, str]:
+def _parse_options(name: str, written: str) -> dict[str, str]:
     options: dict[str, str] = {}
     for part in written.split(","):
         option, equals, value = part.partition("=")
@@ -118,7 +120,7 @@ def _read_options(name: str, written: str) -> dict[str, str]:
     return options
 
 
-def _read_input(name: str, options: dict[str, str]) -> dict[str, Any]:
+def _parse_input(name: str, options: dict[str, str]) -> dict[str, Any]:
     """The fields of HubEntry that the options `input.…` give."""
     given: dict[str, Any] = {}
     for option, value in options.items():
@@ -126,9 +128,10 @@ def _read_input(name: str, options: dict[str, str]) -> dict[str, Any]:
             continue
         if option == "input.size":
             match = re.fullmatch(r"([0-9]{1,4})x([0-9]{1,4})", value)
-            if match is None or not all(int(side) in SIDES for side in match.groups()):
+            if match is None or not all(int(side) in INPUT_SIDES_PIXELS for side in match.groups()):
                 _bad_option(
-                    name, f"{option}={value} is not HEIGHTxWIDTH, each {SIDES[0]} to {SIDES[-1]}"
+                    name,
+                    f"{option}={value} is not HEIGHTxWIDTH, each {INPUT_SIDES_PIXELS[0]} to {INPUT_SIDES_PIXELS[-1]}",
                 )
             given["height"], given["width"] = (int(side) for side in match.groups())
         elif option in ("input.mean", "input.std"):
@@ -151,9 +154,9 @@ def _channels(name: str, option: str, value: str) -> tuple[float, ...]:
     return channels
 
 
-def _value(written: str) -> Value:
-    if written.lower() in LITERALS:
-        return LITERALS[written.lower()]
+def _parse_argument(written: str) -> HubArgument:
+    if written.lower() in HUB_ARGUMENT_LITERALS:
+        return HUB_ARGUMENT_LITERALS[written.lower()]
     if re.fullmatch(r"-?[0-9]+", written):
         return int(written)
     if re.fullmatch(r"-?[0-9]*\.?[0-9]+(e[+-]?[0-9]+)?", written):
@@ -161,24 +164,24 @@ def _value(written: str) -> Value:
     return written
 
 
-def _arguments(hub: HubEntry) -> list[str]:
+def _arguments(hub: TorchHubEntry) -> list[str]:
     return [f"{option}={value}" for option, value in hub.arguments]
 
 
-def _input(hub: HubEntry) -> list[str]:
+def _input(hub: TorchHubEntry) -> list[str]:
     """What the network is shown, where it is not the usual."""
     options = []
     if hub.mean != IMAGENET_MEAN:
         options.append(f"input.mean={'/'.join(map(repr, hub.mean))}")
-    if (hub.height, hub.width) != (DEFAULT_SIDE, DEFAULT_SIDE):
+    if (hub.height, hub.width) != (DEFAULT_INPUT_SIDE_PIXELS, DEFAULT_INPUT_SIDE_PIXELS):
         options.append(f"input.size={hub.height}x{hub.width}")
     if hub.std != IMAGENET_STD:
         options.append(f"input.std={'/'.join(map(repr, hub.std))}")
     return options
 
 
-def _join(hub: HubEntry, options: list[str]) -> str:
-    name = f"{PREFIX}{hub.source}:{hub.entry}"
+def _join(hub: TorchHubEntry, options: list[str]) -> str:
+    name = f"{TORCHHUB_PREFIX}{hub.source}:{hub.entry}"
     return f"{name}:{','.join(options)}" if options else name
 
 
@@ -190,9 +193,9 @@ def _bad_option(name: str, fault: str) -> NoReturn:
     )
 
 
-def _refuse(name: str, fault: str) -> NoReturn:
+def _raise_bad_name(name: str, fault: str) -> NoReturn:
     raise Misconfigured(
         "bad_torchhub_name",
         f"The extractor {name!r} can't be read: {fault}. It is written "
-        f"{PREFIX}OWNER/NAME@COMMIT:ENTRY or {PREFIX}/FOLDER:ENTRY, then :OPTION=VALUE,...",
+        f"{TORCHHUB_PREFIX}OWNER/NAME@COMMIT:ENTRY or {TORCHHUB_PREFIX}/FOLDER:ENTRY, then :OPTION=VALUE,...",
     )

@@ -16,15 +16,15 @@ from shared.chunks import decode_rows
 from shared.errors import Unavailable
 
 CENTRES, PROVENANCE = "centres", "provenance"
-LONG_AGO = (1980, 1, 1, 0, 0, 0)  # no clock in the file: equal vocabularies are equal bytes
+ZIP_TIMESTAMP = (1980, 1, 1, 0, 0, 0)  # no clock in the file: equal vocabularies are equal bytes
 
 
-def is_known(provenance: dict[str, Any]) -> bool:
+def has_provenance(provenance: dict[str, Any]) -> bool:
     """Does it say what the vocabulary was learnt from?"""
     return "backbone_fingerprint" in provenance
 
 
-def encode_npz(centres: bytes, provenance: dict[str, Any]) -> bytes:
+def encode_vocabulary_npz(centres: bytes, provenance: dict[str, Any]) -> bytes:
     """The `.npz` of centres, which are the bytes of a `.npy` file."""
     text = json.dumps(provenance, sort_keys=True, ensure_ascii=False)
     said = io.BytesIO()
@@ -32,7 +32,7 @@ def encode_npz(centres: bytes, provenance: dict[str, Any]) -> bytes:
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
         for name, data in ((CENTRES, centres), (PROVENANCE, said.getvalue())):
-            archive.writestr(zipfile.ZipInfo(f"{name}.npy", LONG_AGO), data)
+            archive.writestr(zipfile.ZipInfo(f"{name}.npy", ZIP_TIMESTAMP), data)
     return buffer.getvalue()
 
 
@@ -52,7 +52,7 @@ def encode_vocabulary_file(
             "The vocabulary is not what was stored (its hash differs). Restore it from a backup, "
             "or fit a new one.",
         )
-    if not is_known(provenance):
+    if not has_provenance(provenance):
         return centres, ".npy"
     # An imported file may have said less: what reads it compares the hash.
-    return encode_npz(centres, {**provenance, "sha256": sha256}), ".npz"
+    return encode_vocabulary_npz(centres, {**provenance, "sha256": sha256}), ".npz"

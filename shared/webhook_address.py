@@ -14,19 +14,21 @@ import socket
 from dataclasses import dataclass
 from urllib.parse import urlsplit
 
-from shared.errors import PlacewiseError, Unprocessable, invalid_field
+from shared.errors import PlacewiseError, Unprocessable, invalid_field_error
 
-MOST_CHARACTERS = 2000
-PORTS = {"http": 80, "https": 443}
+MAX_URL_CHARACTERS = 2000
+DEFAULT_PORTS = {"http": 80, "https": 443}
 NAT64 = ipaddress.ip_network("64:ff9b::/96")  # RFC 6052: an IPv4 address in its last 32 bits
 # Of protocols and not of machines (RFC 6890); the standard library calls parts of them global.
-NOT_PUBLIC = tuple(map(ipaddress.ip_network, ("192.0.0.0/24", "192.88.99.0/24", "64:ff9b:1::/48")))
+NON_PUBLIC_NETWORKS = tuple(
+    map(ipaddress.ip_network, ("192.0.0.0/24", "192.88.99.0/24", "64:ff9b:1::/48"))
+)
 
 Address = ipaddress.IPv4Address | ipaddress.IPv6Address
 
 
 @dataclass(frozen=True, slots=True)
-class Target:
+class WebhookTarget:
     """The parts of a webhook's URL that a connection needs."""
 
     scheme: str
@@ -38,31 +40,33 @@ class Target:
     @property
     def host_header(self) -> str:
         host = f"[{self.host}]" if ":" in self.host else self.host
-        return host if self.port == PORTS[self.scheme] else f"{host}:{self.port}"
+        return host if self.port == DEFAULT_PORTS[self.scheme] else f"{host}:{self.port}"
 
 
-def parse_target(url: str, *, allow_private: bool) -> Target:
-    """The URL's parts. Unprocessable (`invalid_field`) for what no webhook may be: it needs HTTPS,
+def parse_webhook_url(url: str, *, allow_private: bool) -> WebhookTarget:
+    """The URL's parts. Unprocessable (`invalid_field_error`) for what no webhook may be: it needs HTTPS,
     unless private addresses are allowed, and holds no user, password or fragment."""
     schemes = ("https", "http") if allow_private else ("https",)
-    if len(url) > MOST_CHARACTERS or not re.fullmatch(r"[!-~]+", url):
-        raise invalid_field("url", f"has at most {MOST_CHARACTERS} ASCII characters, no blanks")
+    if len(url) > MAX_URL_CHARACTERS or not re.fullmatch(r"[!-~]+", url):
+        raise invalid_field_error(
+            "url", f"has at most {MAX_URL_CHARACTERS} ASCII characters, no blanks"
+        )
     try:
         parts = urlsplit(url)
         port, host = parts.port, parts.hostname
     except ValueError:
-        raise invalid_field("url", "is no address") from None
+        raise invalid_field_error("url", "is no address") from None
     if parts.scheme not in schemes or not host:
-        raise invalid_field("url", f"begins with {' or '.join(schemes)}:// and names a host")
+        raise invalid_field_error("url", f"begins with {' or '.join(schemes)}:// and names a host")
     if parts.username is not None or parts.password is not None or parts.fragment:
-        raise invalid_field("url", "holds no user, no password and no fragment")
+        raise invalid_field_error("url", "holds no user, no password and no fragment")
     if port == 0:
-        raise invalid_field("url", "has no port 0")
+        raise invalid_field_error("url", "has no port 0")
     path = (parts.path or "/") + (f"?{parts.query}" if parts.query else "")
-    return Target(parts.scheme, host, port or PORTS[parts.scheme], path)
+    return WebhookTarget(parts.scheme, host, port or DEFAULT_PORTS[parts.scheme], path)
 
 
-def resolve(target: Target, *, allow_private: bool) -> str:
+def resolve_webhook_target(target: WebhookTarget, *, allow_private: bool) -> str:
     """An address that the target may be connected at, now.
 
     Raises Unprocessable (`webhook_address_forbidden`) where one of the name's addresses is not
@@ -77,7 +81,7 @@ def resolve(target: Target, *, allow_private: bool) -> str:
     addresses = [str(entry[4][0]) for entry in found]
     if not allow_private:
         for address in addresses:
-            if not is_public(ipaddress.ip_address(address)):
+            if not is_public_address(ipaddress.ip_address(address)):
                 raise Unprocessable(
                     "webhook_address_forbidden",
                     f"{target.host} leads to {address}, which is no public address. Webhooks to "
@@ -86,22 +90,22 @@ def resolve(target: Target, *, allow_private: bool) -> str:
     return addresses[0]
 
 
-def is_public(address: Address) -> bool:
+def is_public_address(address: Address) -> bool:
     """Is it a machine of the internet, whichever way the address is written?"""
     if isinstance(address, ipaddress.IPv6Address):
-        inner = _within(address)
+        inner = _embedded_ipv4(address)
         if inner is not None:
-            return is_public(inner)
+            return is_public_address(inner)
         if address.scope_id is not None or address.is_site_local:
             return False
-    if any(address in network for network in NOT_PUBLIC):
+    if any(address in network for network in NON_PUBLIC_NETWORKS):
         return False
     return address.is_global and not (
         address.is_multicast or address.is_reserved or address.is_unspecified
     )
 
 
-def _within(address: ipaddress.IPv6Address) -> ipaddress.IPv4Address | None:
+def _embedded_ipv4(address: ipaddress.IPv6Address) -> ipaddress.IPv4Address | None:
     """The IPv4 address that an IPv6 one leads to: mapped, NAT64, 6to4, Teredo."""
     if address.ipv4_mapped is not None:
         return address.ipv4_mapped

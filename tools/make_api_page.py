@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any, cast
 
 from services.gateway.app import create_app
-from services.gateway.context import Gateway
-from services.gateway.keys import NoKeys
+from services.gateway.context import GatewayContext
+from services.gateway.keys import LocalhostAuthenticator
 from shared.settings import Settings
 
 PAGE = Path(__file__).parents[1] / "docs" / "api-calls.md"
@@ -19,18 +19,22 @@ have in common stands on [the API in short](api.md).
 """
 
 
-def description() -> dict[str, Any]:
+def openapi_description() -> dict[str, Any]:
     """The OpenAPI description. Its ports are never used: no call is made."""
     nothing = cast(Any, None)
-    return create_app(Gateway(nothing, nothing, nothing, nothing, Settings(), NoKeys())).openapi()
+    return create_app(
+        GatewayContext(nothing, nothing, nothing, nothing, Settings(), LocalhostAuthenticator())
+    ).openapi()
 
 
-def page() -> str:
+def render_page() -> str:
     """The page's text: a table for each tag, in the order of the calls."""
     tables: dict[str, list[str]] = {}
-    for path, methods in description()["paths"].items():
+    for path, methods in openapi_description()["paths"].items():
         for method, call in methods.items():
-            tables.setdefault(call.get("tags", ["server"])[0], []).append(_line(path, method, call))
+            tables.setdefault(call.get("tags", ["server"])[0], []).append(
+                _call_row(path, method, call)
+            )
     parts = [HEAD]
     for tag, lines in tables.items():
         head = ["| call | parameters | answers | |", "|---|---|---|---|"]
@@ -38,7 +42,7 @@ def page() -> str:
     return "\n".join(parts)
 
 
-def _line(path: str, method: str, call: dict[str, Any]) -> str:
+def _call_row(path: str, method: str, call: dict[str, Any]) -> str:
     said = [
         f"`{one['name']}`{'' if one.get('required') else '?'}"
         for one in call.get("parameters", [])
@@ -53,4 +57,4 @@ def _line(path: str, method: str, call: dict[str, Any]) -> str:
 
 
 if __name__ == "__main__":
-    PAGE.write_text(page())
+    PAGE.write_text(render_page())

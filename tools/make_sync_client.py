@@ -13,13 +13,13 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-FILES = {
+GENERATED_FILES = {
     "shared/client/async_wire.py": "shared/client/wire.py",
     "shared/client/async_calls.py": "shared/client/calls.py",
     "placewise/async_client.py": "placewise/client.py",
 }
 # In this order: what is replaced first is seen by none of those below it.
-REPLACED = (
+REPLACEMENTS = (
     (r"^import asyncio\n", ""),
     (r"asyncio\.sleep", "time.sleep"),
     (r"`(\w+)\.py` is made of this file by `make client`: change this one\.", r"MADE"),
@@ -39,18 +39,18 @@ REPLACED = (
 )
 
 
-def synchronous(source: str) -> str:
+def to_synchronous(source: str) -> str:
     """The text of an asynchronous module as that of its synchronous twin, formatted."""
     text = (ROOT / source).read_text()
-    for pattern, word in REPLACED:
+    for pattern, word in REPLACEMENTS:
         text = re.sub(pattern, word, text, flags=re.MULTILINE)
     text = text.replace(
         "MADE", f"Made of `{Path(source).name}` by `make client`: change that one, not this.", 1
     )
-    return _formatted(text, FILES[source])
+    return _format_source(text, GENERATED_FILES[source])
 
 
-def _formatted(text: str, name: str) -> str:
+def _format_source(text: str, name: str) -> str:
     ruff = shutil.which("ruff", path=Path(sys.executable).parent) or "ruff"
     for arguments in (["check", "--select", "I", "--fix", "--quiet"], ["format", "--quiet"]):
         done = subprocess.run(  # noqa: S603
@@ -66,5 +66,5 @@ def _formatted(text: str, name: str) -> str:
 
 
 if __name__ == "__main__":
-    for source, made in FILES.items():
-        (ROOT / made).write_text(synchronous(source))
+    for source, made in GENERATED_FILES.items():
+        (ROOT / made).write_text(to_synchronous(source))

@@ -14,42 +14,42 @@ from sqlalchemy import select
 from starlette.testclient import TestClient
 
 from benchmarks.catalog.explain import Explainer
-from benchmarks.catalog.fill import BIG, Filled
+from benchmarks.catalog.fill import LARGEST_MAP, SyntheticCatalog
 from services.gateway.app import create_app
-from services.gateway.context import Gateway
-from services.gateway.keys import NoKeys
-from services.search.follow import wanted_versions
-from services.steward.located import read_located
-from services.steward.loop import Steward
-from shared.catalog.chunks import Descriptor, live_chunks, live_facts
-from shared.catalog.photos import Photo, PhotoRole, changed_since
-from shared.catalog.search_workers import tell_of_worker
+from services.gateway.context import GatewayContext
+from services.gateway.keys import LocalhostAuthenticator
+from services.search.follow import read_generation_versions
+from services.steward.located import read_geotagged_photos
+from services.steward.loop import Scheduler
+from shared.catalog.chunks import Descriptor, list_live_chunks, list_live_filter_values
+from shared.catalog.photos import Photo, PhotoRole, list_photos_changed_since
+from shared.catalog.search_workers import upsert_search_worker
 from shared.catalog.session import Catalog
 from shared.errors import PlacewiseError
 from shared.ids import new_id
-from shared.jobs import InProcessHints, Job, JobState, begin, claim, extend_lease
-from shared.jobs.finish import release
-from shared.jobs.leases import held
+from shared.jobs import InProcessWakeups, Job, JobState, claim_jobs, extend_lease, mark_started
+from shared.jobs.finish import release_job
+from shared.jobs.leases import lock_leased_jobs
 from shared.jobs.table import STEWARD_JOBS
 from shared.objects import FolderStore
-from shared.search_protocol import Hit, SearchRequest, SearchResponse, SearchStatus
+from shared.search_protocol import SearchHit, SearchRequest, SearchResponse, SearchStatus
 from shared.settings import Settings
-from shared.shards import WHOLE
+from shared.shards import SINGLE_SHARD
 
 # They read a whole map, and that is known: a count every so often, an evaluation, and parts of file
 # names that are too short for an index.
-READS_EVERYTHING = (
+KNOWN_FULL_SCANS = (
     "steward: count large maps",
     "evaluation: located photos",
     "GET /search?filename=zq",
 )
 
 
-class AnySearch:
+class FakeSearch:
     """Answers every search with the same photos: here the join with the catalog counts."""
 
     def __init__(self, photo_ids: list[UUID]) -> None:
-        self._hits = tuple(Hit(photo_id=photo_id, score=0.5) for photo_id in photo_ids)
+        self._hits = tuple(SearchHit(photo_id=photo_id, score=0.5) for photo_id in photo_ids)
 
     def search(self, request: SearchRequest) -> SearchResponse:
         return SearchResponse(
@@ -65,18 +65,18 @@ class AnySearch:
         return SearchStatus(shard="0/1", rows=0, resident_bytes=0, versions={}, missing=())
 
 
-def call_everything(
-    catalog: Catalog, filled: Filled, explainer: Explainer, folder: Path
+def run_all_calls(
+    catalog: Catalog, filled: SyntheticCatalog, explainer: Explainer, folder: Path
 ) -> Iterator[str]:
     """Make every call once, on the largest map; yields each one's name before it is made."""
-    for name, do in _calls(catalog, filled, folder):
+    for name, do in _all_calls(catalog, filled, folder):
         yield name
         with explainer.call(name):
             do()
 
 
-def _calls(
-    catalog: Catalog, filled: Filled, folder: Path
+def _all_calls(
+    catalog: Catalog, filled: SyntheticCatalog, folder: Path
 ) -> Iterator[tuple[str, Callable[[], object]]]:
     settings = Settings(_env_file=None).model_copy(update={"auto_evaluate_photos": 20})
     store = FolderStore(folder / "objects")
@@ -89,20 +89,29 @@ def _calls(
         ).all()
     ids = list(described)
     client = TestClient(
-        create_app(Gateway(catalog, store, InProcessHints(), AnySearch(ids), settings, NoKeys())),
+        create_app(
+            GatewayContext(
+                catalog,
+                store,
+                InProcessWakeups(),
+                FakeSearch(ids),
+                settings,
+                LocalhostAuthenticator(),
+            )
+        ),
         base_url="http://localhost",
     )
-    steward = Steward(catalog, store, InProcessHints(), settings)
+    steward = Scheduler(catalog, store, InProcessWakeups(), settings)
     # First, because requests read what it has counted; so does it, wherever it has run before.
-    for duty in sorted(steward.duties, key=lambda duty: duty.name != "count large maps"):
-        yield f"steward: {duty.name}", duty.do
-    yield from _requests(client, catalog, filled, ids)
-    yield from _extractor(catalog)
-    yield from _search(catalog, filled)
+    for duty in sorted(steward.tasks, key=lambda duty: duty.name != "count large maps"):
+        yield f"steward: {duty.name}", duty.run
+    yield from _gateway_requests(client, catalog, filled, ids)
+    yield from _extractor_calls(catalog)
+    yield from _search_calls(catalog, filled)
 
 
-def _requests(
-    client: TestClient, catalog: Catalog, filled: Filled, ids: list[UUID]
+def _gateway_requests(
+    client: TestClient, catalog: Catalog, filled: SyntheticCatalog, ids: list[UUID]
 ) -> Iterator[tuple[str, Callable[[], object]]]:
     with catalog.read() as session:
         photo = session.get_one(Photo, ids[50])
@@ -117,9 +126,9 @@ def _requests(
 
     def ask(method: str, path: str, **options: Any) -> tuple[str, Callable[[], object]]:
         wanted = options.pop("params", {})
-        params = wanted if path.startswith("/maps") else {"map": BIG, **wanted}
+        params = wanted if path.startswith("/maps") else {"map": LARGEST_MAP, **wanted}
         said = "&".join(f"{name}={str(value)[:40]}" for name, value in wanted.items())
-        label = f"{method} {_without_ids(path)}{'?' if said else ''}{said}"
+        label = f"{method} {_path_template(path)}{'?' if said else ''}{said}"
 
         def call() -> None:
             answer = client.request(method, f"/api/v1{path}", params=params, **options)
@@ -156,7 +165,7 @@ def _requests(
     ):
         yield ask("GET", "/search", params=found)
     one = f"/uploads/{photo.id}"
-    for path in ("/maps", f"/maps/{BIG}", "/database/stats", one, "/generations"):
+    for path in ("/maps", f"/maps/{LARGEST_MAP}", "/database/stats", one, "/generations"):
         yield ask("GET", path)
     for found in (
         {},
@@ -182,34 +191,36 @@ def _requests(
     yield ask("POST", "/evaluations", json={})
 
 
-def _extractor(catalog: Catalog) -> Iterator[tuple[str, Callable[[], object]]]:
+def _extractor_calls(catalog: Catalog) -> Iterator[tuple[str, Callable[[], object]]]:
     claimed: list[Job] = []
 
     def take() -> None:
         with catalog.write() as session:
-            claimed[:] = claim(session, worker="bench", limit=16, lease_seconds=60, begun=False)
+            claimed[:] = claim_jobs(
+                session, worker="bench", limit=16, lease_seconds=60, started=False
+            )
 
     def keep() -> None:
         token = claimed[0].lease_token
         assert token is not None
         with catalog.write() as session:
-            begin(session, token, len(claimed))
+            mark_started(session, token, len(claimed))
             extend_lease(session, token, 60)
 
     def give_back() -> None:
         token = claimed[0].lease_token
         assert token is not None
         with catalog.write() as session:
-            for job in held(session, token, claimed):
-                release(job)
+            for job in lock_leased_jobs(session, token, claimed):
+                release_job(job)
 
     def take_queries() -> None:
         with catalog.write() as session:
-            claim(session, worker="bench", limit=16, lease_seconds=60, least_priority=100)
+            claim_jobs(session, worker="bench", limit=16, lease_seconds=60, min_priority=100)
 
     def take_evaluations() -> None:
         with catalog.write() as session:
-            claim(session, worker="bench", limit=1, lease_seconds=60, kinds=STEWARD_JOBS)
+            claim_jobs(session, worker="bench", limit=1, lease_seconds=60, kinds=STEWARD_JOBS)
 
     yield "extractor: claim a batch", take
     yield "extractor: hold the lease", keep
@@ -218,28 +229,30 @@ def _extractor(catalog: Catalog) -> Iterator[tuple[str, Callable[[], object]]]:
     yield "evaluator: claim", take_evaluations
 
 
-def _search(catalog: Catalog, filled: Filled) -> Iterator[tuple[str, Callable[[], object]]]:
+def _search_calls(
+    catalog: Catalog, filled: SyntheticCatalog
+) -> Iterator[tuple[str, Callable[[], object]]]:
     def follow() -> None:
-        versions = wanted_versions(catalog)
+        versions = read_generation_versions(catalog)
         assert filled.generation in versions
         with catalog.read() as session:
-            chunks = live_chunks(session, filled.generation)
-            live_facts(session, chunks[0].id)
-            changed_since(session, filled.big, filled.photos - 100)
+            chunks = list_live_chunks(session, filled.generation)
+            list_live_filter_values(session, chunks[0].id)
+            list_photos_changed_since(session, filled.big, filled.photos - 100)
 
     def tell() -> None:
         with catalog.write() as session:
-            tell_of_worker(session, new_id(), "bench", None, WHOLE, {})
+            upsert_search_worker(session, new_id(), "bench", None, SINGLE_SHARD, {})
 
     def evaluate() -> None:
         with catalog.read() as session:
-            read_located(session, filled.big, filled.generation, PhotoRole.QUERY)
-            read_located(session, filled.big, filled.generation, PhotoRole.DATABASE)
+            read_geotagged_photos(session, filled.big, filled.generation, PhotoRole.QUERY)
+            read_geotagged_photos(session, filled.big, filled.generation, PhotoRole.DATABASE)
 
     yield "search: follow", follow
     yield "search: register", tell
     yield "evaluation: located photos", evaluate
 
 
-def _without_ids(path: str) -> str:
+def _path_template(path: str) -> str:
     return "/".join("{id}" if len(part) == 36 else part for part in path.split("/"))

@@ -16,12 +16,12 @@ from psycopg.sql import SQL, Identifier
 from rich.table import Table
 from sqlalchemy.engine import URL, make_url
 
-from benchmarks.catalog.calls import READS_EVERYTHING, call_everything
+from benchmarks.catalog.calls import KNOWN_FULL_SCANS, run_all_calls
 from benchmarks.catalog.explain import Explainer
-from benchmarks.catalog.fill import fill
+from benchmarks.catalog.fill import fill_catalog
 from services.cli.configuration import read_settings
-from services.cli.output import JsonOption, answers, explained, messages, print_json
-from shared.catalog.connections import Limits, Pool
+from services.cli.output import JsonOption, console, err_console, print_json, report_errors
+from shared.catalog.connections import PoolConfig, TransactionTimeouts
 from shared.catalog.schema import migrate
 from shared.catalog.session import Catalog
 from shared.errors import Misconfigured
@@ -37,23 +37,27 @@ def bench_catalog(
     On the server of DATABASE_URL, in a database of its own, which is dropped in the end. Exit code
     1 when a statement reads a large table from end to end, or far more than it returns.
     """
-    with explained(as_json):
+    with report_errors(as_json):
         url = make_url(read_settings().catalog_url())
         if url.get_backend_name() != "postgresql":
             raise Misconfigured("postgres_missing", "Set DATABASE_URL to a PostgreSQL to fill.")
-        with _own_database(url) as own, tempfile.TemporaryDirectory() as folder:
-            catalog = Catalog(own, Pool(name="placewise-bench"), Limits(3600, 3600))
+        with _create_database(url) as own, tempfile.TemporaryDirectory() as folder:
+            catalog = Catalog(
+                own, PoolConfig(name="placewise-bench"), TransactionTimeouts(3600, 3600)
+            )
             try:
                 migrate(catalog)
                 started = time.perf_counter()
-                filled = fill(catalog, photos)
-                messages.print(f"{photos:,} photos made in {time.perf_counter() - started:.0f} s")
+                filled = fill_catalog(catalog, photos)
+                err_console.print(
+                    f"{photos:,} photos made in {time.perf_counter() - started:.0f} s"
+                )
                 explainer = Explainer(catalog)
-                for name in call_everything(catalog, filled, explainer, Path(folder)):
-                    messages.print(f"  {name}", soft_wrap=True)
+                for name in run_all_calls(catalog, filled, explainer, Path(folder)):
+                    err_console.print(f"  {name}", soft_wrap=True)
             finally:
                 catalog.close()
-    faulty = [e for e in explainer.found if e.faults() and e.call not in READS_EVERYTHING]
+    faulty = [e for e in explainer.found if e.faults() and e.call not in KNOWN_FULL_SCANS]
     if as_json:
         statements = [{**asdict(e), "faults": e.faults()} for e in explainer.found]
         print_json({"photos": photos, "tables": filled.tables, "statements": statements})
@@ -69,17 +73,17 @@ def bench_catalog(
                 ", ".join(e.scans),
                 style=style,
             )
-        answers.print(table)
+        console.print(table)
         for name, size_bytes in sorted(filled.tables.items(), key=lambda item: -item[1]):
-            answers.print(f"{name}: {size_bytes / photos:,.0f} bytes per photo")
+            console.print(f"{name}: {size_bytes / photos:,.0f} bytes per photo")
         for e in faulty:
-            answers.print(f"[red]{e.call}[/red]: {'; '.join(e.faults())}\n  {e.sql}")
+            console.print(f"[red]{e.call}[/red]: {'; '.join(e.faults())}\n  {e.sql}")
     if faulty:
         raise typer.Exit(1)
 
 
 @contextlib.contextmanager
-def _own_database(url: URL) -> Iterator[str]:
+def _create_database(url: URL) -> Iterator[str]:
     """The URL of a new database on the same server."""
     name = f"placewise_bench_{new_id().hex}"
     admin = url.set(drivername="postgresql").render_as_string(hide_password=False)

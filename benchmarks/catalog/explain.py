@@ -10,19 +10,19 @@ from typing import Any
 
 from sqlalchemy import event
 
-from shared.catalog.metadata_search import COUNTED_AT_MOST
+from shared.catalog.metadata_search import MAX_COUNTED_MATCHES
 from shared.catalog.session import Catalog
 
-EXPLAINED = re.compile(r"\s*(SELECT|WITH|UPDATE|DELETE|INSERT)\b", re.IGNORECASE)
-LARGE = ("photos", "jobs", "descriptors", "searches")
+EXPLAINABLE = re.compile(r"\s*(SELECT|WITH|UPDATE|DELETE|INSERT)\b", re.IGNORECASE)
+LARGE_TABLES = ("photos", "jobs", "descriptors", "searches")
 
 # What may be read whatever is returned: counts stop at COUNTED_AT_MOST, of two tables at most.
-READ_FREELY = 2 * COUNTED_AT_MOST + 2_000
-READ_PER_ROW = 20
+MAX_ROWS_READ = 2 * MAX_COUNTED_MATCHES + 2_000
+MAX_ROWS_READ_PER_RETURNED = 20
 
 
 @dataclass(frozen=True, slots=True)
-class Explained:
+class StatementPlan:
     """One statement. `read` is rows that scans have looked at, `milliseconds` the server's."""
 
     call: str
@@ -36,7 +36,7 @@ class Explained:
 
     def faults(self) -> list[str]:
         found = [f"sequential scan over {table}" for table in self.sequential]
-        if self.read > max(READ_FREELY, READ_PER_ROW * self.returned):
+        if self.read > max(MAX_ROWS_READ, MAX_ROWS_READ_PER_RETURNED * self.returned):
             found.append(f"reads {self.read:,} rows to return {self.returned:,}")
         return found
 
@@ -49,7 +49,7 @@ class Explainer:
     small: bool = False
     """Reading everything is cheap, so the planner would: what matters is that it need not. Scans
     and joins of whole tables are forbidden; a walk through a whole index shows in what is read."""
-    found: list[Explained] = field(default_factory=list)
+    found: list[StatementPlan] = field(default_factory=list)
 
     @contextlib.contextmanager
     def call(self, name: str) -> Iterator[None]:
@@ -58,7 +58,7 @@ class Explainer:
         def before(
             connection: Any, _cursor: Any, sql: str, parameters: Any, _context: Any, many: bool
         ) -> None:
-            if many or sql in seen or not EXPLAINED.match(sql) or "pg_catalog" in sql:
+            if many or sql in seen or not EXPLAINABLE.match(sql) or "pg_catalog" in sql:
                 return
             seen.add(sql)
             self.found.append(self._explain(connection, name, sql, parameters))
@@ -69,7 +69,7 @@ class Explainer:
         finally:
             event.remove(self.catalog.engine, "before_cursor_execute", before)
 
-    def _explain(self, connection: Any, call: str, sql: str, parameters: Any) -> Explained:
+    def _explain(self, connection: Any, call: str, sql: str, parameters: Any) -> StatementPlan:
         # In its own transaction, so on the very rows; and undone, so that it changes nothing.
         with connection.connection.cursor() as cursor:
             cursor.execute("SAVEPOINT explained")
@@ -79,43 +79,43 @@ class Explainer:
             cursor.execute(f"EXPLAIN (ANALYZE, FORMAT JSON) {sql}", parameters)
             plan = cursor.fetchone()[0][0]
             cursor.execute("ROLLBACK TO SAVEPOINT explained")
-        nodes = list(_nodes(plan["Plan"]))
+        nodes = list(_plan_nodes(plan["Plan"]))
         scans = [node for node in nodes if "Relation Name" in node and "Scan" in node["Node Type"]]
-        return Explained(
+        return StatementPlan(
             call=call,
             sql=" ".join(sql.split()),
-            scans=tuple(_named(node) for node in nodes if "Scan" in node["Node Type"]),
-            read=sum(_read(node) for node in scans),
-            returned=_returned(plan["Plan"]),
+            scans=tuple(_node_label(node) for node in nodes if "Scan" in node["Node Type"]),
+            read=sum(_rows_read(node) for node in scans),
+            returned=_rows_returned(plan["Plan"]),
             milliseconds=plan["Planning Time"] + plan["Execution Time"],
             sequential=tuple(
                 node["Relation Name"]
                 for node in scans
                 if node["Node Type"] == "Seq Scan"
-                and node["Relation Name"] in LARGE
-                and _read(node) > READ_FREELY
+                and node["Relation Name"] in LARGE_TABLES
+                and _rows_read(node) > MAX_ROWS_READ
             ),
         )
 
 
-def _nodes(plan: dict[str, Any]) -> Iterator[dict[str, Any]]:
+def _plan_nodes(plan: dict[str, Any]) -> Iterator[dict[str, Any]]:
     yield plan
     for child in plan.get("Plans", ()):
-        yield from _nodes(child)
+        yield from _plan_nodes(child)
 
 
-def _read(node: dict[str, Any]) -> int:
+def _rows_read(node: dict[str, Any]) -> int:
     removed = node.get("Rows Removed by Filter", 0) + node.get("Rows Removed by Index Recheck", 0)
     return int((node["Actual Rows"] + removed) * node["Actual Loops"])
 
 
-def _returned(plan: dict[str, Any]) -> int:
+def _rows_returned(plan: dict[str, Any]) -> int:
     """Rows that come out; of a change, those that it is applied to."""
     if plan["Node Type"] == "ModifyTable":
-        return max((_returned(child) for child in plan.get("Plans", ())), default=1)
+        return max((_rows_returned(child) for child in plan.get("Plans", ())), default=1)
     return int(plan["Actual Rows"])
 
 
-def _named(node: dict[str, Any]) -> str:
+def _node_label(node: dict[str, Any]) -> str:
     on = node.get("Index Name") or node.get("Relation Name") or node.get("CTE Name") or ""
     return f"{node['Node Type']} {on}".strip()

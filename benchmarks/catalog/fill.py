@@ -13,23 +13,23 @@ from sqlalchemy import text
 
 from shared.catalog.generations import Generation, GenerationState, active_generation
 from shared.catalog.maps import create_map
-from shared.catalog.models import ensure_model
+from shared.catalog.models import get_or_create_model
 from shared.catalog.session import Catalog
 from shared.ids import new_id
 
 MAPS = 10
-BIG, SECOND = "map-0", "map-1"
+LARGEST_MAP, SECOND_MAP = "map-0", "map-1"
 SLOT_ROWS = 1000
-WAITING_JOBS = 0.01  # of the photos: uploaded a moment ago, not described yet
+WAITING_JOB_SHARE = 0.01  # of the photos: uploaded a moment ago, not described yet
 
 # The n-th row of a kind, from 30 days ago until now.
-MOMENT = "now() - interval '30 days' * (1 - n::float8 / :photos)"
-ID = (
+CREATED_AT_SQL = "now() - interval '30 days' * (1 - n::float8 / :photos)"
+UUID_SQL = (
     "(lpad(to_hex((extract(epoch FROM {moment}) * 1000)::bigint), 12, '0') || '700{kind}8'"
     " || lpad(to_hex(n), 15, '0'))::uuid"
 )
 
-FILL = {
+FILL_STATEMENTS = {
     "numbers": """
         CREATE TEMPORARY TABLE numbers ON COMMIT DROP AS
         SELECT n, (:maps)::uuid[] AS maps, (:generations)::uuid[] AS generations, which,
@@ -96,7 +96,7 @@ FILL = {
 
 
 @dataclass(frozen=True, slots=True)
-class Filled:
+class SyntheticCatalog:
     """What lies there. `tables`: bytes of each table with its indexes."""
 
     photos: int
@@ -105,11 +105,11 @@ class Filled:
     tables: dict[str, int]
 
 
-def fill(catalog: Catalog, photos: int) -> Filled:
+def fill_catalog(catalog: Catalog, photos: int) -> SyntheticCatalog:
     """Fill an empty, migrated PostgreSQL catalog, and let the planner look at it."""
     with catalog.write() as session:
         maps = [create_map(session, f"map-{n}", "test-tiny-avg").id for n in range(MAPS)]
-        model = ensure_model(session, "bench", "0" * 64, "MIT", {})
+        model = get_or_create_model(session, "bench", "0" * 64, "MIT", {})
         for map_id in maps:
             session.add(
                 Generation(
@@ -126,7 +126,7 @@ def fill(catalog: Catalog, photos: int) -> Filled:
         session.flush()
         generations = [found.id for m in maps if (found := active_generation(session, m))]
         ids = {
-            name: ID.format(moment=MOMENT, kind=kind)
+            name: UUID_SQL.format(moment=CREATED_AT_SQL, kind=kind)
             for kind, name in enumerate(("photo", "job", "search"))
         }
         values = {
@@ -134,10 +134,10 @@ def fill(catalog: Catalog, photos: int) -> Filled:
             "maps": [str(map_id) for map_id in maps],
             "generations": [str(generation_id) for generation_id in generations],
             "slot_rows": SLOT_ROWS,
-            "waiting": WAITING_JOBS,
+            "waiting": WAITING_JOB_SHARE,
         }
-        for statement in FILL.values():
-            session.execute(text(statement.format(moment=MOMENT, **ids)), values)
+        for statement in FILL_STATEMENTS.values():
+            session.execute(text(statement.format(moment=CREATED_AT_SQL, **ids)), values)
     with catalog.engine.connect() as connection:
         connection.execution_options(isolation_level="AUTOCOMMIT").exec_driver_sql(
             "VACUUM (ANALYZE)"
@@ -147,4 +147,4 @@ def fill(catalog: Catalog, photos: int) -> Filled:
             " WHERE relkind = 'r' AND relnamespace = 'public'::regnamespace"
         )
         tables = {name: int(size) for name, size in sizes}
-    return Filled(photos, maps[0], generations[0], tables)
+    return SyntheticCatalog(photos, maps[0], generations[0], tables)

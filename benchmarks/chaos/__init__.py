@@ -11,22 +11,22 @@ from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from benchmarks.chaos.faults import every_fault
-from benchmarks.chaos.run import Outcome, Run, run_chaos
+from benchmarks.chaos.faults import all_faults
+from benchmarks.chaos.run import ChaosRun, FaultOutcome, run_chaos
 from benchmarks.report import Report
 
 if TYPE_CHECKING:
     from rich.progress import Progress
 
-__all__ = ["Run", "measure", "run_chaos"]
+__all__ = ["ChaosRun", "measure", "run_chaos"]
 
 
 def measure(progress: Progress, *, photos: int, fault_seconds: float, seed: int) -> Report:
     """Every fault once, in the order that the seed decides."""
-    faults = every_fault()
+    faults = all_faults()
     bar = progress.add_task("breaking things", total=len(faults))
 
-    def show(outcome: Outcome) -> None:
+    def show(outcome: FaultOutcome) -> None:
         progress.update(bar, advance=1, description=outcome.fault)
 
     with tempfile.TemporaryDirectory() as folder:
@@ -50,5 +50,8 @@ def measure(progress: Progress, *, photos: int, fault_seconds: float, seed: int)
     report.add("answers compared", run.asked)
     for what, count in counted.items():
         report.add(what, count, at_most=0)
-    report.details = {"fell": [name for o in run.outcomes for name in o.fell], "found": run.details}
+    report.details = {
+        "fell": [name for o in run.outcomes for name in o.crashed],
+        "found": run.details,
+    }
     return report

@@ -17,12 +17,12 @@ from shared.catalog.session import Catalog
 from shared.chunks import manifest_key
 from shared.errors import NotFound
 from shared.jobs import Job
-from shared.jobs.table import UNFINISHED, JobKind, JobState
+from shared.jobs.table import UNFINISHED_STATES, JobKind, JobState
 from shared.objects import ObjectStore
 
 
 @dataclass(slots=True)
-class Counts:
+class InvariantViolations:
     """All of it has to be zero."""
 
     lost: int = 0
@@ -38,22 +38,24 @@ class Counts:
     details: list[str] = field(default_factory=list)
 
     @property
-    def all_zero(self) -> bool:
+    def none_found(self) -> bool:
         return not (self.lost or self.twice or self.stuck or self.failed or self.torn)
 
 
-def unfinished(catalog: Catalog, *, photos: bool = False) -> int:
+def count_unfinished_jobs(catalog: Catalog, *, photos: bool = False) -> int:
     """Jobs that have not ended yet; `photos`: without those of questions."""
-    wanted: list[ColumnElement[bool]] = [Job.state.in_(UNFINISHED)]
+    wanted: list[ColumnElement[bool]] = [Job.state.in_(UNFINISHED_STATES)]
     if photos:
         wanted.append(Job.kind != JobKind.DESCRIBE)
     with catalog.read() as session:
         return session.scalar(select(func.count()).select_from(Job).where(*wanted)) or 0
 
 
-def audit(catalog: Catalog, store: ObjectStore, acknowledged: Mapping[str, UUID]) -> Counts:
+def check_invariants(
+    catalog: Catalog, store: ObjectStore, acknowledged: Mapping[str, UUID]
+) -> InvariantViolations:
     """Count; `acknowledged` gives the photo's id for the sha256 of each photo that was taken."""
-    counts = Counts()
+    counts = InvariantViolations()
     with catalog.read() as session:
         photos = {
             photo.id: photo
@@ -68,7 +70,7 @@ def audit(catalog: Catalog, store: ObjectStore, acknowledged: Mapping[str, UUID]
         )
         chunks = session.scalars(select(Chunk).where(Chunk.superseded_at.is_(None))).all()
         failed = session.scalars(select(Job).where(Job.state == JobState.FAILED)).all()
-    counts.stuck = unfinished(catalog)
+    counts.stuck = count_unfinished_jobs(catalog)
     counts.failed = len(failed)
     counts.details += [f"the job {job.id} ({job.kind}) failed: {job.error}" for job in failed]
     stored = {info.key for info in store.list("originals/")}
@@ -90,13 +92,13 @@ def audit(catalog: Catalog, store: ObjectStore, acknowledged: Mapping[str, UUID]
     counts.details += [f"{sha256} is stored {by_bytes[sha256]} times" for sha256 in several]
     counts.details += [f"{photo_id} has {rows[photo_id]} rows" for photo_id in doubled]
     for chunk in chunks:
-        if not _whole(store, chunk):
+        if not _is_intact(store, chunk):
             counts.torn += 1
             counts.details.append(f"the chunk {chunk.object_key} is not what the catalog says")
     return counts
 
 
-def _whole(store: ObjectStore, chunk: Chunk) -> bool:
+def _is_intact(store: ObjectStore, chunk: Chunk) -> bool:
     try:
         data, manifest = store.get(chunk.object_key), store.get(manifest_key(chunk.object_key))
     except NotFound:

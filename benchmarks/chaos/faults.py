@@ -11,12 +11,12 @@ from dataclasses import dataclass
 from redis import Redis
 
 from benchmarks.fleet import Fleet
-from benchmarks.fleet.doubler import Doubler
-from benchmarks.fleet.proxy import Mode
+from benchmarks.fleet.doubler import MessageDuplicator
+from benchmarks.fleet.proxy import ProxyMode
 from tests.support.servers.handle import Handle
 
 # From beginning to end these have another idea of the time of day, by so many seconds.
-CLOCKS_OFF = {
+CLOCK_OFFSETS_SECONDS = {
     "gateway-1": 3600,
     "extractor-1": 3600,
     "extractor-2": -3600,
@@ -31,36 +31,36 @@ class Fault:
     repaired. What it breaks stays broken for `seconds` where the fault has a length."""
 
     name: str
-    broken: Callable[[Fleet, float], AbstractContextManager[None]]
+    inject: Callable[[Fleet, float], AbstractContextManager[None]]
 
 
-def every_fault() -> list[Fault]:
+def all_faults() -> list[Fault]:
     """In the order of the documentation; a run shuffles them."""
     return [
-        *(Fault(f"kill -9 of {name}", _killed(name)) for name in _ONE_OF_EACH),
-        Fault("kill -9 of every service at once", _all_killed),
-        Fault("an extractor stands still beyond its lease", _paused("extractor-0")),
-        Fault("a search worker stands still", _paused("search-0-0")),
-        Fault("FLUSHALL", _flushed),
-        Fault("Redis stopped", _stopped(lambda fleet: fleet.servers.redis.process)),
-        Fault("every message doubled", _doubled),
-        Fault("PostgreSQL killed and started", _postgres_restarted),
-        Fault("PostgreSQL stopped", _stopped(lambda fleet: fleet.servers.postgres.process)),
-        Fault("the S3 store killed", _stopped(lambda fleet: fleet.servers.s3.process)),
-        Fault("the S3 store full (507)", _connections("the S3 store", Mode.FULL)),
+        *(Fault(f"kill -9 of {name}", _kill_service(name)) for name in _ONE_SERVICE_OF_EACH),
+        Fault("kill -9 of every service at once", _kill_all_services),
+        Fault("an extractor stands still beyond its lease", _pause_service("extractor-0")),
+        Fault("a search worker stands still", _pause_service("search-0-0")),
+        Fault("FLUSHALL", _flush_redis),
+        Fault("Redis stopped", _stop_server(lambda fleet: fleet.servers.redis.process)),
+        Fault("every message doubled", _duplicate_messages),
+        Fault("PostgreSQL killed and started", _restart_postgres),
+        Fault("PostgreSQL stopped", _stop_server(lambda fleet: fleet.servers.postgres.process)),
+        Fault("the S3 store killed", _stop_server(lambda fleet: fleet.servers.s3.process)),
+        Fault("the S3 store full (507)", _break_connections("the S3 store", ProxyMode.FULL)),
         *(
-            Fault(f"connections to {server} {mode.name.lower()}", _connections(server, mode))
+            Fault(f"connections to {server} {mode.name.lower()}", _break_connections(server, mode))
             for server in ("PostgreSQL", "Redis", "the S3 store")
-            for mode in (Mode.REFUSED, Mode.CUT, Mode.SLOW)
+            for mode in (ProxyMode.REFUSED, ProxyMode.CUT, ProxyMode.SLOW)
         ),
     ]
 
 
-_ONE_OF_EACH = ("gateway-0", "extractor-0", "search-0-0", "search-1-0", "steward-0")
-_Broken = Callable[[Fleet, float], AbstractContextManager[None]]
+_ONE_SERVICE_OF_EACH = ("gateway-0", "extractor-0", "search-0-0", "search-1-0", "steward-0")
+_FaultContext = Callable[[Fleet, float], AbstractContextManager[None]]
 
 
-def _killed(name: str) -> _Broken:
+def _kill_service(name: str) -> _FaultContext:
     @contextlib.contextmanager
     def broken(fleet: Fleet, _seconds: float) -> Iterator[None]:
         with fleet.without(name):
@@ -70,14 +70,14 @@ def _killed(name: str) -> _Broken:
 
 
 @contextlib.contextmanager
-def _all_killed(fleet: Fleet, _seconds: float) -> Iterator[None]:
+def _kill_all_services(fleet: Fleet, _seconds: float) -> Iterator[None]:
     for service in fleet.services.values():
         service.kill()
     yield
     fleet.start()
 
 
-def _paused(name: str) -> _Broken:
+def _pause_service(name: str) -> _FaultContext:
     @contextlib.contextmanager
     def broken(fleet: Fleet, _seconds: float) -> Iterator[None]:
         fleet[name].pause()
@@ -91,7 +91,7 @@ def _paused(name: str) -> _Broken:
 
 
 @contextlib.contextmanager
-def _flushed(fleet: Fleet, _seconds: float) -> Iterator[None]:
+def _flush_redis(fleet: Fleet, _seconds: float) -> Iterator[None]:
     with Redis.from_url(fleet.servers.redis.url) as client:
         client.flushall()
         yield
@@ -99,13 +99,13 @@ def _flushed(fleet: Fleet, _seconds: float) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _doubled(fleet: Fleet, seconds: float) -> Iterator[None]:
-    with Doubler(fleet.servers.redis.url).at_work():
+def _duplicate_messages(fleet: Fleet, seconds: float) -> Iterator[None]:
+    with MessageDuplicator(fleet.servers.redis.url).duplicating():
         yield
         time.sleep(seconds)
 
 
-def _stopped(choose: Callable[[Fleet], Handle | None]) -> _Broken:
+def _stop_server(choose: Callable[[Fleet], Handle | None]) -> _FaultContext:
     @contextlib.contextmanager
     def broken(fleet: Fleet, seconds: float) -> Iterator[None]:
         server = choose(fleet)
@@ -121,7 +121,7 @@ def _stopped(choose: Callable[[Fleet], Handle | None]) -> _Broken:
 
 
 @contextlib.contextmanager
-def _postgres_restarted(fleet: Fleet, _seconds: float) -> Iterator[None]:
+def _restart_postgres(fleet: Fleet, _seconds: float) -> Iterator[None]:
     server = fleet.servers.postgres.process
     assert server is not None
     server.kill()
@@ -129,7 +129,7 @@ def _postgres_restarted(fleet: Fleet, _seconds: float) -> Iterator[None]:
     yield
 
 
-def _connections(server: str, mode: Mode) -> _Broken:
+def _break_connections(server: str, mode: ProxyMode) -> _FaultContext:
     @contextlib.contextmanager
     def broken(fleet: Fleet, seconds: float) -> Iterator[None]:
         servers = fleet.servers
@@ -138,7 +138,7 @@ def _connections(server: str, mode: Mode) -> _Broken:
             "Redis": servers.redis_proxy,
             "the S3 store": servers.s3_proxy,
         }[server]
-        with proxy.misbehaving(mode):
+        with proxy.in_mode(mode):
             yield
             time.sleep(seconds)
 

@@ -8,30 +8,32 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from benchmarks.chaos.audit import Counts, audit, unfinished
-from benchmarks.chaos.faults import CLOCKS_OFF, Fault, every_fault
+from benchmarks.chaos.audit import InvariantViolations, check_invariants, count_unfinished_jobs
+from benchmarks.chaos.faults import CLOCK_OFFSETS_SECONDS, Fault, all_faults
 from benchmarks.chaos.traffic import Traffic
 from benchmarks.fleet import Fleet, start_servers
 from tests.support.clock import clock_off_by
 
-RECOVERY_SECONDS = 180.0  # what has not recovered by then is counted as stuck
+RECOVERY_TIMEOUT_SECONDS = 180.0  # what has not recovered by then is counted as stuck
 LEASE_SECONDS = 2.0
-LOOK_SECONDS = 0.1
-ASKED = 10  # known photos that are asked for after each fault, beside those asked for meanwhile
-BEFORE_SECONDS = 0.5  # at most: how long the fault waits for uploads to be under way
+POLL_SECONDS = 0.1
+QUERIES_PER_FAULT = (
+    10  # known photos that are asked for after each fault, beside those asked for meanwhile
+)
+MAX_FAULT_DELAY_SECONDS = 0.5  # at most: how long the fault waits for uploads to be under way
 
 
 @dataclass(slots=True)
-class Outcome:
+class FaultOutcome:
     """After one fault. Everything but `refused` and `recovery_seconds` has to be zero."""
 
     fault: str
-    counts: Counts
+    counts: InvariantViolations
     wrong: int
     """Answers that did not begin with the photo that was asked with, or had one twice."""
     unexpected: int
     """Answers that were neither a result nor a request to try again, and calls without one."""
-    fell: list[str]
+    crashed: list[str]
     """Services that ended although the fault did not kill them."""
     refused: int
     """Calls that had to be repeated."""
@@ -40,14 +42,14 @@ class Outcome:
 
     @property
     def good(self) -> bool:
-        return self.counts.all_zero and not self.wrong and not self.unexpected
+        return self.counts.none_found and not self.wrong and not self.unexpected
 
 
 @dataclass(slots=True)
-class Run:
+class ChaosRun:
     """What became of a run, fault by fault."""
 
-    outcomes: list[Outcome] = field(default_factory=list)
+    outcomes: list[FaultOutcome] = field(default_factory=list)
     asked: int = 0
     """Answers that were compared with what they had to be."""
     details: list[str] = field(default_factory=list)
@@ -66,17 +68,17 @@ def run_chaos(
     seed: int,
     faults: Sequence[Fault] | None = None,
     executed: bool = True,
-    on_outcome: Callable[[Outcome], object] = lambda outcome: None,
-) -> Run:
+    on_outcome: Callable[[FaultOutcome], object] = lambda outcome: None,
+) -> ChaosRun:
     """Upload `photos` in equal parts, one for each fault, in an order that the seed decides.
 
     Faults that have a length last `fault_seconds`. Ends at the first fault after which something
     is not as it has to be, with the services' logs in the run. `executed`: see `Fleet`.
     """
     moments = random.Random(seed)
-    chosen = list(faults or every_fault())
+    chosen = list(faults or all_faults())
     moments.shuffle(chosen)
-    run = Run()
+    run = ChaosRun()
     with (
         start_servers() as servers,
         Fleet(
@@ -95,13 +97,13 @@ def run_chaos(
             superseded_grace_seconds=5,
         ) as fleet,
     ):
-        for name, seconds in CLOCKS_OFF.items():
+        for name, seconds in CLOCK_OFFSETS_SECONDS.items():
             fleet[name].environment.update(clock_off_by(seconds))
         fleet.start()
         with Traffic(fleet.gateway_urls, seed) as traffic:
             for number, fault in enumerate(chosen):
-                upload = _thirds(traffic, photos, number, len(chosen))
-                outcome = _do(fleet, traffic, fault, fault_seconds, moments, upload)
+                upload = _upload_by_thirds(traffic, photos, number, len(chosen))
+                outcome = _run_fault(fleet, traffic, fault, fault_seconds, moments, upload)
                 run.outcomes.append(outcome)
                 on_outcome(outcome)
                 if not outcome.good:
@@ -111,7 +113,9 @@ def run_chaos(
     return run
 
 
-def _thirds(traffic: Traffic, photos: int, place: int, faults: int) -> Callable[[int], None]:
+def _upload_by_thirds(
+    traffic: Traffic, photos: int, place: int, faults: int
+) -> Callable[[int], None]:
     """Releases the first, second or third third of the part of the fault at `place`."""
 
     def upload(third: int) -> None:
@@ -120,45 +124,48 @@ def _thirds(traffic: Traffic, photos: int, place: int, faults: int) -> Callable[
     return upload
 
 
-def _do(
+def _run_fault(
     fleet: Fleet,
     traffic: Traffic,
     fault: Fault,
     seconds: float,
     moments: random.Random,
     upload: Callable[[int], None],
-) -> Outcome:
+) -> FaultOutcome:
     """Photos are uploaded before the fault, while it lasts, and after it; then all is counted."""
     before = traffic.answers.copy()
-    fell = len(fleet.fell)
+    fell = len(fleet.crashed)
     upload(1)
-    time.sleep(moments.uniform(0, BEFORE_SECONDS))
-    with fault.broken(fleet, seconds):
+    time.sleep(moments.uniform(0, MAX_FAULT_DELAY_SECONDS))
+    with fault.inject(fleet, seconds):
         upload(2)
     repaired = time.monotonic()
     upload(3)
-    deadline = repaired + RECOVERY_SECONDS
-    _wait(deadline, lambda: traffic.all_acknowledged and not unfinished(fleet.catalog, photos=True))
+    deadline = repaired + RECOVERY_TIMEOUT_SECONDS
+    _wait_until(
+        deadline,
+        lambda: traffic.all_acknowledged and not count_unfinished_jobs(fleet.catalog, photos=True),
+    )
     recovery_seconds = time.monotonic() - repaired
-    traffic.remember()
-    with traffic.nobody_asks():
+    traffic.mark_searchable()
+    with traffic.pause_queries():
         # Questions whose gateway died are answered to nobody, but answered.
-        _wait(deadline, lambda: not unfinished(fleet.catalog))
-        counts = audit(fleet.catalog, fleet.store, traffic.acknowledged)
-    for known in moments.sample(traffic.known, min(ASKED, len(traffic.known))):
+        _wait_until(deadline, lambda: not count_unfinished_jobs(fleet.catalog))
+        counts = check_invariants(fleet.catalog, fleet.store, traffic.acknowledged)
+    for known in moments.sample(traffic.known, min(QUERIES_PER_FAULT, len(traffic.known))):
         traffic.ask(known)
     change = traffic.answers - before
-    return Outcome(
+    return FaultOutcome(
         fault=fault.name,
         counts=counts,
         wrong=change["wrong"],
         unexpected=change["unexpected"],
-        fell=fleet.fell[fell:],
+        crashed=fleet.crashed[fell:],
         refused=change["away"],
         recovery_seconds=recovery_seconds,
     )
 
 
-def _wait(deadline: float, done: Callable[[], bool]) -> None:
+def _wait_until(deadline: float, done: Callable[[], bool]) -> None:
     while not done() and time.monotonic() < deadline:
-        time.sleep(LOOK_SECONDS)
+        time.sleep(POLL_SECONDS)

@@ -19,11 +19,11 @@ from tests.support.photos import photo_bytes
 from tests.support.server import SERVICES_KEY
 
 UPLOADERS = 4
-CALL_SECONDS = 60.0
-AGAIN_SECONDS = 0.1
-SELF_SCORE = 0.9999
+CALL_TIMEOUT_SECONDS = 60.0
+RETRY_SECONDS = 0.1
+MIN_SELF_SCORE = 0.9999
 # What a caller is told to try again: anything else that is not an answer is a fault of ours.
-AWAY = (429, 503, 507)
+RETRYABLE_STATUSES = (429, 503, 507)
 
 
 class Traffic:
@@ -37,7 +37,8 @@ class Traffic:
         self._random = random.Random(seed)
         headers = {"Authorization": f"Bearer {SERVICES_KEY}"}
         self._clients = [
-            httpx2.Client(base_url=url, headers=headers, timeout=CALL_SECONDS) for url in urls
+            httpx2.Client(base_url=url, headers=headers, timeout=CALL_TIMEOUT_SECONDS)
+            for url in urls
         ]
         self._lock = threading.Lock()
         self._released = 0
@@ -55,7 +56,7 @@ class Traffic:
             threading.Thread(target=self._upload, args=(caller,), name="uploader", daemon=True)
             for caller in range(UPLOADERS)
         ]
-        self._threads.append(threading.Thread(target=self._ask_on, name="asker", daemon=True))
+        self._threads.append(threading.Thread(target=self._query_loop, name="asker", daemon=True))
 
     def __enter__(self) -> Self:
         for thread in self._threads:
@@ -82,13 +83,13 @@ class Traffic:
     def all_acknowledged(self) -> bool:
         return len(self.acknowledged) >= self._released
 
-    def remember(self) -> None:
+    def mark_searchable(self) -> None:
         """All is well: from now on every answer has to know what is acknowledged."""
         with self._lock:
             self.known = sorted(self._numbers.values())
 
     @contextlib.contextmanager
-    def nobody_asks(self) -> Iterator[None]:
+    def pause_queries(self) -> Iterator[None]:
         """No question is under way while the block runs."""
         with self._asking:
             yield
@@ -116,10 +117,10 @@ class Traffic:
                     self.answers["acknowledged"] += 1
                     break
                 tries += 1
-                self._stop.wait(AGAIN_SECONDS)
+                self._stop.wait(RETRY_SECONDS)
 
-    def _ask_on(self) -> None:
-        while not self._stop.wait(AGAIN_SECONDS):
+    def _query_loop(self) -> None:
+        while not self._stop.wait(RETRY_SECONDS):
             with self._lock:
                 number = self._random.choice(self.known) if self.known else None
             if number is not None:
@@ -143,7 +144,7 @@ class Traffic:
         right = (
             bool(found)
             and self._numbers.get(UUID(ids[0])) == number
-            and found[0]["similarity_score"] > SELF_SCORE
+            and found[0]["similarity_score"] > MIN_SELF_SCORE
             and len(set(ids)) == len(ids)
         )
         self.answers["right" if right else "wrong"] += 1
@@ -168,7 +169,7 @@ class Traffic:
         if answer.status_code in wanted:
             body: dict[str, Any] = answer.json()
             return body
-        if answer.status_code in AWAY:
+        if answer.status_code in RETRYABLE_STATUSES:
             self.answers["away"] += 1
         else:
             self.answers["unexpected"] += 1

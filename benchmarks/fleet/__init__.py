@@ -10,6 +10,6 @@ are those of the tests.
 
 from benchmarks.fleet.fleet import Fleet
 from benchmarks.fleet.servers import Servers, start_servers
-from benchmarks.fleet.service import Service
+from benchmarks.fleet.service import ServiceProcess
 
-__all__ = ["Fleet", "Servers", "Service", "start_servers"]
+__all__ = ["Fleet", "Servers", "ServiceProcess", "start_servers"]

@@ -9,18 +9,18 @@ from collections.abc import Iterator
 from redis import Redis
 from redis.exceptions import RedisError
 
-from shared.jobs.hints import Lane
+from shared.jobs.hints import WakeupQueue
 
 
-class Doubler:
+class MessageDuplicator:
     """Watches Redis and pushes each message of a lane once more. `doubled` counts them."""
 
     def __init__(self, url: str) -> None:
         self._url = url
-        self.doubled = 0
+        self.duplicated_messages = 0
 
     @contextlib.contextmanager
-    def at_work(self) -> Iterator[None]:
+    def duplicating(self) -> Iterator[None]:
         with (
             Redis.from_url(self._url) as watching,
             Redis.from_url(self._url) as pushing,
@@ -45,7 +45,7 @@ class Doubler:
                 if stop.is_set():
                     return
                 words = seen["command"].split(" ", 2)
-                if words[0] != "LPUSH" or words[1] not in set(Lane):
+                if words[0] != "LPUSH" or words[1] not in set(WakeupQueue):
                     continue
                 if seen["client_port"] == own_port:
                     continue
@@ -53,4 +53,4 @@ class Doubler:
                 message = pushing.lindex(words[1], 0)
                 if message is not None:
                     pushing.lpush(words[1], message)
-                    self.doubled += 1
+                    self.duplicated_messages += 1

@@ -11,7 +11,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from benchmarks.fleet.servers import Servers
-from benchmarks.fleet.service import Service
+from benchmarks.fleet.service import ServiceProcess
 from shared.catalog.schema import migrate
 from shared.catalog.session import Catalog
 from shared.objects import ObjectStore
@@ -21,7 +21,7 @@ from tests.support.server import SERVICES_KEY, environment
 from tests.support.servers.daemon import free_ports
 
 S3_TIMEOUT_SECONDS = 2.0  # so that a silent store is noticed within a fault
-LOOK_SECONDS = 0.2
+POLL_SECONDS = 0.2
 
 
 class Fleet:
@@ -76,7 +76,7 @@ class Fleet:
             **settings,
         }
         self.lease_seconds = float(settings.get("lease_seconds", 60.0))
-        self.services: dict[str, Service] = {}
+        self.services: dict[str, ServiceProcess] = {}
         for (shard, replica), port in searches.items():
             self._add(f"search-{shard}-{replica}", port, search_shard=f"{shard}/{shards}")
         self.gateway_urls: list[str] = []
@@ -90,13 +90,13 @@ class Fleet:
             self._add(f"steward-{number}", None)
         self._stop = threading.Event()
         self._supervisor = threading.Thread(target=self._supervise, name="supervisor", daemon=True)
-        self.fell: list[str] = []
+        self.crashed: list[str] = []
         """Services that ended although nobody had killed them, in order."""
 
     def _add(self, name: str, port: int | None, **settings: Any) -> None:
         service = name.partition("-")[0]
         own = {**self._settings, **settings, **({"port": port} if port else {})}
-        self.services[name] = Service(
+        self.services[name] = ServiceProcess(
             name,
             [PLACEWISE, service],
             environment(self._folder / "home", **own),
@@ -106,7 +106,7 @@ class Fleet:
             executed=self._executed,
         )
 
-    def __getitem__(self, name: str) -> Service:
+    def __getitem__(self, name: str) -> ServiceProcess:
         return self.services[name]
 
     def __enter__(self) -> Self:
@@ -137,10 +137,10 @@ class Fleet:
             self._supervisor.start()
 
     def _supervise(self) -> None:
-        while not self._stop.wait(LOOK_SECONDS):
+        while not self._stop.wait(POLL_SECONDS):
             for service in self.services.values():
-                if service.start_if_ended():
-                    self.fell.append(service.name)
+                if service.restart_if_exited():
+                    self.crashed.append(service.name)
 
     @contextlib.contextmanager
     def without(self, name: str) -> Iterator[None]:

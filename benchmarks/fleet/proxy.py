@@ -11,18 +11,18 @@ from collections.abc import AsyncIterator, Iterator
 from types import TracebackType
 from typing import Self
 
-PIECE_BYTES = 65_536
+CHUNK_BYTES = 65_536
 CUT_AFTER_BYTES = 700  # within a photo or a chunk, after the head of its request
-SLOW_SECONDS = 0.05  # for each piece
-SLOW_PIECE_BYTES = 2_048
-FULL = (
+SLOW_DELAY_SECONDS = 0.05  # for each piece
+SLOW_CHUNK_BYTES = 2_048
+DISK_FULL_RESPONSE = (
     b"HTTP/1.1 507 Insufficient Storage\r\nContent-Type: application/xml\r\n"
     b"Content-Length: 0\r\nConnection: close\r\n\r\n"
 )
-WRITES = (b"PUT ", b"POST ")
+WRITE_METHODS = (b"PUT ", b"POST ")
 
 
-class Mode(enum.Enum):
+class ProxyMode(enum.Enum):
     """How connections fare. A change of it ends those that stand."""
 
     OPEN = "everything passes"
@@ -33,7 +33,7 @@ class Mode(enum.Enum):
     FULL = "HTTP: what would write is answered with 507, the rest passes"
 
 
-CUTS = {Mode.CUT, Mode.CUT_ANSWER}
+CUT_MODES = {ProxyMode.CUT, ProxyMode.CUT_ANSWER}
 
 
 class FaultProxy:
@@ -42,7 +42,7 @@ class FaultProxy:
     def __init__(self, port: int, target: int) -> None:
         self.port = port
         self._target = target
-        self._mode = Mode.OPEN
+        self._mode = ProxyMode.OPEN
         self._cut_after_bytes = CUT_AFTER_BYTES
         self._open: set[asyncio.Task[None]] = set()
         self._loop = asyncio.new_event_loop()
@@ -69,16 +69,16 @@ class FaultProxy:
         self._loop.close()
 
     @contextlib.contextmanager
-    def misbehaving(self, mode: Mode, *, cut_after_bytes: int = CUT_AFTER_BYTES) -> Iterator[None]:
+    def in_mode(self, mode: ProxyMode, *, cut_after_bytes: int = CUT_AFTER_BYTES) -> Iterator[None]:
         """While the block runs."""
         self._cut_after_bytes = cut_after_bytes
         self._set(mode)
         try:
             yield
         finally:
-            self._set(Mode.OPEN)
+            self._set(ProxyMode.OPEN)
 
-    def _set(self, mode: Mode) -> None:
+    def _set(self, mode: ProxyMode) -> None:
         async def change() -> None:
             self._mode = mode
             await self._drop_all()
@@ -112,12 +112,12 @@ class FaultProxy:
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         mode = self._mode
-        if mode is Mode.REFUSED:
+        if mode is ProxyMode.REFUSED:
             return
         head = b""
-        if mode is Mode.FULL:
+        if mode is ProxyMode.FULL:
             head = await reader.readuntil(b"\r\n\r\n")
-            if head.startswith(WRITES):
+            if head.startswith(WRITE_METHODS):
                 await self._refuse_as_full(head, reader, writer)
                 return
             # One request on this connection: the next one may be a write.
@@ -127,13 +127,13 @@ class FaultProxy:
         async with self._upstream() as (up_reader, up_writer):
             up_writer.write(head)
             both = [
-                asyncio.create_task(self._pump(reader, up_writer, mode, cut=mode is Mode.CUT)),
-                asyncio.create_task(self._pump(up_reader, writer, mode, cut=mode in CUTS)),
+                asyncio.create_task(self._pump(reader, up_writer, mode, cut=mode is ProxyMode.CUT)),
+                asyncio.create_task(self._pump(up_reader, writer, mode, cut=mode in CUT_MODES)),
             ]
             try:
                 await asyncio.wait(both, return_when=asyncio.FIRST_COMPLETED)
                 # What the other side had sent already still arrives.
-                await asyncio.wait(both, timeout=0 if mode in CUTS else 1)
+                await asyncio.wait(both, timeout=0 if mode in CUT_MODES else 1)
             finally:
                 for pump in both:
                     pump.cancel()
@@ -152,22 +152,29 @@ class FaultProxy:
     ) -> None:
         length = re.search(rb"(?i)\r\ncontent-length: *(\d+)", head)
         await reader.readexactly(int(length[1]) if length else 0)
-        writer.write(FULL)
+        writer.write(DISK_FULL_RESPONSE)
         await writer.drain()
         writer.write_eof()
         await reader.read()  # until the client has had it all
 
     async def _pump(
-        self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, mode: Mode, *, cut: bool
+        self,
+        reader: asyncio.StreamReader,
+        writer: asyncio.StreamWriter,
+        mode: ProxyMode,
+        *,
+        cut: bool,
     ) -> None:
         passed, most = 0, self._cut_after_bytes
-        while piece := await reader.read(SLOW_PIECE_BYTES if mode is Mode.SLOW else PIECE_BYTES):
+        while piece := await reader.read(
+            SLOW_CHUNK_BYTES if mode is ProxyMode.SLOW else CHUNK_BYTES
+        ):
             if cut and passed + len(piece) > most:
                 writer.write(piece[: most - passed])
                 await writer.drain()
                 return
-            if mode is Mode.SLOW:
-                await asyncio.sleep(SLOW_SECONDS)
+            if mode is ProxyMode.SLOW:
+                await asyncio.sleep(SLOW_DELAY_SECONDS)
             writer.write(piece)
             await writer.drain()
             passed += len(piece)

@@ -15,11 +15,11 @@ import psutil
 from tests.support.processes import Process, start
 from tests.support.servers.daemon import cpu_seconds_of
 
-START_SECONDS = 120.0
-STOP_SECONDS = 60.0
+START_TIMEOUT_SECONDS = 120.0
+STOP_TIMEOUT_SECONDS = 60.0
 
 
-class Service:
+class ServiceProcess:
     """`ready_url` answers 200 when it is at work; what serves no HTTP writes `ready_line` then.
 
     While it is `wanted`, a supervisor starts it again (`start_if_ended`), as an orchestrator would.
@@ -64,7 +64,7 @@ class Service:
             self.wanted = True
             self._start()
 
-    def start_if_ended(self) -> bool:
+    def restart_if_exited(self) -> bool:
         """Start it again if it ought to run and doesn't; whether that was so."""
         with self._lock:
             if not self.wanted or self.running:
@@ -102,7 +102,7 @@ class Service:
             self.wanted = False
             assert self._process is not None
             self._process.terminate()
-            return self._process.wait(timeout=STOP_SECONDS)
+            return self._process.wait(timeout=STOP_TIMEOUT_SECONDS)
 
     def pause(self) -> None:
         self._signal(signal.SIGSTOP)
@@ -116,14 +116,14 @@ class Service:
 
     def wait_until_ready(self) -> None:
         """AssertionError with the end of its log where it does not come to that."""
-        deadline = time.monotonic() + START_SECONDS
+        deadline = time.monotonic() + START_TIMEOUT_SECONDS
         while not self._ready():
             assert time.monotonic() < deadline, f"{self.name} is not ready: {self.log()}"
             time.sleep(0.1)
 
     def _ready(self) -> bool:
         if self.ready_url is None:
-            return self.running and self.ready_line in self._own_log()
+            return self.running and self.ready_line in self._log_since_start()
         with contextlib.suppress(httpx2.TransportError):
             return httpx2.get(self.ready_url, timeout=5).is_success
         return False
@@ -132,7 +132,7 @@ class Service:
         """User and system time of the process and its children so far."""
         return cpu_seconds_of(self.process.pid)
 
-    def _own_log(self) -> bytes:
+    def _log_since_start(self) -> bytes:
         with self.log_path.open("rb") as log:
             log.seek(self._log_begin)
             return log.read()

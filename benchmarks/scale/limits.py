@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from benchmarks.scale.inputs import Inputs, Width
 from benchmarks.scale.plan import SLOT_ROWS, chunk_row_bytes
-from shared.search_http.port import CALLS_AT_ONCE
+from shared.search_http.port import MAX_CONCURRENT_CALLS
 from shared.settings import Settings
 
 LOADING_SECONDS = 600.0
@@ -44,9 +44,9 @@ def limits(width: Width, i: Inputs) -> list[Limit]:
             "machine_ram_bytes x ram_used / (a row in memory x generations_held)",
         ),
         Limit(
-            f"a query needs more shards than a gateway asks at once ({CALLS_AT_ONCE})",
-            CALLS_AT_ONCE * min(per_second, per_machine),
-            f"{CALLS_AT_ONCE} x the lesser of the limits of scan and memory",
+            f"a query needs more shards than a gateway asks at once ({MAX_CONCURRENT_CALLS})",
+            MAX_CONCURRENT_CALLS * min(per_second, per_machine),
+            f"{MAX_CONCURRENT_CALLS} x the lesser of the limits of scan and memory",
         ),
         Limit(
             f"a lone search worker loads for more than {LOADING_SECONDS:.0f} s",

@@ -19,12 +19,12 @@ from threadpoolctl import threadpool_limits
 from benchmarks.report import Report
 from services.search.loaded_chunk import LoadedChunk
 from services.search.photo_columns import PhotoColumns
-from services.search.scan import scan
-from shared.catalog.chunks import Chunk, live_chunks
+from services.search.scan import scan_top_k
+from shared.catalog.chunks import Chunk, list_live_chunks
 from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.maps import create_map
-from shared.catalog.models import ensure_model
-from shared.catalog.photos import PhotoFacts, PhotoRole
+from shared.catalog.models import get_or_create_model
+from shared.catalog.photos import PhotoFilterValues, PhotoRole
 from shared.catalog.schema import migrate
 from shared.catalog.session import Catalog
 from shared.ids import new_id
@@ -68,14 +68,14 @@ def _scan_seconds(dimension: int, chunks: int) -> float:
     query, asked = loaded[0].rows[0], np.ones(chunks * CHUNK_ROWS, bool)
     asked[0] = False  # the query's own photo
     with threadpool_limits(1):
-        seconds = _median_seconds(lambda: scan(loaded, query, 10, asked))
+        seconds = _median_seconds(lambda: scan_top_k(loaded, query, 10, asked))
     return seconds / (chunks * CHUNK_ROWS)
 
 
-def _facts(count: int) -> list[PhotoFacts]:
+def _facts(count: int) -> list[PhotoFilterValues]:
     """Photos as a street has them: coordinates and a time, every third with a place, two tags."""
     return [
-        PhotoFacts(
+        PhotoFilterValues(
             photo_id=new_id(),
             role=PhotoRole.DATABASE,
             deleted_at=None,
@@ -118,7 +118,7 @@ def _list_microseconds() -> float:
 
             def list_them() -> None:
                 with catalog.read() as session:
-                    assert len(live_chunks(session, generation_id)) == LISTED
+                    assert len(list_live_chunks(session, generation_id)) == LISTED
 
             return 1e6 * _median_seconds(list_them) / LISTED
         finally:
@@ -135,7 +135,7 @@ def _generation_of(catalog: Catalog, chunks: int) -> Any:
             spec={"clusters": None},
             spec_fingerprint="0" * 64,
             dimension=7168,
-            model_id=ensure_model(session, "bench", "0" * 64, "MIT", {}).id,
+            model_id=get_or_create_model(session, "bench", "0" * 64, "MIT", {}).id,
         )
         session.add(generation)
         session.flush()

@@ -13,13 +13,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from benchmarks.report import Report
-from benchmarks.search.cold import measure_cold
-from benchmarks.search.comparison import tell
+from benchmarks.search.cold import measure_cold_cache
+from benchmarks.search.comparison import report_comparison
 from benchmarks.search.growth import measure_growth
 from benchmarks.search.load import measure_load
-from benchmarks.search.places import City
-from benchmarks.search.turns import compare
-from benchmarks.search.world import CHUNK_ROWS, enough_memory, new_world
+from benchmarks.search.places import SyntheticCity
+from benchmarks.search.turns import compare_methods
+from benchmarks.search.world import CHUNK_ROWS, create_synthetic_map, required_memory_bytes
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -44,24 +44,24 @@ def measure(
     """
     report = Report("Search", details={"comparisons": []})
     for dimension in sorted(dimensions, reverse=True):
-        city = City(dimension, SEED)
+        city = SyntheticCity(dimension, SEED)
         for count in sorted(photos):
             with tempfile.TemporaryDirectory(dir=folder, prefix="placewise-bench-") as home:
                 making = progress.add_task(f"{count:,} x {dimension:,}", total=count)
-                with new_world(
+                with create_synthetic_map(
                     Path(home, "home"),
                     dimension,
-                    search_memory_budget=enough_memory(count, dimension),
+                    search_memory_budget=required_memory_bytes(count, dimension),
                 ) as world:
                     for rows in city.chunks(count, CHUNK_ROWS):
                         world.add(rows)
                         progress.advance(making, len(rows))
-                    compared = compare(world, city, queries, progress)
+                    compared = compare_methods(world, city, queries, progress)
                     report.tables.append(compared.table())
                     report.details["comparisons"].append(compared.as_json())
-                    tell(report, compared)
+                    report_comparison(report, compared)
                     if (count, dimension) == (max(photos), max(dimensions)):
-                        measure_cold(report, world, city, queries, progress)
+                        measure_cold_cache(report, world, city, queries, progress)
                         if load_seconds:
                             measure_load(report, world, city, load_seconds, progress)
     if growth:

@@ -11,20 +11,22 @@ import time
 import numpy as np
 from rich.progress import Progress
 
-from benchmarks.report import Report, Spread
-from benchmarks.search.comparison import MATCHED
-from benchmarks.search.methods import Asked, Ours
-from benchmarks.search.oracle import Oracle, Ranking, same
-from benchmarks.search.places import City
-from benchmarks.search.turns import load
-from benchmarks.search.world import World
+from benchmarks.report import LatencySummary, Report
+from benchmarks.search.comparison import MATCHED_CASE
+from benchmarks.search.methods import BenchmarkQuery, PlacewiseSearch
+from benchmarks.search.oracle import BruteForce, Ranking, same_ranking
+from benchmarks.search.places import SyntheticCity
+from benchmarks.search.turns import load_worker
+from benchmarks.search.world import SyntheticMap
 from services.search.snapshot import Snapshot
 
-WANTED = 5.0  # times a warm query, of the slowest in twenty
-MOST_CACHED = 0.01  # of the rows' pages: else nothing was cold
+TARGET_SLOWDOWN = 5.0  # times a warm query, of the slowest in twenty
+MAX_CACHED_SHARE = 0.01  # of the rows' pages: else nothing was cold
 
 
-def measure_cold(report: Report, world: World, city: City, queries: int, bar: Progress) -> None:
+def measure_cold_cache(
+    report: Report, world: SyntheticMap, city: SyntheticCity, queries: int, bar: Progress
+) -> None:
     """Each query warm, then with every row dropped from the page cache. The codes stay in memory.
 
     A page that a process has mapped can't be dropped: its own mapping is given up first
@@ -35,32 +37,32 @@ def measure_cold(report: Report, world: World, city: City, queries: int, bar: Pr
     task = bar.add_task("cold", total=queries)
     asked = city.revisits(len(world.photo_ids), queries)
     pieces = (np.load(path, mmap_mode="r") for path in world.chunk_paths())
-    oracle = Oracle.of(pieces, world.photo_ids, asked)
-    worker = load(world)
+    oracle = BruteForce.of(pieces, world.photo_ids, asked)
+    worker = load_worker(world)
     snapshot = worker.snapshot(world.generation_id, world.version)
-    ours = Ours(world, worker, asked)
+    ours = PlacewiseSearch(world, worker, asked)
     warm, cold, cached, differ = [], [], [], 0
     for number in range(queries):
-        question = Asked(number, MATCHED.k)
+        question = BenchmarkQuery(number, MATCHED_CASE.k)
         ours.search(question)
-        warm.append(_timed(ours, question)[0])
-        drop(snapshot, world)
+        warm.append(_time_search(ours, question)[0])
+        drop_page_cache(snapshot, world)
         cached.append(cached_share(snapshot))
-        seconds, found = _timed(ours, question)
+        seconds, found = _time_search(ours, question)
         cold.append(seconds)
-        differ += not same(found, oracle.best(number, MATCHED.k))
+        differ += not same_ranking(found, oracle.best(number, MATCHED_CASE.k))
         bar.advance(task)
-    w, c = Spread.of(warm), Spread.of(cold)
+    w, c = LatencySummary.of(warm), LatencySummary.of(cold)
     report.add("cold: our answers that differ", differ, at_most=0)
-    report.add("cold: pages still cached, at most", max(cached), at_most=MOST_CACHED)
+    report.add("cold: pages still cached, at most", max(cached), at_most=MAX_CACHED_SHARE)
     report.add("cold: warm query, p95", 1000 * w.p95, "ms")
     report.add("cold: query, median", 1000 * c.median, "ms")
     report.add("cold: query, p95", 1000 * c.p95, "ms")
-    report.add("cold: p95, of a warm query's", c.p95 / w.p95, "x", at_most=WANTED)
+    report.add("cold: p95, of a warm query's", c.p95 / w.p95, "x", at_most=TARGET_SLOWDOWN)
     report.details["cold"] = {"warm_seconds": warm, "cold_seconds": cold, "cached": cached}
 
 
-def drop(snapshot: Snapshot, world: World) -> None:
+def drop_page_cache(snapshot: Snapshot, world: SyntheticMap) -> None:
     """Drop the chunks' rows from the page cache."""
     for chunk in snapshot.chunks:
         assert chunk.stored is not None, "a loaded chunk lies on the disk"
@@ -88,7 +90,7 @@ def cached_share(snapshot: Snapshot) -> float:
     return there / pages
 
 
-def _timed(ours: Ours, question: Asked) -> tuple[float, Ranking]:
+def _time_search(ours: PlacewiseSearch, question: BenchmarkQuery) -> tuple[float, Ranking]:
     begun = time.perf_counter()
     found = ours.search(question)
     return time.perf_counter() - begun, found

@@ -7,16 +7,22 @@ from dataclasses import asdict, dataclass, field
 from rich.table import Table
 
 from benchmarks.report import Report
-from benchmarks.search.methods import FlatIP, NumpyResident, Ours, OurWorker, Predecessor
+from benchmarks.search.methods import (
+    AnyLocSearch,
+    FaissFlat,
+    NumpySearch,
+    PlacewiseSearch,
+    PlacewiseWorker,
+)
 
-OURS = (Ours.name, OurWorker.name)
-BOUNDS_AT = (10_000, 98_304)
+PLACEWISE_METHODS = (PlacewiseSearch.name, PlacewiseWorker.name)
+TARGET_MAP_SIZE = (10_000, 98_304)
 """Photos and dimension for which figures are wanted."""
-AS_FAST = 1.1  # of two medians of one run: less is the clock's noise
+NOISE_FACTOR = 1.1  # of two medians of one run: less is the clock's noise
 
 
 @dataclass(frozen=True, slots=True)
-class Case:
+class QueryCase:
     """Queries of one kind. `matched`: their places are in the map."""
 
     name: str
@@ -25,20 +31,20 @@ class Case:
     min_score: float | None = None
 
 
-MATCHED = Case("in the map, k=10", True, 10)
-OUTSIDE = Case("not in the map, k=10", False, 10)
-WITH_FLOOR = Case("not in the map, k=10, min_score=0.3", False, 10, 0.3)
-CASES = (
-    MATCHED,
-    Case("in the map, k=1", True, 1),
-    Case("in the map, k=100", True, 100),
-    OUTSIDE,
-    WITH_FLOOR,
+MATCHED_CASE = QueryCase("in the map, k=10", True, 10)
+OUT_OF_MAP_CASE = QueryCase("not in the map, k=10", False, 10)
+MIN_SCORE_CASE = QueryCase("not in the map, k=10, min_score=0.3", False, 10, 0.3)
+QUERY_CASES = (
+    MATCHED_CASE,
+    QueryCase("in the map, k=1", True, 1),
+    QueryCase("in the map, k=100", True, 100),
+    OUT_OF_MAP_CASE,
+    MIN_SCORE_CASE,
 )
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class MethodTiming:
     """What one method did in one case."""
 
     case: str
@@ -55,12 +61,12 @@ class Row:
 
 
 @dataclass(slots=True)
-class Compared:
+class MethodComparison:
     """All cases of one size of map."""
 
     photos: int
     dimension: int
-    rows: list[Row]
+    rows: list[MethodTiming]
     read_bytes_per_second: float
     grown_bytes: int
     """Private memory that loading the map took."""
@@ -68,12 +74,12 @@ class Compared:
     took: dict[str, dict[str, list[float]]] = field(default_factory=dict)
     """Seconds of each query, by case and method."""
 
-    def row(self, case: Case, method: str) -> Row:
+    def row(self, case: QueryCase, method: str) -> MethodTiming:
         return next(row for row in self.rows if (row.case, row.method) == (case.name, method))
 
-    def ratio(self, case: Case, method: str) -> float:
+    def ratio(self, case: QueryCase, method: str) -> float:
         """How many times longer the method takes than ours."""
-        return self.row(case, method).median_ms / self.row(case, Ours.name).median_ms
+        return self.row(case, method).median_ms / self.row(case, PlacewiseSearch.name).median_ms
 
     def as_json(self) -> dict[str, object]:
         return {**asdict(self), "rows": [asdict(row) for row in self.rows]}
@@ -84,7 +90,7 @@ class Compared:
             *("asked", "differ"),
             title=f"{self.photos:,} photos, {self.dimension:,} dimensions",
         )
-        for case in CASES:
+        for case in QUERY_CASES:
             for row in (row for row in self.rows if row.case == case.name):
                 table.add_row(
                     row.case,
@@ -102,24 +108,24 @@ class Compared:
         return table
 
 
-def tell(report: Report, compared: Compared) -> None:
+def report_comparison(report: Report, compared: MethodComparison) -> None:
     """Put what is wanted of a comparison into the report."""
     c = compared
-    wanted = (c.photos, c.dimension) == BOUNDS_AT
+    wanted = (c.photos, c.dimension) == TARGET_MAP_SIZE
     size = f"{c.photos:,} x {c.dimension:,}"
-    ours = c.row(MATCHED, Ours.name)
+    ours = c.row(MATCHED_CASE, PlacewiseSearch.name)
     memory = max(c.grown_bytes, ours.memory_bytes)
     report.add(
         f"{size}: our answers that differ",
-        sum(row.differ for row in c.rows if row.method in OURS),
+        sum(row.differ for row in c.rows if row.method in PLACEWISE_METHODS),
         at_most=0,
     )
-    report.add(f"{size}: {MATCHED.name}, median", ours.median_ms, "ms")
+    report.add(f"{size}: {MATCHED_CASE.name}, median", ours.median_ms, "ms")
     for case, method, least in (
-        (MATCHED, NumpyResident.name, 40),
-        (MATCHED, FlatIP.name, 100),
-        (MATCHED, Predecessor.name, 300),
-        (OUTSIDE, NumpyResident.name, 6),
+        (MATCHED_CASE, NumpySearch.name, 40),
+        (MATCHED_CASE, FaissFlat.name, 100),
+        (MATCHED_CASE, AnyLocSearch.name, 300),
+        (OUT_OF_MAP_CASE, NumpySearch.name, 6),
     ):
         report.add(
             f"{size}: {case.name}, {method} takes",
@@ -128,16 +134,16 @@ def tell(report: Report, compared: Compared) -> None:
             at_least=least if wanted else None,
         )
     report.add(
-        f"{size}: {MATCHED.name}, of reading what it reads",
+        f"{size}: {MATCHED_CASE.name}, of reading what it reads",
         ours.floor_ratio,
         "x",
         at_most=4 if wanted else None,
     )
     report.add(
-        f"{size}: {WITH_FLOOR.name}, of a matched query",
-        c.row(WITH_FLOOR, Ours.name).median_ms / ours.median_ms,
+        f"{size}: {MIN_SCORE_CASE.name}, of a matched query",
+        c.row(MIN_SCORE_CASE, PlacewiseSearch.name).median_ms / ours.median_ms,
         "x",
-        at_most=AS_FAST if wanted else None,
+        at_most=NOISE_FACTOR if wanted else None,
     )
     report.add(
         f"{size}: float32 rows, of what the index holds",

@@ -11,26 +11,28 @@ from rich.progress import Progress
 from rich.table import Table
 
 from benchmarks.report import Report
-from benchmarks.search.memory import ReadSpeed
-from services.search.cascade import Blocks, CodedQuery, glance
-from shared.codes.rotation import rotation
+from benchmarks.search.memory import MemoryBandwidth
+from services.search.cascade import SignCodeBlocks, SignCodedQuery, scan_first_level
+from shared.codes.rotation import get_rotation
 from shared.codes.signs import level_ends
 
 DIMENSION = 98_304
-MEASURED = (100_000, 1_000_000)
-RECKONED = (3_000_000, 10_000_000)
+MEASURED_SIZES = (100_000, 1_000_000)
+EXTRAPOLATED_SIZES = (3_000_000, 10_000_000)
 BLOCK_ROWS = 1000  # of a chunk
 ROUNDS = 15
-WANTED = 1.3
+TARGET_RATIO = 1.3
 SEED = 20_261_121
 
 
-def measure_growth(report: Report, progress: Progress, sizes: Sequence[int] = MEASURED) -> None:
+def measure_growth(
+    report: Report, progress: Progress, sizes: Sequence[int] = MEASURED_SIZES
+) -> None:
     """Scans and reads of the same codes, in turn."""
-    turn = rotation(DIMENSION)
+    turn = get_rotation(DIMENSION)
     words = int(level_ends(turn.padded)[0])
     draw = np.random.default_rng(SEED)
-    query = CodedQuery.of(draw.standard_normal(DIMENSION).astype(np.float32), turn)
+    query = SignCodedQuery.of(draw.standard_normal(DIMENSION).astype(np.float32), turn)
     task = progress.add_task("growth", total=len(sizes) * ROUNDS)
     table = Table("photos", "first bits", "scan", "of reading them", "", title="Growth")
     per_row = 0.0
@@ -40,11 +42,11 @@ def measure_growth(report: Report, progress: Progress, sizes: Sequence[int] = ME
         blocks = _blocks(codes)
         asked = np.ones(rows, bool)
         took = []
-        glance(blocks, [query], [asked])
-        with ReadSpeed(codes) as speed:
+        scan_first_level(blocks, [query], [asked])
+        with MemoryBandwidth(codes) as speed:
             for _ in range(ROUNDS):
                 begun = time.perf_counter()
-                glance(blocks, [query], [asked])
+                scan_first_level(blocks, [query], [asked])
                 took.append(time.perf_counter() - begun)
                 speed.sample()
                 progress.advance(task)
@@ -52,7 +54,7 @@ def measure_growth(report: Report, progress: Progress, sizes: Sequence[int] = ME
         ratio = seconds * speed.bytes_per_second / codes.nbytes
         per_row = seconds / rows
         report.add(f"growth: scan of {rows:,} codes, median", 1000 * seconds, "ms")
-        report.add(f"growth: {rows:,} codes, of reading them", ratio, "x", at_most=WANTED)
+        report.add(f"growth: {rows:,} codes, of reading them", ratio, "x", at_most=TARGET_RATIO)
         table.add_row(
             f"{rows:,}",
             f"{codes.nbytes / 1e9:.2f} GB",
@@ -61,7 +63,7 @@ def measure_growth(report: Report, progress: Progress, sizes: Sequence[int] = ME
             "measured",
         )
         found.append({"rows": rows, "seconds": took, "ratio": ratio, "measured": True})
-    for rows in RECKONED:
+    for rows in EXTRAPOLATED_SIZES:
         table.add_row(
             f"{rows:,}",
             f"{8 * rows * words / 1e9:.2f} GB",
@@ -74,16 +76,18 @@ def measure_growth(report: Report, progress: Progress, sizes: Sequence[int] = ME
     report.details["growth"] = found
 
 
-def _blocks(codes: np.ndarray[tuple[int, int], np.dtype[np.uint64]]) -> Blocks:
+def _blocks(codes: np.ndarray[tuple[int, int], np.dtype[np.uint64]]) -> SignCodeBlocks:
     """Codes as a scan wants them: chunk by chunk, their first level only."""
     begins = np.arange(0, len(codes), BLOCK_ROWS)
     nothing = np.empty(0, np.uint64)
-    return Blocks(
+    return SignCodeBlocks(
         dimension=DIMENSION,
-        first=np.array([*begins, len(codes)], np.int64),
-        levels=(codes.ctypes.data + begins * codes.strides[0]).astype(np.uint64)[np.newaxis],
-        rows=nothing,
+        first_rows=np.array([*begins, len(codes)], np.int64),
+        level_addresses=(codes.ctypes.data + begins * codes.strides[0]).astype(np.uint64)[
+            np.newaxis
+        ],
+        row_addresses=nothing,
         norms=np.ones(len(codes), np.float32),
-        zeros=np.empty(0, np.int64),
-        kept=codes,
+        zero_rows=np.empty(0, np.int64),
+        keep_alive=codes,
     )

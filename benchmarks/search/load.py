@@ -23,12 +23,12 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 from rich.progress import Progress
 
-from benchmarks.fleet.service import Service
-from benchmarks.report import Report, Spread
-from benchmarks.search.oracle import Oracle, Ranking, same
-from benchmarks.search.places import City
-from benchmarks.search.world import World
-from benchmarks.traffic import Caller
+from benchmarks.fleet.service import ServiceProcess
+from benchmarks.report import LatencySummary, Report
+from benchmarks.search.oracle import BruteForce, Ranking, same_ranking
+from benchmarks.search.places import SyntheticCity
+from benchmarks.search.world import SyntheticMap
+from benchmarks.traffic import HttpCaller
 from shared.chunks import Rows
 from shared.search_protocol import SearchResponse
 from tests.support.server import environment
@@ -36,18 +36,18 @@ from tests.support.servers.daemon import free_ports
 
 CLIENTS = 32
 QUERIES = 48
-OUT_OF_MAP = 16  # of them
-KS = (1, 10, 100)
-POOL = 240  # photos that are added meanwhile
+OUT_OF_MAP_QUERIES = 16  # of them
+TOP_KS = (1, 10, 100)
+ADDED_PHOTOS = 240  # photos that are added meanwhile
 CHANGE_SECONDS = 0.25
-CHANGES_A_MERGE = 20
-ALIKE = 0.8  # how much of another photo is in one that is added
+CHANGES_PER_MERGE = 20
+MAX_SIMILARITY = 0.8  # how much of another photo is in one that is added
 SEED = 20_261_121
-JSON = {"Content-Type": "application/json"}
+JSON_HEADERS = {"Content-Type": "application/json"}
 
 
 @dataclass(frozen=True, slots=True)
-class Answered:
+class SearchObservation:
     query: int
     k: int
     least_version: int
@@ -57,10 +57,10 @@ class Answered:
 
 
 @dataclass(slots=True)
-class Outcome:
+class LoadOutcome:
     """What clients and the one who changes the map have seen."""
 
-    answered: list[Answered] = field(default_factory=list)
+    answered: list[SearchObservation] = field(default_factory=list)
     failed: list[str] = field(default_factory=list)
     versions: list[int] = field(default_factory=list)
     """Rising."""
@@ -78,22 +78,25 @@ class Outcome:
 
 
 def measure_load(
-    report: Report, world: World, city: City, seconds: float, progress: Progress
+    report: Report, world: SyntheticMap, city: SyntheticCity, seconds: float, progress: Progress
 ) -> None:
     """CLIENTS ask for `seconds`."""
     photos = len(world.photo_ids)
     paths = world.chunk_paths()
     queries = np.concatenate(
-        [city.revisits(photos, QUERIES - OUT_OF_MAP), city.elsewhere(OUT_OF_MAP)]
+        [
+            city.revisits(photos, QUERIES - OUT_OF_MAP_QUERIES),
+            city.out_of_map_rows(OUT_OF_MAP_QUERIES),
+        ]
     )
-    pool = _like(queries, city.elsewhere(OUT_OF_MAP + 1)[OUT_OF_MAP:])
-    with _service(world) as service:
-        outcome = _run(world, service, queries, pool, seconds, progress)
+    pool = _similar_rows(queries, city.out_of_map_rows(OUT_OF_MAP_QUERIES + 1)[OUT_OF_MAP_QUERIES:])
+    with _start_search_service(world) as service:
+        outcome = _run_load(world, service, queries, pool, seconds, progress)
     pieces: Iterator[Rows] = (np.load(path, mmap_mode="r") for path in paths)
     added = len(world.photo_ids) - photos
-    oracle = Oracle.of((*pieces, pool[:added]), world.photo_ids, queries)
-    wrong = count_wrong(outcome, oracle)
-    spread = Spread.of([answered.seconds for answered in outcome.answered])
+    oracle = BruteForce.of((*pieces, pool[:added]), world.photo_ids, queries)
+    wrong = count_wrong_answers(outcome, oracle)
+    spread = LatencySummary.of([answered.seconds for answered in outcome.answered])
     report.add("load: answers", len(outcome.answered), at_least=1)
     report.add("load: versions of the map", len(outcome.versions) + outcome.merges, at_least=2)
     report.add("load: wrong answers", wrong, at_most=0)
@@ -112,7 +115,7 @@ def measure_load(
     }
 
 
-def count_wrong(outcome: Outcome, oracle: Oracle) -> int:
+def count_wrong_answers(outcome: LoadOutcome, oracle: BruteForce) -> int:
     """Answers that are not those of brute force on the version that they name, or that name one
     older than they had to know."""
     expected: dict[tuple[int, int, int], Ranking] = {}
@@ -128,34 +131,34 @@ def count_wrong(outcome: Outcome, oracle: Oracle) -> int:
             live[: len(outcome.live[at[0]])] = outcome.live[at[0]]
             expected[at] = oracle.best(answered.query, answered.k, live=live)
         found = [(hit.photo_id, hit.score) for hit in response.hits]
-        wrong += not same(found, expected[at])
+        wrong += not same_ranking(found, expected[at])
     return wrong
 
 
-def _run(
-    world: World,
-    service: Service,
+def _run_load(
+    world: SyntheticMap,
+    service: ServiceProcess,
     queries: Rows,
     pool: Rows,
     seconds: float,
     progress: Progress,
-) -> Outcome:
-    keys = [world.ask_with(row) for row in queries]
-    outcome = Outcome(versions=[world.version], live=[np.ones(len(world.photo_ids), bool)])
+) -> LoadOutcome:
+    keys = [world.store_query(row) for row in queries]
+    outcome = LoadOutcome(versions=[world.version], live=[np.ones(len(world.photo_ids), bool)])
     stop = threading.Event()
     task = progress.add_task("load", total=seconds)
     assert service.ready_url is not None
-    with Caller(service.ready_url.removesuffix("/readyz")) as caller:
-        for number in range(len(KS)):  # what is compiled is compiled now
-            _ask(world, caller, keys, number, KS[number], outcome)
+    with HttpCaller(service.ready_url.removesuffix("/readyz")) as caller:
+        for number in range(len(TOP_KS)):  # what is compiled is compiled now
+            _send_query(world, caller, keys, number, TOP_KS[number], outcome)
         outcome.answered.clear()
         with ThreadPoolExecutor(CLIENTS + 1) as pool_of_threads:
             begun = time.monotonic()
             calls = [
-                pool_of_threads.submit(_client, world, caller, keys, number, outcome, stop)
+                pool_of_threads.submit(_client_loop, world, caller, keys, number, outcome, stop)
                 for number in range(CLIENTS)
             ]
-            calls.append(pool_of_threads.submit(_change, world, pool, outcome, stop))
+            calls.append(pool_of_threads.submit(_change_loop, world, pool, outcome, stop))
             try:
                 while (spent := time.monotonic() - begun) < seconds:
                     progress.update(task, completed=spent)
@@ -170,38 +173,45 @@ def _run(
     return outcome
 
 
-def _client(
-    world: World,
-    caller: Caller,
+def _client_loop(
+    world: SyntheticMap,
+    caller: HttpCaller,
     keys: list[str],
     number: int,
-    outcome: Outcome,
+    outcome: LoadOutcome,
     stop: threading.Event,
 ) -> None:
     draw = random.Random(SEED + number)
     while not stop.is_set():
-        _ask(world, caller, keys, draw.randrange(len(keys)), draw.choice(KS), outcome)
+        _send_query(world, caller, keys, draw.randrange(len(keys)), draw.choice(TOP_KS), outcome)
 
 
-def _ask(
-    world: World, caller: Caller, keys: list[str], query: int, k: int, outcome: Outcome
+def _send_query(
+    world: SyntheticMap,
+    caller: HttpCaller,
+    keys: list[str],
+    query: int,
+    k: int,
+    outcome: LoadOutcome,
 ) -> None:
     least = outcome.versions[-1]
     body = world.request(keys[query], k, least).model_dump_json().encode()
     begun = time.perf_counter()
     try:
-        answer = caller.call("POST", "/search", body, **JSON)
+        answer = caller.call("POST", "/search", body, **JSON_HEADERS)
         took = time.perf_counter() - begun
         if answer.status == 200:
             response = SearchResponse.model_validate_json(answer.body)
-            outcome.answered.append(Answered(query, k, least, response, took))
+            outcome.answered.append(SearchObservation(query, k, least, response, took))
         else:
             outcome.failed.append(f"{answer.status}: {answer.body[:200]!r}")
     except (OSError, HTTPException, ValidationError) as error:
         outcome.failed.append(f"{type(error).__name__}: {error}")
 
 
-def _change(world: World, pool: Rows, outcome: Outcome, stop: threading.Event) -> None:
+def _change_loop(
+    world: SyntheticMap, pool: Rows, outcome: LoadOutcome, stop: threading.Event
+) -> None:
     """Add a photo, delete another one, merge what was added from time to time."""
     draw = random.Random(SEED)
     slot = len(world.photo_ids)  # far beyond those that are there
@@ -213,27 +223,27 @@ def _change(world: World, pool: Rows, outcome: Outcome, stop: threading.Event) -
             version = world.add(pool[added : added + 1], slot)
             added += 1
             live = np.append(live, True)
-            _note(outcome, version, live)
+            _record_version(outcome, version, live)
         gone = int(draw.choice(np.flatnonzero(live).tolist()))
         version = world.delete(world.photo_ids[gone])
         live = live.copy()
         live[gone] = False
-        _note(outcome, version, live)
-        if turn % CHANGES_A_MERGE == 0 and world.merge(slot):
+        _record_version(outcome, version, live)
+        if turn % CHANGES_PER_MERGE == 0 and world.merge(slot):
             outcome.merges += 1
 
 
-def _note(outcome: Outcome, version: int, live: NDArray[np.bool_]) -> None:
+def _record_version(outcome: LoadOutcome, version: int, live: NDArray[np.bool_]) -> None:
     outcome.live.append(live)
     outcome.versions.append(version)  # last: clients ask for it from now on
 
 
-def _like(queries: Rows, others: Rows) -> Rows:
+def _similar_rows(queries: Rows, others: Rows) -> Rows:
     """(POOL, dimension): photos that answer the queries more or less."""
     draw = np.random.default_rng(SEED)
-    rows = queries[draw.integers(len(queries), size=POOL)]
+    rows = queries[draw.integers(len(queries), size=ADDED_PHOTOS)]
     for row in rows:  # one after the other: the pool alone is large enough
-        row += draw.uniform(0.1, 2 * ALIKE) * others[draw.integers(len(others))]
+        row += draw.uniform(0.1, 2 * MAX_SIMILARITY) * others[draw.integers(len(others))]
         noise = draw.standard_normal(len(row)).astype(np.float32)
         row += np.float32(draw.uniform(0.2, 1.0)) * noise / np.linalg.norm(noise)
         row /= np.linalg.norm(row)
@@ -241,11 +251,11 @@ def _like(queries: Rows, others: Rows) -> Rows:
 
 
 @contextlib.contextmanager
-def _service(world: World) -> Iterator[Service]:
+def _start_search_service(world: SyntheticMap) -> Iterator[ServiceProcess]:
     """`placewise search` on the map."""
     (port,) = free_ports(1)
     home = world.settings.placewise_home
-    service = Service(
+    service = ServiceProcess(
         "search",
         [str(Path(sys.executable).with_name("placewise")), "search"],
         environment(home, port=port, search_memory_budget=world.settings.search_memory_bytes),

@@ -19,15 +19,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.search import kernels
-from shared.codes.compiled import IN_LANES, compiled
+from shared.codes.compiled import REORDERED_FASTMATH, numba_jit
 
 STREAM_BYTES = 256_000_000  # beyond every cache
 
 Words = NDArray[np.uint64]
 
 
-@compiled(IN_LANES)
-def _read(words: Words) -> np.uint64:
+@numba_jit(REORDERED_FASTMATH)
+def _xor_words(words: Words) -> np.uint64:
     """Something that depends on every word; four streams at once, which is faster than one."""
     quarter = words.shape[0] // 4
     a, b, c = words[:quarter], words[quarter : 2 * quarter], words[2 * quarter : 3 * quarter]
@@ -38,7 +38,7 @@ def _read(words: Words) -> np.uint64:
     return found
 
 
-class ReadSpeed:
+class MemoryBandwidth:
     """How fast memory is read: by one thread, and by one on each core; the faster is the floor.
 
     A context manager. Samples are taken between other measurements, so that what disturbs one
@@ -52,14 +52,14 @@ class ReadSpeed:
         self._parts = np.array_split(self._words, cores)
         self._pool = ThreadPoolExecutor(cores, thread_name_prefix="read")
         self._took: tuple[list[float], list[float]] = ([], [])
-        _read(self._words[:8])
+        _xor_words(self._words[:8])
 
     def sample(self) -> None:
         """Read everything once in each way."""
         begun = time.perf_counter()
-        _read(self._words)
+        _xor_words(self._words)
         alone = time.perf_counter()
-        list(self._pool.map(_read, self._parts))
+        list(self._pool.map(_xor_words, self._parts))
         self._took[0].append(alone - begun)
         self._took[1].append(time.perf_counter() - alone)
 
@@ -76,20 +76,20 @@ class ReadSpeed:
 
 
 @dataclass(slots=True)
-class Touched:
+class ByteCounter:
     """Bytes of codes and rows that were read."""
 
     size_bytes: int = 0
 
 
 @contextlib.contextmanager
-def touched() -> Iterator[Touched]:
+def count_bytes_read() -> Iterator[ByteCounter]:
     """Counts what searches by codes read while the block runs: their loops are told which rows."""
-    count = Touched()
+    count = ByteCounter()
 
     lock = threading.Lock()
     loops: dict[str, Callable[..., int]] = {
-        "distances": _of_distances,
+        "distances": _distance_bytes,
         "distances_at": lambda _, __, rows, query, *___: 8 * len(query) * len(rows),
         "weighted_at": lambda _, __, rows, ___, planes, ____: 8 * planes.shape[1] * len(rows),
         "products_at": lambda _, __, rows, query, *___: 4 * len(query) * len(rows),
@@ -113,7 +113,7 @@ def touched() -> Iterator[Touched]:
         yield count
 
 
-def _of_distances(
+def _distance_bytes(
     _blocks: Any, _first: Any, asked: NDArray[np.bool_], query: Words, begin: int, end: int, *_: Any
 ) -> int:
     rows = np.count_nonzero(asked[..., begin:end].reshape(-1, end - begin).any(axis=0))

@@ -12,20 +12,20 @@ import faiss
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.search.memory import touched
+from benchmarks.search.memory import count_bytes_read
 from benchmarks.search.oracle import Ranking
-from benchmarks.search.world import World
-from services.search.answer import Question, answer
+from benchmarks.search.world import SyntheticMap
+from services.search.answer import SearchOptions, execute_query
 from services.search.worker import SearchWorker
 from shared.chunks import Rows
-from shared.codes.rotation import rotation
+from shared.codes.rotation import get_rotation
 from shared.codes.signs import SignCodes, pack_signs
 
-LEAST_CANDIDATES = 32  # of the binary index, compared exactly
+MIN_CANDIDATES = 32  # of the binary index, compared exactly
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
+class BenchmarkQuery:
     """One question: the row of query number `query`, how many photos, from which score on."""
 
     query: int
@@ -33,72 +33,74 @@ class Asked:
     min_score: float | None = None
 
 
-class Method(Protocol):
+class SearchMethod(Protocol):
     name: str
     memory_bytes: int
     """That the index holds, without what the system caches of files."""
 
-    def search(self, asked: Asked) -> Ranking: ...
+    def search(self, asked: BenchmarkQuery) -> Ranking: ...
 
-    def bytes_touched(self, asked: Asked) -> int:
+    def bytes_touched(self, asked: BenchmarkQuery) -> int:
         """Of codes and rows."""
 
 
-class Ours:
+class PlacewiseSearch:
     """What a search worker has loaded, asked directly."""
 
     name = "Placewise, answer()"
 
-    def __init__(self, world: World, worker: SearchWorker, queries: Rows) -> None:
+    def __init__(self, world: SyntheticMap, worker: SearchWorker, queries: Rows) -> None:
         self._snapshot = worker.snapshot(world.generation_id, world.version)
-        self._glances = worker.together
+        self._glances = worker.query_batcher
         self._queries = queries
         self._asked = self._snapshot.photos.findable
         self.memory_bytes = worker.status().resident_bytes
         self.certificates: set[str] = set()
 
-    def search(self, asked: Asked) -> Ranking:
-        found = answer(
+    def search(self, asked: BenchmarkQuery) -> Ranking:
+        found = execute_query(
             self._snapshot,
             self._queries[asked.query],
             self._asked,
-            Question(asked.k, asked.min_score),
+            SearchOptions(asked.k, asked.min_score),
             self._glances,
         )
         self.certificates.add(found.certificate)
         return [(hit.photo_id, hit.score) for hit in found.hits]
 
-    def bytes_touched(self, asked: Asked) -> int:
-        with touched() as count:
+    def bytes_touched(self, asked: BenchmarkQuery) -> int:
+        with count_bytes_read() as count:
             self.search(asked)
         # Without codes every row is read.
         return count.size_bytes or int(self._queries[0].nbytes) * len(self._asked)
 
 
-class OurWorker:
+class PlacewiseWorker:
     """The same through the worker: the query's descriptor is read from the store."""
 
     name = "Placewise, SearchWorker"
 
-    def __init__(self, world: World, worker: SearchWorker, queries: Rows, ours: Ours) -> None:
+    def __init__(
+        self, world: SyntheticMap, worker: SearchWorker, queries: Rows, ours: PlacewiseSearch
+    ) -> None:
         self._world = world
         self._worker = worker
         self._version = world.version
-        self._keys = [world.ask_with(row) for row in queries]
+        self._keys = [world.store_query(row) for row in queries]
         self._ours = ours
         self.memory_bytes = ours.memory_bytes
 
-    def search(self, asked: Asked) -> Ranking:
+    def search(self, asked: BenchmarkQuery) -> Ranking:
         request = self._world.request(
             self._keys[asked.query], asked.k, self._version, asked.min_score
         )
         return [(hit.photo_id, hit.score) for hit in self._worker.search(request).hits]
 
-    def bytes_touched(self, asked: Asked) -> int:
+    def bytes_touched(self, asked: BenchmarkQuery) -> int:
         return self._ours.bytes_touched(asked)
 
 
-class NumpyResident:
+class NumpySearch:
     """All rows in one float32 array."""
 
     name = "NumPy, resident float32"
@@ -109,14 +111,14 @@ class NumpyResident:
         self._queries = queries
         self.memory_bytes = rows.nbytes
 
-    def search(self, asked: Asked) -> Ranking:
-        return ranked(self._rows @ self._queries[asked.query], self._ids, asked)
+    def search(self, asked: BenchmarkQuery) -> Ranking:
+        return top_k(self._rows @ self._queries[asked.query], self._ids, asked)
 
-    def bytes_touched(self, asked: Asked) -> int:
+    def bytes_touched(self, asked: BenchmarkQuery) -> int:
         return self._rows.nbytes
 
 
-class Predecessor:
+class AnyLocSearch:
     """Every chunk is loaded for every query (AnyLoc's similarity service)."""
 
     name = "predecessor: np.load of every chunk"
@@ -127,16 +129,16 @@ class Predecessor:
         self._ids = photo_ids
         self._queries = queries
 
-    def search(self, asked: Asked) -> Ranking:
+    def search(self, asked: BenchmarkQuery) -> Ranking:
         query = self._queries[asked.query]
         scores = np.concatenate([np.dot(np.load(path), query) for path in self._paths])
-        return ranked(scores, self._ids, asked)
+        return top_k(scores, self._ids, asked)
 
-    def bytes_touched(self, asked: Asked) -> int:
+    def bytes_touched(self, asked: BenchmarkQuery) -> int:
         return int(self._queries[0].nbytes) * len(self._ids)
 
 
-class FlatIP:
+class FaissFlat:
     """`faiss.IndexFlatIP`. Its rows are NumPy's, too: one copy is enough for both."""
 
     name = "faiss.IndexFlatIP"
@@ -147,7 +149,7 @@ class FlatIP:
         self._queries = queries
         self.memory_bytes = int(queries[0].nbytes) * len(photo_ids)
 
-    def search(self, asked: Asked) -> Ranking:
+    def search(self, asked: BenchmarkQuery) -> Ranking:
         query = self._queries[asked.query]
         k = min(asked.k, len(self._ids))
         scores, numbers = self._index.search(query[np.newaxis], k)
@@ -155,11 +157,11 @@ class FlatIP:
         least = -np.inf if asked.min_score is None else asked.min_score
         return [(self._ids[number], score) for number, score in found if score >= least]
 
-    def bytes_touched(self, asked: Asked) -> int:
+    def bytes_touched(self, asked: BenchmarkQuery) -> int:
         return self.memory_bytes
 
 
-class BinaryFlat:
+class FaissBinary:
     """`faiss.IndexBinaryFlat` on our codes, and the best of it compared exactly.
 
     Nothing says how many candidates are enough.
@@ -176,26 +178,28 @@ class BinaryFlat:
         self._rows = rows
         self._ids = photo_ids
         self._queries = queries
-        self._turn = rotation(rows.shape[1])
+        self._turn = get_rotation(rows.shape[1])
         self.memory_bytes = words.nbytes
 
-    def search(self, asked: Asked) -> Ranking:
+    def search(self, asked: BenchmarkQuery) -> Ranking:
         query = self._queries[asked.query]
         code = pack_signs(self._turn.rotate(query[np.newaxis])).view(np.uint8)
         _, numbers = self._index.search(code, self._candidates(asked))
         rows = numbers[0]
         scores = self._rows[rows].astype(np.float64) @ query.astype(np.float64)
-        return ranked(scores, [self._ids[row] for row in rows.tolist()], asked)
+        return top_k(scores, [self._ids[row] for row in rows.tolist()], asked)
 
-    def bytes_touched(self, asked: Asked) -> int:
+    def bytes_touched(self, asked: BenchmarkQuery) -> int:
         return self.memory_bytes + self._candidates(asked) * self._rows.strides[0]
 
-    def _candidates(self, asked: Asked) -> int:
-        return min(max(LEAST_CANDIDATES, 3 * asked.k), len(self._ids))
+    def _candidates(self, asked: BenchmarkQuery) -> int:
+        return min(max(MIN_CANDIDATES, 3 * asked.k), len(self._ids))
 
 
-def ranked(
-    scores: NDArray[np.floating[np.typing.NBitBase]], photo_ids: Sequence[UUID], asked: Asked
+def top_k(
+    scores: NDArray[np.floating[np.typing.NBitBase]],
+    photo_ids: Sequence[UUID],
+    asked: BenchmarkQuery,
 ) -> Ranking:
     """The best of all rows' scores, which stand in the order of the photos."""
     k = min(asked.k, len(scores))

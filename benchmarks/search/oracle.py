@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from shared.chunks import Rows
 
-AT_ONCE = 128  # rows that are brought to float64: 100 MB at 98,304 dimensions
+BLOCK_ROWS = 128  # rows that are brought to float64: 100 MB at 98,304 dimensions
 DECIMALS = 12  # scores that agree to so many are equal, and the photos' ids decide
 TOLERANCE = 1e-9  # of a score: float64 sums of 98,304 products differ by less than 1e-14
 
@@ -20,7 +20,7 @@ Ranking = Sequence[tuple[UUID, float]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Oracle:
+class BruteForce:
     """The cosines of n photos with q queries."""
 
     photo_ids: Sequence[UUID]
@@ -28,15 +28,15 @@ class Oracle:
     """(q, n)"""
 
     @classmethod
-    def of(cls, pieces: Iterable[Rows], photo_ids: Sequence[UUID], queries: Rows) -> Oracle:
+    def of(cls, pieces: Iterable[Rows], photo_ids: Sequence[UUID], queries: Rows) -> BruteForce:
         """`pieces` are the rows of the photos, in their order; rows have length 1."""
         asked = queries.astype(np.float64)
         asked /= np.linalg.norm(asked, axis=1, keepdims=True)
         scores = np.empty((len(queries), len(photo_ids)))
         done = 0
         for rows in pieces:
-            for begin in range(0, len(rows), AT_ONCE):
-                part = rows[begin : begin + AT_ONCE].astype(np.float64)
+            for begin in range(0, len(rows), BLOCK_ROWS):
+                part = rows[begin : begin + BLOCK_ROWS].astype(np.float64)
                 scores[:, done : done + len(part)] = asked @ part.T
                 done += len(part)
         if done != len(photo_ids):
@@ -63,7 +63,7 @@ class Oracle:
         return [(photo_id, -score) for score, photo_id in found[:k]]
 
 
-def same(found: Ranking, expected: Ranking) -> bool:
+def same_ranking(found: Ranking, expected: Ranking) -> bool:
     """Whether the photos are the same in the same order, with the same scores."""
     return len(found) == len(expected) and all(
         ours[0] == truth[0] and abs(ours[1] - truth[1]) <= TOLERANCE

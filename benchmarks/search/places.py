@@ -24,7 +24,7 @@ from shared.chunks import Rows
 
 BLOCKS = 64
 WALK_PHOTOS = 250
-PHOTOS_OF_A_PLACE = (1, 3, 30)
+PHOTOS_PER_PLACE = (1, 3, 30)
 """Of walk number n: the entry n modulo 3."""
 
 SUBSPACE = 110  # dimensions of a block's subspace, at most; half of the block's own
@@ -32,16 +32,16 @@ DECAY = 0.6  # the strength of its i-th direction is i^-DECAY
 SHARED = 0.42  # strength of the shared direction, against 1 of the subspace
 NOISE = 0.5  # of what no other photo repeats
 EMPTY_BELOW = -0.583  # of a normal deviate: 28 % of the blocks
-RICH = 0.22  # how much photos differ in the number of their words
+WORD_COUNT_SPREAD = 0.22  # how much photos differ in the number of their words
 STRONG_CHANNELS = 0.01
 STRENGTH = 9.0  # of their noise
 
-SAME_PLACE = 0.985  # AR(1) coefficients
-NEXT_PLACE = 0.85
-LEAST_CHANGE, MOST_CHANGE = 0.05, 0.6
+SAME_PLACE_CORRELATION = 0.985  # AR(1) coefficients
+NEXT_PLACE_CORRELATION = 0.85
+MIN_CHANGE, MAX_CHANGE = 0.05, 0.6
 """Of the appearance of a place that is seen again: the share of the latent variance."""
 
-OUTSIDE = 1_000_000  # numbers of walks that are in no map
+OUT_OF_MAP_WALKS = 1_000_000  # numbers of walks that are in no map
 
 Floats = NDArray[np.float32]
 
@@ -56,7 +56,7 @@ class Latents:
     """(n, BLOCKS): a block is empty where this is low."""
 
 
-class City:
+class SyntheticCity:
     """Photos of one dimension, the same for the same seed; 64 must divide the dimension."""
 
     def __init__(self, dimension: int, seed: int) -> None:
@@ -66,13 +66,13 @@ class City:
         self.seed = seed
         self._width = dimension // BLOCKS
         self._subspace = min(SUBSPACE, self._width // 2)
-        draw = self._draw(OUTSIDE, 1)
-        self._strengths = _unit(np.arange(1, self._subspace + 1, dtype=np.float32) ** -DECAY)
+        draw = self._draw(OUT_OF_MAP_WALKS, 1)
+        self._strengths = _normalise(np.arange(1, self._subspace + 1, dtype=np.float32) ** -DECAY)
         bases = draw.standard_normal((BLOCKS, self._width, self._subspace), np.float32)
         self._bases = np.ascontiguousarray(np.linalg.qr(bases)[0].transpose(0, 2, 1))
-        self._common = SHARED * _unit(draw.standard_normal((BLOCKS, self._width), np.float32))
+        self._common = SHARED * _normalise(draw.standard_normal((BLOCKS, self._width), np.float32))
         strong = draw.random((BLOCKS, self._width)) < STRONG_CHANNELS
-        self._channels = NOISE * _unit(np.where(strong, np.float32(STRENGTH), np.float32(1.0)))
+        self._channels = NOISE * _normalise(np.where(strong, np.float32(STRENGTH), np.float32(1.0)))
 
     def chunks(self, photos: int, chunk_rows: int) -> Iterator[Rows]:
         """The map's first `photos` descriptors, (n, dimension) of length 1, in pieces."""
@@ -91,27 +91,27 @@ class City:
 
     def revisits(self, photos: int, count: int) -> Rows:
         """(count, dimension): places of the map seen again, changed little or much."""
-        draw = self._draw(OUTSIDE, 2)
+        draw = self._draw(OUT_OF_MAP_WALKS, 2)
         rows = np.empty((count, self.dimension), np.float32)
         walks = photos // WALK_PHOTOS
         for number in range(count):
-            if walks < len(PHOTOS_OF_A_PLACE):
+            if walks < len(PHOTOS_PER_PLACE):
                 walk, photo = 0, int(draw.integers(min(photos, WALK_PHOTOS)))
             else:
-                kind = number % len(PHOTOS_OF_A_PLACE)
-                kinds = np.arange(kind, walks, len(PHOTOS_OF_A_PLACE))
+                kind = number % len(PHOTOS_PER_PLACE)
+                kinds = np.arange(kind, walks, len(PHOTOS_PER_PLACE))
                 walk, photo = int(draw.choice(kinds)), int(draw.integers(WALK_PHOTOS))
             there = self.walk(walk)
             here = Latents(there.looks[photo : photo + 1], there.words[photo : photo + 1])
-            change = draw.uniform(LEAST_CHANGE, MOST_CHANGE)
+            change = draw.uniform(MIN_CHANGE, MAX_CHANGE)
             rows[number] = self.describe(self._changed(here, change, draw), draw)[0]
         return rows
 
-    def elsewhere(self, count: int) -> Rows:
+    def out_of_map_rows(self, count: int) -> Rows:
         """(count, dimension): photos of other walks, whose places are not in the map."""
         rows = np.empty((count, self.dimension), np.float32)
         for number in range(count):
-            draw = self._draw(OUTSIDE + 1 + number, 0)
+            draw = self._draw(OUT_OF_MAP_WALKS + 1 + number, 0)
             rows[number] = self.describe(self._fresh(1, draw), draw)[0]
         return rows
 
@@ -119,11 +119,11 @@ class City:
         """The photos of a walk, one after the other."""
         draw = self._draw(number, 0)
         found = self._fresh(WALK_PHOTOS, draw)
-        of_a_place = PHOTOS_OF_A_PLACE[number % len(PHOTOS_OF_A_PLACE)]
+        of_a_place = PHOTOS_PER_PLACE[number % len(PHOTOS_PER_PLACE)]
         for photo in range(1, WALK_PHOTOS):
-            keep = SAME_PLACE if photo % of_a_place else NEXT_PLACE
+            keep = SAME_PLACE_CORRELATION if photo % of_a_place else NEXT_PLACE_CORRELATION
             for part in (found.looks, found.words):
-                part[photo] = np.float32(keep) * part[photo - 1] + _rest(keep) * part[photo]
+                part[photo] = np.float32(keep) * part[photo - 1] + _complement(keep) * part[photo]
         return found
 
     def describe(self, latents: Latents, draw: np.random.Generator) -> Rows:
@@ -147,27 +147,29 @@ class City:
         looks = draw.standard_normal((count, BLOCKS, self._subspace), np.float32)
         rich = draw.standard_normal((count, 1), np.float32)
         words = draw.standard_normal((count, BLOCKS), np.float32)
-        return Latents(looks, np.float32(RICH) * rich + _rest(RICH) * words)
+        return Latents(
+            looks, np.float32(WORD_COUNT_SPREAD) * rich + _complement(WORD_COUNT_SPREAD) * words
+        )
 
     def _changed(self, photos: Latents, share: float, draw: np.random.Generator) -> Latents:
         """The same places, `share` of what they look like another."""
         new = self._fresh(len(photos.looks), draw)
         keep = math.sqrt(1 - share)
         return Latents(
-            np.float32(keep) * photos.looks + _rest(keep) * new.looks,
-            np.float32(keep) * photos.words + _rest(keep) * new.words,
+            np.float32(keep) * photos.looks + _complement(keep) * new.looks,
+            np.float32(keep) * photos.words + _complement(keep) * new.words,
         )
 
     def _draw(self, stream: int, part: int) -> np.random.Generator:
         return np.random.default_rng([self.seed, self.dimension, stream, part])
 
 
-def _rest(keep: float) -> np.float32:
+def _complement(keep: float) -> np.float32:
     """What a new deviate is multiplied with, so that the variance stays 1."""
     return np.float32(math.sqrt(1 - keep**2))
 
 
-def _unit(rows: Floats) -> Floats:
+def _normalise(rows: Floats) -> Floats:
     """Each row of length 1."""
     found: Floats = rows / np.linalg.norm(rows, axis=-1, keepdims=True)
     return found

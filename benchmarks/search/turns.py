@@ -13,77 +13,85 @@ import faiss
 import numpy as np
 from rich.progress import Progress
 
-from benchmarks.report import Spread
-from benchmarks.search.comparison import CASES, OURS, Case, Compared, Row
-from benchmarks.search.memory import ReadSpeed, private_bytes
-from benchmarks.search.methods import (
-    Asked,
-    BinaryFlat,
-    FlatIP,
-    Method,
-    NumpyResident,
-    Ours,
-    OurWorker,
-    Predecessor,
+from benchmarks.report import LatencySummary
+from benchmarks.search.comparison import (
+    PLACEWISE_METHODS,
+    QUERY_CASES,
+    MethodComparison,
+    MethodTiming,
+    QueryCase,
 )
-from benchmarks.search.oracle import Oracle, same, same_photos
-from benchmarks.search.places import City
-from benchmarks.search.world import World
+from benchmarks.search.memory import MemoryBandwidth, private_bytes
+from benchmarks.search.methods import (
+    AnyLocSearch,
+    BenchmarkQuery,
+    FaissBinary,
+    FaissFlat,
+    NumpySearch,
+    PlacewiseSearch,
+    PlacewiseWorker,
+    SearchMethod,
+)
+from benchmarks.search.oracle import BruteForce, same_photos, same_ranking
+from benchmarks.search.places import SyntheticCity
+from benchmarks.search.world import SyntheticMap
 from services.search.snapshot import Snapshot
 from services.search.worker import SearchWorker
 from shared.chunks import Rows
-from shared.codes.signs import SignCodes, sign_codes
+from shared.codes.signs import SignCodes, encode_signs
 
 # So long BLAS' threads look for more work before they sleep, on a core that the next method needs.
-REST_SECONDS = 0.05
+PAUSE_SECONDS = 0.05
 
 
-def load(world: World) -> SearchWorker:
+def load_worker(world: SyntheticMap) -> SearchWorker:
     """A search worker that has loaded the map."""
     worker = SearchWorker(world.catalog, world.store, world.settings)
-    worker.follow()
+    worker.sync()
     status = worker.status()
     assert not status.missing, status.missing
     assert status.rows == len(world.photo_ids), "every photo can be found"
     return worker
 
 
-def compare(world: World, city: City, queries: int, progress: Progress) -> Compared:
+def compare_methods(
+    world: SyntheticMap, city: SyntheticCity, queries: int, progress: Progress
+) -> MethodComparison:
     """All cases with `queries` each."""
-    task = progress.add_task("asking", total=len(CASES) * queries)
+    task = progress.add_task("asking", total=len(QUERY_CASES) * queries)
     photos = len(world.photo_ids)
-    asked = np.concatenate([city.revisits(photos, queries), city.elsewhere(queries)])
-    oracle = Oracle.of(_stored(world), world.photo_ids, asked)
+    asked = np.concatenate([city.revisits(photos, queries), city.out_of_map_rows(queries)])
+    oracle = BruteForce.of(_stored_rows(world), world.photo_ids, asked)
     before = private_bytes()
-    worker = load(world)
+    worker = load_worker(world)
     grown = private_bytes() - before
     took: dict[str, dict[str, list[float]]] = {}
     differ: Counter[tuple[str, str]] = Counter()
     draw = random.Random(city.seed)
-    with ReadSpeed() as speed, _methods(world, worker, asked) as (methods, ours):
-        for case in CASES:
+    with MemoryBandwidth() as speed, _make_methods(world, worker, asked) as (methods, ours):
+        for case in QUERY_CASES:
             numbers = range(queries) if case.matched else range(queries, 2 * queries)
             took[case.name] = {method.name: [] for method in methods}
             for method in methods:
-                method.search(Asked(numbers[0], case.k, case.min_score))  # compiles, maps
+                method.search(BenchmarkQuery(numbers[0], case.k, case.min_score))  # compiles, maps
             for number in numbers:
-                question = Asked(number, case.k, case.min_score)
+                question = BenchmarkQuery(number, case.k, case.min_score)
                 expected = oracle.best(number, case.k, case.min_score)
                 for method in draw.sample(methods, len(methods)):
-                    time.sleep(REST_SECONDS)
+                    time.sleep(PAUSE_SECONDS)
                     begun = time.perf_counter()
                     found = method.search(question)
                     took[case.name][method.name].append(time.perf_counter() - begun)
-                    right = same if method.name in OURS else same_photos
+                    right = same_ranking if method.name in PLACEWISE_METHODS else same_photos
                     differ[case.name, method.name] += not right(found, expected)
                 speed.sample()
                 progress.advance(task)
         rows = [
-            _row(case, method, took[case.name][method.name], differ, speed, queries)
-            for case in CASES
+            _summarise_timing(case, method, took[case.name][method.name], differ, speed, queries)
+            for case in QUERY_CASES
             for method in methods
         ]
-        return Compared(
+        return MethodComparison(
             photos=photos,
             dimension=world.dimension,
             rows=rows,
@@ -94,23 +102,23 @@ def compare(world: World, city: City, queries: int, progress: Progress) -> Compa
         )
 
 
-def _row(
-    case: Case,
-    method: Method,
+def _summarise_timing(
+    case: QueryCase,
+    method: SearchMethod,
     took: list[float],
     differ: Counter[tuple[str, str]],
-    speed: ReadSpeed,
+    speed: MemoryBandwidth,
     queries: int,
-) -> Row:
-    spread = Spread.of(took)
+) -> MethodTiming:
+    spread = LatencySummary.of(took)
     first = 0 if case.matched else queries
     reads = int(
         median(
-            method.bytes_touched(Asked(first + number, case.k, case.min_score))
+            method.bytes_touched(BenchmarkQuery(first + number, case.k, case.min_score))
             for number in range(len(took))
         )
     )
-    return Row(
+    return MethodTiming(
         case=case.name,
         method=method.name,
         median_ms=1000 * spread.median,
@@ -124,42 +132,42 @@ def _row(
 
 
 @contextlib.contextmanager
-def _methods(
-    world: World, worker: SearchWorker, queries: Rows
-) -> Iterator[tuple[list[Method], Ours]]:
+def _make_methods(
+    world: SyntheticMap, worker: SearchWorker, queries: Rows
+) -> Iterator[tuple[list[SearchMethod], PlacewiseSearch]]:
     index = faiss.IndexFlatIP(world.dimension)
-    for rows in _stored(world):
+    for rows in _stored_rows(world):
         index.add(rows)
     photos = len(world.photo_ids)
     rows = faiss.rev_swig_ptr(index.get_xb(), photos * world.dimension)
     rows = rows.reshape(photos, world.dimension)
     ids = world.photo_ids
-    ours = Ours(world, worker, queries)
+    ours = PlacewiseSearch(world, worker, queries)
     snapshot = worker.snapshot(world.generation_id, world.version)
     yield (
         [
             ours,
-            OurWorker(world, worker, queries, ours),
-            NumpyResident(rows, ids, queries),
-            FlatIP(index, ids, queries),
-            BinaryFlat(_codes(snapshot, rows), rows, ids, queries),
-            Predecessor(world.chunk_paths(), ids, queries),
+            PlacewiseWorker(world, worker, queries, ours),
+            NumpySearch(rows, ids, queries),
+            FaissFlat(index, ids, queries),
+            FaissBinary(_sign_codes_of(snapshot, rows), rows, ids, queries),
+            AnyLocSearch(world.chunk_paths(), ids, queries),
         ],
         ours,
     )
 
 
-def _codes(snapshot: Snapshot, rows: Rows) -> SignCodes:
+def _sign_codes_of(snapshot: Snapshot, rows: Rows) -> SignCodes:
     """Those of the snapshot, or made here where it does without."""
     codes = [chunk.codes for chunk in snapshot.chunks if chunk.codes is not None]
     if len(codes) < len(snapshot.chunks):
-        return sign_codes(rows)
+        return encode_signs(rows)
     levels = zip(*(code.levels for code in codes), strict=True)
     norms = np.concatenate([code.norms for code in codes])
     return SignCodes(tuple(np.concatenate(level) for level in levels), norms)
 
 
-def _stored(world: World) -> Iterator[Rows]:
+def _stored_rows(world: SyntheticMap) -> Iterator[Rows]:
     """The rows of each chunk, mapped from its file."""
     for path in world.chunk_paths():
         yield np.load(path, mmap_mode="r")

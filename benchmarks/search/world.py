@@ -11,17 +11,17 @@ from uuid import UUID
 import numpy as np
 from sqlalchemy import insert
 
-from services.search.follow import CODED_FROM_BYTES
+from services.search.follow import MIN_CODED_BYTES
 from services.steward.compact import merge_slot
-from shared.catalog.chunks import Chunk, Descriptor, live_chunks
+from shared.catalog.chunks import Chunk, Descriptor, list_live_chunks
 from shared.catalog.generations import Generation, GenerationState
-from shared.catalog.maps import Map, bump_version, create_map, lock_map
-from shared.catalog.models import ensure_model
-from shared.catalog.photos import Photo, mark_deleted
+from shared.catalog.maps import Map, create_map, increment_map_version, lock_map
+from shared.catalog.models import get_or_create_model
+from shared.catalog.photos import Photo, mark_photo_deleted
 from shared.catalog.schema import migrate
 from shared.catalog.session import Catalog
 from shared.chunks import Row, Rows, encode_rows, write_chunk
-from shared.codes.rotation import rotation
+from shared.codes.rotation import get_rotation
 from shared.ids import new_id
 from shared.objects import FolderStore
 from shared.search_protocol import SearchRequest
@@ -31,7 +31,7 @@ CHUNK_ROWS = 1000
 
 
 @dataclass(slots=True)
-class World:
+class SyntheticMap:
     """One map in a folder, changed as the extractor, the gateway and the steward change it."""
 
     settings: Settings
@@ -89,7 +89,7 @@ class World:
                     for row, photo_id in enumerate(photo_ids)
                 ],
             )
-            version = bump_version(session, self.map_id)
+            version = increment_map_version(session, self.map_id)
         self.photo_ids += photo_ids
         return version
 
@@ -97,8 +97,8 @@ class World:
         """The version from which on the photo is gone."""
         with self.catalog.write() as session:
             lock_map(session, self.map_id)
-            version = bump_version(session, self.map_id)
-            mark_deleted(session, session.get_one(Photo, photo_id), version)
+            version = increment_map_version(session, self.map_id)
+            mark_photo_deleted(session, session.get_one(Photo, photo_id), version)
         return version
 
     def merge(self, slot: int) -> bool:
@@ -108,7 +108,7 @@ class World:
     def chunk_paths(self) -> list[Path]:
         """The files of the live chunks."""
         with self.catalog.read() as session:
-            keys = [chunk.object_key for chunk in live_chunks(session, self.generation_id)]
+            keys = [chunk.object_key for chunk in list_live_chunks(session, self.generation_id)]
         return [self.store.path(key) for key in keys]
 
     def request(
@@ -125,7 +125,7 @@ class World:
             min_score=min_score,
         )
 
-    def ask_with(self, row: Row) -> str:
+    def store_query(self, row: Row) -> str:
         """Store a query's descriptor, as a `describe` job does; its key."""
         key = f"queries/{new_id()}.npy"
         self.store.put(key, encode_rows(row[np.newaxis]))
@@ -146,7 +146,9 @@ class World:
 
 
 @contextlib.contextmanager
-def new_world(home: Path, dimension: int, *, search_memory_budget: int) -> Iterator[World]:
+def create_synthetic_map(
+    home: Path, dimension: int, *, search_memory_budget: int
+) -> Iterator[SyntheticMap]:
     """An empty map in the folder `home`, in a SQLite catalog."""
     chosen = Settings(
         _env_file=None, placewise_home=home, search_memory_budget=search_memory_budget
@@ -165,17 +167,17 @@ def new_world(home: Path, dimension: int, *, search_memory_budget: int) -> Itera
                 spec={"clusters": None},
                 spec_fingerprint="0" * 64,
                 dimension=dimension,
-                model_id=ensure_model(session, "bench", "0" * 64, "MIT", {}).id,
+                model_id=get_or_create_model(session, "bench", "0" * 64, "MIT", {}).id,
             )
             session.add(generation)
         store = FolderStore(home / "objects")
-        world = World(chosen, catalog, store, map_id, generation.id, dimension)
+        world = SyntheticMap(chosen, catalog, store, map_id, generation.id, dimension)
         yield world
     finally:
         catalog.close()
 
 
-def enough_memory(photos: int, dimension: int) -> int:
+def required_memory_bytes(photos: int, dimension: int) -> int:
     """SEARCH_MEMORY_BUDGET for the codes of so many photos, or their rows where search does
     without codes; other rows stay mapped files."""
-    return max(photos * rotation(dimension).padded // 8, CODED_FROM_BYTES)
+    return max(photos * get_rotation(dimension).padded // 8, MIN_CODED_BYTES)

@@ -11,15 +11,15 @@ import torch
 from benchmarks.report import Report
 from benchmarks.train.learning import measure_grid, measure_learning
 from benchmarks.train.throughput import measure_throughput
-from services.trainer.configuration import make_arguments
-from services.trainer.device import choose_device
+from services.trainer.configuration import build_arguments
+from services.trainer.device import resolve_device
 
 if TYPE_CHECKING:
     from rich.progress import Progress
 
-WANTED_POINTS = 30.0
+TARGET_POINTS = 30.0
 """of R@1 over the untrained network"""
-WANTED_SHARE_WAITING = 0.05
+MAX_WAIT_SHARE = 0.05
 """on a GPU"""
 
 
@@ -37,7 +37,7 @@ def measure(
 ) -> Report:
     """Throughput at 224 pixels; learning on a generated city of so many places, of ResNet-18 with
     GeM and MultiSimilarity from random weights; with `grid` six settings more."""
-    chosen = choose_device(make_arguments({"accelerator": device}))
+    chosen = resolve_device(build_arguments({"accelerator": device}))
     report = Report(f"training on {chosen.torch_device.type}")
     with tempfile.TemporaryDirectory(prefix="placewise-bench-") as folder:
         out = Path(folder)
@@ -49,7 +49,7 @@ def measure(
         report.add(
             "share of the time waiting for photos",
             pace.share_waiting,
-            at_most=WANTED_SHARE_WAITING if chosen.accelerator == "gpu" else None,
+            at_most=MAX_WAIT_SHARE if chosen.accelerator == "gpu" else None,
         )
         report.add(
             "reading, as a multiple of the network's pace",
@@ -60,7 +60,7 @@ def measure(
         for where, gain in learnt.items():
             report.add(f"R@1 untrained, {where}", 100 * gain.untrained, "%")
             report.add(f"R@1 trained, {where}", 100 * gain.trained, "%")
-            report.add(f"points gained, {where}", 100 * gain.mean, "points", at_least=WANTED_POINTS)
+            report.add(f"points gained, {where}", 100 * gain.mean, "points", at_least=TARGET_POINTS)
             report.add(f"points gained at least (95 %), {where}", 100 * gain.low, "points")
         report.details = {
             "torch": torch.__version__,

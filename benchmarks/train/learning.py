@@ -14,15 +14,15 @@ import numpy as np
 from rich.table import Table
 
 from services.trainer import run
-from services.trainer.configuration import make_arguments
+from services.trainer.configuration import build_arguments
 from services.trainer.device import Device
-from services.trainer.display import Quiet
-from services.trainer.evaluation.bootstrap import paired
-from services.trainer.evaluation.clusters import clusters_of
-from services.trainer.evaluation.describe_model import DescribeModel
-from services.trainer.evaluation.hits import hits_of
-from services.trainer.evaluation.recalls import recalls
-from services.trainer.grid import Trainer, run_grid
+from services.trainer.display import NullDisplay
+from services.trainer.evaluation.bootstrap import paired_differences
+from services.trainer.evaluation.clusters import cluster_queries
+from services.trainer.evaluation.describe_model import ModelDescriber
+from services.trainer.evaluation.hits import compute_hits
+from services.trainer.evaluation.recalls import evaluate_recall
+from services.trainer.grid import RunFunctions, run_grid
 from services.trainer.grid_plan import GridPlan, PlannedRun
 from services.trainer.leaderboard import leaderboard
 from services.trainer.make_model import make_model
@@ -33,12 +33,12 @@ from shared.datasets.city.write import write_city
 from shared.datasets.sets import open_evaluation_set
 from shared.datasets.shots import EvaluationSet
 from shared.vision.place_models.checkpoint import load_checkpoint
-from shared.vision.place_models.model import PlaceModel
+from shared.vision.place_models.model import VprModel
 
 if TYPE_CHECKING:
     from rich.progress import Progress
 
-PHOTO = (160, 120)
+PHOTO_SIZE = (160, 120)
 """width and height of the generated photos"""
 VIEWS = 2
 PLACES_PER_BATCH = 16
@@ -53,7 +53,7 @@ Json = dict[str, Any]
 
 
 @dataclass(frozen=True, slots=True)
-class Gain:
+class RecallGain:
     """R@k as shares; the gain's 95 % interval is a paired bootstrap over clusters of queries."""
 
     untrained: float
@@ -68,7 +68,7 @@ class Gain:
         return {name: getattr(self, name) for name in self.__slots__}
 
 
-class BarDisplay(Quiet):
+class BarDisplay(NullDisplay):
     """A run's progress as bars of a benchmark."""
 
     def __init__(self, progress: Progress) -> None:
@@ -93,56 +93,60 @@ def measure_learning(
     workers: int,
     device: Device,
     seed: int,
-) -> dict[str, Gain]:
+) -> dict[str, RecallGain]:
     """By where it was asked: `other streets` and `another catalogue`."""
-    width, height = PHOTO
+    width, height = PHOTO_SIZE
     here = CityOptions(places, VIEWS, places, seed, 0, 0.0, width, height)
     elsewhere = replace(here, seed=seed + 1, catalogue_seed=1, train=False)
     sets = {
-        "other streets": _drawn(progress, here, folder / "here"),
-        "another catalogue": _drawn(progress, elsewhere, folder / "elsewhere"),
+        "other streets": _draw_city(progress, here, folder / "here"),
+        "another catalogue": _draw_city(progress, elsewhere, folder / "elsewhere"),
     }
-    said = _said(folder / "here", folder / "runs", epochs, image_size, workers, device, seed)
+    said = _training_arguments(
+        folder / "here", folder / "runs", epochs, image_size, workers, device, seed
+    )
     report = run.run(
-        make_arguments({**said, "run_name": "gem"}), BarDisplay(progress), StopRequest()
+        build_arguments({**said, "run_name": "gem"}), BarDisplay(progress), StopRequest()
     )
     trained = load_checkpoint(Path(report["best"]["path"])).model
     seed_everything(seed)
-    untrained = make_model(make_arguments(said), Quiet(), resuming=False)
+    untrained = make_model(build_arguments(said), NullDisplay(), resuming=False)
     return {
-        where: gain_of(untrained, trained, asked, image_size, device)
+        where: measure_gain(untrained, trained, asked, image_size, device)
         for where, asked in sets.items()
     }
 
 
-def gain_of(
-    untrained: PlaceModel,
-    trained: PlaceModel,
-    asked: EvaluationSet,
+def measure_gain(
+    untrained: VprModel,
+    trained: VprModel,
+    evaluation_set: EvaluationSet,
     image_size: int,
     device: Device,
     k: int = 1,
-) -> Gain:
+) -> RecallGain:
     """What the one network finds among its first k beyond the other, on the same queries."""
     found = []
     for model in (untrained, trained):
-        describe = DescribeModel(
+        describe = ModelDescriber(
             model.to(device.torch_device), device.torch_device, (image_size, image_size)
         )
-        ranked = recalls(describe, asked, ks=(k,)).ranked.indices
-        hits = hits_of(ranked, asked.positives)[:, :k]
+        ranked = evaluate_recall(describe, evaluation_set, ks=(k,)).ranked.indices
+        hits = compute_hits(ranked, evaluation_set.positives)[:, :k]
         found.append(np.any(hits, axis=1)[:, np.newaxis].astype(np.float64))
-    (difference,) = paired(found[1], found[0], clusters_of(asked.queries).of)
+    (difference,) = paired_differences(
+        found[1], found[0], cluster_queries(evaluation_set.queries).of
+    )
     assert difference.low is not None
     assert difference.high is not None
-    return Gain(
+    return RecallGain(
         float(found[0].mean()),
         float(found[1].mean()),
         difference.mean,
         difference.low,
         difference.high,
-        len(asked.queries),
-        asked.fingerprint,
+        len(evaluation_set.queries),
+        evaluation_set.fingerprint,
     )
 
 
@@ -156,7 +160,9 @@ def measure_grid(
     seed: int,
 ) -> tuple[Table, list[dict[str, str]]]:
     """Three aggregators x two losses on the city that `measure_learning` has drawn."""
-    said = _said(folder / "here", folder / "grid", epochs, image_size, workers, device, seed)
+    said = _training_arguments(
+        folder / "here", folder / "grid", epochs, image_size, workers, device, seed
+    )
     del said["default_root_dir"]
     plan = GridPlan(
         tuple(
@@ -168,7 +174,7 @@ def measure_grid(
         ),
         {},
     )
-    trainer = Trainer(run.run, run.resume)
+    trainer = RunFunctions(run.run, run.resume)
     outcomes = run_grid(
         plan, folder / "grid", trainer, BarDisplay(progress), StopRequest(), lambda done: None
     )
@@ -179,14 +185,14 @@ def measure_grid(
     return table, rows
 
 
-def _drawn(progress: Progress, options: CityOptions, out: Path) -> EvaluationSet:
+def _draw_city(progress: Progress, options: CityOptions, out: Path) -> EvaluationSet:
     plan = make_plan(options)
-    bar = progress.add_task(f"drawing {out.name}", total=len(plan.shots))
+    bar = progress.add_task(f"drawing {out.name}", total=len(plan.photos))
     write_city(plan, out, lambda count: progress.advance(bar, count))
     return open_evaluation_set(out)
 
 
-def _said(
+def _training_arguments(
     data_root: Path,
     out: Path,
     epochs: int,

@@ -11,26 +11,26 @@ import numpy as np
 import torch
 from PIL import Image
 
-from services.trainer.augment import augmented, to_tensor
-from services.trainer.batches import PlacePhotos, TrainingBatches
-from services.trainer.configuration import make_arguments
+from services.trainer.augment import apply_randaugment, to_tensor
+from services.trainer.batches import PlaceDataset, ResumableDataLoader
+from services.trainer.configuration import build_arguments
 from services.trainer.device import Device
-from services.trainer.display import Quiet
+from services.trainer.display import NullDisplay
 from services.trainer.losses import make_loss
 from services.trainer.make_model import make_model
 from services.trainer.miners import make_miner
 from services.trainer.optimise import make_optimizer
-from services.trainer.sampling import BatchPlan
+from services.trainer.sampling import PlaceBatchSampler
 from shared.datasets.shots import TrainingPlace
-from shared.vision.decode_small import decode_small
+from shared.vision.decode_small import decode_resized
 
 if TYPE_CHECKING:
     from rich.progress import Progress
 
-SIDE = 224
-STORED = (960, 1280)
+IMAGE_PIXELS = 224
+STORED_PHOTO_SIZE = (960, 1280)
 """height and width of a photo as cameras and street view give them"""
-DIFFERENT = 32
+DISTINCT_PHOTOS = 32
 """photos drawn; they are read again and again, from the page cache"""
 PHOTOS_PER_PLACE = 4
 PLACES_PER_BATCH = 8
@@ -38,7 +38,7 @@ WARM_UP_BATCHES = 2
 
 
 @dataclass(frozen=True, slots=True)
-class Pace:
+class TrainingThroughput:
     reading: dict[str, float]
     """photos a second, by how"""
     network: float
@@ -49,35 +49,42 @@ class Pace:
 
 def measure_throughput(
     progress: Progress, folder: Path, photos: int, workers: int, device: Device
-) -> Pace:
+) -> TrainingThroughput:
     """Over so many photos; the first batches, in which workers start, are left out."""
-    files = _draw(folder)
+    files = _draw_photos(folder)
     places = [
-        TrainingPlace(number, "city", tuple(files[(number * 4 + i) % DIFFERENT] for i in range(4)))
+        TrainingPlace(
+            number, "city", tuple(files[(number * 4 + i) % DISTINCT_PHOTOS] for i in range(4))
+        )
         for number in range(max(photos // PHOTOS_PER_PLACE, 4 * PLACES_PER_BATCH))
     ]
     bar = progress.add_task("photos a second", total=4)
     reading = {}
-    for what, read in (("decoded in full, one process", _in_full), ("one process", _drafted)):
+    for what, read in (
+        ("decoded in full, one process", _decode_full),
+        ("one process", _decode_draft),
+    ):
         began = time.perf_counter()
         for file in files:
             read(file)
         reading[what] = len(files) / (time.perf_counter() - began)
         progress.advance(bar)
-    reading["with its workers"] = _read_all(_batches(places, workers, device))
+    reading["with its workers"] = _measure_reading(_batches(places, workers, device))
     progress.advance(bar)
-    network, training, waited = _learn(places, workers, device)
+    network, training, waited = _measure_training(places, workers, device)
     progress.advance(bar)
-    return Pace(reading, network, training, waited)
+    return TrainingThroughput(reading, network, training, waited)
 
 
-def _draw(folder: Path) -> list[Path]:
+def _draw_photos(folder: Path) -> list[Path]:
     folder.mkdir(parents=True)
     files = []
-    for number in range(DIFFERENT):
+    for number in range(DISTINCT_PHOTOS):
         rng = np.random.default_rng(number)
         coarse = Image.fromarray(rng.integers(0, 255, (30, 40, 3)).astype(np.uint8))
-        pixels = np.asarray(coarse.resize(STORED[::-1], Image.Resampling.BICUBIC), np.int16)
+        pixels = np.asarray(
+            coarse.resize(STORED_PHOTO_SIZE[::-1], Image.Resampling.BICUBIC), np.int16
+        )
         grain = rng.normal(0, 6, pixels.shape)  # so that a file has a photo's 300 to 500 kB
         path = folder / f"{number}.jpg"
         Image.fromarray(np.clip(pixels + grain, 0, 255).astype(np.uint8)).save(path, quality=90)
@@ -85,24 +92,24 @@ def _draw(folder: Path) -> list[Path]:
     return files
 
 
-def _in_full(path: Path) -> None:
+def _decode_full(path: Path) -> None:
     with Image.open(path) as image:
-        small = image.convert("RGB").resize((SIDE, SIDE), Image.Resampling.BILINEAR)
-    to_tensor(augmented(small, 0))
+        small = image.convert("RGB").resize((IMAGE_PIXELS, IMAGE_PIXELS), Image.Resampling.BILINEAR)
+    to_tensor(apply_randaugment(small, 0))
 
 
-def _drafted(path: Path) -> None:
-    to_tensor(augmented(decode_small(path, (SIDE, SIDE)), 0))
+def _decode_draft(path: Path) -> None:
+    to_tensor(apply_randaugment(decode_resized(path, (IMAGE_PIXELS, IMAGE_PIXELS)), 0))
 
 
-def _batches(places: list[TrainingPlace], workers: int, device: Device) -> TrainingBatches:
-    plan = BatchPlan(places, PLACES_PER_BATCH, PHOTOS_PER_PLACE, False, True, 1, 1)
-    photos = PlacePhotos(plan, (SIDE, SIDE), bad_is_error=True)
+def _batches(places: list[TrainingPlace], workers: int, device: Device) -> ResumableDataLoader:
+    plan = PlaceBatchSampler(places, PLACES_PER_BATCH, PHOTOS_PER_PLACE, False, True, 1, 1)
+    photos = PlaceDataset(plan, (IMAGE_PIXELS, IMAGE_PIXELS), fail_on_undecodable=True)
     pinned = device.accelerator == "gpu"
-    return TrainingBatches(plan, photos, num_workers=workers, pin_memory=pinned)
+    return ResumableDataLoader(plan, photos, num_workers=workers, pin_memory=pinned)
 
 
-def _read_all(batches: TrainingBatches) -> float:
+def _measure_reading(batches: ResumableDataLoader) -> float:
     given = iter(batches)
     for _ in range(WARM_UP_BATCHES):
         next(given)
@@ -112,12 +119,14 @@ def _read_all(batches: TrainingBatches) -> float:
     return count / (time.perf_counter() - began)
 
 
-def _learn(places: list[TrainingPlace], workers: int, device: Device) -> tuple[float, float, float]:
-    arguments = make_arguments(
-        {"pretrained": False, "layers_to_freeze": -1, "agg_arch": "gem", "image_size": SIDE}
+def _measure_training(
+    places: list[TrainingPlace], workers: int, device: Device
+) -> tuple[float, float, float]:
+    arguments = build_arguments(
+        {"pretrained": False, "layers_to_freeze": -1, "agg_arch": "gem", "image_size": IMAGE_PIXELS}
     )
     torch.manual_seed(0)
-    model = make_model(arguments, Quiet(), resuming=False).to(device.torch_device).train()
+    model = make_model(arguments, NullDisplay(), resuming=False).to(device.torch_device).train()
     loss, miner = make_loss("MultiSimilarityLoss"), make_miner("MultiSimilarityMiner")
     assert miner is not None
     optimizer = make_optimizer(model.parameters(), arguments)
@@ -136,30 +145,30 @@ def _learn(places: list[TrainingPlace], workers: int, device: Device) -> tuple[f
         batch = next(given)
         step(batch.photos, batch.labels)
     repeats = max(2, (len(batches) - WARM_UP_BATCHES) // 2)
-    _wait(device)
+    _synchronise(device)
     began = time.perf_counter()
     for _ in range(repeats):
         step(batch.photos, batch.labels)
-    _wait(device)
+    _synchronise(device)
     network = repeats * len(batch.photos) / (time.perf_counter() - began)
     given = iter(_batches(places, workers, device))
     for _ in range(WARM_UP_BATCHES):
         batch = next(given)
         step(batch.photos, batch.labels)
     count, waited = 0, 0.0
-    _wait(device)
+    _synchronise(device)
     began = asked = time.perf_counter()
     for batch in given:
         waited += time.perf_counter() - asked
         step(batch.photos, batch.labels)
         count += len(batch.photos)
         # The device has nothing to do from here until the next batch is there.
-        _wait(device)
+        _synchronise(device)
         asked = time.perf_counter()
     seconds = time.perf_counter() - began
     return network, count / seconds, waited / seconds
 
 
-def _wait(device: Device) -> None:
+def _synchronise(device: Device) -> None:
     if device.accelerator == "gpu":
         torch.cuda.synchronize()

@@ -15,14 +15,14 @@ from services.cli.output import (
     KeyOption,
     MapOption,
     ServerOption,
-    answers,
-    explained,
+    console,
     print_json,
     progress_bar,
+    report_errors,
 )
-from services.cli.wait import wait_with_bar
+from services.cli.wait import wait_for_job
 
-ModelName = Annotated[str, typer.Argument(metavar="NAME", help="As `models added` says.")]
+AddedModelName = Annotated[str, typer.Argument(metavar="NAME", help="As `models added` says.")]
 
 
 def add(
@@ -45,7 +45,7 @@ def add(
     It is sent to the server, whose extractor checks it; what describes photos is kept, and nothing
     else. `--map` only says whose job list shows it.
     """
-    with explained(as_json):
+    with report_errors(as_json):
         with connect(server, map_name, key) as client, progress_bar() as progress:
             client.models()  # a wrong address or key is said before the file is sent
             sending = progress.add_task("sending (bytes)", total=checkpoint.stat().st_size)
@@ -56,23 +56,25 @@ def add(
                 note=note,
                 on_sent=lambda sent_bytes: progress.update(sending, completed=sent_bytes),
             )
-            job = wait_with_bar(client, started["job_id"], progress, "checking")
+            job = wait_for_job(client, started["job_id"], progress, "checking")
         if as_json:
             print_json(job)
             return
-        added = job["result"]
-        answers.print(
-            f"{added['extractor']}: {added['dimension']} dimensions, "
-            f"{added['size_bytes'] / 1e6:.1f} MB, fingerprint {added['fingerprint'][:12]}"
-            f"{'; it was there already' if added['already_there'] else ''}.",
+        list_added = job["result"]
+        console.print(
+            f"{list_added['extractor']}: {list_added['dimension']} dimensions, "
+            f"{list_added['size_bytes'] / 1e6:.1f} MB, fingerprint {list_added['fingerprint'][:12]}"
+            f"{'; it was there already' if list_added['already_there'] else ''}.",
             soft_wrap=True,
             markup=False,
         )
 
 
-def added(server: ServerOption = None, key: KeyOption = None, as_json: JsonOption = False) -> None:
+def list_added(
+    server: ServerOption = None, key: KeyOption = None, as_json: JsonOption = False
+) -> None:
     """The models that were added, with the maps that are described with them."""
-    with explained(as_json):
+    with report_errors(as_json):
         with connect(server, None, key) as client:
             found = client.models()
         if as_json:
@@ -91,20 +93,20 @@ def added(server: ServerOption = None, key: KeyOption = None, as_json: JsonOptio
                 escape(", ".join(model["maps"])),
                 escape(model["note"] or ""),
             )
-        answers.print(table)
+        console.print(table)
 
 
 def remove(
-    name: ModelName,
+    name: AddedModelName,
     server: ServerOption = None,
     key: KeyOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Remove a model that no map is described with. Its name never means other weights."""
-    with explained(as_json):
+    with report_errors(as_json):
         with connect(server, None, key) as client:
             removed = client.remove_model(name)
         if as_json:
             print_json(removed)
             return
-        answers.print(removed["message"], soft_wrap=True, markup=False)
+        console.print(removed["message"], soft_wrap=True, markup=False)

@@ -20,7 +20,7 @@ from typing import Any
 from shared.errors import InvalidRequest, PlacewiseError
 
 DATABASE_NAME = "similarity.db"
-BESIDE_IT = ("", "-wal", "-journal")  # rows may still lie in its write-ahead log
+SQLITE_SUFFIXES = ("", "-wal", "-journal")  # rows may still lie in its write-ahead log
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +35,7 @@ class AnylocRow:
     """The user's, with `anyloc_image_id` and `anyloc_upload_time` (ISO 8601, UTC)."""
 
 
-def read_rows(database: Path) -> list[AnylocRow]:
+def read_anyloc_rows(database: Path) -> list[AnylocRow]:
     """Every row of the table, in the order of the uploads; whatever is in a row can be read.
 
     Nothing is written beside the database: even to read, SQLite would make files for its
@@ -43,48 +43,50 @@ def read_rows(database: Path) -> list[AnylocRow]:
     """
     try:
         with tempfile.TemporaryDirectory() as folder:
-            for ending in BESIDE_IT:
+            for ending in SQLITE_SUFFIXES:
                 source = database.with_name(database.name + ending)
                 if source.exists():
                     shutil.copyfile(source, Path(folder, DATABASE_NAME + ending))
             with contextlib.closing(sqlite3.connect(Path(folder, DATABASE_NAME))) as connection:
-                return _read(connection, database)
+                return _read_images_table(connection, database)
     except (sqlite3.Error, OSError) as error:
-        raise _unreadable(database, str(error)) from error
+        raise _database_error(database, str(error)) from error
 
 
-def _read(connection: sqlite3.Connection, database: Path) -> list[AnylocRow]:
+def _read_images_table(connection: sqlite3.Connection, database: Path) -> list[AnylocRow]:
     # It lets any bytes into a text column, and one bad name must not cost the other photos.
     connection.text_factory = lambda data: data.decode("utf-8", "replace")
     connection.row_factory = sqlite3.Row
     found = connection.execute("PRAGMA quick_check(1)").fetchone()[0]
     if found != "ok":
-        raise _unreadable(database, f"it is damaged: {found}")
-    return [_row(dict(row)) for row in connection.execute("SELECT * FROM images ORDER BY rowid")]
+        raise _database_error(database, f"it is damaged: {found}")
+    return [
+        _parse_row(dict(row)) for row in connection.execute("SELECT * FROM images ORDER BY rowid")
+    ]
 
 
-def _row(row: dict[str, Any]) -> AnylocRow:
-    metadata = _metadata(_text(row.get("metadata_json")))
-    if image_id := _text(row.get("image_id")):
+def _parse_row(row: dict[str, Any]) -> AnylocRow:
+    metadata = _parse_metadata(_clean_text(row.get("metadata_json")))
+    if image_id := _clean_text(row.get("image_id")):
         metadata["anyloc_image_id"] = image_id
-    if uploaded := _text(row.get("upload_time")):
-        metadata["anyloc_upload_time"] = _as_utc(uploaded)
+    if uploaded := _clean_text(row.get("upload_time")):
+        metadata["anyloc_upload_time"] = _to_utc(uploaded)
     return AnylocRow(
-        image_path=_text(row.get("image_path")),
-        name=_text(row.get("original_filename")),
-        tags=_tags(_text(row.get("tags"))),
+        image_path=_clean_text(row.get("image_path")),
+        name=_clean_text(row.get("original_filename")),
+        tags=_parse_tags(_clean_text(row.get("tags"))),
         metadata=metadata,
     )
 
 
-def _text(value: object) -> str:
+def _clean_text(value: object) -> str:
     """SQLite's columns take values of any type; a NUL can't be stored again."""
     if isinstance(value, bytes):
         value = value.decode("utf-8", "replace")
     return "" if value is None else str(value).replace("\0", "").strip()
 
 
-def _as_utc(text: str) -> str:
+def _to_utc(text: str) -> str:
     """As it stands where it is no time: better odd than lost."""
     try:
         time = datetime.fromisoformat(text)
@@ -93,33 +95,33 @@ def _as_utc(text: str) -> str:
         return text
 
 
-def _tags(text: str) -> list[str]:
+def _parse_tags(text: str) -> list[str]:
     """A JSON list, or words separated by commas; the upload form separates tags by commas."""
     tags: list[Any] = text.split(",")
     if text[:1] in ("[", '"') or text == "null":
         with contextlib.suppress(ValueError, RecursionError):
             value = json.loads(text) or []
             tags = value if isinstance(value, list) else value.split(",")
-    cleaned = (" ".join(_text(tag).replace(",", " ").split()) for tag in tags)
+    cleaned = (" ".join(_clean_text(tag).replace(",", " ").split()) for tag in tags)
     return list(dict.fromkeys(tag for tag in cleaned if tag))
 
 
-def _metadata(text: str) -> dict[str, Any]:
+def _parse_metadata(text: str) -> dict[str, Any]:
     """The JSON object; what is none is kept as it stands, as `anyloc_metadata`."""
     if not text:
         return {}
     with contextlib.suppress(ValueError, RecursionError):
-        value = json.loads(text, parse_constant=_no_constant)
+        value = json.loads(text, parse_constant=_reject_constant)
         if isinstance(value, dict):
             return value
     return {"anyloc_metadata": text}
 
 
-def _no_constant(name: str) -> Any:
+def _reject_constant(name: str) -> Any:
     raise ValueError(f"{name} is not JSON, though Python writes it")
 
 
-def _unreadable(database: Path, reason: str) -> PlacewiseError:
+def _database_error(database: Path, reason: str) -> PlacewiseError:
     return InvalidRequest(
         "bad_anyloc_database",
         f"Can't read {database} as the predecessor's database: {reason}. If the predecessor still "

@@ -16,15 +16,15 @@ from itertools import takewhile
 from pathlib import Path, PureWindowsPath
 from typing import Any
 
-from services.cli.anyloc_database import DATABASE_NAME, AnylocRow, read_rows
-from services.cli.output import shown
-from services.cli.photo_places import FoundPhoto
+from services.cli.anyloc_database import DATABASE_NAME, AnylocRow, read_anyloc_rows
+from services.cli.output import printable_path
+from services.cli.photo_places import LocalPhoto
 from shared.client import Json
 from shared.errors import InvalidRequest
 from shared.photo_formats import PHOTO_SUFFIXES
 
-UPLOADS = "uploads"
-VOCABULARY = "c_centers.pt"
+UPLOADS_FOLDER = "uploads"
+VOCABULARY_FILE = "c_centers.pt"
 
 
 @dataclass(slots=True)
@@ -34,10 +34,10 @@ class AnylocPhoto:
     tags: list[str] = field(default_factory=list)
     metadata: dict[str, Any] = field(default_factory=dict)
 
-    def as_found(self) -> FoundPhoto:
+    def to_local_photo(self) -> LocalPhoto:
         """As the upload form says it."""
         fields = {"tags": ",".join(self.tags), "metadata": json.dumps(self.metadata)}
-        return FoundPhoto(
+        return LocalPhoto(
             self.path, {k: v for k, v in fields.items() if v not in ("", "{}")}, self.name
         )
 
@@ -48,7 +48,7 @@ class AnylocFolder:
 
     database: Path
     rows: int
-    photos: list[FoundPhoto]
+    photos: list[LocalPhoto]
     unlisted: int
     """How many of the photos no row names."""
     missing: list[Json]
@@ -58,43 +58,43 @@ class AnylocFolder:
     vocabularies: list[Path]
 
 
-def read_folder(folder: Path, database: Path | None, uploads: Path | None) -> AnylocFolder:
+def read_anyloc_folder(folder: Path, database: Path | None, uploads: Path | None) -> AnylocFolder:
     """Look through the folder; `database` and `uploads` say where those lie if not below it.
 
     Raises InvalidRequest: `no_anyloc_database`, `several_anyloc_databases`, `no_anyloc_uploads`,
     `bad_anyloc_database`.
     """
-    below = list(_walk(folder))
-    database = database or _only_database(folder, below)
+    below = list(_list_files(folder))
+    database = database or _find_database(folder, below)
     files = _uploaded_files(folder, below, uploads)
-    rows = read_rows(database)
-    listed, missing = _join(rows, files)
+    rows = read_anyloc_rows(database)
+    listed, missing = _match_rows_to_files(rows, files)
     named = {photo.path for photo in listed}
     unlisted = [
-        AnylocPhoto(path, shown(Path(path.name)))
+        AnylocPhoto(path, printable_path(Path(path.name)))
         for path in sorted(set().union(*files.values()) - named)
         if path.suffix.lower() in PHOTO_SUFFIXES
     ]
-    kept, duplicates = _without_doubles(listed + unlisted)
+    kept, duplicates = _drop_duplicates(listed + unlisted)
     return AnylocFolder(
         database=database,
         rows=len(rows),
-        photos=[photo.as_found() for photo in kept],
+        photos=[photo.to_local_photo() for photo in kept],
         unlisted=len(unlisted),
         missing=missing,
         duplicates=duplicates,
-        vocabularies=sorted(path for path in below if path.name == VOCABULARY),
+        vocabularies=sorted(path for path in below if path.name == VOCABULARY_FILE),
     )
 
 
-def _walk(folder: Path) -> Iterator[Path]:
+def _list_files(folder: Path) -> Iterator[Path]:
     """Every file below the folder, but for hidden ones (`.git`, `.venv`, `.gitkeep`)."""
     for directory, folders, names in os.walk(folder):
         folders[:] = [name for name in folders if not name.startswith(".")]
         yield from (Path(directory, name) for name in names if not name.startswith("."))
 
 
-def _only_database(folder: Path, below: list[Path]) -> Path:
+def _find_database(folder: Path, below: list[Path]) -> Path:
     found = sorted(path for path in below if path.name == DATABASE_NAME)
     if not found:
         raise InvalidRequest(
@@ -114,15 +114,15 @@ def _only_database(folder: Path, below: list[Path]) -> Path:
 def _uploaded_files(folder: Path, below: list[Path], uploads: Path | None) -> dict[str, set[Path]]:
     """The files below the folders called `uploads`, by name."""
     if uploads is not None:
-        paths = list(_walk(uploads))
-    elif folder.resolve().name == UPLOADS:
+        paths = list(_list_files(uploads))
+    elif folder.resolve().name == UPLOADS_FOLDER:
         paths = below
     else:
-        paths = [path for path in below if UPLOADS in path.relative_to(folder).parts[:-1]]
+        paths = [path for path in below if UPLOADS_FOLDER in path.relative_to(folder).parts[:-1]]
     if not paths:
         raise InvalidRequest(
             "no_anyloc_uploads",
-            f"No photo lies in a folder called {UPLOADS} below {folder}. If they lie elsewhere: "
+            f"No photo lies in a folder called {UPLOADS_FOLDER} below {folder}. If they lie elsewhere: "
             "--uploads FOLDER.",
         )
     files: dict[str, set[Path]] = defaultdict(set)
@@ -131,7 +131,7 @@ def _uploaded_files(folder: Path, below: list[Path], uploads: Path | None) -> di
     return files
 
 
-def _join(
+def _match_rows_to_files(
     rows: list[AnylocRow], files: dict[str, set[Path]]
 ) -> tuple[list[AnylocPhoto], list[Json]]:
     listed: list[AnylocPhoto] = []
@@ -139,7 +139,9 @@ def _join(
     for row in rows:
         path = PureWindowsPath(row.image_path)  # takes both kinds of slashes
         # Of several with this name, one whose folders are called most like the row's.
-        there = sorted(files.get(path.name, ()), key=lambda file: (-_same_end(file, path), file))
+        there = sorted(
+            files.get(path.name, ()), key=lambda file: (-_common_suffix_length(file, path), file)
+        )
         if there:
             listed.append(AnylocPhoto(there[0], row.name or path.name, row.tags, row.metadata))
         else:
@@ -153,17 +155,17 @@ def _join(
     return listed, missing
 
 
-def _same_end(file: Path, path: PureWindowsPath) -> int:
+def _common_suffix_length(file: Path, path: PureWindowsPath) -> int:
     """How many parts the two paths have in common, from the end."""
     pairs = zip(reversed(file.parts), reversed(path.parts), strict=False)
     return len(list(takewhile(lambda pair: pair[0] == pair[1], pairs)))
 
 
-def _without_doubles(photos: list[AnylocPhoto]) -> tuple[list[AnylocPhoto], list[Json]]:
+def _drop_duplicates(photos: list[AnylocPhoto]) -> tuple[list[AnylocPhoto], list[Json]]:
     """A map keeps the same bytes once: the first one stays and remembers the others."""
     first: dict[object, AnylocPhoto] = {}
     duplicates: list[Json] = []
-    for key, photo in zip(_contents(photos), photos, strict=True):
+    for key, photo in zip(_content_keys(photos), photos, strict=True):
         kept = first.setdefault(key, photo)
         if kept is photo:
             continue
@@ -172,7 +174,7 @@ def _without_doubles(photos: list[AnylocPhoto]) -> tuple[list[AnylocPhoto], list
         kept.metadata.setdefault("anyloc_same_photo", []).append(other)
         duplicates.append(
             {
-                "path": shown(photo.path),
+                "path": printable_path(photo.path),
                 "filename": photo.name,
                 "reason": f"the same photo as {kept.name}",
             }
@@ -180,7 +182,7 @@ def _without_doubles(photos: list[AnylocPhoto]) -> tuple[list[AnylocPhoto], list
     return list(first.values()), duplicates
 
 
-def _contents(photos: list[AnylocPhoto]) -> Iterator[object]:
+def _content_keys(photos: list[AnylocPhoto]) -> Iterator[object]:
     """For each photo a value that it shares with those of the same bytes.
 
     Only files of the same size are read. One that can't be read shares its value with none: the
@@ -188,22 +190,22 @@ def _contents(photos: list[AnylocPhoto]) -> Iterator[object]:
     """
     sizes: dict[int, set[Path]] = defaultdict(set)
     for photo in photos:
-        sizes[_size(photo.path)].add(photo.path)
+        sizes[_file_size(photo.path)].add(photo.path)
     for photo in photos:
-        size = _size(photo.path)
+        size = _file_size(photo.path)
         try:
-            yield photo.path if len(sizes[size]) == 1 else _sha256(photo.path)
+            yield photo.path if len(sizes[size]) == 1 else _file_sha256(photo.path)
         except OSError:
             yield photo.path
 
 
-def _size(path: Path) -> int:
+def _file_size(path: Path) -> int:
     try:
         return path.stat().st_size
     except OSError:
         return -1
 
 
-def _sha256(path: Path) -> str:
+def _file_sha256(path: Path) -> str:
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

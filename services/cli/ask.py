@@ -14,14 +14,14 @@ from services.cli.output import (
     KeyOption,
     MapOption,
     ServerOption,
-    answers,
-    explained,
+    console,
     print_json,
+    report_errors,
 )
 from shared.client import Json
-from shared.comparison import MOST_RERANKED
+from shared.comparison import MAX_RERANK_CANDIDATES
 
-MOST_CLUSTERS = 3  # shown of an explanation
+MAX_CLUSTERS_SHOWN = 3  # shown of an explanation
 
 
 def query(
@@ -45,7 +45,10 @@ def query(
     rerank: Annotated[
         int | None,
         typer.Option(
-            min=1, max=MOST_RERANKED, help="Compare the first N photos patch by patch.", metavar="N"
+            min=1,
+            max=MAX_RERANK_CANDIDATES,
+            help="Compare the first N photos patch by patch.",
+            metavar="N",
         ),
     ] = None,
     explain: Annotated[
@@ -57,7 +60,7 @@ def query(
     as_json: JsonOption = False,
 ) -> None:
     """Find the indexed photos most similar to a photo, which is not stored."""
-    with explained(as_json):
+    with report_errors(as_json):
         with connect(server, map_name, key) as client:
             answer = client.similar_to_file(
                 photo,
@@ -93,37 +96,37 @@ def query(
                 str(rank),
                 f"{found['similarity_score']:.4f}",
                 *([f"{found['weighted_score']:.4f}"] if weighted else []),
-                *([_score(found["rerank_score"])] if rerank else []),
+                *([_format_score(found["rerank_score"])] if rerank else []),
                 found["original_filename"],
-                _degrees(found["latitude"]),
-                _degrees(found["longitude"]),
+                _format_degrees(found["latitude"]),
+                _format_degrees(found["longitude"]),
                 found["place"] or "",
-                *([_made_of(found["explanation"])] if explain else []),
+                *([_format_explanation(found["explanation"])] if explain else []),
             )
-        answers.print(table)
-        answers.print(_place(answer["estimate"]), soft_wrap=True)
-        answers.print(
+        console.print(table)
+        console.print(_format_estimate(answer["estimate"]), soft_wrap=True)
+        console.print(
             f"{answer['rows_scanned']} photos compared ({answer['certificate']}), "
             f"vocabulary: {answer['vocabulary']}, word weights: {answer['word_weights']}",
             soft_wrap=True,
         )
 
 
-def _score(value: float | None) -> str:
+def _format_score(value: float | None) -> str:
     return "" if value is None else f"{value:.4f}"
 
 
-def _made_of(explanation: Json | None) -> str:
+def _format_explanation(explanation: Json | None) -> str:
     """The clusters that add most to the score; without a vocabulary, its grid."""
     if explanation is None:
         return ""
     if explanation["clusters"] is None:
         return f"{explanation['rows']} x {explanation['columns']} patches"
-    most = explanation["clusters"][:MOST_CLUSTERS]
+    most = explanation["clusters"][:MAX_CLUSTERS_SHOWN]
     return ", ".join(f"cluster {one['cluster']}: {one['share']:+.4f}" for one in most)
 
 
-def _place(estimate: Json) -> str:
+def _format_estimate(estimate: Json) -> str:
     """The estimate in one line."""
     if estimate["in_map"] is False:
         return str(estimate["reason"])
@@ -144,5 +147,5 @@ def _place(estimate: Json) -> str:
     return f"Estimate: {'; '.join(where)}, {sure}{known}"
 
 
-def _degrees(value: float | None) -> str:
+def _format_degrees(value: float | None) -> str:
     return "" if value is None else f"{value:.6f}"

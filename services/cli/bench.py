@@ -13,14 +13,22 @@ from typing import Annotated, Any
 
 import typer
 
-from services.cli.output import JsonOption, answers, explained, print_json, progress_bar
+from services.cli.output import JsonOption, console, print_json, progress_bar, report_errors
 from shared.errors import Misconfigured
 
 app = typer.Typer(help="Measure this machine.", no_args_is_help=True)
 
 DeviceOption = Annotated[str, typer.Option("--device", help="auto, cpu or cuda.")]
 
-OF_DEV = ("benchmarks", "tests", "faiss", "psutil", "pytest", "testcontainers", "threadpoolctl")
+DEV_PACKAGES = (
+    "benchmarks",
+    "tests",
+    "faiss",
+    "psutil",
+    "pytest",
+    "testcontainers",
+    "threadpoolctl",
+)
 
 
 @app.command("spine")
@@ -30,7 +38,7 @@ def spine(
     as_json: JsonOption = False,
 ) -> None:
     """How long do upload, description and both kinds of query take on an embedded server?"""
-    _measure("spine", as_json, photos=photos, queries=queries)
+    _run_benchmark("spine", as_json, photos=photos, queries=queries)
 
 
 @app.command("scaling")
@@ -42,8 +50,8 @@ def scaling(
     as_json: JsonOption = False,
 ) -> None:
     """Do more extractors describe as many more photos, and none of them twice?"""
-    numbers = _numbers(workers)
-    _measure(
+    numbers = _parse_integers(workers)
+    _run_benchmark(
         "scaling", as_json, workers=numbers, photos=photos, milliseconds=milliseconds, batch=batch
     )
 
@@ -57,8 +65,13 @@ def pipeline(
     as_json: JsonOption = False,
 ) -> None:
     """How much CPU time does a photo take around the model, and how fast are uploads?"""
-    _measure(
-        "pipeline", as_json, widths=_numbers(widths), photos=photos, batch=batch, rounds=rounds
+    _run_benchmark(
+        "pipeline",
+        as_json,
+        widths=_parse_integers(widths),
+        photos=photos,
+        batch=batch,
+        rounds=rounds,
     )
 
 
@@ -80,9 +93,9 @@ def extract(
 
     Without weights on this machine, random ones are measured, and the title says so.
     """
-    _among(device, "--device", "auto", "cpu", "cuda")
-    _among(precision, "--precision", "auto", "float32", "bfloat16")
-    _measure(
+    _check_choice(device, "--device", "auto", "cpu", "cuda")
+    _check_choice(precision, "--precision", "auto", "float32", "bfloat16")
+    _run_benchmark(
         "extract",
         as_json,
         extractor=extractor,
@@ -106,8 +119,8 @@ def precision(
     as_json: JsonOption = False,
 ) -> None:
     """What does bfloat16 change of patches, descriptors and recall, against float32?"""
-    _among(device, "--device", "auto", "cpu", "cuda")
-    _measure(
+    _check_choice(device, "--device", "auto", "cpu", "cuda")
+    _run_benchmark(
         "precision",
         as_json,
         extractor=extractor,
@@ -133,8 +146,8 @@ def train(
     as_json: JsonOption = False,
 ) -> None:
     """How fast is training, does it wait for photos, and is what it learns real?"""
-    _among(device, "--device", "auto", "cpu", "gpu", "mps")
-    _measure(
+    _check_choice(device, "--device", "auto", "cpu", "gpu", "mps")
+    _run_benchmark(
         "train",
         as_json,
         places=places,
@@ -157,7 +170,7 @@ def query_latency(
     as_json: JsonOption = False,
 ) -> None:
     """How long does a query photo take while thousands of uploads wait?"""
-    _measure(
+    _run_benchmark(
         "query_latency",
         as_json,
         backlog=backlog,
@@ -177,7 +190,7 @@ def rerank(
 
     With PLACEWISE_TEST_DATA also the ranks of the true places of real photos.
     """
-    _measure("rerank", as_json, places=places, seed=seed)
+    _run_benchmark("rerank", as_json, places=places, seed=seed)
 
 
 @app.command("search")
@@ -204,11 +217,11 @@ def search(
     as_json: JsonOption = False,
 ) -> None:
     """How fast is search, next to NumPy, faiss and reading every chunk, and is it ever wrong?"""
-    _measure(
+    _run_benchmark(
         "search",
         as_json,
-        photos=_numbers("1000,5000,10000" if everything else photos),
-        dimensions=_numbers(dimensions),
+        photos=_parse_integers("1000,5000,10000" if everything else photos),
+        dimensions=_parse_integers(dimensions),
         queries=queries,
         growth=growth or everything,
         load_seconds=load or (60.0 if everything else 0.0),
@@ -225,8 +238,8 @@ def catalog(
 
     Fills a database of its own on the server of DATABASE_URL, and drops it in the end.
     """
-    with explained(as_json):
-        program = _program("catalog.command")
+    with report_errors(as_json):
+        program = _load_benchmark("catalog.command")
     program.bench_catalog(photos, as_json)
 
 
@@ -240,13 +253,13 @@ def chaos(
     as_json: JsonOption = False,
 ) -> None:
     """Is anything lost, doubled, stuck or wrong while every part dies, one after the other?"""
-    _measure("chaos", as_json, photos=photos, fault_seconds=fault_seconds, seed=seed)
+    _run_benchmark("chaos", as_json, photos=photos, fault_seconds=fault_seconds, seed=seed)
 
 
 @app.command("rolling")
 def rolling(as_json: JsonOption = False) -> None:
     """Is a request refused or a job lost while every service is restarted, one after the other?"""
-    _measure("rolling", as_json)
+    _run_benchmark("rolling", as_json)
 
 
 @app.command("slow-clients")
@@ -259,7 +272,9 @@ def slow_clients(
 ) -> None:
     """How long do other calls take while clients are slow on purpose? The server may open 1,024
     files."""
-    _measure("slow_clients", as_json, seconds=seconds, idle=idle, bodies=bodies, streams=streams)
+    _run_benchmark(
+        "slow_clients", as_json, seconds=seconds, idle=idle, bodies=bodies, streams=streams
+    )
 
 
 @app.command("scale")
@@ -283,8 +298,8 @@ def scale(
     as_json: JsonOption = False,
 ) -> None:
     """What do 10 thousand, 1 million and 100 million photos take: machines, bytes, money?"""
-    with explained(as_json):
-        program = _program("scale")
+    with report_errors(as_json):
+        program = _load_benchmark("scale")
         found = None
         if measured:
             with progress_bar() as progress:
@@ -296,31 +311,31 @@ def scale(
         print_json(sizing.as_json())
     elif page is None:
         for sheet in sizing.sheets():
-            answers.print(sheet.table())
+            console.print(sheet.table())
 
 
-def _measure(name: str, as_json: bool, **options: Any) -> None:
+def _run_benchmark(name: str, as_json: bool, **options: Any) -> None:
     # As the command does before torch is loaded; see services/cli/__init__.py.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    with explained(as_json):
-        program = _program(name)
+    with report_errors(as_json):
+        program = _load_benchmark(name)
         with progress_bar() as progress:
             report = program.measure(progress, **options)
     if as_json:
         print_json(report.as_json())
     else:
         for table in (*report.tables, report.table()):
-            answers.print(table)
+            console.print(table)
     if report.missed:
         raise typer.Exit(1)
 
 
-def _program(name: str) -> Any:
+def _load_benchmark(name: str) -> Any:
     """The module `benchmarks.NAME`. Misconfigured (`no_benchmarks`) where it can't be loaded."""
     try:
         return importlib.import_module(f"benchmarks.{name}")
     except ModuleNotFoundError as error:
-        if (error.name or "").partition(".")[0] not in OF_DEV:
+        if (error.name or "").partition(".")[0] not in DEV_PACKAGES:
             raise
         raise Misconfigured(
             "no_benchmarks",
@@ -329,12 +344,12 @@ def _program(name: str) -> Any:
         ) from error
 
 
-def _among(value: str, option: str, *allowed: str) -> None:
+def _check_choice(value: str, option: str, *allowed: str) -> None:
     if value not in allowed:
         raise typer.BadParameter(f"{option} is one of {', '.join(allowed)}, not {value!r}")
 
 
-def _numbers(text: str) -> list[int]:
+def _parse_integers(text: str) -> list[int]:
     try:
         found = sorted({int(part) for part in text.split(",")})
     except ValueError:

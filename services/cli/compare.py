@@ -8,8 +8,8 @@ from typing import Annotated
 
 import typer
 
-from services.cli.output import JsonOption, explained
-from services.cli.trainer_packages import check_trainer_packages
+from services.cli.output import JsonOption, report_errors
+from services.cli.trainer_packages import require_packages
 
 
 def compare(
@@ -50,8 +50,8 @@ def compare(
     """
     # Read when torch is loaded, which is below; see services/cli/__init__.py.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    with explained(as_json):
-        check_trainer_packages()
+    with report_errors(as_json):
+        require_packages()
         from services.cli.compare_extractors import compare_extractors
 
         compare_extractors(

@@ -15,42 +15,42 @@ from rich.table import Column, Table
 from services.cli.configuration import read_settings
 from services.cli.describe_sets import (
     Describer,
-    describer_of_checkpoint,
-    describer_of_extractor,
+    checkpoint_describer,
+    extractor_describer,
 )
-from services.cli.evaluate_sets import told_by
-from services.cli.output import answers, print_json, progress_bar, shown
-from services.trainer.evaluation.bootstrap import Difference, paired
-from services.trainer.evaluation.clusters import clusters_of
-from services.trainer.evaluation.measure import Measured, measure
-from services.trainer.evaluation.nearest import nearest
+from services.cli.evaluate_sets import progress_bars
+from services.cli.output import console, print_json, printable_path, progress_bar
+from services.trainer.evaluation.bootstrap import PairedDifference, paired_differences
+from services.trainer.evaluation.clusters import cluster_queries
+from services.trainer.evaluation.measure import RetrievalMetrics, compute_metrics
+from services.trainer.evaluation.nearest import exact_knn
 from services.trainer.evaluation.pareto import pareto_front
-from services.trainer.evaluation.recalls import KS, rows_of_set
-from services.trainer.evaluation.report.comparison import Compared, comparison_page
-from services.trainer.evaluation.whiten import whiten
-from services.trainer.evaluation.write import versions
+from services.trainer.evaluation.recalls import DEFAULT_KS, describe_evaluation_set
+from services.trainer.evaluation.report.comparison import ComparedExtractor, render_comparison
+from services.trainer.evaluation.whiten import whiten_set
+from services.trainer.evaluation.write import package_versions
 from shared.datasets.sets import EvaluationSet, open_evaluation_set
 from shared.errors import InvalidRequest, Misconfigured
-from shared.recipes import MOST_PCA, get_recipe
+from shared.recipes import MAX_PCA_DIMENSION, get_extractor_config
 from shared.settings import Settings
 from shared.vision.extractors import choose_device
 
 FLOAT32_BYTES = 4
-PCA = re.compile(r"pca([1-9][0-9]{0,4})")
+PCA_SUFFIX = re.compile(r"pca([1-9][0-9]{0,4})")
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
+class ComparisonEntry:
     """One descriptor of a comparison."""
 
-    written: str
+    spec_text: str
     name: str
     """an extractor's name with its options, or a checkpoint's path"""
     fit: bool = False
     pca: int | None = None
 
 
-def read_entries(text: str) -> list[Entry]:
+def parse_entries(text: str) -> list[ComparisonEntry]:
     """`a,b:layer=9,facet=key+pca512,run.ckpt` -> three; InvalidRequest (`bad_extractors`)."""
     parts: list[str] = []
     for part in text.split(","):
@@ -59,27 +59,27 @@ def read_entries(text: str) -> list[Entry]:
             parts[-1] += "," + part
         else:
             parts.append(part.strip())
-    return [_entry(part) for part in parts]
+    return [_parse_entry(part) for part in parts]
 
 
-def _entry(written: str) -> Entry:
-    name, *additions = written.split("+")
+def _parse_entry(spec_text: str) -> ComparisonEntry:
+    name, *additions = spec_text.split("+")
     fit, pca = False, None
     for addition in additions:
-        match = PCA.fullmatch(addition)
+        match = PCA_SUFFIX.fullmatch(addition)
         if addition == "fit":
             fit = True
-        elif match and int(match[1]) <= MOST_PCA:
+        elif match and int(match[1]) <= MAX_PCA_DIMENSION:
             pca = int(match[1])
         else:
             raise InvalidRequest(
                 "bad_extractors",
-                f"{written}: +{addition} is not known. There are +fit, and +pcaN to N dimensions, "
-                f"up to {MOST_PCA}.",
+                f"{spec_text}: +{addition} is not known. There are +fit, and +pcaN to N dimensions, "
+                f"up to {MAX_PCA_DIMENSION}.",
             )
     if not name:
-        raise InvalidRequest("bad_extractors", f"--extractors: {written!r} names no extractor.")
-    return Entry(written, name, fit, pca)
+        raise InvalidRequest("bad_extractors", f"--extractors: {spec_text!r} names no extractor.")
+    return ComparisonEntry(spec_text, name, fit, pca)
 
 
 def compare_extractors(
@@ -94,33 +94,39 @@ def compare_extractors(
     as_json: bool,
 ) -> None:
     """Raises as reading the set, loading the extractors and describing does."""
-    entries = read_entries(extractors)
+    entries = parse_entries(extractors)
     settings = read_settings()
-    _check(entries, settings, out)
+    _validate_entries(entries, settings, out)
     asked = open_evaluation_set(data, set_name, protocol=protocol, rule=rule)
-    clusters = clusters_of(asked.queries)
-    found: list[tuple[Compared, Measured]] = []
+    clusters = cluster_queries(asked.queries)
+    found: list[tuple[ComparedExtractor, RetrievalMetrics]] = []
     with progress_bar() as progress:
         for entry in entries:
-            about, measured = _measure(entry, asked, settings, faiss_gpu, progress)
+            about, measured = _evaluate_entry(entry, asked, settings, faiss_gpu, progress)
             first = found[0][1] if found else None
-            difference: Difference | None = None
+            difference: PairedDifference | None = None
             if first is not None:
-                (difference,) = paired(measured.within[:, :1], first.within[:, :1], clusters.of)
-            found.append((Compared(entry.written, measured, difference, **about), measured))
+                (difference,) = paired_differences(
+                    measured.within[:, :1], first.within[:, :1], clusters.of
+                )
+            found.append(
+                (ComparedExtractor(entry.spec_text, measured, difference, **about), measured)
+            )
     compared = [one for one, _ in found]
-    report = _as_json(asked, compared)
+    report = _comparison_as_json(asked, compared)
     if out is not None:
-        _write(out, report, comparison_page(asked, compared))
+        _write_report(out, report, render_comparison(asked, compared))
     if as_json:
         print_json(report)
         return
-    _print(asked, compared)
+    _print_comparison(asked, compared)
     if out is not None:
-        answers.print(shown(out / "report.html"), soft_wrap=True, markup=False)
+        console.print(printable_path(out / "report.html"), soft_wrap=True, markup=False)
 
 
-def _check(entries: Sequence[Entry], settings: Settings, out: Path | None) -> None:
+def _validate_entries(
+    entries: Sequence[ComparisonEntry], settings: Settings, out: Path | None
+) -> None:
     """All names, before the first of them takes its hours."""
     for entry in entries:
         if entry.name.endswith(".ckpt"):
@@ -128,13 +134,15 @@ def _check(entries: Sequence[Entry], settings: Settings, out: Path | None) -> No
                 raise InvalidRequest("bad_extractors", f"There is no checkpoint {entry.name}.")
             if entry.fit:
                 raise InvalidRequest(
-                    "bad_extractors", f"{entry.written}: a checkpoint has no vocabulary to fit."
+                    "bad_extractors", f"{entry.spec_text}: a checkpoint has no vocabulary to fit."
                 )
             continue
-        recipe = get_recipe(entry.name, allow_test_extractors=settings.allow_test_extractors)
+        recipe = get_extractor_config(
+            entry.name, allow_test_extractors=settings.allow_test_extractors
+        )
         if entry.fit and not recipe.needs_vocabulary:
             raise InvalidRequest(
-                "bad_extractors", f"{entry.written}: {recipe.name} uses no vocabulary to fit."
+                "bad_extractors", f"{entry.spec_text}: {recipe.name} uses no vocabulary to fit."
             )
     if out is not None:
         try:
@@ -145,28 +153,38 @@ def _check(entries: Sequence[Entry], settings: Settings, out: Path | None) -> No
             ) from error
 
 
-def _measure(
-    entry: Entry, asked: EvaluationSet, settings: Settings, faiss_gpu: bool, progress: Progress
-) -> tuple[dict[str, Any], Measured]:
-    describer = _describer(entry, asked, settings, progress)
-    told = told_by(progress, entry.written)
-    describer.describe.told = lambda done, most: told("known photos", done, most)
-    with rows_of_set(describer.describe, asked, told=told) as (database, queries):
+def _evaluate_entry(
+    entry: ComparisonEntry,
+    evaluation_set: EvaluationSet,
+    settings: Settings,
+    faiss_gpu: bool,
+    progress: Progress,
+) -> tuple[dict[str, Any], RetrievalMetrics]:
+    describer = _make_describer(entry, evaluation_set, settings, progress)
+    told = progress_bars(progress, entry.spec_text)
+    describer.describe.on_lookup = lambda done, most: told("known photos", done, most)
+    with describe_evaluation_set(describer.describe, evaluation_set, on_progress=told) as (
+        database,
+        queries,
+    ):
         took = describer.describe.milliseconds_a_photo()
         if entry.pca is not None:
-            short = whiten(database, queries, entry.pca, choose_device(settings.device), told)
+            short = whiten_set(database, queries, entry.pca, choose_device(settings.device), told)
             database, queries = short.database, short.queries
             took = None if took is None else took + short.milliseconds_a_photo
-        ranked = nearest(
+        ranked = exact_knn(
             queries,
             database,
-            max(KS),
+            max(DEFAULT_KS),
             faiss_gpu=faiss_gpu,
-            told=lambda done, most: told("search", done, most),
+            on_progress=lambda done, most: told("search", done, most),
         )
         dimension = database.shape[1]
-    measured = measure(
-        ranked.indices, asked.positives, clusters_of(asked.queries), scores=ranked.scores
+    measured = compute_metrics(
+        ranked.indices,
+        evaluation_set.positives,
+        cluster_queries(evaluation_set.queries),
+        scores=ranked.scores,
     )
     return {
         "dimension": dimension,
@@ -177,26 +195,28 @@ def _measure(
     }, measured
 
 
-def _describer(
-    entry: Entry, asked: EvaluationSet, settings: Settings, progress: Progress
+def _make_describer(
+    entry: ComparisonEntry, evaluation_set: EvaluationSet, settings: Settings, progress: Progress
 ) -> Describer:
     if entry.name.endswith(".ckpt"):
-        return describer_of_checkpoint(Path(entry.name), "same", settings)
-    recipe = get_recipe(entry.name, allow_test_extractors=settings.allow_test_extractors)
-    database = [shot.path for shot in asked.database]
-    return describer_of_extractor(recipe, None, database, settings, progress, fit=entry.fit)
+        return checkpoint_describer(Path(entry.name), "same", settings)
+    recipe = get_extractor_config(entry.name, allow_test_extractors=settings.allow_test_extractors)
+    database = [shot.path for shot in evaluation_set.database]
+    return extractor_describer(recipe, None, database, settings, progress, fit=entry.fit)
 
 
-def _as_json(asked: EvaluationSet, compared: Sequence[Compared]) -> dict[str, Any]:
+def _comparison_as_json(
+    evaluation_set: EvaluationSet, compared: Sequence[ComparedExtractor]
+) -> dict[str, Any]:
     recalls = [one.recall_at_1 for one in compared]
     by_size = pareto_front([one.bytes_a_photo for one in compared], recalls)
     by_time = pareto_front([one.milliseconds for one in compared], recalls)
     return {
-        "set": asked.name,
-        "protocol": asked.protocol,
-        "rule": asked.rule,
-        "fingerprint": asked.fingerprint,
-        "versions": versions(),
+        "set": evaluation_set.name,
+        "protocol": evaluation_set.protocol,
+        "rule": evaluation_set.rule,
+        "fingerprint": evaluation_set.fingerprint,
+        "versions": package_versions(),
         "extractors": [
             {**one.as_json(), "pareto_by_size": size, "pareto_by_time": duration}
             for one, size, duration in zip(compared, by_size, by_time, strict=True)
@@ -204,7 +224,7 @@ def _as_json(asked: EvaluationSet, compared: Sequence[Compared]) -> dict[str, An
     }
 
 
-def _write(out: Path, report: dict[str, Any], page: str) -> None:
+def _write_report(out: Path, report: dict[str, Any], page: str) -> None:
     try:
         text = json.dumps(report, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
         (out / "comparison.json").write_text(text, encoding="utf-8")
@@ -215,24 +235,26 @@ def _write(out: Path, report: dict[str, Any], page: str) -> None:
         ) from error
 
 
-def _print(asked: EvaluationSet, compared: Sequence[Compared]) -> None:
-    ks = list(compared[0].measured.recalls.of_all)
+def _print_comparison(evaluation_set: EvaluationSet, compared: Sequence[ComparedExtractor]) -> None:
+    ks = list(compared[0].measured.recalls.recall_all)
     columns = (*(f"R@{k}" for k in ks), "95 % of R@1", "ms", "bytes", "against the first")
-    table = Table(asked.name, *(Column(name, justify="right", no_wrap=True) for name in columns))
+    table = Table(
+        evaluation_set.name, *(Column(name, justify="right", no_wrap=True) for name in columns)
+    )
     for one in compared:
         interval = one.measured.recall_intervals
         table.add_row(
             one.name,
-            *(f"{100 * share:.1f}" for share in one.measured.recalls.of_all.values()),
+            *(f"{100 * share:.1f}" for share in one.measured.recalls.recall_all.values()),
             f"{100 * interval[0].low:.1f} to {100 * interval[0].high:.1f}" if interval else "-",
             "-" if one.milliseconds_a_photo is None else f"{one.milliseconds_a_photo:.1f}",
             f"{one.bytes_a_photo:,}",
             one.against_first(),
         )
-    answers.print(table)
+    console.print(table)
     clusters = compared[0].measured.clusters
-    answers.print(
-        f"Right: {asked.rule}; protocol {asked.protocol}; fingerprint {asked.fingerprint[:16]}; "
+    console.print(
+        f"Right: {evaluation_set.rule}; protocol {evaluation_set.protocol}; fingerprint {evaluation_set.fingerprint[:16]}; "
         f"intervals over {clusters.count} {clusters.kind}. ms: network and aggregation of one "
         "photo, measured when its row was made. bytes: float32.",
         soft_wrap=True,

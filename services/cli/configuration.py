@@ -5,7 +5,7 @@ from __future__ import annotations
 from pydantic import ValidationError
 from rich.table import Table
 
-from services.cli.output import JsonOption, answers, explained, print_json
+from services.cli.output import JsonOption, console, print_json, report_errors
 from shared.errors import Misconfigured
 from shared.settings import Settings
 
@@ -28,7 +28,7 @@ def read_settings() -> Settings:
 
 def config(as_json: JsonOption = False) -> None:
     """Print every setting that is in force, secrets masked."""
-    with explained(as_json):
+    with report_errors(as_json):
         settings = read_settings()
     values = settings.model_dump(mode="json")
     if as_json:
@@ -38,5 +38,5 @@ def config(as_json: JsonOption = False) -> None:
     for name, field in Settings.model_fields.items():
         default = field.get_default(call_default_factory=True, validated_data={})
         table.add_row(name.upper(), str(values[name]), str(default), field.description or "")
-    answers.print(table)
-    answers.print(f"New maps are described by {settings.new_map_extractor}.", soft_wrap=True)
+    console.print(table)
+    console.print(f"New maps are described by {settings.new_map_extractor}.", soft_wrap=True)

@@ -10,9 +10,9 @@ from collections.abc import Iterator
 from services.cli.configuration import read_settings
 from shared.client import Client
 from shared.errors import Unavailable
-from shared.home import RunningServer, running_server
+from shared.home import RunningServer, find_running_server
 
-START_SECONDS = 30.0
+START_TIMEOUT_SECONDS = 30.0
 
 
 @contextlib.contextmanager
@@ -22,21 +22,21 @@ def connect(server: str | None, map_name: str | None, key: str | None = None) ->
     `key` is what `server` wants. The server on PLACEWISE_HOME leaves one there for its own user.
     """
     settings = read_settings()
-    found = RunningServer(server) if server else running_server(settings.placewise_home)
+    found = RunningServer(server) if server else find_running_server(settings.placewise_home)
     if found is not None:
         with Client(found.url, map_name, key or found.key) as client:
             yield client
         return
     # Imported only here: torch takes seconds, and a client of a running server needs none of it.
-    from services.standalone import standalone
+    from services.standalone import run_standalone
 
     own = settings.model_copy(update={"host": "127.0.0.1", "port": 0})
-    with standalone(own) as running:
+    with run_standalone(own) as running:
         # Not the main thread: uvicorn would take over the command's signals there.
         serving = threading.Thread(target=running.serve, name="http")
         serving.start()
         try:
-            deadline = time.monotonic() + START_SECONDS
+            deadline = time.monotonic() + START_TIMEOUT_SECONDS
             while not running.server.started:
                 if time.monotonic() > deadline or not serving.is_alive():
                     raise Unavailable("server_unreachable", "The embedded server did not start.")

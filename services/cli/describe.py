@@ -22,15 +22,15 @@ from services.cli.extractor_options import (
 )
 from services.cli.output import (
     JsonOption,
-    answers,
-    explained,
+    console,
     print_json,
+    printable_path,
     progress_bar,
-    shown,
+    report_errors,
 )
-from services.cli.trainer_packages import check_trainer_packages
+from services.cli.trainer_packages import require_packages
 from shared.errors import InvalidRequest
-from shared.recipes import get_recipe
+from shared.recipes import get_extractor_config
 
 
 def describe(
@@ -95,8 +95,8 @@ def describe(
     """
     # Read when torch is loaded, which is below; see services/cli/__init__.py.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    with explained(as_json):
-        names = _names(photos, out, root)
+    with report_errors(as_json):
+        names = _hdf5_names(photos, out, root)
         settings = read_settings()
         name = extractor_name(
             extractor or (settings.new_map_extractor if backbone is None else None),
@@ -107,7 +107,7 @@ def describe(
             aggregator=aggregator,
             temperature=temperature,
         )
-        recipe = get_recipe(name, allow_test_extractors=settings.allow_test_extractors)
+        recipe = get_extractor_config(name, allow_test_extractors=settings.allow_test_extractors)
         if weights is not None:
             if recipe.depth is None:
                 raise InvalidRequest(
@@ -134,15 +134,15 @@ def describe(
     if as_json:
         print_json(found.as_json())
         return
-    answers.print(
-        f"{found.rows} rows of {found.spec['dimension']} numbers are in {shown(out)} "
+    console.print(
+        f"{found.rows} rows of {found.spec['dimension']} numbers are in {printable_path(out)} "
         f"({recipe.name}, {found.seconds['total']:.1f} s).",
         soft_wrap=True,
         markup=False,
     )
 
 
-def _names(photos: Sequence[Path], out: Path, root: Path | None) -> list[str] | None:
+def _hdf5_names(photos: Sequence[Path], out: Path, root: Path | None) -> list[str] | None:
     """What an .h5 file calls the photos; None for a file of rows alone.
 
     InvalidRequest: `options_contradict`, `bad_names` (not below the root, or the same name twice);
@@ -152,7 +152,7 @@ def _names(photos: Sequence[Path], out: Path, root: Path | None) -> list[str] | 
         if root is not None:
             raise InvalidRequest("options_contradict", "--root: only with --out FILE.h5.")
         return None
-    check_trainer_packages("h5py")
+    require_packages("h5py")
     try:
         named = [(p.absolute().relative_to(root.absolute()) if root else p) for p in photos]
     except ValueError as error:

@@ -14,24 +14,24 @@ from typing import Any
 import numpy as np
 
 from services.cli.load_extractor import load_extractor
-from services.cli.output import shown
-from services.cli.photo_files import decoded_batches
-from services.cli.row_files import open_rows
-from services.cli.whole_file import whole_or_nothing
+from services.cli.output import printable_path
+from services.cli.photo_files import decode_batches
+from services.cli.row_files import open_descriptor_writer
+from services.cli.whole_file import atomic_write
 from shared.errors import Misconfigured, PlacewiseError, Unprocessable
-from shared.recipes import Recipe
+from shared.recipes import ExtractorConfig
 from shared.settings import Settings
-from shared.vision.extractors import Extractor, not_finite
-from shared.vision.passes import PhotoDoesNotFit
-from shared.vision.pca import Projection
+from shared.vision.extractors import Extractor, not_finite_error
+from shared.vision.passes import PhotoTooLargeForGpu
+from shared.vision.pca import PcaProjection
 from shared.vision.pca_file import decode_whitening
-from shared.vision.provenance import check_fits, check_width
-from shared.vision.vocabulary import Centres
+from shared.vision.provenance import check_vocabulary_fits, check_vocabulary_width
+from shared.vision.vocabulary import ClusterCentres
 from shared.vision.vocabulary_file import VocabularyFile, read_vocabulary
 
 
 @dataclass(slots=True)
-class DescribedFiles:
+class DescriptorFile:
     """What was written, and how."""
 
     out: Path
@@ -44,7 +44,7 @@ class DescribedFiles:
 
     def as_json(self) -> dict[str, Any]:
         return {
-            "file": shown(self.out),
+            "file": printable_path(self.out),
             "rows": self.rows,
             "dimension": self.spec["dimension"],
             "spec": self.spec,
@@ -55,36 +55,36 @@ class DescribedFiles:
 def describe_files(
     photos: Sequence[Path],
     out: Path,
-    recipe: Recipe,
+    recipe: ExtractorConfig,
     vocabulary: Path | None,
     pca: Path | None,
     settings: Settings,
     advance: Callable[[int], None],
     *,
     names: Sequence[str] | None = None,
-) -> DescribedFiles:
+) -> DescriptorFile:
     """Write (photos, dimension) float32 to `out`, whole or not at all: an `.npy` of rows, or with
     `names`, one for each photo, an `.h5` of hloc's global features.
 
-    `advance` is told how many more photos are done. Raises Unprocessable: `photos_refused`, which
+    `advance` is told how many more photos are done. Raises Unprocessable: `refused_photos_error`, which
     names every photo that can't be described and why; `vocabulary_unfit`, `pca_unfit`;
     Misconfigured: `vocabulary_missing`, `out_unwritable`, and what loading the extractor raises.
     """
     started = time.perf_counter()
-    own = own_vocabulary(recipe, vocabulary)
+    own = load_own_vocabulary(recipe, vocabulary)
     whitening = decode_whitening(pca.read_bytes()) if pca is not None else None
     extractor = load_extractor(recipe, settings)
-    centres = centres_of(extractor, own)
+    centres = resolve_centres(extractor, own)
     projection = None
     if whitening is not None:
-        whitening.check_fits(extractor.spec(centres))
-        projection = Projection(whitening.whitening, extractor.backbone.device)
-    described = DescribedFiles(out, extractor.spec(centres, projection), len(photos))
+        whitening.check_compatible(extractor.spec(centres))
+        projection = PcaProjection(whitening.whitening, extractor.backbone.device)
+    described = DescriptorFile(out, extractor.spec(centres, projection), len(photos))
     described.seconds["load"] = time.perf_counter() - started
     shape = (len(photos), extractor.dimension(centres, projection))
     refused: list[tuple[Path, PlacewiseError]] = []
-    with whole_or_nothing(out) as file, open_rows(file, shape, names) as write:
-        for batch in decoded_batches(photos, extractor.preprocessing, settings, described.seconds):
+    with atomic_write(out) as file, open_descriptor_writer(file, shape, names) as write:
+        for batch in decode_batches(photos, extractor.preprocessing, settings, described.seconds):
             pixels = []
             for photo, outcome in batch:
                 if isinstance(outcome, PlacewiseError):
@@ -95,22 +95,22 @@ def describe_files(
                 begun = time.perf_counter()
                 try:
                     rows = extractor.describe(pixels, centres, projection)
-                except PhotoDoesNotFit as error:
+                except PhotoTooLargeForGpu as error:
                     refused.append((batch[error.place][0], error))
                 else:
                     for (photo, _), row in zip(batch, rows, strict=True):
                         if not np.isfinite(row).all():
-                            refused.append((photo, not_finite()))
+                            refused.append((photo, not_finite_error()))
                     write(rows)
                 described.seconds["describe"] += time.perf_counter() - begun
             advance(len(batch))
         if refused:
-            raise _refusal(refused, len(photos))
+            raise _refused_photos_error(refused, len(photos))
     described.seconds["total"] = time.perf_counter() - started
     return described
 
 
-def own_vocabulary(recipe: Recipe, vocabulary: Path | None) -> VocabularyFile | None:
+def load_own_vocabulary(recipe: ExtractorConfig, vocabulary: Path | None) -> VocabularyFile | None:
     """The file's; None where the recipe does without, or brings its own.
 
     Raises Unprocessable (`vocabulary_unfit`) and Misconfigured (`vocabulary_missing`).
@@ -121,7 +121,7 @@ def own_vocabulary(recipe: Recipe, vocabulary: Path | None) -> VocabularyFile | 
                 "vocabulary_unfit", f"The extractor {recipe.name} uses no vocabulary."
             )
         own = read_vocabulary(vocabulary)
-        check_width(own.centres, recipe, recipe.width)  # before the weights are loaded
+        check_vocabulary_width(own.centres, recipe, recipe.width)  # before the weights are loaded
         return own
     if recipe.needs_vocabulary and recipe.shipped_vocabulary is None:
         raise Misconfigured(
@@ -132,10 +132,10 @@ def own_vocabulary(recipe: Recipe, vocabulary: Path | None) -> VocabularyFile | 
     return None
 
 
-def centres_of(extractor: Extractor, own: VocabularyFile | None) -> Centres | None:
+def resolve_centres(extractor: Extractor, own: VocabularyFile | None) -> ClusterCentres | None:
     """Those of the file, else the shipped ones; Unprocessable (`vocabulary_unfit`)."""
     if own is not None:
-        check_fits(own.provenance, own.centres, extractor)
+        check_vocabulary_fits(own.provenance, own.centres, extractor)
         return own.centres
     if not extractor.recipe.needs_vocabulary:
         return None
@@ -144,13 +144,13 @@ def centres_of(extractor: Extractor, own: VocabularyFile | None) -> Centres | No
     return shipped[0]
 
 
-def _refusal(refused: list[tuple[Path, PlacewiseError]], photos: int) -> Unprocessable:
-    named = "\n".join(f"{shown(photo)}: {error.detail}" for photo, error in refused)
+def _refused_photos_error(refused: list[tuple[Path, PlacewiseError]], photos: int) -> Unprocessable:
+    named = "\n".join(f"{printable_path(photo)}: {error.detail}" for photo, error in refused)
     return Unprocessable(
         "photos_refused",
         f"{len(refused)} of {photos} photos can't be described, and nothing was written.\n{named}",
         refused=[
-            {"photo": shown(photo), "code": error.code, "detail": error.detail}
+            {"photo": printable_path(photo), "code": error.code, "detail": error.detail}
             for photo, error in refused
         ],
     )

@@ -11,25 +11,25 @@ from typing import Any
 
 from rich.progress import Progress
 
-from services.cli.describe_files import centres_of, own_vocabulary
+from services.cli.describe_files import load_own_vocabulary, resolve_centres
 from services.cli.load_extractor import load_extractor
-from services.cli.photo_files import decoded_batches, pixels_of
-from services.trainer.evaluation.cache import CachedDescribe, Timed
-from services.trainer.evaluation.describe import Rows, photos_refused
-from services.trainer.evaluation.describe_model import DescribeModel
+from services.cli.photo_files import decode_batches, decode_pixels
+from services.trainer.evaluation.cache import CachedDescriber, TimedDescriber
+from services.trainer.evaluation.describe import Rows, refused_photos_error
+from services.trainer.evaluation.describe_model import ModelDescriber
 from shared.errors import PlacewiseError
-from shared.recipes import Recipe
+from shared.recipes import ExtractorConfig
 from shared.settings import Settings
 from shared.vision.decode import DECODER
 from shared.vision.extractors import Extractor, choose_device, spec_fingerprint
-from shared.vision.fit_photos import fit_photos
-from shared.vision.passes import PhotoDoesNotFit
-from shared.vision.patches import choose_photos
+from shared.vision.fit_photos import fit_vocabulary
+from shared.vision.passes import PhotoTooLargeForGpu
+from shared.vision.patches import sample_photos
 from shared.vision.place_models.checkpoint import load_checkpoint
-from shared.vision.vocabulary import Centres
+from shared.vision.vocabulary import ClusterCentres
 
-CACHE = "descriptors"
-FIT_PHOTOS = 1000  # as a map's fit learns from
+CACHE_FOLDER = "descriptors"
+FIT_SAMPLE_PHOTOS = 1000  # as a map's fit learns from
 SEED = 0
 
 
@@ -38,7 +38,7 @@ class Describer:
     """Photos to rows, with what a result says of it."""
 
     name: str
-    describe: CachedDescribe
+    describe: CachedDescriber
     spec: dict[str, Any]
     """everything that decides a row's value"""
     about: dict[str, Any] = field(default_factory=dict)
@@ -48,10 +48,12 @@ class Describer:
         return spec_fingerprint(self.spec)
 
 
-class DescribeExtractor:
+class ExtractorDescriber:
     """An extractor's rows, by the decoding children of every upload."""
 
-    def __init__(self, extractor: Extractor, centres: Centres | None, settings: Settings) -> None:
+    def __init__(
+        self, extractor: Extractor, centres: ClusterCentres | None, settings: Settings
+    ) -> None:
         self._extractor = extractor
         self._centres = centres
         self._settings = settings
@@ -61,7 +63,7 @@ class DescribeExtractor:
 
     def __call__(self, photos: Sequence[Path]) -> Iterator[Rows]:
         refused: list[tuple[Path, PlacewiseError]] = []
-        batches = decoded_batches(
+        batches = decode_batches(
             photos, self._extractor.preprocessing, self._settings, defaultdict(float)
         )
         for batch in batches:
@@ -76,17 +78,17 @@ class DescribeExtractor:
             begun = time.perf_counter()
             try:
                 rows = self._extractor.describe(pixels, self._centres)
-            except PhotoDoesNotFit as error:
+            except PhotoTooLargeForGpu as error:
                 refused.append((batch[error.place][0], error))
                 continue
             self.seconds += time.perf_counter() - begun
             self.photos += len(rows)
             yield rows
         if refused:
-            raise photos_refused(refused, len(photos))
+            raise refused_photos_error(refused, len(photos))
 
 
-def describer_of_checkpoint(
+def checkpoint_describer(
     checkpoint: Path, image_size: str | tuple[int, int], settings: Settings
 ) -> Describer:
     """`image_size`: `same` as the model was built for, `native`, or (height, width)."""
@@ -95,7 +97,7 @@ def describer_of_checkpoint(
     if not isinstance(image_size, str):
         size = image_size
     device = choose_device(settings.device)
-    describe = DescribeModel(
+    describe = ModelDescriber(
         loaded.model.to(device),
         device,
         size,
@@ -114,11 +116,11 @@ def describer_of_checkpoint(
         "device": device.type,
     }
     about |= {name: loaded.about[name] for name in ("epoch",) if name in loaded.about}
-    return Describer(checkpoint.stem, _cached(describe, spec, settings), spec, about)
+    return Describer(checkpoint.stem, _with_cache(describe, spec, settings), spec, about)
 
 
-def describer_of_extractor(
-    recipe: Recipe,
+def extractor_describer(
+    recipe: ExtractorConfig,
     vocabulary: Path | None,
     database: Sequence[Path],
     settings: Settings,
@@ -131,43 +133,45 @@ def describer_of_extractor(
     about: dict[str, Any] = {}
     extractor = load_extractor(recipe, settings)
     if recipe.needs_vocabulary and vocabulary is None and (fit or not recipe.shipped_vocabulary):
-        centres: Centres | None = _fitted(extractor, database, settings, progress)
+        centres: ClusterCentres | None = _fit_vocabulary(extractor, database, settings, progress)
         about["vocabulary"] = "fitted on the database's photos"
     else:
-        centres = centres_of(extractor, own_vocabulary(recipe, vocabulary))
+        centres = resolve_centres(extractor, load_own_vocabulary(recipe, vocabulary))
         if centres is not None:
             about["vocabulary"] = vocabulary.name if vocabulary else "the shipped one"
     spec = extractor.spec(centres)
-    describe = DescribeExtractor(extractor, centres, settings)
+    describe = ExtractorDescriber(extractor, centres, settings)
     about |= {"precision": extractor.precision, "device": extractor.backbone.device.type}
-    return Describer(recipe.name, _cached(describe, spec, settings), spec, about)
+    return Describer(recipe.name, _with_cache(describe, spec, settings), spec, about)
 
 
-def _fitted(
+def _fit_vocabulary(
     extractor: Extractor, database: Sequence[Path], settings: Settings, progress: Progress
-) -> Centres:
-    chosen = choose_photos(len(database), FIT_PHOTOS, extractor.backbone.width, SEED)
+) -> ClusterCentres:
+    chosen = sample_photos(len(database), FIT_SAMPLE_PHOTOS, extractor.backbone.width, SEED)
     photos = [database[number] for number in chosen]
     bars = {name: progress.add_task(name, total=None) for name in ("vocabulary", "clustering")}
     names = {"describing": "vocabulary", "clustering": "clustering"}
     refused: list[dict[str, str]] = []
-    fitted = fit_photos(
+    fitted = fit_vocabulary(
         extractor,
-        pixels_of(photos, extractor.preprocessing, settings, refused),
+        decode_pixels(photos, extractor.preprocessing, settings, refused),
         len(photos),
         clusters=extractor.recipe.clusters,
         seed=SEED,
-        told=lambda what, done, most: progress.update(
+        on_progress=lambda what, done, most: progress.update(
             bars[names[what]], completed=done, total=most
         ),
     )
     return fitted.centres
 
 
-def _cached(describe: Timed, spec: dict[str, Any], settings: Settings) -> CachedDescribe:
-    return CachedDescribe(
+def _with_cache(
+    describe: TimedDescriber, spec: dict[str, Any], settings: Settings
+) -> CachedDescriber:
+    return CachedDescriber(
         describe,
-        settings.placewise_home / CACHE,
+        settings.placewise_home / CACHE_FOLDER,
         spec,
         most_bytes=settings.descriptor_cache_bytes,
     )

@@ -17,32 +17,32 @@ from sqlalchemy import func, select
 from sqlalchemy.exc import SQLAlchemyError
 
 from services.cli.configuration import read_settings
-from services.cli.extractor_checks import device_check, extractor_check, memory_check
-from services.cli.output import JsonOption, KeyOption, ServerOption, answers, print_json
-from services.cli.server_checks import objects_check, postgres_check, redis_check
+from services.cli.extractor_checks import check_device, check_extractor, check_memory
+from services.cli.output import JsonOption, KeyOption, ServerOption, console, print_json
+from services.cli.server_checks import check_object_store, check_postgres, check_redis
 from services.cli.service_checks import (
-    gateway_check,
-    processes_check,
-    search_check,
-    steward_check,
+    check_gateway,
+    check_processes,
+    check_search,
+    check_steward,
 )
 from services.cli.store_checks import collection_check, permissions_check
-from shared.catalog.away import as_unavailable
+from shared.catalog.away import to_unavailable
 from shared.catalog.open_catalog import open_catalog
 from shared.catalog.photos import Photo
 from shared.catalog.schema import check_schema
 from shared.catalog.unusable import check_pages
 from shared.client import Client
 from shared.errors import Misconfigured, PlacewiseError
-from shared.home import running_server
+from shared.home import find_running_server
 from shared.journal.lag import catalog_lag
 from shared.settings import Settings
 
-LOW_DISK_BYTES = 1_000_000_000
+MIN_FREE_DISK_BYTES = 1_000_000_000
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class CheckResult:
     part: str
     ok: bool
     detail: str
@@ -57,66 +57,68 @@ def doctor(server: ServerOption = None, key: KeyOption = None, as_json: JsonOpti
     try:
         settings = read_settings()
     except Misconfigured as error:
-        _report([Finding("settings", False, error.detail)], as_json)
+        _print_results([CheckResult("settings", False, error.detail)], as_json)
         raise typer.Exit(1) from None
-    checks: list[tuple[str, Callable[[Settings], str]]] = [("python", _python)]
-    checks.append(("settings", _settings))
+    checks: list[tuple[str, Callable[[Settings], str]]] = [("python", _check_python)]
+    checks.append(("settings", _check_settings))
     if settings.s3_endpoint is None or settings.database_url is None:
-        checks.append(("folder", _folder))  # else a service may have none that it can write to
+        checks.append(("folder", _check_home))  # else a service may have none that it can write to
         checks.append(("permissions", permissions_check))
     if settings.s3_endpoint is None:
-        checks.append(("uploads", _uploads))
+        checks.append(("uploads", _check_upload_dir))
     else:
-        checks.append(("objects", objects_check))
+        checks.append(("objects", check_object_store))
     checks.append(("collection", collection_check))
     checks.append(("journal", _journal))
     if settings.database_url is None:
-        checks += [("server", _server), ("vocabulary", _vocabulary)]
+        checks += [("server", _check_server), ("vocabulary", _check_vocabulary)]
     else:
         checks += [
-            ("postgresql", postgres_check),
-            ("redis", redis_check),
-            ("search", search_check),
-            ("gateways", partial(processes_check, role="gateway")),
-            ("extractors", partial(processes_check, role="extractor")),
-            ("stewards", steward_check),
+            ("postgresql", check_postgres),
+            ("redis", check_redis),
+            ("search", check_search),
+            ("gateways", partial(check_processes, role="gateway")),
+            ("extractors", partial(check_processes, role="extractor")),
+            ("stewards", check_steward),
         ]
     if server is not None:
-        checks.append(("gateway", lambda _: gateway_check(server, key)))
-    checks += [("device", device_check), ("memory", memory_check), ("extractor", extractor_check)]
-    findings = [_look(part, check, settings) for part, check in checks]
-    _report(findings, as_json)
+        checks.append(("gateway", lambda _: check_gateway(server, key)))
+    checks += [("device", check_device), ("memory", check_memory), ("extractor", check_extractor)]
+    findings = [_run_check(part, check, settings) for part, check in checks]
+    _print_results(findings, as_json)
     if not all(finding.ok for finding in findings):
         raise typer.Exit(1)
 
 
-def _report(findings: list[Finding], as_json: bool) -> None:
+def _print_results(results: list[CheckResult], as_json: bool) -> None:
     if as_json:
-        print_json([asdict(finding) for finding in findings])
+        print_json([asdict(finding) for finding in results])
         return
-    for finding in findings:
+    for finding in results:
         mark = "[green]ok[/green]  " if finding.ok else "[red]look[/red]"
         # What was found is no markup: a path may hold brackets.
-        answers.print(f"{mark} {finding.part}: {escape(finding.detail)}", soft_wrap=True)
+        console.print(f"{mark} {finding.part}: {escape(finding.detail)}", soft_wrap=True)
 
 
-def _look(part: str, check: Callable[[Settings], str], settings: Settings) -> Finding:
+def _run_check(part: str, check: Callable[[Settings], str], settings: Settings) -> CheckResult:
     try:
-        return Finding(part, True, check(settings))
+        return CheckResult(part, True, check(settings))
     except PlacewiseError as error:
-        return Finding(part, False, error.detail)
+        return CheckResult(part, False, error.detail)
     except ModuleNotFoundError as error:
         # Each image has its service's packages only.
-        return Finding(part, True, f"not looked at: {error.name} is not installed here")
+        return CheckResult(part, True, f"not looked at: {error.name} is not installed here")
     except OSError as error:
-        return Finding(part, False, f"{error.filename or ''}: {error.strerror}. Check permissions.")
+        return CheckResult(
+            part, False, f"{error.filename or ''}: {error.strerror}. Check permissions."
+        )
 
 
-def _python(_settings: Settings) -> str:
+def _check_python(_settings: Settings) -> str:
     return f"Python {sys.version.split()[0]}"
 
 
-def _settings(settings: Settings) -> str:
+def _check_settings(settings: Settings) -> str:
     """They were read, or nothing else would be looked at."""
     if settings.otel_exporter_otlp_endpoint is not None and not _is_installed("opentelemetry.sdk"):
         raise Misconfigured(
@@ -134,19 +136,19 @@ def _is_installed(package: str) -> bool:
         return False
 
 
-def _folder(settings: Settings) -> str:
+def _check_home(settings: Settings) -> str:
     home = settings.placewise_home
     there = next(folder for folder in (home, *home.parents) if folder.exists())
     if not os.access(there, os.W_OK | os.X_OK):
         raise OSError(errno.EACCES, "this user may not write there", str(there))
     free = shutil.disk_usage(there).free
-    if free < LOW_DISK_BYTES:
+    if free < MIN_FREE_DISK_BYTES:
         raise OSError(errno.ENOSPC, f"only {free / 1e9:.1f} GB are free", str(there))
     state = "is writable" if there == home else "is not there yet and can be made"
     return f"{home} {state}, {free / 1e9:.0f} GB free"
 
 
-def _uploads(settings: Settings) -> str:
+def _check_upload_dir(settings: Settings) -> str:
     folder = settings.upload_dir
     if folder is None:
         return "originals lie under PLACEWISE_HOME"
@@ -165,9 +167,9 @@ def _journal(settings: Settings) -> str:
     catalog = open_catalog(settings, "doctor")
     try:
         check_schema(catalog)
-        lag = catalog_lag(catalog, open_store(settings, alone=False))
+        lag = catalog_lag(catalog, open_store(settings, exclusive=False))
     except SQLAlchemyError as error:
-        raise as_unavailable(error) or Misconfigured(
+        raise to_unavailable(error) or Misconfigured(
             "catalog_unreadable",
             f"The catalog can't be read ({type(error).__name__}). Check its permissions, or "
             "restore it from a backup.",
@@ -179,8 +181,8 @@ def _journal(settings: Settings) -> str:
     return "the catalog is as new as the object store"
 
 
-def _vocabulary(settings: Settings) -> str:
-    running = running_server(settings.placewise_home)
+def _check_vocabulary(settings: Settings) -> str:
+    running = find_running_server(settings.placewise_home)
     if running is None:
         return "asked of a running server only"
     with Client(running.url, key=running.key) as client:
@@ -200,10 +202,10 @@ def _vocabulary(settings: Settings) -> str:
     return "no map has a foreign one"
 
 
-def _server(settings: Settings) -> str:
-    running = running_server(settings.placewise_home)
+def _check_server(settings: Settings) -> str:
+    running = find_running_server(settings.placewise_home)
     if running is not None:
-        gateway_check(running.url, running.key)
+        check_gateway(running.url, running.key)
         with Client(running.url, key=running.key) as client:
             maps = client.maps()
         searchable, photos = sum(m["searchable"] for m in maps), sum(m["photos"] for m in maps)

@@ -10,17 +10,17 @@ from typing import Annotated
 
 import typer
 
-from services.cli.output import JsonOption, KeyOption, MapOption, ServerOption, explained
-from services.cli.trainer_packages import check_trainer_packages
+from services.cli.output import JsonOption, KeyOption, MapOption, ServerOption, report_errors
+from services.cli.trainer_packages import require_packages
 from shared.errors import InvalidRequest
 
-Given = dict[str, object]
+OptionValues = dict[str, object]
 
-SIZE = re.compile(r"([1-9][0-9]{1,3})[x ]([1-9][0-9]{1,3})")
+SIZE_PATTERN = re.compile(r"([1-9][0-9]{1,3})[x ]([1-9][0-9]{1,3})")
 
 
 @dataclass(frozen=True, slots=True)
-class Wanted:
+class ReportOptions:
     """Where results go and what they show."""
 
     out: Path | None
@@ -148,54 +148,54 @@ def evaluate(
     and about its labelled queries. With --data: a --checkpoint, an --extractor or a --server is
     asked about a data set.
     """
-    wanted = Wanted(out, against, pairs, depth, grids, only_wrong, faiss_gpu, as_json)
-    of_a_map: Given = {"--sample": sample, "--seed": seed, "--word-weights": word_weights}
-    of_photos: Given = {
+    wanted = ReportOptions(out, against, pairs, depth, grids, only_wrong, faiss_gpu, as_json)
+    of_a_map: OptionValues = {"--sample": sample, "--seed": seed, "--word-weights": word_weights}
+    of_photos: OptionValues = {
         "--checkpoint": checkpoint, "--extractor": extractor, "--vocabulary": vocabulary,
         "--fit-vocabulary": fit_vocabulary, "--protocol": protocol, "--rule": rule,
     }  # fmt: skip
-    of_a_file: Given = {
+    of_a_file: OptionValues = {
         "--ground-truth": ground_truth,
         "--database": database,
         "--queries": queries,
     }
-    of_results: Given = {"--out": out, "--against": against, "--pairs": pairs, "--set": sets}
-    with explained(as_json):
+    of_results: OptionValues = {"--out": out, "--against": against, "--pairs": pairs, "--set": sets}
+    with report_errors(as_json):
         # Read when torch is loaded, which is below; see services/cli/__init__.py.
         os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
         if predictions is not None:
-            _refuse("with --predictions", of_a_map | of_photos)
+            _reject_options("with --predictions", of_a_map | of_photos)
             if ground_truth is None:
                 raise InvalidRequest("no_ground_truth", "Say what is right: --ground-truth GT.npy")
-            check_trainer_packages()
+            require_packages()
             from services.cli.evaluate_predictions import evaluate_predictions
 
             evaluate_predictions(predictions, ground_truth, database, queries, data, sets, wanted)
             return
         if data is not None:
-            _refuse("with --data", of_a_map | of_a_file)
-            check_trainer_packages()
-            from services.cli.evaluate_sets import Asking, evaluate_sets
+            _reject_options("with --data", of_a_map | of_a_file)
+            require_packages()
+            from services.cli.evaluate_sets import EvaluationTarget, evaluate_sets
 
-            size = _image_size(image_size, checkpoint)
-            asking = Asking(
+            size = _parse_image_size(image_size, checkpoint)
+            asking = EvaluationTarget(
                 checkpoint, size, extractor, vocabulary, fit_vocabulary, server, map_name, key
             )
             evaluate_sets(data, sets, protocol, rule, asking, wanted)
             return
-        _refuse("without --data", of_photos | of_a_file | of_results)
+        _reject_options("without --data", of_photos | of_a_file | of_results)
         from services.cli.evaluate_map import evaluate_map
 
         evaluate_map(sample, seed, word_weights, map_name, server, key, as_json)
 
 
-def _refuse(when: str, options: Given) -> None:
+def _reject_options(context: str, options: OptionValues) -> None:
     given = [name for name, value in options.items() if value]
     if given:
-        raise InvalidRequest("options_contradict", f"{', '.join(given)}: not {when}.")
+        raise InvalidRequest("options_contradict", f"{', '.join(given)}: not {context}.")
 
 
-def _image_size(text: str, checkpoint: Path | None) -> str | tuple[int, int]:
+def _parse_image_size(text: str, checkpoint: Path | None) -> str | tuple[int, int]:
     """`same`, `native` or (height, width) of `320x320`."""
     if checkpoint is None and text != "same":
         raise InvalidRequest(
@@ -204,7 +204,7 @@ def _image_size(text: str, checkpoint: Path | None) -> str | tuple[int, int]:
         )
     if text in ("same", "native"):
         return text
-    match = SIZE.fullmatch(text)
+    match = SIZE_PATTERN.fullmatch(text)
     if match is None:
         raise InvalidRequest(
             "bad_image_size", f"--image-size {text}: same, native or HEIGHTxWIDTH is needed."

@@ -6,14 +6,14 @@ from rich.progress import Progress
 from rich.table import Column, Table
 
 from services.cli.connect import connect
-from services.cli.output import answers, print_json, progress_bar
-from services.cli.wait import wait_with_bar
+from services.cli.output import console, print_json, progress_bar
+from services.cli.wait import wait_for_job
 from shared.client import Client, Json
 from shared.errors import Conflict
-from shared.estimate.calibration import LEAST_LABELLED, LEAST_OF_A_KIND
+from shared.estimate.calibration import MIN_LABELLED_QUERIES, MIN_QUERIES_PER_CLASS
 
-SHOWN = 6  # evaluations that were asked for, this one and those before
-LOOKED_AT = 100
+MAX_EVALUATIONS_SHOWN = 6  # evaluations that were asked for, this one and those before
+EVALUATIONS_FETCHED = 100
 
 
 def evaluate_map(
@@ -31,23 +31,25 @@ def evaluate_map(
     learnt: Json | None = None
     with connect(server, map_name, key) as client, progress_bar() as progress:
         if word_weights:
-            learnt = _learn(client, given, progress)
-        job = wait_with_bar(client, client.evaluate(**given)["job_id"], progress, "asking")
-        asked_for = [e for e in client.evaluations(LOOKED_AT) if not e["automatic"]][:SHOWN]
-        vocabularies = _vocabularies(client)
+            learnt = _fit_word_weights(client, given, progress)
+        job = wait_for_job(client, client.evaluate(**given)["job_id"], progress, "asking")
+        asked_for = [e for e in client.evaluations(EVALUATIONS_FETCHED) if not e["automatic"]][
+            :MAX_EVALUATIONS_SHOWN
+        ]
+        vocabularies = _vocabulary_origins(client)
     if as_json:
         print_json({**job["result"], "word_weights": learnt} if learnt else job["result"])
         return
-    _print(asked_for, vocabularies)
+    _print_evaluations(asked_for, vocabularies)
     if learnt:
-        answers.print(
+        console.print(
             f"Word weights: {learnt['outcome']}. {learnt['reason']}",
             soft_wrap=True,
             markup=False,
         )
 
 
-def _learn(client: Client, given: dict[str, int], progress: Progress) -> Json:
+def _fit_word_weights(client: Client, parameters: dict[str, int], progress: Progress) -> Json:
     """Learn the active generation's word weights; what came of it."""
     active = [g["generation_id"] for g in client.generations() if g["state"] == "active"]
     if not active:
@@ -55,12 +57,12 @@ def _learn(client: Client, given: dict[str, int], progress: Progress) -> Json:
             "nothing_to_evaluate",
             "The map has no described photo yet. Upload some: placewise index.",
         )
-    started = client.learn_word_weights(active[0], **given)
-    result: Json = wait_with_bar(client, started["job_id"], progress, "word weights")["result"]
+    started = client.learn_word_weights(active[0], **parameters)
+    result: Json = wait_for_job(client, started["job_id"], progress, "word weights")["result"]
     return result
 
 
-def _vocabularies(client: Client) -> dict[str, str]:
+def _vocabulary_origins(client: Client) -> dict[str, str]:
     """The origin of each generation's vocabulary, by generation."""
     origins = {v["vocabulary_id"]: v["origin"] for v in client.vocabularies()}
     return {
@@ -68,7 +70,7 @@ def _vocabularies(client: Client) -> dict[str, str]:
     }
 
 
-def _print(evaluations: list[Json], vocabularies: dict[str, str]) -> None:
+def _print_evaluations(evaluations: list[Json], vocabularies: dict[str, str]) -> None:
     table = Table(
         Column("evaluated", no_wrap=True),
         "vocabulary",
@@ -78,25 +80,25 @@ def _print(evaluations: list[Json], vocabularies: dict[str, str]) -> None:
     )
     for found in evaluations:
         figures = found["figures"]
-        rows = _recalls(figures)
+        rows = _recall_rows(figures)
         # Evaluations of earlier releases don't speak of weights.
         if weighted := figures.get("with_word_weights"):
-            rows += [(f"{what}, word weights", recall) for what, recall in _recalls(weighted)]
+            rows += [(f"{what}, word weights", recall) for what, recall in _recall_rows(weighted)]
         for what, recall in rows:
             table.add_row(
                 found["evaluated_at"][5:19].replace("T", " "),
                 vocabularies.get(found["generation_id"], ""),
                 str(found["searchable"]),
                 f"{recall['queries']} {what}",
-                *(_percent(recall[f"R@{k}"]) for k in (1, 5, 10)),
+                *(_format_percent(recall[f"R@{k}"]) for k in (1, 5, 10)),
             )
-    answers.print(table)
+    console.print(table)
     figures = evaluations[0]["figures"]
     for line in _estimate_lines(figures.get("with_word_weights") or figures):
-        answers.print(line, soft_wrap=True)
+        console.print(line, soft_wrap=True)
 
 
-def _recalls(figures: Json) -> list[tuple[str, Json]]:
+def _recall_rows(figures: Json) -> list[tuple[str, Json]]:
     rows = [("own photos", figures["leave_one_out"])]
     if figures["labelled_queries"]:
         rows.append(("labelled queries", figures["labelled_queries"]))
@@ -116,22 +118,22 @@ def _estimate_lines(figures: Json) -> list[str]:
         teaching = labelled["queries"] + labelled["out_of_map"] - labelled["same_session"]
         lines.append(
             f"Confidence is uncalibrated: {teaching} labelled queries of another session are "
-            f"there, at least {LEAST_LABELLED} are needed, with {LEAST_OF_A_KIND} whose answer is "
-            f"right and {LEAST_OF_A_KIND} whose answer is wrong."
+            f"there, at least {MIN_LABELLED_QUERIES} are needed, with {MIN_QUERIES_PER_CLASS} whose answer is "
+            f"right and {MIN_QUERIES_PER_CLASS} whose answer is wrong."
         )
     lines.append(
-        f"Of {labelled['queries']} queries in the map {_percent(labelled['accepted_in_map'])} are "
-        f"accepted; of {labelled['out_of_map']} out of it {_percent(labelled['false_accepts'])}; "
-        f"of all accepted {_percent(labelled['right_of_accepted'])} are right."
+        f"Of {labelled['queries']} queries in the map {_format_percent(labelled['accepted_in_map'])} are "
+        f"accepted; of {labelled['out_of_map']} out of it {_format_percent(labelled['false_accepts'])}; "
+        f"of all accepted {_format_percent(labelled['right_of_accepted'])} are right."
     )
     if labelled["auroc"] is not None:
         lines.append(
             f"Confidence ({estimate['calibration']}, cross-validated): calibration error "
             f"{labelled['calibration_error']:.3f}, AUROC {labelled['auroc']:.3f}, recall at 99 % "
-            f"precision {_percent(labelled['recall_at_99_precision'])}."
+            f"precision {_format_percent(labelled['recall_at_99_precision'])}."
         )
     return lines
 
 
-def _percent(share: float | None) -> str:
+def _format_percent(share: float | None) -> str:
     return "-" if share is None else f"{100 * share:.1f} %"

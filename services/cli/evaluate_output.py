@@ -8,100 +8,118 @@ from pathlib import Path
 
 from rich.table import Column, Table
 
-from services.cli.evaluate import Wanted
-from services.cli.output import answers, print_json, shown
-from services.trainer.evaluation.against import compare_with
-from services.trainer.evaluation.bootstrap import Interval
-from services.trainer.evaluation.clusters import alone, clusters_of
-from services.trainer.evaluation.measure import measure
-from services.trainer.evaluation.metres import metres_of
-from services.trainer.evaluation.nearest import Ranked
-from services.trainer.evaluation.recalls import KS
-from services.trainer.evaluation.report.page import page
-from services.trainer.evaluation.result import Result, Run
-from services.trainer.evaluation.write import metrics, write_files, write_pairs
-from shared.datasets.audit import find_suspects
-from shared.datasets.published import published_on
+from services.cli.evaluate import ReportOptions
+from services.cli.output import console, print_json, printable_path
+from services.trainer.evaluation.against import compare_with_run
+from services.trainer.evaluation.bootstrap import ConfidenceInterval
+from services.trainer.evaluation.clusters import cluster_queries, singleton_clusters
+from services.trainer.evaluation.measure import compute_metrics
+from services.trainer.evaluation.metres import match_distances
+from services.trainer.evaluation.nearest import Rankings
+from services.trainer.evaluation.recalls import DEFAULT_KS
+from services.trainer.evaluation.report.page import render_report
+from services.trainer.evaluation.result import EvaluationResult, EvaluationRun
+from services.trainer.evaluation.write import build_metrics, write_pairs, write_run_files
+from shared.datasets.audit import find_suspect_labels
+from shared.datasets.published import find_published_results
 from shared.datasets.sets import EvaluationSet
 from shared.errors import Misconfigured
 
 
-def check_out(wanted: Wanted) -> None:
+def check_output_folders(options: ReportOptions) -> None:
     """Before the minutes that describing takes: whether results can be written where they are
     wanted; Misconfigured (`out_unwritable`)."""
     try:
-        if wanted.out is not None:
-            wanted.out.mkdir(parents=True, exist_ok=True)
-        if wanted.pairs is not None:
-            wanted.pairs.parent.mkdir(parents=True, exist_ok=True)
+        if options.out is not None:
+            options.out.mkdir(parents=True, exist_ok=True)
+        if options.pairs is not None:
+            options.pairs.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise _unwritable(wanted.out or wanted.pairs, error) from error
+        raise _unwritable_error(options.out or options.pairs, error) from error
 
 
-def result_of(
-    asked: EvaluationSet,
-    ranked: Ranked,
-    wanted: Wanted,
+def evaluate_rankings(
+    evaluation_set: EvaluationSet,
+    ranked: Rankings,
+    options: ReportOptions,
     *,
     has_scores: bool,
     about: dict[str, object],
-) -> Result:
+) -> EvaluationResult:
     """All figures of one set, and those against an earlier run."""
-    measured = measure(
+    measured = compute_metrics(
         ranked.indices,
-        asked.positives,
-        clusters_of(asked.queries) if asked.database else alone(len(asked.queries)),
+        evaluation_set.positives,
+        cluster_queries(evaluation_set.queries)
+        if evaluation_set.database
+        else singleton_clusters(len(evaluation_set.queries)),
         scores=ranked.scores if has_scores else None,
         metres=(
-            metres_of(asked.queries, asked.database, ranked.indices) if asked.database else None
+            match_distances(evaluation_set.queries, evaluation_set.database, ranked.indices)
+            if evaluation_set.database
+            else None
         ),
-        ks=KS,
+        ks=DEFAULT_KS,
     )
     against = None
-    if wanted.against is not None:
-        against = compare_with(
-            wanted.against, asked.name, asked.fingerprint, measured, asked.positives
+    if options.against is not None:
+        against = compare_with_run(
+            options.against,
+            evaluation_set.name,
+            evaluation_set.fingerprint,
+            measured,
+            evaluation_set.positives,
         )
-    return Result(
-        asked,
+    return EvaluationResult(
+        evaluation_set,
         ranked,
         has_scores,
         measured,
         about,
         against=against,
-        published=published_on(asked),
+        published=find_published_results(evaluation_set),
         suspects=(
-            tuple(find_suspects(asked, ranked.indices, ranked.scores if has_scores else None))
-            if asked.database
+            tuple(
+                find_suspect_labels(
+                    evaluation_set, ranked.indices, ranked.scores if has_scores else None
+                )
+            )
+            if evaluation_set.database
             else ()
         ),
     )
 
 
-def finish(run: Run, results: Sequence[Result], wanted: Wanted) -> None:
+def output_results(
+    run: EvaluationRun, results: Sequence[EvaluationResult], options: ReportOptions
+) -> None:
     """Write what is wanted, print the figures."""
     try:
-        if wanted.out is not None:
-            write_files(wanted.out, run, results)
-            report = page(run, results, grids_shown=wanted.grids, only_wrong=wanted.only_wrong)
-            (wanted.out / "report.html").write_text(report, encoding="utf-8")
-        if wanted.pairs is not None:
-            write_pairs(wanted.pairs, results)
+        if options.out is not None:
+            write_run_files(options.out, run, results)
+            report = render_report(
+                run, results, grids_shown=options.grids, only_wrong=options.only_wrong
+            )
+            (options.out / "report.html").write_text(report, encoding="utf-8")
+        if options.pairs is not None:
+            write_pairs(options.pairs, results)
     except OSError as error:
-        raise _unwritable(wanted.out or wanted.pairs, error) from error
-    if wanted.as_json:
-        found = metrics(run, results)
+        raise _unwritable_error(options.out or options.pairs, error) from error
+    if options.as_json:
+        found = build_metrics(run, results)
         if len(results) == 1:  # a program that asks about one set need not know its name
             found |= found["sets"][results[0].asked.name]
         print_json(found)
         return
     for result in results:
-        _print(result)
-    if wanted.out is not None:
-        answers.print(f"{shown(wanted.out / 'report.html')}", soft_wrap=True, markup=False)
+        _print_result(result)
+    if options.out is not None:
+        console.print(
+            f"{printable_path(options.out / 'report.html')}", soft_wrap=True, markup=False
+        )
 
 
-def _print(result: Result) -> None:
+def _print_result(result: EvaluationResult) -> None:
     asked, measured = result.asked, result.measured
     recalls = measured.recalls
     table = Table(
@@ -109,16 +127,16 @@ def _print(result: Result) -> None:
         Column(f"all {recalls.queries} queries", justify="right"),
         Column(f"{recalls.queries - recalls.without_positive} with a positive", justify="right"),
     )
-    for at, (k, share) in enumerate(recalls.of_all.items()):
+    for at, (k, share) in enumerate(recalls.recall_all.items()):
         table.add_row(
             f"R@{k}",
-            _cell(share, measured.recall_intervals, at),
-            _cell(recalls.of_findable[k], measured.findable_intervals, at),
+            _format_share(share, measured.recall_intervals, at),
+            _format_share(recalls.recall_findable[k], measured.findable_intervals, at),
         )
     mean, within = measured.mean_average_precision, measured.map_interval
-    table.add_row(f"mAP@{measured.depth}", "", _cell(mean, [within] if within else None, 0))
-    answers.print(table)
-    answers.print(
+    table.add_row(f"mAP@{measured.depth}", "", _format_share(mean, [within] if within else None, 0))
+    console.print(table)
+    console.print(
         f"Right: {asked.rule}; protocol {asked.protocol}; fingerprint {asked.fingerprint[:16]}; "
         + (
             f"95 % intervals over {measured.clusters.count} {measured.clusters.kind}."
@@ -135,7 +153,7 @@ def _print(result: Result) -> None:
                 if found.low is not None and found.high is not None
                 else ""
             )
-            answers.print(
+            console.print(
                 f"R@{k} {100 * found.mean:+.1f} points{interval} against {result.against.other}: "
                 f"{found.won} won, {found.lost} lost.",
                 soft_wrap=True,
@@ -143,13 +161,15 @@ def _print(result: Result) -> None:
             )
 
 
-def _cell(share: float, found: Sequence[Interval] | None, at: int) -> str:
+def _format_share(
+    share: float, intervals: Sequence[ConfidenceInterval] | None, position: int
+) -> str:
     if math.isnan(share):  # no query to take it of
         return "-"
-    if found is None:
+    if intervals is None:
         return f"{100 * share:.1f} %"
-    return f"{100 * share:.1f} % ({100 * found[at].low:.1f} to {100 * found[at].high:.1f})"
+    return f"{100 * share:.1f} % ({100 * intervals[position].low:.1f} to {100 * intervals[position].high:.1f})"
 
 
-def _unwritable(path: Path | None, error: OSError) -> Misconfigured:
+def _unwritable_error(path: Path | None, error: OSError) -> Misconfigured:
     return Misconfigured("out_unwritable", f"{path} can't be written: {error.strerror}.")

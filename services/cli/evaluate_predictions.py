@@ -7,18 +7,18 @@ from pathlib import Path
 
 import numpy as np
 
-from services.cli.evaluate import Wanted
-from services.cli.evaluate_output import check_out, finish, result_of
-from services.trainer.evaluation.nearest import Ranked
+from services.cli.evaluate import ReportOptions
+from services.cli.evaluate_output import check_output_folders, evaluate_rankings, output_results
+from services.trainer.evaluation.nearest import Rankings
 from services.trainer.evaluation.predictions import check_predictions, read_predictions
-from services.trainer.evaluation.result import Run
+from services.trainer.evaluation.result import EvaluationRun
 from shared.datasets.ground_truth_files import read_ground_truth
 from shared.datasets.integer_lists import read_integer_lists
-from shared.datasets.photo_lists import read_list
-from shared.datasets.sets import EvaluationSet, Shot
+from shared.datasets.photo_lists import read_photo_list
+from shared.datasets.sets import DatasetPhoto, EvaluationSet
 from shared.errors import InvalidRequest
 
-PROTOCOL = "predictions file"
+PREDICTIONS_PROTOCOL = "predictions file"
 
 
 def evaluate_predictions(
@@ -28,7 +28,7 @@ def evaluate_predictions(
     queries: Path | None,
     photos: Path | None,
     sets: Sequence[str] | None,
-    wanted: Wanted,
+    options: ReportOptions,
 ) -> None:
     """`photos` is the folder in which the lists' names are looked for; left out: that of the lists.
 
@@ -38,13 +38,13 @@ def evaluate_predictions(
         raise InvalidRequest("one_list", "Give both lists, --database and --queries, or none.")
     if sets and len(sets) > 1:
         raise InvalidRequest("which_set", "A predictions file is of one set: give --set once.")
-    check_out(wanted)
+    check_output_folders(options)
     ranked = read_predictions(predictions)
     name = sets[0] if sets else ground_truth.stem
     rule = None
-    shots: tuple[tuple[Shot, ...], tuple[Shot, ...]]
+    shots: tuple[tuple[DatasetPhoto, ...], tuple[DatasetPhoto, ...]]
     if database is not None and queries is not None:
-        shots = read_list(database, photos), read_list(queries, photos)
+        shots = read_photo_list(database, photos), read_photo_list(queries, photos)
         there, asked_for = ([shot.name for shot in role] for role in shots)
         positives, rule = read_ground_truth(ground_truth, database=there, queries=asked_for)
         check_predictions(predictions, ranked, positives, len(there))
@@ -52,7 +52,9 @@ def evaluate_predictions(
         positives = read_integer_lists(ground_truth)
         check_predictions(predictions, ranked, positives, None)
         # Nothing is known of them but their numbers.
-        numbered = tuple(Shot(Path(f"query {q}"), f"query {q}") for q in range(len(positives)))
+        numbered = tuple(
+            DatasetPhoto(Path(f"query {q}"), f"query {q}") for q in range(len(positives))
+        )
         shots = (), numbered
     asked = EvaluationSet(
         name=name,
@@ -61,10 +63,10 @@ def evaluate_predictions(
         queries=shots[1],
         positives=tuple(positives),
         rule=rule or f"given by {ground_truth.name}",
-        protocol=PROTOCOL,
+        protocol=PREDICTIONS_PROTOCOL,
     )
-    kept = ranked[:, : wanted.depth]
-    found = Ranked(kept, np.zeros(kept.shape, np.float32))
-    result = result_of(asked, found, wanted, has_scores=False, about={})
-    run = Run(predictions.stem, None, {"predictions": predictions.name})
-    finish(run, [result], wanted)
+    kept = ranked[:, : options.depth]
+    found = Rankings(kept, np.zeros(kept.shape, np.float32))
+    result = evaluate_rankings(asked, found, options, has_scores=False, about={})
+    run = EvaluationRun(predictions.stem, None, {"predictions": predictions.name})
+    output_results(run, [result], options)

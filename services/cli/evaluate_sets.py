@@ -15,23 +15,23 @@ from rich.progress import Progress
 from services.cli.configuration import read_settings
 from services.cli.describe_sets import (
     Describer,
-    describer_of_checkpoint,
-    describer_of_extractor,
+    checkpoint_describer,
+    extractor_describer,
 )
-from services.cli.evaluate import Wanted
-from services.cli.evaluate_output import check_out, finish, result_of
-from services.cli.evaluate_server import ask_server
+from services.cli.evaluate import ReportOptions
+from services.cli.evaluate_output import check_output_folders, evaluate_rankings, output_results
+from services.cli.evaluate_server import evaluate_server
 from services.cli.output import progress_bar
-from services.trainer.evaluation.recalls import KS, Told, recalls
-from services.trainer.evaluation.result import Result, Run
+from services.trainer.evaluation.recalls import DEFAULT_KS, ProgressCallback, evaluate_recall
+from services.trainer.evaluation.result import EvaluationResult, EvaluationRun
 from shared.datasets.sets import EvaluationSet, evaluation_set_names, open_evaluation_set
 from shared.errors import InvalidRequest, NotFound
-from shared.recipes import get_recipe
+from shared.recipes import get_extractor_config
 from shared.settings import Settings
 
 
 @dataclass(frozen=True, slots=True)
-class Asking:
+class EvaluationTarget:
     """Who is asked."""
 
     checkpoint: Path | None
@@ -66,79 +66,84 @@ def evaluate_sets(
     names: Sequence[str] | None,
     protocol: str | None,
     rule: str | None,
-    asking: Asking,
-    wanted: Wanted,
+    target: EvaluationTarget,
+    options: ReportOptions,
 ) -> None:
     """Evaluate the named sets below `data`, or all of them. Raises as what it calls does."""
-    asking.check()
-    check_out(wanted)
+    target.check()
+    check_output_folders(options)
     settings = read_settings()
     chosen = names or evaluation_set_names(data)
     if not chosen:
         raise NotFound("no_evaluation_set", f"{data} holds no set to evaluate on.")
     asked = [open_evaluation_set(data, n, protocol=protocol, rule=rule) for n in chosen]
-    results: list[Result] = []
-    run: Run | None = None
+    results: list[EvaluationResult] = []
+    run: EvaluationRun | None = None
     with progress_bar() as progress:
         for one in asked:
-            if asking.checkpoint is None and asking.extractor is None:
-                result, run = _by_server(one, asking, wanted, progress)
+            if target.checkpoint is None and target.extractor is None:
+                result, run = _evaluate_on_server(one, target, options, progress)
             else:
-                describer = _describer(one, asking, settings, progress)
-                result = _by_describer(one, describer, wanted, progress)
-                run = Run(describer.name, describer.fingerprint, describer.about)
+                describer = _make_describer(one, target, settings, progress)
+                result = _evaluate_describer(one, describer, options, progress)
+                run = EvaluationRun(describer.name, describer.fingerprint, describer.about)
             results.append(result)
     assert run is not None, "there is a set"
-    finish(run, results, wanted)
+    output_results(run, results, options)
 
 
-def _describer(
-    asked: EvaluationSet, asking: Asking, settings: Settings, progress: Progress
+def _make_describer(
+    evaluation_set: EvaluationSet, target: EvaluationTarget, settings: Settings, progress: Progress
 ) -> Describer:
-    if asking.checkpoint is not None:
-        return describer_of_checkpoint(asking.checkpoint, asking.image_size, settings)
-    assert asking.extractor is not None
-    recipe = get_recipe(asking.extractor, allow_test_extractors=settings.allow_test_extractors)
-    return describer_of_extractor(
+    if target.checkpoint is not None:
+        return checkpoint_describer(target.checkpoint, target.image_size, settings)
+    assert target.extractor is not None
+    recipe = get_extractor_config(
+        target.extractor, allow_test_extractors=settings.allow_test_extractors
+    )
+    return extractor_describer(
         recipe,
-        asking.vocabulary,
-        [shot.path for shot in asked.database],
+        target.vocabulary,
+        [shot.path for shot in evaluation_set.database],
         settings,
         progress,
-        fit=asking.fit_vocabulary,
+        fit=target.fit_vocabulary,
     )
 
 
-def _by_describer(
-    asked: EvaluationSet, describer: Describer, wanted: Wanted, progress: Progress
-) -> Result:
-    told = told_by(progress, asked.name)
-    describer.describe.told = lambda done, most: told("known photos", done, most)
-    found = recalls(
+def _evaluate_describer(
+    evaluation_set: EvaluationSet, describer: Describer, options: ReportOptions, progress: Progress
+) -> EvaluationResult:
+    told = progress_bars(progress, evaluation_set.name)
+    describer.describe.on_lookup = lambda done, most: told("known photos", done, most)
+    found = evaluate_recall(
         describer.describe,
-        asked,
-        ks=[*(k for k in KS if k <= wanted.depth), wanted.depth],
-        faiss_gpu=wanted.faiss_gpu,
-        told=told,
+        evaluation_set,
+        ks=[*(k for k in DEFAULT_KS if k <= options.depth), options.depth],
+        faiss_gpu=options.faiss_gpu,
+        on_progress=told,
     )
     about: dict[str, Any] = {
         "dimension": found.dimension,
         "bytes_a_photo": 4 * found.dimension,
         "describe_ms_a_photo": describer.describe.milliseconds_a_photo(),
     }
-    return result_of(asked, found.ranked, wanted, has_scores=True, about=about)
+    return evaluate_rankings(evaluation_set, found.ranked, options, has_scores=True, about=about)
 
 
-def _by_server(
-    asked: EvaluationSet, asking: Asking, wanted: Wanted, progress: Progress
-) -> tuple[Result, Run]:
-    ranked, run, about = ask_server(
-        asked, asking.server, asking.map_name, asking.key, wanted.depth, progress
+def _evaluate_on_server(
+    evaluation_set: EvaluationSet,
+    target: EvaluationTarget,
+    options: ReportOptions,
+    progress: Progress,
+) -> tuple[EvaluationResult, EvaluationRun]:
+    ranked, run, about = evaluate_server(
+        evaluation_set, target.server, target.map_name, target.key, options.depth, progress
     )
-    return result_of(asked, ranked, wanted, has_scores=True, about=about), run
+    return evaluate_rankings(evaluation_set, ranked, options, has_scores=True, about=about), run
 
 
-def told_by(progress: Progress, name: str) -> Told:
+def progress_bars(progress: Progress, name: str) -> ProgressCallback:
     """Bars for each thing that is done about a set."""
     bars: dict[str, Any] = {}
 

@@ -9,19 +9,19 @@ import typer
 
 from services.cli.connect import connect
 from services.cli.export_descriptors import export_descriptors
-from services.cli.export_geojson import write_geojson
-from services.cli.export_pairs import PairNames, write_pairs
+from services.cli.export_geojson import export_geojson
+from services.cli.export_pairs import PairNames, export_pairs
 from services.cli.output import (
     JsonOption,
     KeyOption,
     MapOption,
     ServerOption,
-    answers,
-    explained,
+    console,
     print_json,
     progress_bar,
+    report_errors,
 )
-from services.cli.whole_file import check_out, whole_or_nothing
+from services.cli.whole_file import atomic_write, check_output_path
 from shared.client import Json
 
 app = typer.Typer(help="Write a map's descriptors, pairs for hloc, or its photos as GeoJSON.")
@@ -42,10 +42,12 @@ def descriptors(
 ) -> None:
     """Write descriptors.npy (photos x dimension, float32), and photos.csv and names.txt in the
     order of its rows. np.load(..., mmap_mode="r") reads it without loading it."""
-    with explained(as_json):
+    with report_errors(as_json):
         with connect(server, map_name, key) as client, progress_bar() as progress:
             written = export_descriptors(client, out, generation, progress)
-        _say(written, as_json, f"{written['rows']} rows of {written['dimension']} dimensions")
+        _print_result(
+            written, as_json, f"{written['rows']} rows of {written['dimension']} dimensions"
+        )
 
 
 @app.command("pairs")
@@ -66,15 +68,15 @@ def pairs(
 
     Asked are the map's labelled queries; where it has none, all of its photos.
     """
-    with explained(as_json):
-        check_out(out, ".txt", "a list of pairs")
+    with report_errors(as_json):
+        check_output_path(out, ".txt", "a list of pairs")
         with (
             connect(server, map_name, key) as client,
             progress_bar() as progress,
-            whole_or_nothing(out) as file,
+            atomic_write(out) as file,
         ):
-            written = write_pairs(client, file, top_k, names, progress)
-        _say(
+            written = export_pairs(client, file, top_k, names, progress)
+        _print_result(
             {"file": str(out), **written},
             as_json,
             f"{written['pairs']} pairs of {written['asked']} photos, "
@@ -95,23 +97,23 @@ def geojson(
     as_json: JsonOption = False,
 ) -> None:
     """Write every photo with what is known of it as a GeoJSON feature (RFC 7946)."""
-    with explained(as_json):
-        check_out(out, ".geojson", "GeoJSON")
+    with report_errors(as_json):
+        check_output_path(out, ".geojson", "GeoJSON")
         with (
             connect(server, map_name, key) as client,
             progress_bar() as progress,
-            whole_or_nothing(out) as file,
+            atomic_write(out) as file,
         ):
-            written = write_geojson(client, file, estimates, progress)
-        _say(
+            written = export_geojson(client, file, estimates, progress)
+        _print_result(
             {"file": str(out), **written},
             as_json,
             f"{written['photos']} photos, {written['estimates']} estimates",
         )
 
 
-def _say(written: Json, as_json: bool, what: str) -> None:
+def _print_result(result: Json, as_json: bool, summary: str) -> None:
     if as_json:
-        print_json(written)
+        print_json(result)
     else:
-        answers.print(f"{written['file']}: {what}.", soft_wrap=True, markup=False)
+        console.print(f"{result['file']}: {summary}.", soft_wrap=True, markup=False)

@@ -11,12 +11,12 @@ from uuid import UUID
 import numpy as np
 from rich.progress import Progress
 
-from services.cli.output import shown
-from services.cli.whole_file import whole_or_nothing
+from services.cli.output import printable_path
+from services.cli.whole_file import atomic_write
 from shared.client import Client, Json
 from shared.errors import Conflict, InvalidRequest, Misconfigured
 
-FILES = ("photos.csv", "names.txt", "descriptors.npy")
+EXPORTED_FILES = ("photos.csv", "names.txt", "descriptors.npy")
 
 
 def export_descriptors(
@@ -27,7 +27,9 @@ def export_descriptors(
     Raises InvalidRequest (`bad_id`), Conflict (`nothing_described`), NotFound, Misconfigured
     (`out_unwritable`).
     """
-    chosen = _checked(generation_id) if generation_id else _active(client)
+    chosen = (
+        _validate_generation_id(generation_id) if generation_id else _active_generation_id(client)
+    )
     receiving = progress.add_task("receiving (bytes)", total=None)
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -37,25 +39,25 @@ def export_descriptors(
             )
             received.seek(0)
             with tarfile.open(fileobj=received, mode="r:") as tar:
-                for name in FILES:
+                for name in EXPORTED_FILES:
                     member = tar.extractfile(name)
                     assert member is not None, "the server sends files"
-                    with member, whole_or_nothing(out / name) as file:
+                    with member, atomic_write(out / name) as file:
                         shutil.copyfileobj(member, file)
     except OSError as error:
         raise Misconfigured(
-            "out_unwritable", f"{shown(out)} can't be written: {error.strerror}."
+            "out_unwritable", f"{printable_path(out)} can't be written: {error.strerror}."
         ) from error
     rows = np.load(out / "descriptors.npy", mmap_mode="r")
     return {
-        "file": shown(out / "descriptors.npy"),
+        "file": printable_path(out / "descriptors.npy"),
         "generation_id": chosen,
         "rows": rows.shape[0],
         "dimension": rows.shape[1],
     }
 
 
-def _active(client: Client) -> str:
+def _active_generation_id(client: Client) -> str:
     for one in client.generations():
         if one["state"] == "active":
             return str(one["generation_id"])
@@ -64,7 +66,7 @@ def _active(client: Client) -> str:
     )
 
 
-def _checked(generation_id: str) -> str:
+def _validate_generation_id(generation_id: str) -> str:
     """What is no id would be another path."""
     try:
         return str(UUID(generation_id))

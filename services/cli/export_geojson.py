@@ -10,7 +10,7 @@ from rich.progress import Progress
 from shared.client import Client, Json
 from shared.errors import Conflict
 
-PROPERTIES = (
+PHOTO_PROPERTIES = (
     "original_filename",
     "upload_time",
     "captured_at",
@@ -23,7 +23,7 @@ PROPERTIES = (
 )
 
 
-def write_geojson(client: Client, file: BinaryIO, estimates: bool, progress: Progress) -> Json:
+def export_geojson(client: Client, file: BinaryIO, estimates: bool, progress: Progress) -> Json:
     """One feature for each photo, without a geometry where it has no coordinates. With
     `estimates`, each labelled query is asked with, and its estimate is a feature of its own.
 
@@ -32,9 +32,9 @@ def write_geojson(client: Client, file: BinaryIO, estimates: bool, progress: Pro
     writing = progress.add_task("photos", total=client.stats()["total_images"])
     photos = 0
     queries: list[Json] = []
-    out = _Features(file)
+    out = _FeatureWriter(file)
     for photo in client.each("/search", "images"):
-        kept = {name: photo[name] for name in PROPERTIES}
+        kept = {name: photo[name] for name in PHOTO_PROPERTIES}
         out.add(photo["image_id"], photo, {"kind": "photo", **kept})
         photos += 1
         if estimates and photo["role"] == "query":
@@ -61,7 +61,7 @@ def write_geojson(client: Client, file: BinaryIO, estimates: bool, progress: Pro
     }
 
 
-class _Features:
+class _FeatureWriter:
     """Features, one a line, written as they come."""
 
     def __init__(self, file: BinaryIO) -> None:

@@ -17,7 +17,7 @@ class PairNames(StrEnum):
     ID = "id"
 
 
-def write_pairs(
+def export_pairs(
     client: Client, file: BinaryIO, top_k: int, names: PairNames, progress: Progress
 ) -> Json:
     """Ask with each labelled query, or with every photo where there is none.
@@ -28,7 +28,7 @@ def write_pairs(
     """
     photos = list(client.each("/search", "images"))
     if names == PairNames.FILENAME:
-        _check_names(photos)
+        _check_unique_names(photos)
     asked = [one for one in photos if one["role"] == "query"] or photos
     if not asked:
         raise Conflict("no_photos", "The map has no photos yet. Upload some: placewise index.")
@@ -43,17 +43,17 @@ def write_pairs(
             passed_over += 1
             found = []
         for match in found:
-            file.write(f"{_name(photo, names)} {_name(match, names)}\n".encode())
+            file.write(f"{_photo_name(photo, names)} {_photo_name(match, names)}\n".encode())
             pairs += 1
         progress.advance(asking)
     return {"asked": len(asked), "pairs": pairs, "passed_over": passed_over}
 
 
-def _name(photo: Json, names: PairNames) -> str:
+def _photo_name(photo: Json, names: PairNames) -> str:
     return str(photo["original_filename" if names == PairNames.FILENAME else "image_id"])
 
 
-def _check_names(photos: list[Json]) -> None:
+def _check_unique_names(photos: list[Json]) -> None:
     times = Counter(photo["original_filename"] for photo in photos)
     bad = [name for name, count in times.items() if count > 1 or name.split() != [name]]
     if bad:

@@ -7,12 +7,18 @@ from typing import Annotated
 import typer
 
 from shared.errors import InvalidRequest
-from shared.recipes import AGGREGATORS, FACETS, PREPROCESSINGS, RECIPES, with_options
+from shared.recipes import (
+    EXTRACTOR_AGGREGATORS,
+    EXTRACTOR_CONFIGS,
+    FACETS,
+    PREPROCESSING_NAMES,
+    add_extractor_options,
+)
 
 # `dinov2_vits14`, as its publisher writes it.
 BACKBONES = {
     recipe.backbone.replace("dinov2-", "dinov2_"): name
-    for name, recipe in RECIPES.items()
+    for name, recipe in EXTRACTOR_CONFIGS.items()
     if not recipe.for_tests
 }
 
@@ -20,7 +26,7 @@ PreprocessingOption = Annotated[
     str | None,
     typer.Option(
         "--preprocessing",
-        help=f"How photos are brought to size: {', '.join(PREPROCESSINGS)}; left out: the "
+        help=f"How photos are brought to size: {', '.join(PREPROCESSING_NAMES)}; left out: the "
         "extractor's own.",
     ),
 ]
@@ -35,7 +41,8 @@ FacetOption = Annotated[
 AggregatorOption = Annotated[
     str | None,
     typer.Option(
-        "--aggregator", help=f"What makes one descriptor of them: {', '.join(AGGREGATORS)}."
+        "--aggregator",
+        help=f"What makes one descriptor of them: {', '.join(EXTRACTOR_AGGREGATORS)}.",
     ),
 ]
 TemperatureOption = Annotated[
@@ -62,4 +69,4 @@ def extractor_name(
             "unknown_backbone",
             f"There is no backbone {backbone!r}. Known: {', '.join(BACKBONES)}.",
         )
-    return with_options(extractor or BACKBONES[str(backbone)], options)
+    return add_extractor_options(extractor or BACKBONES[str(backbone)], options)

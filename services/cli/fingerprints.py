@@ -15,7 +15,7 @@ from typing import Any
 
 
 @dataclass(frozen=True, slots=True)
-class Known:
+class WeightsRecord:
     """What reading or loading the weights has shown."""
 
     fingerprint: str
@@ -23,19 +23,19 @@ class Known:
     size_bytes: int
 
 
-def remembered(key: str) -> Known | None:
+def load_record(key: str) -> WeightsRecord | None:
     """What `remember` was given for that key; None when it is not known any more."""
     try:
-        return Known(**_read()[key])
+        return WeightsRecord(**_load_cache()[key])
     except (KeyError, TypeError):
         return None
 
 
-def remember(key: str, known: Known) -> None:
+def save_record(key: str, record: WeightsRecord) -> None:
     """Keep it for the next command."""
-    path = _path()
+    path = _cache_path()
     path.parent.mkdir(parents=True, exist_ok=True)
-    everything = {**_read(), key: asdict(known)}
+    everything = {**_load_cache(), key: asdict(record)}
     # Another command may be reading.
     with tempfile.NamedTemporaryFile("w", dir=path.parent, delete=False) as file:
         json.dump(everything, file, indent=1)
@@ -48,14 +48,14 @@ def file_key(extractor: str, path: Path) -> str:
     return f"{extractor} {path} {there.st_size} {there.st_mtime_ns}"
 
 
-def _read() -> dict[str, Any]:
+def _load_cache() -> dict[str, Any]:
     try:
-        found = json.loads(_path().read_text())
+        found = json.loads(_cache_path().read_text())
     except (FileNotFoundError, ValueError):
         return {}
     return found if isinstance(found, dict) else {}
 
 
-def _path() -> Path:
+def _cache_path() -> Path:
     cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     return Path(cache, "placewise", "fingerprints.json")

@@ -12,19 +12,19 @@ from rich.progress import Progress
 
 from services.cli.configuration import read_settings
 from services.cli.load_extractor import load_extractor
-from services.cli.output import shown
-from services.cli.photo_files import pixels_of
-from services.cli.photo_places import photo_paths
-from services.cli.whole_file import check_out, whole_or_nothing
+from services.cli.output import printable_path
+from services.cli.photo_files import decode_pixels
+from services.cli.photo_places import list_photos
+from services.cli.whole_file import atomic_write, check_output_path
 from shared.errors import Unprocessable
-from shared.recipes import get_recipe
-from shared.vision.fit_photos import fit_photos
-from shared.vision.patches import choose_photos
+from shared.recipes import get_extractor_config
+from shared.vision.fit_photos import fit_vocabulary
+from shared.vision.patches import sample_photos
 
-SAMPLE_PHOTOS = 1000  # as a map's fit learns from, unless told otherwise
+DEFAULT_SAMPLE_PHOTOS = 1000  # as a map's fit learns from, unless told otherwise
 
 
-def fit_folder(
+def fit_vocabulary_on_folder(
     folder: Path,
     out: Path,
     *,
@@ -40,9 +40,9 @@ def fit_folder(
     (`no_photos`, `bad_out`), Unprocessable (`no_photos`, `vocabulary_unfit`), Misconfigured
     (`out_unwritable`) and what loading the extractor raises.
     """
-    check_out(out, ".npz", "a vocabulary")
+    check_output_path(out, ".npz", "a vocabulary")
     settings = read_settings()
-    recipe = get_recipe(
+    recipe = get_extractor_config(
         extractor or settings.new_map_extractor,
         allow_test_extractors=settings.allow_test_extractors,
     )
@@ -51,25 +51,29 @@ def fit_folder(
             "vocabulary_unfit",
             f"The extractor {recipe.name} uses no vocabulary: there is nothing to fit.",
         )
-    there = photo_paths(folder)
+    there = list_photos(folder)
     loaded = load_extractor(recipe, settings)
     seed = seed or 0
-    numbers = choose_photos(len(there), sample or SAMPLE_PHOTOS, loaded.backbone.width, seed)
+    numbers = sample_photos(
+        len(there), sample or DEFAULT_SAMPLE_PHOTOS, loaded.backbone.width, seed
+    )
     photos = [there[number] for number in numbers]
     refused: list[dict[str, str]] = []
     bars = {name: progress.add_task(name, total=None) for name in ("describing", "clustering")}
-    fitted = fit_photos(
+    fitted = fit_vocabulary(
         loaded,
-        pixels_of(photos, loaded.preprocessing, settings, refused),
+        decode_pixels(photos, loaded.preprocessing, settings, refused),
         len(photos),
         clusters=clusters or recipe.clusters,
         seed=seed,
-        told=lambda what, done, most: progress.update(bars[what], completed=done, total=most),
+        on_progress=lambda what, done, most: progress.update(
+            bars[what], completed=done, total=most
+        ),
     )
-    with whole_or_nothing(out) as file:
+    with atomic_write(out) as file:
         file.write(fitted.encode())
     return {
-        "file": shown(out),
+        "file": printable_path(out),
         "clusters": fitted.centres.clusters,
         "dimension": fitted.centres.dimension,
         "provenance": fitted.provenance,

@@ -13,32 +13,32 @@ import numpy as np
 from rich.progress import Progress
 
 from services.cli.configuration import read_settings
-from services.cli.describe_files import centres_of, own_vocabulary
+from services.cli.describe_files import load_own_vocabulary, resolve_centres
 from services.cli.load_extractor import load_extractor
-from services.cli.output import shown
-from services.cli.photo_files import pixels_of
-from services.cli.photo_places import photo_paths
-from services.cli.whole_file import check_out, whole_or_nothing
+from services.cli.output import printable_path
+from services.cli.photo_files import decode_pixels
+from services.cli.photo_places import list_photos
+from services.cli.whole_file import atomic_write, check_output_path
 from shared.errors import InvalidRequest, Unprocessable
-from shared.recipes import get_recipe
+from shared.recipes import get_extractor_config
 from shared.settings import Settings
 from shared.vision.extractors import Extractor
 from shared.vision.pca import Rows
-from shared.vision.pca_file import WhiteningFile
-from shared.vision.pca_fit import check_can_fit
-from shared.vision.pca_rows import choose_rows, sample_size
-from shared.vision.pca_stream import fit_stream
-from shared.vision.vocabulary import Centres
+from shared.vision.pca_file import PcaWhiteningFile
+from shared.vision.pca_fit import check_pca_fittable
+from shared.vision.pca_rows import sample_rows, sample_size
+from shared.vision.pca_stream import fit_pca_stream
+from shared.vision.vocabulary import ClusterCentres
 
-READ_BYTES = 16_000_000  # of rows that are read together
-UNIT_WITHIN = 0.01  # of a row's length: half precision keeps three digits
+READ_BLOCK_BYTES = 16_000_000  # of rows that are read together
+UNIT_NORM_TOLERANCE = 0.01  # of a row's length: half precision keeps three digits
 SEED = 0  # which rows are learnt from, where there are more than needed
 
 
-def fit_pca_file(
+def fit_pca_locally(
     source: Path,
     out: Path,
-    kept: int,
+    components: int,
     *,
     extractor: str | None,
     vocabulary: Path | None,
@@ -51,7 +51,7 @@ def fit_pca_file(
     Misconfigured (`out_unwritable`), and for a folder what loading the extractor and its vocabulary
     raises.
     """
-    check_out(out, ".safetensors", "a whitening")
+    check_output_path(out, ".safetensors", "a whitening")
     bars = {name: progress.add_task(name, total=None) for name in ("gathering", "reducing")}
     told = lambda what, done, most: progress.update(bars[what], completed=done, total=most)  # noqa: E731
     refused: list[dict[str, str]] = []
@@ -59,32 +59,34 @@ def fit_pca_file(
     batches: Iterator[Rows]
     if source.is_dir():
         settings = read_settings()
-        loaded, centres = _load(settings, extractor, vocabulary)
+        loaded, centres = _load_extractor(settings, extractor, vocabulary)
         spec = loaded.spec(centres)
-        there = photo_paths(source)
+        there = list_photos(source)
         dimension = loaded.dimension(centres)
-        check_can_fit(len(there), dimension, kept)
-        chosen = choose_rows(len(there), sample_size(dimension, kept), SEED)
+        check_pca_fittable(len(there), dimension, components)
+        chosen = sample_rows(len(there), sample_size(dimension, components), SEED)
         photos = [there[number] for number in chosen]
-        pixels = pixels_of(photos, loaded.preprocessing, settings, refused)
+        pixels = decode_pixels(photos, loaded.preprocessing, settings, refused)
         batches = (loaded.describe(batch, centres) for batch in pixels)
     else:
         if extractor is not None or vocabulary is not None:
             raise InvalidRequest(
                 "options_contradict", "--extractor, --vocabulary: only for a fit on photos."
             )
-        rows = _open_rows(source)
+        rows = _open_row_file(source)
         dimension = rows.shape[1]
-        check_can_fit(len(rows), dimension, kept)
-        chosen = choose_rows(len(rows), sample_size(dimension, kept), SEED)
-        batches = _read(rows, chosen)
-    found = WhiteningFile(fit_stream(batches, len(chosen), dimension, kept, told), spec)
-    with whole_or_nothing(out) as file:
+        check_pca_fittable(len(rows), dimension, components)
+        chosen = sample_rows(len(rows), sample_size(dimension, components), SEED)
+        batches = _read_rows(rows, chosen)
+    found = PcaWhiteningFile(
+        fit_pca_stream(batches, len(chosen), dimension, components, told), spec
+    )
+    with atomic_write(out) as file:
         file.write(found.encode())
     return {
-        "file": shown(out),
+        "file": printable_path(out),
         "from_dimension": dimension,
-        "dimension": kept,
+        "dimension": components,
         "rows": found.whitening.rows,
         "explained": found.whitening.explained,
         "sha256": found.whitening.sha256,
@@ -92,39 +94,41 @@ def fit_pca_file(
     }
 
 
-def _load(
+def _load_extractor(
     settings: Settings, extractor: str | None, vocabulary: Path | None
-) -> tuple[Extractor, Centres | None]:
-    recipe = get_recipe(
+) -> tuple[Extractor, ClusterCentres | None]:
+    recipe = get_extractor_config(
         extractor or settings.new_map_extractor,
         allow_test_extractors=settings.allow_test_extractors,
     )
-    own = own_vocabulary(recipe, vocabulary)
+    own = load_own_vocabulary(recipe, vocabulary)
     loaded = load_extractor(recipe, settings)
-    return loaded, centres_of(loaded, own)
+    return loaded, resolve_centres(loaded, own)
 
 
-def _open_rows(file: Path) -> Rows:
+def _open_row_file(file: Path) -> Rows:
     """(n, D) descriptors, mapped from the file."""
     try:
         rows: Rows = np.load(file, mmap_mode="r", allow_pickle=False)
     except (OSError, ValueError, EOFError) as error:
-        raise InvalidRequest("bad_rows", f"{shown(file)} is no .npy file: {error}.") from error
+        raise InvalidRequest(
+            "bad_rows", f"{printable_path(file)} is no .npy file: {error}."
+        ) from error
     if not isinstance(rows, np.ndarray) or rows.ndim != 2 or rows.dtype.kind != "f":
         raise InvalidRequest(
             "bad_rows",
-            f"{shown(file)} does not hold rows of floating point numbers, one for each photo, as "
+            f"{printable_path(file)} does not hold rows of floating point numbers, one for each photo, as "
             "`placewise describe` writes them.",
         )
     return rows
 
 
-def _read(rows: Rows, chosen: Any) -> Iterator[Rows]:
-    at_once = max(1, READ_BYTES // (4 * rows.shape[1]))
+def _read_rows(rows: Rows, chosen: Any) -> Iterator[Rows]:
+    at_once = max(1, READ_BLOCK_BYTES // (4 * rows.shape[1]))
     for begin in range(0, len(chosen), at_once):
         batch = rows[chosen[begin : begin + at_once]].astype(np.float32)
         lengths = np.linalg.norm(batch, axis=1)
-        wrong = (lengths > 0) & (np.abs(lengths - 1) > UNIT_WITHIN)
+        wrong = (lengths > 0) & (np.abs(lengths - 1) > UNIT_NORM_TOLERANCE)
         if wrong.any():
             at = int(np.flatnonzero(wrong)[0])
             raise Unprocessable(

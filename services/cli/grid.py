@@ -9,12 +9,12 @@ from typing import Annotated, Any
 import typer
 from rich.table import Table
 
-from services.cli.output import JsonOption, answers, explained, messages, print_json
-from services.cli.train import NEEDED, STOPPED
+from services.cli.output import JsonOption, console, err_console, print_json, report_errors
+from services.cli.train import EXIT_INTERRUPTED, TRAINING_PACKAGES
 from services.cli.train_display import TerminalDisplay
-from services.cli.train_options import chosen, with_training_options
-from services.cli.trainer_packages import check_trainer_packages
-from services.trainer.configuration import known_keys
+from services.cli.train_options import given_options, with_training_options
+from services.cli.trainer_packages import require_packages
+from services.trainer.configuration import resolve_keys
 
 
 @with_training_options
@@ -32,53 +32,57 @@ def grid(
     Runs that are finished stay as they are, an interrupted one goes on, one that fails is named
     and the others are made. Options of `placewise train` override every run's.
     """
-    with explained(as_json):
-        check_trainer_packages(*NEEDED)
-        overrides = known_keys(chosen(arguments), "the command line")
-        failed = _grid(file, out, dry_run, as_json, overrides)
+    with report_errors(as_json):
+        require_packages(*TRAINING_PACKAGES)
+        overrides = resolve_keys(given_options(arguments), "the command line")
+        failed = _run_grid_command(file, out, dry_run, as_json, overrides)
     if failed:
         raise typer.Exit(1)
 
 
-def _grid(file: Path, out: Path, dry_run: bool, as_json: bool, overrides: dict[str, Any]) -> int:
+def _run_grid_command(
+    file: Path, out: Path, dry_run: bool, as_json: bool, overrides: dict[str, Any]
+) -> int:
     from services.trainer import run
-    from services.trainer.grid import Outcome, State, Trainer, outcome_of, run_grid
-    from services.trainer.grid_plan import read_plan
+    from services.trainer.grid import RunFunctions, RunOutcome, RunState, load_outcome, run_grid
+    from services.trainer.grid_plan import load_grid_plan
     from services.trainer.leaderboard import leaderboard, write_leaderboard
     from services.trainer.stop import RunStopped, StopRequest
 
-    plan = read_plan(file, overrides)
+    plan = load_grid_plan(file, overrides)
     if dry_run:
-        there = [outcome_of(planned, out) for planned in plan.runs]
-        _show([{"run": o.run.name, "state": str(o.state), **_texts(o.run.arguments)}
+        there = [load_outcome(planned, out) for planned in plan.runs]
+        _print_rows([{"run": o.run.name, "state": str(o.state), **_to_strings(o.run.arguments)}
                for o in there], as_json)  # fmt: skip
         return 0
 
-    def write(outcomes: list[Outcome]) -> None:
+    def write(outcomes: list[RunOutcome]) -> None:
         out.mkdir(parents=True, exist_ok=True)
         write_leaderboard(leaderboard(plan, outcomes), out)
 
-    with TerminalDisplay() as display, StopRequest().listening() as stop:
+    with TerminalDisplay() as display, StopRequest().handle_signals() as stop:
         try:
-            trainer = Trainer(run.run, run.resume)
+            trainer = RunFunctions(run.run, run.resume)
             outcomes = run_grid(plan, out, trainer, display, stop, write)
         except RunStopped as stopped:
-            messages.print("Stopped. The same command goes on where the grid is.", soft_wrap=True)
-            raise typer.Exit(STOPPED) from stopped
+            err_console.print(
+                "Stopped. The same command goes on where the grid is.", soft_wrap=True
+            )
+            raise typer.Exit(EXIT_INTERRUPTED) from stopped
     write(outcomes)
     if as_json:
         print_json([asdict(outcome) for outcome in outcomes])
     else:
-        _show(leaderboard(plan, outcomes), False)
-        answers.print(f"Written: {out}/leaderboard.csv and {out}/leaderboard.md", markup=False)
-    return sum(outcome.state is not State.FINISHED for outcome in outcomes)
+        _print_rows(leaderboard(plan, outcomes), False)
+        console.print(f"Written: {out}/leaderboard.csv and {out}/leaderboard.md", markup=False)
+    return sum(outcome.state is not RunState.FINISHED for outcome in outcomes)
 
 
-def _texts(arguments: dict[str, Any]) -> dict[str, str]:
+def _to_strings(arguments: dict[str, Any]) -> dict[str, str]:
     return {name: str(value) for name, value in arguments.items()}
 
 
-def _show(rows: list[dict[str, str]], as_json: bool) -> None:
+def _print_rows(rows: list[dict[str, str]], as_json: bool) -> None:
     if as_json:
         print_json(rows)
         return
@@ -89,4 +93,4 @@ def _show(rows: list[dict[str, str]], as_json: bool) -> None:
     table = Table(*columns)
     for row in rows:
         table.add_row(*(row.get(column, "") for column in columns))
-    answers.print(table)
+    console.print(table)

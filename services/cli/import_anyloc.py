@@ -9,20 +9,20 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
-from services.cli.anyloc_folder import AnylocFolder, read_folder
+from services.cli.anyloc_folder import AnylocFolder, read_anyloc_folder
 from services.cli.connect import connect
 from services.cli.output import (
     JsonOption,
     KeyOption,
     MapOption,
     ServerOption,
-    explained,
-    messages,
-    print_faults,
+    err_console,
+    print_failures,
     print_json,
     progress_bar,
+    report_errors,
 )
-from services.cli.upload_many import FitOption, UpdateOption, upload_many
+from services.cli.upload_many import FitOption, UpdateOption, upload_photos
 from shared.client import Json
 
 DESCRIPTORS_NOTE = (
@@ -64,19 +64,21 @@ def import_anyloc(
 
     Its folder is only read. Run it again after an interruption: nothing is stored twice.
     """
-    with explained(as_json):
-        found = read_folder(folder, database, uploads)
+    with report_errors(as_json):
+        found = read_anyloc_folder(folder, database, uploads)
         with connect(server, map_name, key) as client, progress_bar() as progress:
-            report = _report(found, upload_many(client, found.photos, fit, progress, update=update))
+            report = _build_report(
+                found, upload_photos(client, found.photos, fit, progress, update=update)
+            )
         if as_json:
             print_json(report)
         else:
-            _print(report)
+            _print_report(report)
         if report["refused"] or report["failed"] or report["missing"]:
             raise typer.Exit(1)
 
 
-def _report(found: AnylocFolder, uploaded: Json) -> Json:
+def _build_report(found: AnylocFolder, uploaded: Json) -> Json:
     return {
         "database": str(found.database),
         "rows": found.rows,
@@ -108,19 +110,19 @@ def _vocabulary_note(found: AnylocFolder) -> list[str]:
     ]
 
 
-def _print(report: Json) -> None:
+def _print_report(report: Json) -> None:
     for note in report["notes"]:
-        messages.print(escape(note), soft_wrap=True)
-    messages.print(
+        err_console.print(escape(note), soft_wrap=True)
+    err_console.print(
         f"{report['rows']} rows: {report['imported']} photos imported, {report['already_there']} "
         f"were there already, {len(report['duplicates'])} the same as another, "
         f"{len(report['missing'])} missing, {len(report['refused'])} refused. "
         f"{report['unlisted']} of the photos were in no row.",
         soft_wrap=True,
     )
-    messages.print(
+    err_console.print(
         f"{report['searchable']} photos are searchable in the map "
         f"(vocabulary: {report['vocabulary']})."
     )
-    print_faults(report, "missing", "duplicates", "refused", "failed")
-    messages.print(f"Ask: {sys.argv[0]} query PHOTO")
+    print_failures(report, "missing", "duplicates", "refused", "failed")
+    err_console.print(f"Ask: {sys.argv[0]} query PHOTO")

@@ -14,28 +14,28 @@ import typer
 
 from services.cli.configuration import read_settings
 from services.cli.connect import connect
-from services.cli.journal import Journal
+from services.cli.journal import UploadJournal
 from services.cli.output import (
     JsonOption,
     KeyOption,
     MapOption,
     ServerOption,
-    explained,
-    messages,
-    print_faults,
+    err_console,
+    print_failures,
     print_json,
     progress_bar,
+    report_errors,
 )
-from services.cli.photo_places import FoundPhoto, find_photos, photos_of_manifest
+from services.cli.photo_places import LocalPhoto, find_photos, read_photo_manifest
 from services.cli.upload_batch import (
     check_archive,
     import_keys,
     import_prefix,
-    names_keys,
+    manifest_has_keys,
     upload_archive,
 )
-from services.cli.upload_many import FitOption, UpdateOption, upload_many
-from services.cli.whole_file import check_out, whole_or_nothing
+from services.cli.upload_many import FitOption, UpdateOption, upload_photos
+from services.cli.whole_file import atomic_write, check_output_path
 from shared.catalog.photos import PhotoRole
 from shared.client import Json
 from shared.errors import InvalidRequest
@@ -108,12 +108,12 @@ def index(
         "--role": role != PhotoRole.DATABASE,
     }
     of_server = {**only_folder, "--update": update, "--journal": journal}
-    with explained(as_json):
+    with report_errors(as_json):
         if failures is not None:
-            check_out(failures, ".jsonl", "a list of failures")
+            check_output_path(failures, ".jsonl", "a list of failures")
         path = Path(source)
         if source.startswith("s3://"):
-            _refuse_options("a bucket's prefix", of_server)
+            _reject_options("a bucket's prefix", of_server)
             with connect(server, map_name, key) as client, progress_bar() as progress:
                 report = import_prefix(client, source, fit, progress)
         elif path.is_dir():
@@ -122,29 +122,29 @@ def index(
                 photos = [replace(p, fields={**p.fields, "role": role}) for p in photos]
             # Labelled queries teach no vocabulary: they must not start a fit either.
             learns = fit and role == PhotoRole.DATABASE
-            report = _upload(photos, learns, update, journal, server, map_name, key)
+            report = _upload_photos(photos, learns, update, journal, server, map_name, key)
         elif path.suffix == ".jsonl":
-            _refuse_options("a list", only_folder)
-            data = _read(path)
-            if names_keys(data):
-                _refuse_options("a list of keys", of_server)
+            _reject_options("a list", only_folder)
+            data = _read_manifest(path)
+            if manifest_has_keys(data):
+                _reject_options("a list of keys", of_server)
                 with connect(server, map_name, key) as client, progress_bar() as progress:
                     report = import_keys(client, data, fit, progress)
             else:
-                photos = photos_of_manifest(path, data)
-                report = _upload(photos, fit, update, journal, server, map_name, key)
+                photos = read_photo_manifest(path, data)
+                report = _upload_photos(photos, fit, update, journal, server, map_name, key)
         else:
             check_archive(path)
-            _refuse_options("an archive", of_server)
+            _reject_options("an archive", of_server)
             with connect(server, map_name, key) as client, progress_bar() as progress:
                 report = upload_archive(client, path, fit, progress)
         if failures is not None:
             _write_failures(failures, report)
-        _end(report, map_name, role, as_json)
+        _finish_command(report, map_name, role, as_json)
 
 
-def _upload(
-    photos: list[FoundPhoto],
+def _upload_photos(
+    photos: list[LocalPhoto],
     fit: bool,
     update: bool,
     journal: Path | None,
@@ -159,11 +159,11 @@ def _upload(
     ):
         # A server that a command starts for itself has another port each time.
         url = server or str(read_settings().placewise_home.resolve())
-        written = opened.enter_context(Journal(journal, url, map_name)) if journal else None
-        return upload_many(client, photos, fit, progress, update=update, journal=written)
+        written = opened.enter_context(UploadJournal(journal, url, map_name)) if journal else None
+        return upload_photos(client, photos, fit, progress, update=update, journal=written)
 
 
-def _read(manifest: Path) -> bytes:
+def _read_manifest(manifest: Path) -> bytes:
     try:
         return manifest.read_bytes()
     except OSError as error:
@@ -172,7 +172,7 @@ def _read(manifest: Path) -> bytes:
         ) from error
 
 
-def _refuse_options(what: str, given: Mapping[str, object]) -> None:
+def _reject_options(what: str, given: Mapping[str, object]) -> None:
     """InvalidRequest (`not_for_archives`): what the server reads itself takes no options."""
     if wrong := [name for name, value in given.items() if value]:
         raise InvalidRequest(
@@ -184,29 +184,29 @@ def _refuse_options(what: str, given: Mapping[str, object]) -> None:
 
 def _write_failures(out: Path, report: Json) -> None:
     """One JSON object a line: `outcome`, `path`, `reason`; an empty file where there is none."""
-    with whole_or_nothing(out) as file:
+    with atomic_write(out) as file:
         for outcome in ("refused", "failed"):
             for item in report[outcome]:
                 file.write(json.dumps({"outcome": outcome, **item}).encode() + b"\n")
 
 
-def _end(report: Json, map_name: str | None, role: PhotoRole, as_json: bool) -> None:
+def _finish_command(report: Json, map_name: str | None, role: PhotoRole, as_json: bool) -> None:
     if as_json:
         print_json(report)
     else:
-        _print(report, map_name, role)
+        _print_report(report, map_name, role)
     if report["refused"] or report["failed"]:
         raise typer.Exit(1)
 
 
-def _print(report: Json, map_name: str | None, role: PhotoRole) -> None:
-    messages.print(
+def _print_report(report: Json, map_name: str | None, role: PhotoRole) -> None:
+    err_console.print(
         f"{report['photos']} photos looked at, {report['already_there']} were there already, "
         f"{report['searchable']} searchable in the map (vocabulary: {report['vocabulary']}).",
         soft_wrap=True,
     )
-    print_faults(report, "refused", "failed")
+    print_failures(report, "refused", "failed")
     named = f" --map {map_name}" if map_name else ""
     what = "Ask" if role == PhotoRole.DATABASE else "Evaluate"
     does = "query PHOTO" if role == PhotoRole.DATABASE else "evaluate"
-    messages.print(f"{what}: {sys.argv[0]} {does}{named}", soft_wrap=True)
+    err_console.print(f"{what}: {sys.argv[0]} {does}{named}", soft_wrap=True)

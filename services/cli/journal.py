@@ -8,22 +8,22 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from services.cli.output import shown
-from services.cli.photo_places import FoundPhoto
+from services.cli.output import printable_path
+from services.cli.photo_places import LocalPhoto
 from shared.errors import InvalidRequest, Misconfigured
 
-FORMAT = 1
+JOURNAL_FORMAT = 1
 
 
 @dataclass(frozen=True, slots=True)
-class Acknowledged:
+class JournalEntry:
     """A photo that the server has taken."""
 
     file_id: str
     job_id: str | None
 
 
-class Journal:
+class UploadJournal:
     """One line for each photo that was taken, written when the server has said so.
 
     A photo counts as done if its file has the size and the time of last change that it had then,
@@ -34,7 +34,7 @@ class Journal:
     def __init__(self, path: Path, url: str, map_name: str | None) -> None:
         self._path = path
         self._done: dict[str, dict[str, Any]] = {}
-        about = {"placewise_journal": FORMAT, "server": url, "map": map_name}
+        about = {"placewise_journal": JOURNAL_FORMAT, "server": url, "map": map_name}
         try:
             text = path.read_text() if path.exists() else ""
             self._read(text, about)
@@ -45,7 +45,7 @@ class Journal:
                 self._file.write("\n")  # after a line that was cut off
         except (OSError, UnicodeDecodeError) as error:
             raise Misconfigured(
-                "out_unwritable", f"The journal {shown(path)} can't be used: {error}."
+                "out_unwritable", f"The journal {printable_path(path)} can't be used: {error}."
             ) from error
 
     def __enter__(self) -> Self:
@@ -59,18 +59,18 @@ class Journal:
     ) -> None:
         self._file.close()
 
-    def done(self, photo: FoundPhoto) -> Acknowledged | None:
+    def done(self, photo: LocalPhoto) -> JournalEntry | None:
         """What the server has answered, if the photo was taken as it is now."""
-        line = self._done.get(shown(photo.path))
-        if line is None or line["state"] != _state(photo):
+        line = self._done.get(printable_path(photo.path))
+        if line is None or line["state"] != _file_state(photo):
             return None  # a file that is gone says so when it is sent
-        return Acknowledged(line["file_id"], line["job_id"])
+        return JournalEntry(line["file_id"], line["job_id"])
 
-    def add(self, photo: FoundPhoto, acknowledged: Acknowledged) -> None:
+    def add(self, photo: LocalPhoto, acknowledged: JournalEntry) -> None:
         self._write(
             {
-                "path": shown(photo.path),
-                "state": _state(photo),
+                "path": printable_path(photo.path),
+                "state": _file_state(photo),
                 "file_id": acknowledged.file_id,
                 "job_id": acknowledged.job_id,
             }
@@ -92,12 +92,12 @@ class Journal:
         if not lines or lines[0] != about:
             raise InvalidRequest(
                 "bad_journal",
-                f"{shown(self._path)} is no journal of this server and map. Name another file.",
+                f"{printable_path(self._path)} is no journal of this server and map. Name another file.",
             )
         self._done = {line["path"]: line for line in lines[1:]}
 
 
-def _state(photo: FoundPhoto) -> list[Any]:
+def _file_state(photo: LocalPhoto) -> list[Any]:
     """What makes the photo another one, as JSON."""
     try:
         about = photo.path.stat()

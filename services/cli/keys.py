@@ -15,20 +15,27 @@ import typer
 from rich.table import Table
 
 from services.cli.configuration import read_settings
-from services.cli.output import JsonOption, KeyOption, ServerOption, answers, explained, print_json
+from services.cli.output import (
+    JsonOption,
+    KeyOption,
+    ServerOption,
+    console,
+    print_json,
+    report_errors,
+)
 from shared.api_keys import Scope
-from shared.catalog.keys import ApiKey, KeyLimits, list_keys, make_key, revoke_key
+from shared.catalog.keys import ApiKey, KeyLimits, create_api_key, list_api_keys, revoke_api_key
 from shared.catalog.open_catalog import open_catalog
 from shared.catalog.schema import wait_for_schema
 from shared.catalog.session import Catalog
 from shared.client import Client, Json
 from shared.errors import Conflict, NotFound
-from shared.telemetry.logs import set_up_logs
+from shared.telemetry.logs import configure_logging
 
 app = typer.Typer(help="Keys of the HTTP API: who may call, what, and how much.")
 
-DAY_SECONDS = 86_400.0
-SHOWN = (
+SECONDS_PER_DAY = 86_400.0
+KEY_FIELDS = (
     "id",
     "name",
     "prefix",
@@ -61,7 +68,7 @@ def create(
 ) -> None:
     """Make a key and print it, this once. Limits that are left out are those of the settings."""
     limits = KeyLimits(requests_per_minute, upload_bytes_per_day, max_photos)
-    with explained(as_json):
+    with report_errors(as_json):
         if server:
             with Client(server, key=key) as client:
                 made = client.create_key(
@@ -73,12 +80,12 @@ def create(
                     max_photos=max_photos,
                 )
         else:
-            life_seconds = None if days is None else days * DAY_SECONDS
-            with _catalog() as catalog, catalog.write() as session:
-                row, new = make_key(
+            life_seconds = None if days is None else days * SECONDS_PER_DAY
+            with _open_catalog() as catalog, catalog.write() as session:
+                row, new = create_api_key(
                     session, name, set(scope), life_seconds=life_seconds, limits=limits
                 )
-                made = {**_shown(row), "key": new}
+                made = {**_key_as_json(row), "key": new}
         if as_json:
             print_json(made)
             return
@@ -90,13 +97,13 @@ def create(
 @app.command("list")
 def list_(server: ServerOption = None, key: KeyOption = None, as_json: JsonOption = False) -> None:
     """Show every key that was ever made, without the keys themselves."""
-    with explained(as_json):
+    with report_errors(as_json):
         if server:
             with Client(server, key=key) as client:
                 found = client.keys()
         else:
-            with _catalog() as catalog, catalog.read() as session:
-                found = [_shown(row) for row in list_keys(session)]
+            with _open_catalog() as catalog, catalog.read() as session:
+                found = [_key_as_json(row) for row in list_api_keys(session)]
         if as_json:
             print_json(found)
             return
@@ -108,9 +115,9 @@ def list_(server: ServerOption = None, key: KeyOption = None, as_json: JsonOptio
                 ", ".join(one["scopes"]),
                 one["created_at"][:10],
                 (one["last_used_at"] or "never")[:16],
-                _state(one),
+                _key_status(one),
             )
-        answers.print(table)
+        console.print(table)
 
 
 @app.command("revoke")
@@ -121,24 +128,24 @@ def revoke(
     as_json: JsonOption = False,
 ) -> None:
     """Let a key open nothing from now on."""
-    with explained(as_json):
+    with report_errors(as_json):
         if server:
             with Client(server, key=key) as client:
-                revoked = client.revoke_key(_id_of(which, client.keys()))
+                revoked = client.revoke_key(_resolve_key_id(which, client.keys()))
         else:
-            with _catalog() as catalog, catalog.write() as session:
-                there = [_shown(row) for row in list_keys(session)]
-                revoked = _shown(revoke_key(session, UUID(_id_of(which, there))))
+            with _open_catalog() as catalog, catalog.write() as session:
+                there = [_key_as_json(row) for row in list_api_keys(session)]
+                revoked = _key_as_json(revoke_api_key(session, UUID(_resolve_key_id(which, there))))
         if as_json:
             print_json(revoked)
             return
-        answers.print(f"The key {revoked['prefix']}... ({revoked['name']}) opens nothing any more.")
+        console.print(f"The key {revoked['prefix']}... ({revoked['name']}) opens nothing any more.")
 
 
 @contextlib.contextmanager
-def _catalog() -> Iterator[Catalog]:
+def _open_catalog() -> Iterator[Catalog]:
     settings = read_settings()
-    set_up_logs(settings, "keys")
+    configure_logging(settings, "keys")
     catalog = open_catalog(settings, "keys")
     try:
         wait_for_schema(catalog, 0)
@@ -147,25 +154,25 @@ def _catalog() -> Iterator[Catalog]:
         catalog.close()
 
 
-def _id_of(which: str, there: list[Json]) -> str:
+def _resolve_key_id(id_or_prefix: str, keys: list[Json]) -> str:
     """NotFound (`key_not_found`), Conflict (`key_ambiguous`)."""
-    wanted = which.removesuffix("...")
-    found = [one["id"] for one in there if wanted in (one["id"], one["prefix"])]
+    wanted = id_or_prefix.removesuffix("...")
+    found = [one["id"] for one in keys if wanted in (one["id"], one["prefix"])]
     if not found:
-        raise NotFound("key_not_found", f"There is no key {which!r}: placewise keys list.")
+        raise NotFound("key_not_found", f"There is no key {id_or_prefix!r}: placewise keys list.")
     if len(found) > 1:
         raise Conflict("key_ambiguous", f"Several keys begin with {wanted}: give the id instead.")
     return str(found[0])
 
 
-def _shown(row: ApiKey) -> Json:
+def _key_as_json(row: ApiKey) -> Json:
     """As the API answers it."""
-    shown = {name: getattr(row, name) for name in SHOWN}
+    shown = {name: getattr(row, name) for name in KEY_FIELDS}
     times = {name: value and value.isoformat() for name, value in shown.items() if "_at" in name}
     return {**shown, "id": str(row.id), **times}
 
 
-def _state(key: Json) -> str:
+def _key_status(key: Json) -> str:
     if key["revoked_at"]:
         return f"revoked {key['revoked_at'][:10]}"
     return f"until {key['expires_at'][:10]}" if key["expires_at"] else "good"

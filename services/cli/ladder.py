@@ -15,69 +15,69 @@ from numpy.typing import NDArray
 from PIL import Image
 from rich.progress import Progress
 
-from services.cli.weigh_rows import learn_weights, weigh_rows
-from shared.datasets.city.plan import Plan, Shot
-from shared.datasets.recall import rank, recall_at, true_positives
-from shared.datasets.weak_baselines import WEAK_BASELINES
+from services.cli.weigh_rows import fit_and_apply_word_weights, fit_word_weights
+from shared.datasets.city.plan import CityPlan, PlannedPhoto
+from shared.datasets.recall import positives_within, rank_by_similarity, recall_at_k
+from shared.datasets.weak_baselines import BASELINE_DESCRIPTORS
 
-KS = (1, 5, 10)
+BASELINE_KS = (1, 5, 10)
 
 Rows = NDArray[np.float32]
 
 
-def climb(plan: Plan, out: Path, progress: Progress) -> list[dict[str, Any]]:
+def evaluate_baselines(plan: CityPlan, out: Path, progress: Progress) -> list[dict[str, Any]]:
     """Each rung's name and recalls over the queries on the map, weakest first.
 
     `recall` is over all of them; `recall_in_map` and `recall_other_way` over the two kinds, the
     latter None where there is none.
     """
-    database = [shot for shot in plan.shots if shot.role == "database"]
-    queries = [s for s in plan.shots if s.role == "query" and s.kind != "out_of_map"]
+    database = [shot for shot in plan.photos if shot.role == "database"]
+    queries = [s for s in plan.photos if s.role == "query" and s.kind != "out_of_map"]
     if not queries:
         return []
-    positives = true_positives(_positions(queries), _positions(database))
+    positives = positives_within(_positions(queries), _positions(database))
     other_way = np.array([shot.kind == "other_way" for shot in queries])
     rungs = []
-    described = _described(
+    described = _describe_photos(
         [out / s.folder / s.name for s in database + queries], len(database), progress
     )
-    for name, asked, rows in _with_word_weights(*described, [shot.name for shot in database]):
-        ranked = rank(asked, rows, max(KS))
+    for name, asked, rows in _add_word_weighted(*described, [shot.name for shot in database]):
+        ranked = rank_by_similarity(asked, rows, max(BASELINE_KS))
         rungs.append(
             {
                 "rung": name,
-                "recall": _shares(ranked, positives, np.ones(len(queries), bool)),
-                "recall_in_map": _shares(ranked, positives, ~other_way),
-                "recall_other_way": _shares(ranked, positives, other_way),
+                "recall": _recall_shares(ranked, positives, np.ones(len(queries), bool)),
+                "recall_in_map": _recall_shares(ranked, positives, ~other_way),
+                "recall_other_way": _recall_shares(ranked, positives, other_way),
             }
         )
     return rungs
 
 
-def _described(
+def _describe_photos(
     paths: Sequence[Path], database: int, progress: Progress
 ) -> tuple[list[tuple[str, Rows]], dict[str, int]]:
     """(photos, D) unit rows by each rung, and the words of those that have a vocabulary; the first
     `database` paths may be learnt from."""
-    from services.cli.network_rungs import NetworkRungs  # torch takes seconds
+    from services.cli.network_rungs import NetworkBaselines  # torch takes seconds
 
     bar = progress.add_task("ladder: no network", total=len(paths))
-    weak: dict[str, list[Rows]] = {name: [] for name in WEAK_BASELINES}
+    weak: dict[str, list[Rows]] = {name: [] for name in BASELINE_DESCRIPTORS}
     for path in paths:
         with Image.open(path) as image:
             photo = image.convert("RGB")
-        for name, describe in WEAK_BASELINES.items():
+        for name, describe in BASELINE_DESCRIPTORS.items():
             weak[name].append(describe(photo))
         progress.advance(bar)
     found = [(name, np.stack(rows)) for name, rows in weak.items()]
     bar = progress.add_task("ladder: networks", total=len(paths))
     advance: Callable[[int], None] = lambda count: progress.advance(bar, count)  # noqa: E731
-    networks = NetworkRungs(paths[:database])
+    networks = NetworkBaselines(paths[:database])
     found += networks.describe(paths, advance).items()
     return found, networks.words
 
 
-def _with_word_weights(
+def _add_word_weighted(
     described: Sequence[tuple[str, Rows]], words: Mapping[str, int], names: Sequence[str]
 ) -> list[tuple[str, Rows, Rows]]:
     """(rung, queries, database rows); after each rung with so many words one more, whose queries
@@ -87,20 +87,24 @@ def _with_word_weights(
     for name, rows in described:
         database, queries = rows[: len(names)], rows[len(names) :]
         found.append((name, queries, database))
-        weights = learn_weights(database, names, words[name]) if name in words else None
+        weights = fit_word_weights(database, names, words[name]) if name in words else None
         if weights is not None:
-            found.append((f"{name}, word weights", weigh_rows(queries, weights), database))
+            found.append(
+                (f"{name}, word weights", fit_and_apply_word_weights(queries, weights), database)
+            )
     return found
 
 
-def _positions(shots: Sequence[Shot]) -> NDArray[np.float64]:
+def _positions(shots: Sequence[PlannedPhoto]) -> NDArray[np.float64]:
     return np.array([(shot.camera.x, shot.camera.y) for shot in shots])
 
 
-def _shares(
-    ranked: NDArray[np.int64], positives: list[NDArray[np.int64]], which: NDArray[np.bool_]
+def _recall_shares(
+    ranked: NDArray[np.int64], positives: list[NDArray[np.int64]], selected: NDArray[np.bool_]
 ) -> dict[str, float] | None:
-    if not which.any():
+    if not selected.any():
         return None
-    chosen = [found for found, meant in zip(positives, which, strict=True) if meant]
-    return {str(k): share for k, share in recall_at(ranked[which], chosen, KS).items()}
+    chosen = [found for found, meant in zip(positives, selected, strict=True) if meant]
+    return {
+        str(k): share for k, share in recall_at_k(ranked[selected], chosen, BASELINE_KS).items()
+    }

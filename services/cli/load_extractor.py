@@ -10,20 +10,20 @@ import contextlib
 import torch
 from sqlalchemy.exc import SQLAlchemyError
 
-from services.extractor.added_models import AddedModels
-from shared.catalog.away import as_unavailable
+from services.extractor.added_models import AddedModelLoader
+from shared.catalog.away import to_unavailable
 from shared.catalog.open_catalog import open_catalog
 from shared.catalog.schema import check_schema
 from shared.errors import Misconfigured
 from shared.objects.open_store import open_store
-from shared.recipes import Recipe
+from shared.recipes import ExtractorConfig
 from shared.settings import Settings
 from shared.vision.backbones import Backbone
 from shared.vision.extractors import Extractor, choose_device
 from shared.vision.precision import choose_precision
 
 
-def load_extractor(recipe: Recipe, settings: Settings) -> Extractor:
+def load_extractor(recipe: ExtractorConfig, settings: Settings) -> Extractor:
     """On the device and in the precision that the settings say; raises what loading it does, and as
     `_added_backbone`.
     """
@@ -37,7 +37,9 @@ def load_extractor(recipe: Recipe, settings: Settings) -> Extractor:
     )
 
 
-def _added_backbone(recipe: Recipe, settings: Settings, device: torch.device) -> Backbone | None:
+def _added_backbone(
+    recipe: ExtractorConfig, settings: Settings, device: torch.device
+) -> Backbone | None:
     """The model that the recipe names, from the catalog and the store of the settings, which a
     server may be using; None for an extractor that is no added model.
 
@@ -58,10 +60,10 @@ def _added_backbone(recipe: Recipe, settings: Settings, device: torch.device) ->
     with contextlib.closing(open_catalog(settings, "describe")) as catalog:
         try:
             check_schema(catalog)
-            store = open_store(settings, alone=False)
-            return AddedModels(catalog, store, settings).load(name, device)
+            store = open_store(settings, exclusive=False)
+            return AddedModelLoader(catalog, store, settings).load(name, device)
         except SQLAlchemyError as error:
-            unavailable = as_unavailable(error)
+            unavailable = to_unavailable(error)
             if unavailable is None:
                 raise
             raise unavailable from error

@@ -43,7 +43,7 @@ COMMANDS = {
 }
 
 
-def tree(names: Collection[str] = COMMANDS.keys()) -> typer.Typer:
+def build_app(names: Collection[str] = COMMANDS.keys()) -> typer.Typer:
     """The commands of these names. Each brings libraries that the others can do without."""
     app = typer.Typer(
         name="placewise",
@@ -52,7 +52,7 @@ def tree(names: Collection[str] = COMMANDS.keys()) -> typer.Typer:
         pretty_exceptions_enable=False,
         add_completion=False,
     )
-    app.callback()(_placewise)
+    app.callback()(_root_callback)
     for name in names:
         module, attribute = COMMANDS[name]
         command = getattr(importlib.import_module(f"services.cli.{module}"), attribute)
@@ -70,8 +70,8 @@ def run() -> None:
     )
     asked = sys.argv[1:2]
     # What is no command is answered by the whole tree: the help, or what was meant.
-    tree(asked if asked and asked[0] in COMMANDS else COMMANDS.keys())()
+    build_app(asked if asked and asked[0] in COMMANDS else COMMANDS.keys())()
 
 
-def _placewise() -> None:
+def _root_callback() -> None:
     """Makes a tree of one command a tree, too."""

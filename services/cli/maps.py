@@ -14,18 +14,18 @@ from services.cli.output import (
     JsonOption,
     KeyOption,
     ServerOption,
-    answers,
-    explained,
+    console,
     print_json,
     progress_bar,
+    report_errors,
 )
-from services.cli.wait import wait_with_bar
+from services.cli.wait import wait_for_job
 from shared.client import Json
 from shared.errors import Conflict
 
 app = typer.Typer(help="Named databases of photos, each with its own extractor and vocabulary.")
 
-Name = Annotated[str, typer.Argument(metavar="NAME")]
+MapName = Annotated[str, typer.Argument(metavar="NAME")]
 
 
 @app.command("list")
@@ -33,7 +33,7 @@ def list_maps(
     server: ServerOption = None, key: KeyOption = None, as_json: JsonOption = False
 ) -> None:
     """Show every map."""
-    with explained(as_json):
+    with report_errors(as_json):
         with connect(server, None, key) as client:
             found = client.maps()
         if as_json:
@@ -49,12 +49,12 @@ def list_maps(
                 str(map_["labelled_queries"]),
                 map_["extractor"],
                 map_["vocabulary"] or "",
-                _dimension(map_),
+                _format_dimension(map_),
             )
-        answers.print(table)
+        console.print(table)
 
 
-def _dimension(map_: Json) -> str:
+def _format_dimension(map_: Json) -> str:
     if map_["dimension"] is None:
         return ""
     whole = "" if map_["pca_from"] is None else f" (PCA of {map_['pca_from']})"
@@ -63,7 +63,7 @@ def _dimension(map_: Json) -> str:
 
 @app.command("create")
 def create(
-    name: Name,
+    name: MapName,
     extractor: Annotated[
         str | None, typer.Option(help="How its photos are described; left out: as configured.")
     ] = None,
@@ -73,7 +73,7 @@ def create(
     as_json: JsonOption = False,
 ) -> None:
     """Make an empty map."""
-    with explained(as_json):
+    with report_errors(as_json):
         if preprocessing is not None:
             extractor = extractor_name(extractor, None, preprocessing=preprocessing)
         with connect(server, None, key) as client:
@@ -81,12 +81,12 @@ def create(
         if as_json:
             print_json(made)
             return
-        answers.print(f"The map {name} is there, for photos described by {made['extractor']}.")
+        console.print(f"The map {name} is there, for photos described by {made['extractor']}.")
 
 
 @app.command("switch")
 def switch(
-    name: Name,
+    name: MapName,
     extractor: Annotated[
         str, typer.Option("--extractor", help="By name: gsv:NAME of a model that was added, say.")
     ],
@@ -101,15 +101,15 @@ def switch(
     as_json: JsonOption = False,
 ) -> None:
     """Describe a map's photos with another extractor; search goes on, and switches at the end."""
-    with explained(as_json):
+    with report_errors(as_json):
         with connect(server, name, key) as client, progress_bar() as progress:
             started = client.start_generation(extractor=extractor, vocabulary_id=vocabulary)
-            job = wait_with_bar(client, started["job_id"], progress, "switching")
+            job = wait_for_job(client, started["job_id"], progress, "switching")
         if as_json:
             print_json(job)
             return
         result = job["result"]
-        answers.print(
+        console.print(
             f"The map {name} is described by {extractor}: {result['photos']} photos, "
             f"{result['dimension']} dimensions, {result['failed']} failed.",
             soft_wrap=True,
@@ -119,14 +119,14 @@ def switch(
 
 @app.command("delete")
 def delete(
-    name: Name,
+    name: MapName,
     yes: Annotated[bool, typer.Option("--yes", help="Don't ask.")] = False,
     server: ServerOption = None,
     key: KeyOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Delete a map with all its photos."""
-    with explained(as_json):
+    with report_errors(as_json):
         with connect(server, None, key) as client:
             photos = next((m["photos"] for m in client.maps() if m["name"] == name), None)
             if photos and not yes and not sys.stdin.isatty():
@@ -140,4 +140,4 @@ def delete(
         if as_json:
             print_json(deleted)
             return
-        answers.print(deleted["message"])
+        console.print(deleted["message"])

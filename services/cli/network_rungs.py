@@ -13,26 +13,26 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch.nn.functional import normalize
 
-from shared.recipes import RECIPES
+from shared.recipes import EXTRACTOR_CONFIGS
 from shared.vision.backbones.base import normalise_pixels
 from shared.vision.backbones.efficientnet_lite0 import MEAN, STD
 from shared.vision.extractors import Extractor, choose_device
-from shared.vision.fit_photos import fit_photos
-from shared.vision.patches import choose_photos
-from shared.vision.pca import Projection
-from shared.vision.pca_fit import fit
-from shared.vision.pca_rows import choose_rows, sample_size
+from shared.vision.fit_photos import fit_vocabulary
+from shared.vision.patches import sample_photos
+from shared.vision.pca import PcaProjection
+from shared.vision.pca_fit import fit_pca
+from shared.vision.pca_rows import sample_rows, sample_size
 from shared.vision.vlad import vlad
 
 EXTRACTOR = "efficientnet-lite0-vlad"
-BATCH = 16
-FIT_PHOTOS = 300
+BATCH_PHOTOS = 16
+FIT_SAMPLE_PHOTOS = 300
 SEED = 0
 
 Rows = NDArray[np.float32]
 
 
-class NetworkRungs:
+class NetworkBaselines:
     """Describes photos with an untrained network and with the default extractor twice, and shortens
     the last rows by PCA whitening.
     """
@@ -42,7 +42,7 @@ class NetworkRungs:
         f"{EXTRACTOR}, shipped vocabulary",
         f"{EXTRACTOR}, fitted vocabulary",
     )
-    reduced = (512, 256, 128)
+    pca_dimensions = (512, 256, 128)
     """Dimensions, as far as there are enough database photos."""
 
     def __init__(self, database: Sequence[Path]) -> None:
@@ -50,7 +50,7 @@ class NetworkRungs:
         are the first that `describe` is given.
         """
         self._database = len(database)
-        self.extractor = Extractor(RECIPES[EXTRACTOR], choose_device("auto"))
+        self.extractor = Extractor(EXTRACTOR_CONFIGS[EXTRACTOR], choose_device("auto"))
         device = self.extractor.backbone.device
         torch.manual_seed(SEED)
         self._untrained = timm.create_model(
@@ -69,9 +69,11 @@ class NetworkRungs:
 
     def _fit(self, database: Sequence[Path]) -> torch.Tensor:
         """(clusters, width) centres, learnt as a map learns its own."""
-        chosen = choose_photos(len(database), FIT_PHOTOS, self.extractor.backbone.width, SEED)
+        chosen = sample_photos(
+            len(database), FIT_SAMPLE_PHOTOS, self.extractor.backbone.width, SEED
+        )
         photos = [database[number] for number in chosen]
-        fitted = fit_photos(
+        fitted = fit_vocabulary(
             self.extractor,
             (list(pixels) for pixels in self._batches(photos)),
             len(photos),
@@ -95,16 +97,16 @@ class NetworkRungs:
                 rows[name].append(batch.cpu().numpy())
             advance(len(pixels))
         found = {name: np.concatenate(parts) for name, parts in rows.items()}
-        return found | self._reduced(found[self.names[-1]])
+        return found | self._whitened_rows(found[self.names[-1]])
 
-    def _reduced(self, rows: Rows) -> dict[str, Rows]:
+    def _whitened_rows(self, rows: Rows) -> dict[str, Rows]:
         """The rows, whitened as a map whitens its own."""
         shorter = {}
-        for kept in self.reduced:
+        for kept in self.pca_dimensions:
             if self._database > kept:
                 size = sample_size(rows.shape[1], kept)
-                found = fit(rows[choose_rows(self._database, size, SEED)], kept)
-                projection = Projection(found, self.extractor.backbone.device)
+                found = fit_pca(rows[sample_rows(self._database, size, SEED)], kept)
+                projection = PcaProjection(found, self.extractor.backbone.device)
                 shorter[f"{self.names[-1]}, PCA to {kept}"] = projection.project(rows)
         return shorter
 
@@ -121,11 +123,11 @@ class NetworkRungs:
                 return np.asarray(self.extractor.preprocessing.apply(image.convert("RGB")))
 
         def read_batch(start: int) -> NDArray[np.uint8]:
-            return np.stack([read(path) for path in paths[start : start + BATCH]])
+            return np.stack([read(path) for path in paths[start : start + BATCH_PHOTOS]])
 
         with ThreadPoolExecutor(1) as reader:  # the next batch is decoded beside the network
             pending = None
-            for start in range(0, len(paths), BATCH):
+            for start in range(0, len(paths), BATCH_PHOTOS):
                 upcoming = reader.submit(read_batch, start)
                 if pending is not None:
                     yield pending.result()

@@ -24,8 +24,8 @@ from rich.progress import (
 from shared.errors import PlacewiseError
 
 # Progress and messages go to stderr: stdout is the answer, and can be piped.
-messages = Console(stderr=True, highlight=False)
-answers = Console(highlight=False)
+err_console = Console(stderr=True, highlight=False)
+console = Console(highlight=False)
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the answer as JSON.")]
 MapOption = Annotated[str | None, typer.Option("--map", help="The map that is meant.")]
@@ -49,7 +49,7 @@ KeyOption = Annotated[
 ]
 
 
-def shown(path: Path) -> str:
+def printable_path(path: Path) -> str:
     """The path as text that can be printed, also where it is not UTF-8."""
     return os.fsencode(path).decode("utf-8", "replace")
 
@@ -59,7 +59,7 @@ def print_json(value: Any) -> None:
 
 
 @contextlib.contextmanager
-def explained(as_json: bool) -> Iterator[None]:
+def report_errors(as_json: bool) -> Iterator[None]:
     """Turn an error that can be explained into one line and exit code 1."""
     try:
         yield
@@ -78,9 +78,9 @@ def _database_problem(error: Exception) -> PlacewiseError | None:
     """The explanation of a failure of the catalog; None for every other error."""
     if "sqlalchemy" not in sys.modules:
         return None
-    from shared.catalog.away import as_unavailable  # most commands do without a database
+    from shared.catalog.away import to_unavailable  # most commands do without a database
 
-    return as_unavailable(error)
+    return to_unavailable(error)
 
 
 def _print_error(error: PlacewiseError, as_json: bool) -> None:
@@ -88,7 +88,7 @@ def _print_error(error: PlacewiseError, as_json: bool) -> None:
         print_json(error.as_problem())
     else:
         # What went wrong is no markup: a file's name may hold brackets.
-        messages.print(f"[red]{error.code}[/red]: {escape(error.detail)}", soft_wrap=True)
+        err_console.print(f"[red]{error.code}[/red]: {escape(error.detail)}", soft_wrap=True)
 
 
 def progress_bar() -> Progress:
@@ -98,18 +98,18 @@ def progress_bar() -> Progress:
         BarColumn(),
         MofNCompleteColumn(),
         TimeElapsedColumn(),
-        console=messages,
+        console=err_console,
     )
 
 
-def print_faults(report: dict[str, Any], *words: str) -> None:
+def print_failures(report: dict[str, Any], *words: str) -> None:
     """What is listed under each of the words, with its reason."""
     for word in words:
         if report[word]:
-            messages.print(f"{len(report[word])} {word}:")
+            err_console.print(f"{len(report[word])} {word}:")
         for item in report[word]:
             name = f" ({item['filename']})" if "filename" in item else ""
-            messages.print(
+            err_console.print(
                 f"[red]{word}[/red] {escape(item['path'] + name)}: {escape(item['reason'])}",
                 soft_wrap=True,
             )

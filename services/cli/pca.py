@@ -13,16 +13,16 @@ from services.cli.output import (
     KeyOption,
     MapOption,
     ServerOption,
-    answers,
-    explained,
-    print_faults,
+    console,
+    print_failures,
     print_json,
     progress_bar,
+    report_errors,
 )
-from services.cli.wait import wait_with_bar
+from services.cli.wait import wait_for_job
 from shared.client import Json
 from shared.errors import Conflict, InvalidRequest
-from shared.recipes import MOST_PCA
+from shared.recipes import MAX_PCA_DIMENSION
 
 app = typer.Typer(help="PCA whitening: shorter descriptors, less memory, faster search.")
 
@@ -39,7 +39,8 @@ def fit(
         ),
     ] = None,
     dimension: Annotated[
-        int, typer.Option("--dimension", min=1, max=MOST_PCA, help="Of the descriptors then.")
+        int,
+        typer.Option("--dimension", min=1, max=MAX_PCA_DIMENSION, help="Of the descriptors then."),
     ] = 512,
     out: Annotated[
         Path | None,
@@ -60,7 +61,7 @@ def fit(
 
     With ROWS.npy or DIR: write a file that `describe --pca` takes.
     """
-    with explained(as_json):
+    with report_errors(as_json):
         if source is not None:
             _fit_file(source, out, dimension, extractor, vocabulary, map_name, as_json)
             return
@@ -71,8 +72,8 @@ def fit(
             )
         with connect(server, map_name, key) as client, progress_bar() as progress:
             started = client.start_generation(pca=dimension)
-            job = wait_with_bar(client, started["job_id"], progress, "pca")
-        _print_change(job, as_json)
+            job = wait_for_job(client, started["job_id"], progress, "pca")
+        _print_generation(job, as_json)
 
 
 @app.command("undo")
@@ -83,14 +84,14 @@ def undo(
     as_json: JsonOption = False,
 ) -> None:
     """Describe the map's photos anew without PCA, with the vocabulary that they had, switch."""
-    with explained(as_json):
+    with report_errors(as_json):
         with connect(server, map_name, key) as client, progress_bar() as progress:
             active = next((g for g in client.generations() if g["state"] == "active"), None)
             if active is None or active["pca_from"] is None:
                 raise Conflict("not_reduced", "The map's descriptors are whole: nothing to undo.")
             started = client.start_generation(vocabulary_id=active["vocabulary_id"])
-            job = wait_with_bar(client, started["job_id"], progress, "whole descriptors")
-        _print_change(job, as_json)
+            job = wait_for_job(client, started["job_id"], progress, "whole descriptors")
+        _print_generation(job, as_json)
 
 
 def _fit_file(
@@ -107,33 +108,33 @@ def _fit_file(
         raise InvalidRequest("options_contradict", "--map: only for a fit on a map's descriptors.")
     if out is None:
         raise InvalidRequest("bad_out", "Say where to write: --out FILE.safetensors")
-    from services.cli.fit_pca_file import fit_pca_file  # torch takes seconds
+    from services.cli.fit_pca_file import fit_pca_locally  # torch takes seconds
 
     with progress_bar() as progress:
-        fitted = fit_pca_file(
+        fitted = fit_pca_locally(
             source, out, dimension, extractor=extractor, vocabulary=vocabulary, progress=progress
         )
     if as_json:
         print_json(fitted)
         return
-    print_faults(fitted, "refused")
-    answers.print(f"{fitted['file']}: {_in_words(fitted)}.", soft_wrap=True, markup=False)
+    print_failures(fitted, "refused")
+    console.print(f"{fitted['file']}: {_format_pca(fitted)}.", soft_wrap=True, markup=False)
 
 
-def _print_change(job: Json, as_json: bool) -> None:
+def _print_generation(job: Json, as_json: bool) -> None:
     if as_json:
         print_json(job)
         return
     result = job["result"]
     about = f"{result['dimension']} dimensions"
-    answers.print(
+    console.print(
         f"Generation {result['generation_id']} answers: {result['photos']} photos, "
-        f"{_in_words(result['pca']) if result['pca'] else about}, {result['failed']} failed.",
+        f"{_format_pca(result['pca']) if result['pca'] else about}, {result['failed']} failed.",
         soft_wrap=True,
     )
 
 
-def _in_words(pca: Json) -> str:
+def _format_pca(pca: Json) -> str:
     return (
         f"{pca['dimension']} of {pca['from_dimension']} dimensions with {pca['explained']:.1%} of "
         f"the variance of {pca['rows']} rows"

@@ -9,39 +9,39 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from services.cli.output import shown
+from services.cli.output import printable_path
 from services.extractor.decoding import DecoderPool
 from shared.errors import InvalidRequest, PlacewiseError
 from shared.settings import Settings
-from shared.vision.decode import Decoded
+from shared.vision.decode import DecodedPhoto
 from shared.vision.preprocessing import Preprocessing
 from shared.vision.resample import Pixels
 
-Outcome = Decoded | PlacewiseError
+DecodeOutcome = DecodedPhoto | PlacewiseError
 
 
-def decoded_batches(
+def decode_batches(
     photos: Sequence[Path],
     preprocessing: Preprocessing,
     settings: Settings,
     seconds: defaultdict[str, float],
-) -> Iterator[list[tuple[Path, Outcome]]]:
+) -> Iterator[list[tuple[Path, DecodeOutcome]]]:
     """Batches in the order of the photos; the next one is read while this one is described.
 
     What that takes is added to `seconds["decode"]`. Where a photo can't be had, that says why.
     """
     decoders = DecoderPool(settings)
 
-    def read(begin: int) -> list[tuple[Path, Outcome]]:
+    def read(begin: int) -> list[tuple[Path, DecodeOutcome]]:
         begun = time.perf_counter()
         chosen = photos[begin : begin + settings.batch_photos]
-        contents = [_content(photo) for photo in chosen]
+        contents = [_read_photo(photo) for photo in chosen]
         outcomes = iter(
             decoders.decode(
                 [content for content in contents if isinstance(content, bytes)], preprocessing
             )
         )
-        found: list[tuple[Path, Outcome]] = [
+        found: list[tuple[Path, DecodeOutcome]] = [
             (photo, next(outcomes) if isinstance(content, bytes) else content)
             for photo, content in zip(chosen, contents, strict=True)
         ]
@@ -57,7 +57,7 @@ def decoded_batches(
         yield ahead.result()
 
 
-def pixels_of(
+def decode_pixels(
     photos: Sequence[Path],
     preprocessing: Preprocessing,
     settings: Settings,
@@ -65,18 +65,18 @@ def pixels_of(
 ) -> Iterator[list[Pixels]]:
     """Batches of pixels (height, width, 3) in the order of the photos; of those that can't be had,
     path and reason join `refused`."""
-    for batch in decoded_batches(photos, preprocessing, settings, defaultdict(float)):
+    for batch in decode_batches(photos, preprocessing, settings, defaultdict(float)):
         pixels = []
         for path, outcome in batch:
             if isinstance(outcome, PlacewiseError):
-                refused.append({"path": shown(path), "reason": outcome.detail})
+                refused.append({"path": printable_path(path), "reason": outcome.detail})
             else:
                 pixels.append(outcome.pixels)
         if pixels:
             yield pixels
 
 
-def _content(photo: Path) -> bytes | PlacewiseError:
+def _read_photo(photo: Path) -> bytes | PlacewiseError:
     try:
         return photo.read_bytes()
     except OSError as error:

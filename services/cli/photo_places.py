@@ -8,14 +8,19 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from shared.datasets.utm_names import fields_of_name
+from shared.datasets.utm_names import upload_fields_of_file_name
 from shared.errors import InvalidRequest
-from shared.intake.manifest import MOST_NAMED, bad_lines, read_csv, read_jsonl
+from shared.intake.manifest import (
+    MAX_REPORTED_LINES,
+    bad_lines_error,
+    read_csv_manifest,
+    read_jsonl_manifest,
+)
 from shared.photo_formats import PHOTO_SUFFIXES
 
 
 @dataclass(frozen=True, slots=True)
-class FoundPhoto:
+class LocalPhoto:
     path: Path
     fields: dict[str, str]
     """What is said of it, in the upload form's names."""
@@ -25,7 +30,7 @@ class FoundPhoto:
 
 def find_photos(
     folder: Path, table: Path | None, utm_zone: str | None, *, places_by_folder: bool = False
-) -> list[FoundPhoto]:
+) -> list[LocalPhoto]:
     """Every photo below the folder, in the order of the paths, with what is said of it.
 
     With `places_by_folder`, the name of the folder that a photo lies in is its place, unless the
@@ -34,37 +39,39 @@ def find_photos(
     Raises InvalidRequest for a table that names a photo that is not there, and for coordinates
     that can't be read.
     """
-    paths = photo_paths(folder)
-    said = _read_table(folder, table, set(paths)) if table else {}
+    paths = list_photos(folder)
+    said = _read_csv_fields(folder, table, set(paths)) if table else {}
     found = []
     for path in paths:
-        fields = fields_of_name(path.name, utm_zone)
+        fields = upload_fields_of_file_name(path.name, utm_zone)
         if places_by_folder and path.parent != folder:
             fields["place"] = path.parent.name
-        found.append(FoundPhoto(path, {**fields, **said.get(path, {})}))
+        found.append(LocalPhoto(path, {**fields, **said.get(path, {})}))
     return found
 
 
-def photos_of_manifest(manifest: Path, data: bytes) -> list[FoundPhoto]:
+def read_photo_manifest(manifest: Path, data: bytes) -> list[LocalPhoto]:
     """The photos that the lines of a JSONL manifest name, relative to where it lies.
 
     Raises InvalidRequest (`bad_manifest`), also for a photo that is not there.
     """
     found = []
     missing = []
-    for line in read_jsonl(data, str(manifest)):
+    for line in read_jsonl_manifest(data, str(manifest)):
         path = manifest.parent / line.name
         if not path.is_file():
             missing.append((line.line, f"there is no photo {path}"))
-        found.append(FoundPhoto(path, {**fields_of_name(path.name, None), **line.fields}))
+        found.append(
+            LocalPhoto(path, {**upload_fields_of_file_name(path.name, None), **line.fields})
+        )
     if missing:
-        raise bad_lines("bad_manifest", str(manifest), missing[:MOST_NAMED])
+        raise bad_lines_error("bad_manifest", str(manifest), missing[:MAX_REPORTED_LINES])
     if not found:
         raise InvalidRequest("no_photos", f"{manifest} has no line.")
     return found
 
 
-def photo_paths(folder: Path) -> list[Path]:
+def list_photos(folder: Path) -> list[Path]:
     """Every photo below the folder, in order; InvalidRequest (`no_photos`) where there is none."""
     paths = sorted(
         path
@@ -81,15 +88,17 @@ def photo_paths(folder: Path) -> list[Path]:
     return paths
 
 
-def _read_table(folder: Path, table: Path, paths: set[Path]) -> dict[Path, dict[str, str]]:
+def _read_csv_fields(folder: Path, table: Path, paths: set[Path]) -> dict[Path, dict[str, str]]:
     try:
         data = table.read_bytes()
     except OSError as error:
         raise InvalidRequest("bad_table", f"Can't read {table}: {error}") from error
     said = {}
-    for row in read_csv(data, str(table)):
+    for row in read_csv_manifest(data, str(table)):
         path = folder / row.name
         if path not in paths:
-            raise bad_lines("bad_table", str(table), [(row.line, f"there is no photo {path}")])
+            raise bad_lines_error(
+                "bad_table", str(table), [(row.line, f"there is no photo {path}")]
+            )
         said[path] = row.fields
     return said

@@ -8,11 +8,11 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-DATASET = "global_descriptor"  # as hloc names it
+HLOC_DATASET = "global_descriptor"  # as hloc names it
 
 
 @contextlib.contextmanager
-def open_rows(
+def open_descriptor_writer(
     file: BinaryIO, shape: tuple[int, int], names: Sequence[str] | None
 ) -> Iterator[Callable[[Any], None]]:
     """What takes the next (b, D) rows, until all (n, D) of `shape` are there.
@@ -25,7 +25,7 @@ def open_rows(
         np.lib.format.write_array_header_1_0(
             file, {"descr": "<f4", "fortran_order": False, "shape": shape}
         )
-        yield lambda rows: _append(file, rows)
+        yield lambda rows: _append_rows(file, rows)
         return
     import h5py  # of the extra `trainer`: rows alone need it not
 
@@ -35,10 +35,10 @@ def open_rows(
         def write(rows: Any) -> None:
             for row in rows:
                 group = features.create_group(next(left))
-                group.create_dataset(DATASET, data=np.asarray(row, np.float32))
+                group.create_dataset(HLOC_DATASET, data=np.asarray(row, np.float32))
 
         yield write
 
 
-def _append(file: BinaryIO, rows: Any) -> None:
+def _append_rows(file: BinaryIO, rows: Any) -> None:
     file.write(np.ascontiguousarray(rows, "<f4").tobytes())

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from services.cli.configuration import read_settings
-from services.cli.output import explained, messages
-from shared.telemetry.logs import set_up_logs
-from shared.telemetry.traces import set_up_traces
+from services.cli.output import err_console, report_errors
+from shared.telemetry.logs import configure_logging
+from shared.telemetry.traces import configure_tracing
 
 
 def search() -> None:
@@ -14,24 +14,26 @@ def search() -> None:
     DATABASE_URL is the catalog that it follows. It asks for no key: let only the gateway and the
     steward reach it, which find it by SEARCH_URLS.
     """
-    with explained(as_json=False):
+    with report_errors(as_json=False):
         settings = read_settings()
         # Imported only here: the other commands need no server.
-        from services.search.server import search_service
-        from shared.catalog.installation import open_own_store
+        from services.search.server import run_search_service
+        from shared.catalog.installation import open_installation_store
         from shared.catalog.open_catalog import open_catalog
         from shared.catalog.schema import wait_for_schema
 
-        set_up_logs(settings, "search")
+        configure_logging(settings, "search")
         catalog = open_catalog(settings, "search")
         try:
             wait_for_schema(catalog, settings.schema_wait_seconds)
-            store = open_own_store(catalog, settings, alone=False)  # others write there meanwhile
+            store = open_installation_store(
+                catalog, settings, exclusive=False
+            )  # others write there meanwhile
             with (
-                set_up_traces(settings, "search"),
-                search_service(settings, catalog, store) as running,
+                configure_tracing(settings, "search"),
+                run_search_service(settings, catalog, store) as running,
             ):
-                messages.print(
+                err_console.print(
                     f"Placewise search serves shard {settings.shard} on {running.url}\n"
                     f"  look:     {running.url}/readyz   {running.url}/metrics",
                     soft_wrap=True,

@@ -6,11 +6,11 @@ import sys
 from typing import TYPE_CHECKING
 
 from services.cli.configuration import read_settings
-from services.cli.output import explained, messages
+from services.cli.output import err_console, report_errors
 from shared.api_keys import is_loopback
 from shared.settings import Settings
-from shared.telemetry.logs import set_up_logs
-from shared.telemetry.traces import set_up_traces
+from shared.telemetry.logs import configure_logging
+from shared.telemetry.traces import configure_tracing
 
 if TYPE_CHECKING:
     from services.standalone import Standalone
@@ -22,22 +22,22 @@ def serve() -> None:
     Where HOST is not loopback, every call needs a key: the first start makes and prints an
     admin's, and `placewise keys` makes others.
     """
-    with explained(as_json=False):
+    with report_errors(as_json=False):
         settings = read_settings()
-        from services.standalone import standalone  # brings torch, as `connect` says
+        from services.standalone import run_standalone  # brings torch, as `connect` says
 
-        set_up_logs(settings, "embedded")
-        with set_up_traces(settings, "embedded"), standalone(settings) as running:
-            messages.print(_welcome(running, settings), soft_wrap=True)
+        configure_logging(settings, "embedded")
+        with configure_tracing(settings, "embedded"), run_standalone(settings) as running:
+            err_console.print(_startup_message(running, settings), soft_wrap=True)
             running.serve()
 
 
-def _welcome(running: Standalone, settings: Settings) -> str:
+def _startup_message(running: Standalone, settings: Settings) -> str:
     command, url = sys.argv[0], running.url
     header = '-H "Authorization: Bearer $PLACEWISE_KEY" ' if running.local_key else ""
     lines = [
         f"Placewise serves {settings.placewise_home} on {url}",
-        *_about_the_key(running, settings, command),
+        *_key_instructions(running, settings, command),
         f"  look:     {url}   (the page)   {url}/docs   (the API)",
         (
             f"  put in:   curl {header}-F file=@PHOTO.jpg -F latitude=45.07 -F longitude=7.69 "
@@ -52,14 +52,14 @@ def _welcome(running: Standalone, settings: Settings) -> str:
     return "\n".join(lines)
 
 
-def _about_the_key(running: Standalone, settings: Settings, command: str) -> list[str]:
+def _key_instructions(running: Standalone, settings: Settings, command: str) -> list[str]:
     if running.local_key is None:
         return []
     lines = []
     if not is_loopback(settings.host):
         lines.append(f"  open to:  whoever reaches {settings.host} and has a key")
-    if running.made_key is not None:
-        lines.append(f"  key:      export PLACEWISE_KEY={running.made_key}")
+    if running.first_admin_key is not None:
+        lines.append(f"  key:      export PLACEWISE_KEY={running.first_admin_key}")
         lines.append("            It is shown this once; every call needs one.")
     elif settings.admin_key is not None:
         lines.append("  key:      the one in ADMIN_KEY, or one of placewise keys list")

@@ -8,7 +8,7 @@ from datetime import UTC, datetime
 from sqlalchemy import select, text
 from sqlalchemy.exc import SQLAlchemyError
 
-from shared.catalog.away import as_unavailable
+from shared.catalog.away import to_unavailable
 from shared.catalog.base import db_now
 from shared.catalog.open_catalog import open_catalog
 from shared.catalog.schema import check_schema
@@ -16,28 +16,28 @@ from shared.errors import Misconfigured, Unavailable
 from shared.ids import new_id
 from shared.settings import Settings
 
-LEAST_POSTGRES = 140000  # server_version_num
-LEAST_REDIS = (6, 2)
+MIN_POSTGRES_VERSION = 140000  # server_version_num
+MIN_REDIS_VERSION = (6, 2)
 # Signatures of S3 are refused from 900 s on; ages of objects are compared with the catalog's clock.
-MOST_SKEW_SECONDS = 60.0
+MAX_CLOCK_SKEW_SECONDS = 60.0
 PROBE_BYTES = b"placewise doctor"
 
 
-def postgres_check(settings: Settings) -> str:
+def check_postgres(settings: Settings) -> str:
     """Does it answer, is it new enough, are its tables those of this release, what time is it?"""
     catalog = open_catalog(settings, "doctor")
     try:
         with catalog.read() as session:
             number = int(session.scalar(text("SHOW server_version_num")) or 0)
             now = session.execute(select(db_now())).scalar_one()
-        if number < LEAST_POSTGRES:
+        if number < MIN_POSTGRES_VERSION:
             raise Misconfigured(
                 "postgres_too_old",
                 f"PostgreSQL is {number // 10000}, and 14 or newer is needed: upgrade it.",
             )
         check_schema(catalog)
     except SQLAlchemyError as error:
-        raise as_unavailable(error) or Misconfigured(
+        raise to_unavailable(error) or Misconfigured(
             "catalog_unreadable",
             f"PostgreSQL refuses ({type(error).__name__}): check DATABASE_URL, and what its user "
             "may do.",
@@ -45,14 +45,14 @@ def postgres_check(settings: Settings) -> str:
     finally:
         catalog.close()
     skew = (datetime.now(UTC) - now).total_seconds()
-    _check_skew("PostgreSQL", skew)
+    _check_clock_skew("PostgreSQL", skew)
     return (
         f"PostgreSQL {number // 10000}.{number % 10000}, tables up to date, "
         f"its clock {abs(skew):.1f} s from this machine's"
     )
 
 
-def redis_check(settings: Settings) -> str:
+def check_redis(settings: Settings) -> str:
     """Does it answer, and does it keep what it is given?"""
     if settings.redis_url is None:
         raise Misconfigured(
@@ -77,7 +77,7 @@ def redis_check(settings: Settings) -> str:
         except RedisError:  # some providers let nobody look at it
             found = {}
     version = str(said["redis_version"])
-    if tuple(int(part) for part in version.split(".")[:2]) < LEAST_REDIS:
+    if tuple(int(part) for part in version.split(".")[:2]) < MIN_REDIS_VERSION:
         raise Misconfigured("redis_too_old", f"Redis is {version}, and 6.2 or newer is needed.")
     policy = found.get("maxmemory-policy", "unknown")
     if policy not in ("noeviction", "unknown"):
@@ -89,11 +89,11 @@ def redis_check(settings: Settings) -> str:
     return f"Redis {version} answers, and {said_of}"
 
 
-def objects_check(settings: Settings) -> str:
+def check_object_store(settings: Settings) -> str:
     """Write, look, read a range, delete; and the clock of whoever keeps the objects."""
     from shared.objects.open_store import open_store  # the minio client takes its time
 
-    store = open_store(settings, alone=False)
+    store = open_store(settings, exclusive=False)
     store.check()  # some servers make a bucket of the first object: a misspelt name would go unseen
     key = f"work/doctor-{new_id()}/probe"
     started = time.perf_counter()
@@ -116,7 +116,7 @@ def objects_check(settings: Settings) -> str:
         store.delete(key)
     took = time.perf_counter() - started
     skew = (datetime.now(UTC) - info.modified_at).total_seconds()
-    _check_skew("the object store", skew)
+    _check_clock_skew("the object store", skew)
     where = (
         f"S3_BUCKET {settings.s3_bucket} at {settings.s3_endpoint}"
         if settings.s3_endpoint
@@ -127,10 +127,10 @@ def objects_check(settings: Settings) -> str:
     )
 
 
-def _check_skew(whose: str, seconds: float) -> None:
-    if abs(seconds) > MOST_SKEW_SECONDS:
+def _check_clock_skew(server_name: str, seconds: float) -> None:
+    if abs(seconds) > MAX_CLOCK_SKEW_SECONDS:
         raise Misconfigured(
             "clocks_differ",
-            f"The clocks of {whose} and of this machine are {abs(seconds):.0f} s apart. Set them "
+            f"The clocks of {server_name} and of this machine are {abs(seconds):.0f} s apart. Set them "
             "by NTP: signatures expire, and orphans are taken for older or younger than they are.",
         )

@@ -8,25 +8,27 @@ import httpx2
 from sqlalchemy import func, select
 from sqlalchemy.exc import SQLAlchemyError
 
-from shared.catalog.away import as_unavailable
+from shared.catalog.away import to_unavailable
 from shared.catalog.base import db_now_plus
-from shared.catalog.live_processes import DEAD_SECONDS, Living, living
+from shared.catalog.live_processes import PROCESS_TIMEOUT_SECONDS, ProcessStatus, list_processes
 from shared.catalog.open_catalog import open_catalog
 from shared.catalog.session import Catalog
 from shared.errors import Misconfigured, PlacewiseError, Unavailable
-from shared.jobs.table import UNFINISHED, Job
-from shared.search_http.worker_call import WorkerAway, read_status
+from shared.jobs.table import UNFINISHED_STATES, Job
+from shared.search_http.worker_call import WorkerUnavailable, fetch_status
 from shared.settings import Settings
 
-OVERDUE_SECONDS = 30.0  # for which an expired lease may lie there: the steward looks every second
-SEARCH_SECONDS = 5.0
-MOST_LAG_SECONDS = 30.0
+OVERDUE_LEASE_SECONDS = (
+    30.0  # for which an expired lease may lie there: the steward looks every second
+)
+SEARCH_TIMEOUT_SECONDS = 5.0
+MAX_LAG_SECONDS = 30.0
 MAX_NAMED_CHUNKS = 10
 
 
-def search_check(settings: Settings) -> str:
+def check_search(settings: Settings) -> str:
     """Each worker of SEARCH_URLS, and whether every shard is answered for."""
-    if not settings.search_addresses:
+    if not settings.search_worker_urls:
         raise Misconfigured(
             "search_missing",
             "SEARCH_URLS is not set: name every search worker, for example "
@@ -35,16 +37,16 @@ def search_check(settings: Settings) -> str:
     shards: dict[str, int] = {}
     away, ill, rows = [], [], 0
     with httpx2.Client() as http:
-        for url in settings.search_addresses:
+        for url in settings.search_worker_urls:
             try:
-                status = read_status(http, url, SEARCH_SECONDS)
-            except (WorkerAway, PlacewiseError) as error:
+                status = fetch_status(http, url, SEARCH_TIMEOUT_SECONDS)
+            except (WorkerUnavailable, PlacewiseError) as error:
                 away.append(str(error))
                 continue
             shards[status.shard] = shards.get(status.shard, 0) + 1
             rows += status.rows
             late = max((lag.seconds for lag in status.lags.values() if lag.answers), default=0.0)
-            if late > MOST_LAG_SECONDS:
+            if late > MAX_LAG_SECONDS:
                 ill.append(f"{url} is {late:.0f} s behind")
             if status.missing:
                 named = ", ".join(status.missing[:MAX_NAMED_CHUNKS])
@@ -69,20 +71,20 @@ def search_check(settings: Settings) -> str:
     return answered + (f"; away: {'; '.join(away)} (their shards have others)" if away else "")
 
 
-def processes_check(settings: Settings, role: str) -> str:
+def check_processes(settings: Settings, role: str) -> str:
     """Who of this role gave a sign of life in the last seconds."""
     catalog = open_catalog(settings, "doctor")
     try:
         with catalog.read() as session:
-            known = [one for one in living(session) if one.role == role]
+            known = [one for one in list_processes(session) if one.role == role]
     except SQLAlchemyError as error:
-        raise _no_catalog(error) from error
+        raise _catalog_error(error) from error
     finally:
         catalog.close()
-    live = [one for one in known if one.silent_seconds < DEAD_SECONDS]
+    live = [one for one in known if one.seconds_since_heartbeat < PROCESS_TIMEOUT_SECONDS]
     if live:
-        return _named(live)
-    last = min((one.silent_seconds for one in known), default=None)
+        return _names_by_release(live)
+    last = min((one.seconds_since_heartbeat for one in known), default=None)
     seen = "" if last is None else f" The last sign of one is {last:.0f} s old."
     if role == "extractor":
         seen += " (Scaled to none by KEDA, that is as it should be while no job waits.)"
@@ -91,26 +93,26 @@ def processes_check(settings: Settings, role: str) -> str:
     )
 
 
-def steward_check(settings: Settings) -> str:
+def check_steward(settings: Settings) -> str:
     """Whether one lives, and does what only a steward does."""
-    said = processes_check(settings, "steward")
+    said = check_processes(settings, "steward")
     catalog = open_catalog(settings, "doctor")
     try:
-        overdue = _overdue(catalog)
+        overdue = _count_overdue_leases(catalog)
     except SQLAlchemyError as error:
-        raise _no_catalog(error) from error
+        raise _catalog_error(error) from error
     finally:
         catalog.close()
     if overdue:
         raise Unavailable(
             "leases_overdue",
             f"{said}; and {overdue} jobs of dead workers were not given back for "
-            f"{OVERDUE_SECONDS:.0f} s. Look at the steward's log.",
+            f"{OVERDUE_LEASE_SECONDS:.0f} s. Look at the steward's log.",
         )
     return f"{said}; no lease is overdue"
 
 
-def gateway_check(server: str, key: str | None) -> str:
+def check_gateway(server: str, key: str | None) -> str:
     """What the gateway says of the parts that it needs."""
     try:
         answer = httpx2.get(
@@ -139,19 +141,22 @@ def gateway_check(server: str, key: str | None) -> str:
     )
 
 
-def _overdue(catalog: Catalog) -> int:
+def _count_overdue_leases(catalog: Catalog) -> int:
     with catalog.read() as session:
         return (
             session.scalar(
                 select(func.count())
                 .select_from(Job)
-                .where(Job.state.in_(UNFINISHED), Job.lease_until < db_now_plus(-OVERDUE_SECONDS))
+                .where(
+                    Job.state.in_(UNFINISHED_STATES),
+                    Job.lease_until < db_now_plus(-OVERDUE_LEASE_SECONDS),
+                )
             )
             or 0
         )
 
 
-def _named(processes: list[Living]) -> str:
+def _names_by_release(processes: list[ProcessStatus]) -> str:
     by_release: dict[str, list[str]] = defaultdict(list)
     for one in processes:
         by_release[one.release].append(one.name)
@@ -161,8 +166,8 @@ def _named(processes: list[Living]) -> str:
     )
 
 
-def _no_catalog(error: SQLAlchemyError) -> PlacewiseError:
-    return as_unavailable(error) or Misconfigured(
+def _catalog_error(error: SQLAlchemyError) -> PlacewiseError:
+    return to_unavailable(error) or Misconfigured(
         "catalog_unreadable",
         f"The catalog can't be asked ({type(error).__name__}): see postgresql.",
     )

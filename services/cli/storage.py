@@ -13,10 +13,10 @@ import typer
 from rich.markup import escape
 
 from services.cli.configuration import read_settings
-from services.cli.output import JsonOption, answers, explained, print_json
-from services.cli.stored import what_is_stored
-from shared.catalog.connections import UNLIMITED
-from shared.catalog.installation import adopt_store, ensure_installation
+from services.cli.output import JsonOption, console, print_json, report_errors
+from services.cli.stored import open_storage
+from shared.catalog.connections import NO_TIMEOUTS
+from shared.catalog.installation import adopt_store, get_or_create_installation
 from shared.catalog.open_catalog import open_catalog
 from shared.catalog.schema import check_schema, migrate
 from shared.catalog.session import Catalog
@@ -38,21 +38,21 @@ ConfirmOption = Annotated[
 
 
 @app.command("create-bucket")
-def create(as_json: JsonOption = False) -> None:
+def create_bucket_command(as_json: JsonOption = False) -> None:
     """Make the bucket S3_BUCKET at S3_ENDPOINT, once; one that is there already is fine.
 
     S3_ACCESS_KEY has to be allowed to make buckets, which Placewise itself need not be.
     """
-    with explained(as_json):
+    with report_errors(as_json):
         from shared.objects.s3 import Bucket, create_bucket  # the minio client takes its time
 
-        bucket = Bucket.of(read_settings())
+        bucket = Bucket.from_settings(read_settings())
         made = create_bucket(bucket)
     if as_json:
         print_json({"bucket": bucket.name, "endpoint": bucket.endpoint, "made": made})
         return
     state = "is made" if made else "was there already"
-    answers.print(f"The bucket {bucket.name} at {bucket.endpoint} {state}.", soft_wrap=True)
+    console.print(f"The bucket {bucket.name} at {bucket.endpoint} {state}.", soft_wrap=True)
 
 
 @app.command("adopt")
@@ -63,15 +63,15 @@ def adopt(confirm: ConfirmOption = False, as_json: JsonOption = False) -> None:
     store first: the catalog that owned it refuses to start afterwards. Objects that this catalog
     does not know are kept until `placewise storage collect --confirm`.
     """
-    with explained(as_json), contextlib.ExitStack() as held:
+    with report_errors(as_json), contextlib.ExitStack() as held:
         from services.steward.collect import count_store
 
         settings = read_settings()
         if settings.database_url is None:
             held.enter_context(lock_home(settings.placewise_home))
-        catalog = open_catalog(settings, "storage", UNLIMITED)
+        catalog = open_catalog(settings, "storage", NO_TIMEOUTS)
         held.callback(catalog.close)
-        store = open_store(settings, alone=False)
+        store = open_store(settings, exclusive=False)
         store.check()
         if confirm and catalog.is_sqlite:
             migrate(catalog)
@@ -89,12 +89,12 @@ def adopt(confirm: ConfirmOption = False, as_json: JsonOption = False) -> None:
     if as_json:
         print_json({"adopted": confirm, **_as_dict(count)})
         return
-    answers.print(f"{count.objects} objects; unknown to this catalog: {unknown}")
+    console.print(f"{count.objects} objects; unknown to this catalog: {unknown}")
     _print_orphans(count)
     if confirm:
-        answers.print("The store belongs to this catalog now.")
+        console.print("The store belongs to this catalog now.")
     else:
-        answers.print(
+        console.print(
             "Nothing was changed. --confirm makes this catalog the owner; any other catalog then "
             "refuses to start with this store. Unknown objects are kept: they are not searchable, "
             "and nothing deletes them before `placewise storage collect --confirm`.",
@@ -109,13 +109,13 @@ def collect(confirm: ConfirmOption = False, as_json: JsonOption = False) -> None
 
     Only those older than ORPHAN_AGE_SECONDS. Runs while the service runs.
     """
-    with explained(as_json):
-        from services.steward.collect import StoreCount, collect_orphans, orphans
+    with report_errors(as_json):
+        from services.steward.collect import StoreCount, collect_orphans, find_orphans
 
         settings = read_settings()
-        with what_is_stored(settings, "storage") as (catalog, store):
+        with open_storage(settings, "storage") as (catalog, store):
             count, moved, hold = StoreCount(), 0, read_hold(store)
-            for _ in orphans(catalog, store, settings.orphan_age_seconds, count):
+            for _ in find_orphans(catalog, store, settings.orphan_age_seconds, count):
                 pass
             if confirm:
                 moved = collect_orphans(catalog, store, settings.orphan_age_seconds, confirmed=True)
@@ -123,17 +123,17 @@ def collect(confirm: ConfirmOption = False, as_json: JsonOption = False) -> None
         held = None if hold is None else hold.reason
         print_json({"moved": moved, "held": held, **_as_dict(count)})
         return
-    answers.print(f"{count.objects} objects; known to no row: {count.orphans.total()}")
+    console.print(f"{count.objects} objects; known to no row: {count.orphans.total()}")
     _print_orphans(count)
     if confirm:
-        answers.print(
+        console.print(
             f"{moved} objects were moved to the trash, and are deleted after "
             f"{settings.trash_days:g} days (TRASH_DAYS)."
         )
         return
     if hold is not None:
-        answers.print(f"Collection is held: {escape(hold.describe())}", soft_wrap=True)
-    answers.print("Nothing was changed. --confirm moves them to the trash.")
+        console.print(f"Collection is held: {escape(hold.describe())}", soft_wrap=True)
+    console.print("Nothing was changed. --confirm moves them to the trash.")
 
 
 @app.command("restore-trash")
@@ -149,24 +149,24 @@ def restore(
     ORPHAN_AGE_SECONDS. `placewise verify --repair` takes originals in, `placewise rebuild-catalog`
     makes a catalog of everything.
     """
-    with explained(as_json):
+    with report_errors(as_json):
         settings = read_settings()
         restored, kept = 0, 0
-        with what_is_stored(settings, "storage") as (_, store):
+        with open_storage(settings, "storage") as (_, store):
             for _, is_back in restore_trash(store, prefix):
                 restored += is_back
                 kept += not is_back
     if as_json:
         print_json({"restored": restored, "kept_in_trash": kept})
         return
-    answers.print(f"{restored} objects are back under their keys")
+    console.print(f"{restored} objects are back under their keys")
     if kept:
-        answers.print(f"{kept} stay in the trash: another object has their key by now")
+        console.print(f"{kept} stay in the trash: another object has their key by now")
 
 
 def _check_not_owned(catalog: Catalog, owner: str | None) -> None:
     with catalog.write() as session:
-        installation_id = ensure_installation(session).id
+        installation_id = get_or_create_installation(session).id
     if owner == str(installation_id):
         raise Conflict("already_owner", "The store belongs to this catalog already.")
 
@@ -181,4 +181,4 @@ def _as_dict(count: StoreCount) -> dict[str, Any]:
 
 def _print_orphans(count: StoreCount) -> None:
     for prefix, number in sorted(count.orphans.items()):
-        answers.print(f"  {prefix:14} {number:8}  {count.orphan_bytes[prefix] / 1e6:10.1f} MB")
+        console.print(f"  {prefix:14} {number:8}  {count.orphan_bytes[prefix] / 1e6:10.1f} MB")

@@ -8,7 +8,7 @@ from uuid import UUID
 from sqlalchemy import select
 from sqlalchemy.exc import SQLAlchemyError
 
-from shared.catalog.away import as_unavailable
+from shared.catalog.away import to_unavailable
 from shared.catalog.installation import Installation
 from shared.catalog.open_catalog import open_catalog
 from shared.errors import Misconfigured
@@ -25,7 +25,7 @@ def collection_check(settings: Settings) -> str:
     folder = settings.placewise_home / "objects"
     store: OwnedStore
     if settings.s3_endpoint is not None:
-        store = open_store(settings, alone=False)
+        store = open_store(settings, exclusive=False)
     elif folder.exists():
         store = FolderStore(folder, alone=False)  # UPLOAD_DIR, which has no notes, is not marked
     else:
@@ -81,7 +81,7 @@ def _installation_id(settings: Settings) -> UUID | None:
         with catalog.read() as session:
             return session.scalar(select(Installation.id))
     except SQLAlchemyError as error:
-        raise as_unavailable(error) or Misconfigured(
+        raise to_unavailable(error) or Misconfigured(
             "catalog_unreadable",
             f"The catalog can't be read ({type(error).__name__}). Check its permissions, or "
             "restore it from a backup.",

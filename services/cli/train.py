@@ -7,15 +7,15 @@ from typing import Annotated, Any
 
 import typer
 
-from services.cli.output import JsonOption, explained, messages, print_json
-from services.cli.train_display import TerminalDisplay, show_report
-from services.cli.train_options import chosen, with_training_options
-from services.cli.trainer_packages import check_trainer_packages
-from services.trainer.configuration import known_keys, make_arguments, read_yaml
+from services.cli.output import JsonOption, err_console, print_json, report_errors
+from services.cli.train_display import TerminalDisplay, print_summary
+from services.cli.train_options import given_options, with_training_options
+from services.cli.trainer_packages import require_packages
+from services.trainer.configuration import build_arguments, load_yaml, resolve_keys
 from shared.errors import InvalidRequest
 
-NEEDED = ("lightning", "pytorch_metric_learning", "faiss", "torch", "yaml")
-STOPPED = 130  # what a shell reports for a program that Ctrl-C ended
+TRAINING_PACKAGES = ("lightning", "pytorch_metric_learning", "faiss", "torch", "yaml")
+EXIT_INTERRUPTED = 130  # what a shell reports for a program that Ctrl-C ended
 
 
 @with_training_options
@@ -36,16 +36,18 @@ def train(
     Lists and dicts are JSON. A true-or-false option stands alone, as --no-NAME, or before True or
     False. Names may be written with hyphens. Ctrl-C keeps the run: --resume goes on with it.
     """
-    with explained(as_json):
-        check_trainer_packages(*NEEDED)
-        report = _train(config, resume, known_keys(chosen(arguments), "the command line"))
+    with report_errors(as_json):
+        require_packages(*TRAINING_PACKAGES)
+        report = _run_training(
+            config, resume, resolve_keys(given_options(arguments), "the command line")
+        )
     if as_json:
         print_json(report)
     else:
-        show_report(report)
+        print_summary(report)
 
 
-def _train(config: Path | None, resume: Path | None, said: dict[str, Any]) -> Any:
+def _run_training(config: Path | None, resume: Path | None, overrides: dict[str, Any]) -> Any:
     from services.trainer import run
     from services.trainer.stop import RunStopped, StopRequest
 
@@ -53,12 +55,12 @@ def _train(config: Path | None, resume: Path | None, said: dict[str, Any]) -> An
         raise InvalidRequest(
             "bad_argument", "--resume has the run's own arguments: leave --config out."
         )
-    with TerminalDisplay() as display, StopRequest().listening() as stop:
+    with TerminalDisplay() as display, StopRequest().handle_signals() as stop:
         try:
             if resume is not None:
-                return run.resume(resume, said, display, stop)
-            layers = [read_yaml(config)] if config is not None else []
-            return run.run(make_arguments(*layers, said), display, stop)
+                return run.resume(resume, overrides, display, stop)
+            layers = [load_yaml(config)] if config is not None else []
+            return run.run(build_arguments(*layers, overrides), display, stop)
         except RunStopped as stopped:
-            messages.print(str(stopped), markup=False, soft_wrap=True)
-            raise typer.Exit(STOPPED) from stopped
+            err_console.print(str(stopped), markup=False, soft_wrap=True)
+            raise typer.Exit(EXIT_INTERRUPTED) from stopped

@@ -18,13 +18,13 @@ from rich.progress import (
 )
 from rich.table import Column, Table
 
-from services.cli.output import answers, messages
+from services.cli.output import console, err_console
 
 Json = dict[str, Any]
 
-LINE_EVERY_SECONDS = 60.0
+LOG_INTERVAL_SECONDS = 60.0
 """where stderr is no terminal, and bars would not be seen"""
-KS = ("1", "5", "10", "20")
+SHOWN_KS = ("1", "5", "10", "20")
 
 
 class TerminalDisplay:
@@ -38,11 +38,11 @@ class TerminalDisplay:
             TimeElapsedColumn(),
             TimeRemainingColumn(),
             TextColumn("{task.fields[note]}"),
-            console=messages,
+            console=err_console,
             transient=True,
         )
         self._tasks: dict[str, TaskID] = {}
-        self._line_at = time.monotonic() + LINE_EVERY_SECONDS
+        self._line_at = time.monotonic() + LOG_INTERVAL_SECONDS
 
     def __enter__(self) -> Self:
         self._bars.start()
@@ -56,15 +56,15 @@ class TerminalDisplay:
     ) -> None:
         self._bars.stop()
 
-    def say(self, text: str) -> None:
-        messages.print(escape(text), soft_wrap=True)
+    def info(self, text: str) -> None:
+        err_console.print(escape(text), soft_wrap=True)
 
     def warn(self, text: str) -> None:
-        messages.print(f"[yellow]{escape(text)}[/yellow]", soft_wrap=True)
+        err_console.print(f"[yellow]{escape(text)}[/yellow]", soft_wrap=True)
 
     def progress(self, what: str, done: int, most: int, note: str = "") -> None:
-        if not messages.is_terminal:
-            self._line(what, done, most, note)
+        if not err_console.is_terminal:
+            self._log_line(what, done, most, note)
             return
         task = self._tasks.get(what)
         if task is None:
@@ -73,48 +73,48 @@ class TerminalDisplay:
         if done >= most:
             self._bars.remove_task(self._tasks.pop(what))
 
-    def _line(self, what: str, done: int, most: int, note: str) -> None:
+    def _log_line(self, what: str, done: int, most: int, note: str) -> None:
         if time.monotonic() >= self._line_at:
-            self._line_at = time.monotonic() + LINE_EVERY_SECONDS
-            self.say(f"{what}: {done}/{most}  {note}".rstrip())
+            self._line_at = time.monotonic() + LOG_INTERVAL_SECONDS
+            self.info(f"{what}: {done}/{most}  {note}".rstrip())
 
 
-def show_report(report: Json) -> None:
+def print_summary(report: Json) -> None:
     """A run's summary: sets x R@k, the best checkpoint, what to type next."""
     if report.get("fast_dev_run"):
         return
-    rows = _rows(report)
+    rows = _summary_rows(report)
     if rows:
-        columns = (Column(f"R@{k}", justify="right") for k in KS)
+        columns = (Column(f"R@{k}", justify="right") for k in SHOWN_KS)
         table = Table("set", "of", *columns, "queries", "fingerprint")
         for name, what, recall in rows:
             about = report["sets"][name]
             table.add_row(
                 escape(name),
                 what,
-                *(f"{recall[k]:.1%}" if recall.get(k) is not None else "-" for k in KS),
+                *(f"{recall[k]:.1%}" if recall.get(k) is not None else "-" for k in SHOWN_KS),
                 str(about["queries"]),
                 f"{about['fingerprint'][:12]} {about['protocol']}, {about['rule']}",
             )
-        answers.print(table)
+        console.print(table)
     best = report["best"]
-    answers.print(
+    console.print(
         f"Checkpoint: {best['path']} ({best['dimension']} dimensions, {best['fingerprint'][:12]})",
         soft_wrap=True,
         markup=False,
     )
     if "images" in report and report["images_per_second"]:
-        answers.print(
+        console.print(
             f"{report['images']} photos learned from, {report['images_per_second']:.1f}/s, "
             f"{report['share_waiting_for_data']:.1%} of the time waiting for photos; "
             f"{len(report['bad_photos'])} photos did not decode.",
             soft_wrap=True,
         )
-    answers.print("Next:", *(f"  {line}" for line in report["next"]), sep="\n", markup=False,
+    console.print("Next:", *(f"  {line}" for line in report["next"]), sep="\n", markup=False,
                   soft_wrap=True)  # fmt: skip
 
 
-def _rows(report: Json) -> list[tuple[str, str, Json]]:
+def _summary_rows(report: Json) -> list[tuple[str, str, Json]]:
     rows = []
     if report.get("epochs"):
         monitor = report["monitor"]
@@ -126,7 +126,7 @@ def _rows(report: Json) -> list[tuple[str, str, Json]]:
             ),
         )
         for name in report["arguments"]["val_set_names"]:
-            recall = {k: chosen["figures"].get(f"{name}/R{k}") for k in KS}
+            recall = {k: chosen["figures"].get(f"{name}/R{k}") for k in SHOWN_KS}
             rows.append((name, f"validation, epoch {chosen['number'] + 1}", recall))
     rows += [(name, "test", one["recall"]) for name, one in report["test"].items()]
     return rows

@@ -15,12 +15,12 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperCommand
 
-from services.trainer.arguments import TrainingArguments, group_of, is_flag
-from services.trainer.configuration import NAMES, known_name, nearest
-from services.trainer.read_value import FALSE, TRUE
+from services.trainer.arguments import TrainingArguments, argument_group, is_boolean
+from services.trainer.configuration import ARGUMENT_NAMES, resolve_name, suggest_name
+from services.trainer.read_value import FALSE_WORDS, TRUE_WORDS
 from shared.errors import InvalidRequest
 
-OF_TWO_NUMBERS = ("image_size", "test_image_size")
+SIZE_ARGUMENTS = ("image_size", "test_image_size")
 GROUP_ORDER = (
     "Data",
     "Model",
@@ -43,7 +43,10 @@ def with_training_options(command: Callable[..., None]) -> Callable[..., None]:
         for parameter in inspect.signature(command, eval_str=True).parameters.values()
         if parameter.kind is not inspect.Parameter.VAR_KEYWORD
     ]
-    made = [_option(name) for name in sorted(NAMES, key=lambda n: GROUP_ORDER.index(group_of(n)))]
+    made = [
+        _make_option(name)
+        for name in sorted(ARGUMENT_NAMES, key=lambda n: GROUP_ORDER.index(argument_group(n)))
+    ]
     shaped: Any = command
     shaped.__signature__ = inspect.Signature([*own, *made])
     shaped.__annotations__ = {each.name: each.annotation for each in [*own, *made]}
@@ -51,20 +54,22 @@ def with_training_options(command: Callable[..., None]) -> Callable[..., None]:
     return command
 
 
-def chosen(arguments: dict[str, str | None]) -> dict[str, str]:
+def given_options(arguments: dict[str, str | None]) -> dict[str, str]:
     """What the command line said, without what it left out."""
     return {name: text for name, text in arguments.items() if text is not None}
 
 
-def _option(name: str) -> inspect.Parameter:
+def _make_option(name: str) -> inspect.Parameter:
     field = TrainingArguments.model_fields[name]
     shown = field.default
-    default = "" if shown in (None, ()) or name == "cities" else f" (default: {_brief(shown)})"
+    default = (
+        "" if shown in (None, ()) or name == "cities" else f" (default: {_format_default(shown)})"
+    )
     option = typer.Option(
         f"--{name}",
         help=f"{field.description}{default}",
-        rich_help_panel=group_of(name),
-        metavar="BOOL" if is_flag(name) else "VALUE",
+        rich_help_panel=argument_group(name),
+        metavar="BOOL" if is_boolean(name) else "VALUE",
         show_default=False,
     )
     return inspect.Parameter(
@@ -75,7 +80,7 @@ def _option(name: str) -> inspect.Parameter:
     )
 
 
-def _brief(value: Any) -> str:
+def _format_default(value: Any) -> str:
     if isinstance(value, tuple):
         return f"({', '.join(str(each) for each in value)})"
     return str(value)
@@ -86,13 +91,13 @@ class TrainingCommand(TyperCommand):
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         own = [text for parameter in self.params for text in parameter.opts]
-        return super().parse_args(ctx, spelled_out(args, own))
+        return super().parse_args(ctx, normalise_tokens(args, own))
 
 
-def spelled_out(tokens: Sequence[str], own: Sequence[str] = ()) -> list[str]:
+def normalise_tokens(tokens: Sequence[str], own_options: Sequence[str] = ()) -> list[str]:
     """The same command line with one token `--name=value` for each training argument.
 
-    `own` are the command's other options, which stay as they are, with their values. Raises
+    `own_options` are the command's other options, which stay as they are, with their values. Raises
     typer.BadParameter for an option that there is not.
     """
     left, done = list(tokens), []
@@ -103,36 +108,44 @@ def spelled_out(tokens: Sequence[str], own: Sequence[str] = ()) -> list[str]:
             done.append(token)
             continue
         negated = name.removeprefix("no-").removeprefix("no_")
-        if negated != name and not given and _is_known_flag(negated):
-            done.append(f"--{known_name(negated)}=false")
+        if negated != name and not given and _is_boolean_argument(negated):
+            done.append(f"--{resolve_name(negated)}=false")
             continue
         try:
-            known = known_name(name)
+            known = resolve_name(name)
         except InvalidRequest:
-            if f"--{name}" not in (*own, "--help"):
-                options = [*(text.removeprefix("--") for text in own), *NAMES]
+            if f"--{name}" not in (*own_options, "--help"):
+                options = [*(text.removeprefix("--") for text in own_options), *ARGUMENT_NAMES]
                 raise typer.BadParameter(
-                    f"There is no option --{name}.{nearest(name, options)}"
+                    f"There is no option --{name}.{suggest_name(name, options)}"
                 ) from None
             done.append(token)
             continue
         if not given:
-            value = _take_value(known, left)
+            value = _pop_value(known, left)
         done.append(f"--{known}={value}")
     return done
 
 
-def _is_known_flag(name: str) -> bool:
+def _is_boolean_argument(name: str) -> bool:
     name = name.replace("-", "_")
-    return name in NAMES and is_flag(name)
+    return name in ARGUMENT_NAMES and is_boolean(name)
 
 
-def _take_value(name: str, left: list[str]) -> str:
-    if is_flag(name):
-        return left.pop(0) if left and left[0].strip().lower() in TRUE | FALSE else "true"
-    if not left:
+def _pop_value(name: str, remaining: list[str]) -> str:
+    if is_boolean(name):
+        return (
+            remaining.pop(0)
+            if remaining and remaining[0].strip().lower() in TRUE_WORDS | FALSE_WORDS
+            else "true"
+        )
+    if not remaining:
         raise typer.BadParameter(f"--{name} needs a value.")
-    value = left.pop(0)
-    if name in OF_TWO_NUMBERS and left and all(re.fullmatch(r"\d+", n) for n in (value, left[0])):
-        value = f"{value} {left.pop(0)}"
+    value = remaining.pop(0)
+    if (
+        name in SIZE_ARGUMENTS
+        and remaining
+        and all(re.fullmatch(r"\d+", n) for n in (value, remaining[0]))
+    ):
+        value = f"{value} {remaining.pop(0)}"
     return value

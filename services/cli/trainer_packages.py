@@ -7,7 +7,7 @@ from importlib.util import find_spec
 from shared.errors import Misconfigured
 
 
-def check_trainer_packages(*names: str) -> None:
+def require_packages(*names: str) -> None:
     """Misconfigured (`trainer_missing`) unless all are installed; left out: those of evaluation."""
     missing = [name for name in names or ("faiss", "torch") if find_spec(name) is None]
     if missing:

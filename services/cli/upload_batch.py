@@ -9,9 +9,9 @@ from pathlib import Path
 
 from rich.progress import Progress, TaskID
 
-from services.cli.output import messages
-from services.cli.upload_many import LOOK_SECONDS, fit_if_worth_it
-from shared.archive_formats import ACCEPTED_ARCHIVES, SNIFFED_ARCHIVE_BYTES, sniff_archive
+from services.cli.output import err_console
+from services.cli.upload_many import POLL_SECONDS, fit_vocabulary_if_needed
+from shared.archive_formats import ACCEPTED_ARCHIVES, ARCHIVE_SIGNATURE_BYTES, detect_archive_format
 from shared.client import FINISHED, Client, Json
 from shared.errors import InvalidRequest, Unprocessable
 from shared.intake.manifest import KEY_FIELD
@@ -23,10 +23,10 @@ def check_archive(path: Path) -> None:
     """InvalidRequest (`not_an_archive`) for a file that the server would refuse."""
     try:
         with path.open("rb") as file:
-            begin = file.read(SNIFFED_ARCHIVE_BYTES)
+            begin = file.read(ARCHIVE_SIGNATURE_BYTES)
     except OSError as error:
         raise InvalidRequest("unreadable_file", f"Can't read {path}: {error.strerror}") from error
-    if sniff_archive(begin) is None:
+    if detect_archive_format(begin) is None:
         raise InvalidRequest(
             "not_an_archive",
             f"{path} is no folder, and by its content not {ACCEPTED_ARCHIVES}.",
@@ -36,22 +36,22 @@ def check_archive(path: Path) -> None:
 def upload_archive(client: Client, archive: Path, fit: bool, progress: Progress) -> Json:
     """Upload, describe, and fit a vocabulary where the map needs one.
 
-    Returns what `upload_many` does. Raises the reason of a batch that has failed as a whole.
+    Returns what `upload_photos` does. Raises the reason of a batch that has failed as a whole.
     """
     client.stats()  # a wrong address, key or map is said before gigabytes are sent
     sending = progress.add_task("uploading (bytes)", total=archive.stat().st_size)
     started = client.upload_archive(
         archive, lambda sent_bytes: progress.update(sending, completed=sent_bytes)
     )
-    return _finish(client, started, fit, progress)
+    return _wait_and_report(client, started, fit, progress)
 
 
 def import_prefix(client: Client, prefix: str, fit: bool, progress: Progress) -> Json:
     """As `upload_archive`, with every photo of the server's store below the prefix."""
-    return _finish(client, client.import_prefix(prefix), fit, progress)
+    return _wait_and_report(client, client.import_prefix(prefix), fit, progress)
 
 
-def names_keys(manifest: bytes) -> bool:
+def manifest_has_keys(manifest: bytes) -> bool:
     """Does the first line of a JSONL manifest name an object by its key, not a file?"""
     first = next((line for line in manifest.splitlines() if line.strip()), b"")
     try:
@@ -62,17 +62,17 @@ def names_keys(manifest: bytes) -> bool:
 
 def import_keys(client: Client, manifest: bytes, fit: bool, progress: Progress) -> Json:
     """As `upload_archive`, with the objects that the lines of the manifest name by `key`."""
-    return _finish(client, client.import_manifest(manifest), fit, progress)
+    return _wait_and_report(client, client.import_manifest(manifest), fit, progress)
 
 
-def _finish(client: Client, started: Json, fit: bool, progress: Progress) -> Json:
+def _wait_and_report(client: Client, started: Json, fit: bool, progress: Progress) -> Json:
     describing = progress.add_task("describing", total=None)
-    job = _wait(client, started["job_id"], progress, describing)
+    job = _wait_until_finished(client, started["job_id"], progress, describing)
     stats, fitted = client.stats(), None
     if fit:
-        stats, fitted = fit_if_worth_it(client, stats, progress)
+        stats, fitted = fit_vocabulary_if_needed(client, stats, progress)
     if job["state"] not in FINISHED and stats["vocabulary"] is not None:
-        job = _wait(client, started["job_id"], progress, describing)
+        job = _wait_until_finished(client, started["job_id"], progress, describing)
     if job["state"] in ("failed", "cancelled"):
         error: Json = job["error"] or {}
         raise Unprocessable(
@@ -86,20 +86,20 @@ def _finish(client: Client, started: Json, fit: bool, progress: Progress) -> Jso
         "uploaded": job["progress"]["total"] - there - sum(not item["file_id"] for item in bad),
         "already_there": there,
         "searchable": client.stats()["searchable_images"],
-        "refused": [_fault(item) for item in bad if not item["file_id"]],
-        "failed": [_fault(item) for item in bad if item["file_id"]],
+        "refused": [_item_failure(item) for item in bad if not item["file_id"]],
+        "failed": [_item_failure(item) for item in bad if item["file_id"]],
         "vocabulary": stats["vocabulary"],
         "fitted": fitted,
         "ignored": counts.get("ignored", 0),
     }
 
 
-def _wait(client: Client, job_id: str, progress: Progress, bar: TaskID) -> Json:
+def _wait_until_finished(client: Client, job_id: str, progress: Progress, bar: TaskID) -> Json:
     """The job once it has ended, or waits for a vocabulary."""
     wait_seconds, told = 0.0, False
     while True:
         job = client.job(job_id, wait_seconds)
-        wait_seconds = LOOK_SECONDS
+        wait_seconds = POLL_SECONDS
         done: Json = job["progress"]
         progress.update(bar, completed=done["done"] + done["failed"], total=done["total"] or None)
         if job["state"] in FINISHED or job["waiting_for"] == "vocabulary":
@@ -107,11 +107,13 @@ def _wait(client: Client, job_id: str, progress: Progress, bar: TaskID) -> Json:
         if job["waiting_for"]:
             if not told:
                 what = job["waiting_for"].replace("_", " ")
-                messages.print(f"The batch waits for {what} on the server, and goes on by itself.")
+                err_console.print(
+                    f"The batch waits for {what} on the server, and goes on by itself."
+                )
             told = True
             time.sleep(WAITING_LOOK_SECONDS)  # a server answers at once for a job that waits
 
 
-def _fault(item: Json) -> Json:
+def _item_failure(item: Json) -> Json:
     error: Json = item["error"] or {}
     return {"path": item["name"], "reason": str(error.get("detail", item["state"]))}

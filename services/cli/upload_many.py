@@ -12,23 +12,25 @@ import typer
 from rich.markup import escape
 from rich.progress import Progress, TaskID
 
-from services.cli.journal import Acknowledged, Journal
-from services.cli.output import messages, shown
-from services.cli.photo_places import FoundPhoto
+from services.cli.journal import JournalEntry, UploadJournal
+from services.cli.output import err_console, printable_path
+from services.cli.photo_places import LocalPhoto
 from services.cli.vocabulary import fit_and_wait
 from shared.client import FINISHED, Client, Json
 from shared.errors import Conflict, NotFound, PlacewiseError
 
-FIT_FROM_PHOTOS = 50
-UPLOADS_AT_ONCE = 4
-AWAY_SECONDS = 60.0  # for which a server that is away is waited for; a busy one as long as it says
-LOOK_SECONDS = 1.0  # a job that begins to wait for a vocabulary is not seen by a longer poll
+MIN_PHOTOS_TO_FIT = 50
+UPLOAD_CONCURRENCY = 4
+RETRY_PERIOD_SECONDS = (
+    60.0  # for which a server that is away is waited for; a busy one as long as it says
+)
+POLL_SECONDS = 1.0  # a job that begins to wait for a vocabulary is not seen by a longer poll
 
 FitOption = Annotated[
     bool,
     typer.Option(
         "--fit/--no-fit",
-        help=f"Fit a vocabulary at the end, from {FIT_FROM_PHOTOS} photos up, if the map has none "
+        help=f"Fit a vocabulary at the end, from {MIN_PHOTOS_TO_FIT} photos up, if the map has none "
         "of its own.",
     ),
 ]
@@ -38,18 +40,18 @@ UpdateOption = Annotated[
         "--update", help="Change what is said otherwise now of photos that are there already."
     ),
 ]
-Pending = list[tuple[FoundPhoto, str]]
+PendingJobs = list[tuple[LocalPhoto, str]]
 """Photos with the ids of the jobs that describe them."""
 
 
-def upload_many(
+def upload_photos(
     client: Client,
-    photos: list[FoundPhoto],
+    photos: list[LocalPhoto],
     fit: bool,
     progress: Progress,
     *,
     update: bool = False,
-    journal: Journal | None = None,
+    journal: UploadJournal | None = None,
 ) -> Json:
     """Upload, describe, and fit a vocabulary where the map needs one. Running it again uploads
     the same bytes again and describes nothing twice; what the journal has is not even sent. With
@@ -63,40 +65,40 @@ def upload_many(
     counts: Counter[str] = Counter()
     refused: list[Json] = []
     failed: list[Json] = []
-    pending: Pending = []
+    pending: PendingJobs = []
     uploading = progress.add_task("uploading", total=len(photos))
 
     def show_wait(error: PlacewiseError, seconds: float) -> None:
         progress.update(uploading, description=f"uploading (waits {seconds:.0f} s: {error.code})")
         if error.code not in waited_for:
             waited_for.add(error.code)
-            messages.print(f"Waiting, then going on: {escape(error.detail)}", soft_wrap=True)
+            err_console.print(f"Waiting, then going on: {escape(error.detail)}", soft_wrap=True)
 
     waited_for: set[str] = set()
-    patient = client.patient(AWAY_SECONDS, show_wait)
+    patient = client.patient(RETRY_PERIOD_SECONDS, show_wait)
     left = photos
     if journal is not None:
-        left, taken = _not_yet_taken(photos, journal)
+        left, taken = _split_by_journal(photos, journal)
         pending += taken
         counts["already_there"] += len(photos) - len(left)
         progress.update(uploading, completed=len(photos) - len(left))
-    for photo, outcome in _upload_all(patient, left, update):
+    for photo, outcome in _upload_concurrently(patient, left, update):
         progress.update(uploading, advance=1, description="uploading")
         if isinstance(outcome, PlacewiseError):
-            refused.append(_fault(photo, outcome.detail))
+            refused.append(_photo_failure(photo, outcome.detail))
             continue
         counts["already_there" if outcome["already_there"] else "uploaded"] += 1
         if journal is not None:
-            journal.add(photo, Acknowledged(outcome["file_id"], outcome["job_id"]))
+            journal.add(photo, JournalEntry(outcome["file_id"], outcome["job_id"]))
         if outcome["status"] not in FINISHED:
             pending.append((photo, outcome["job_id"]))
     describing = progress.add_task("describing", total=len(pending))
-    pending = _wait_all(client, pending, failed, progress, describing)
+    pending = _wait_for_jobs(client, pending, failed, progress, describing)
 
     stats, vocabulary = client.stats(), None
     if fit:
-        stats, vocabulary = fit_if_worth_it(client, stats, progress)
-    _wait_all(client, pending, failed, progress, describing)
+        stats, vocabulary = fit_vocabulary_if_needed(client, stats, progress)
+    _wait_for_jobs(client, pending, failed, progress, describing)
     return {
         "photos": len(photos),
         "uploaded": counts["uploaded"],
@@ -109,10 +111,12 @@ def upload_many(
     }
 
 
-def _not_yet_taken(photos: list[FoundPhoto], journal: Journal) -> tuple[list[FoundPhoto], Pending]:
+def _split_by_journal(
+    photos: list[LocalPhoto], journal: UploadJournal
+) -> tuple[list[LocalPhoto], PendingJobs]:
     """The photos that the journal does not have, and the jobs of those that it has."""
-    left: list[FoundPhoto] = []
-    taken: Pending = []
+    left: list[LocalPhoto] = []
+    taken: PendingJobs = []
     for photo in photos:
         done = journal.done(photo)
         if done is None:
@@ -122,19 +126,21 @@ def _not_yet_taken(photos: list[FoundPhoto], journal: Journal) -> tuple[list[Fou
     return left, taken
 
 
-def fit_if_worth_it(client: Client, stats: Json, progress: Progress) -> tuple[Json, Json | None]:
+def fit_vocabulary_if_needed(
+    client: Client, stats: Json, progress: Progress
+) -> tuple[Json, Json | None]:
     """Fit a vocabulary where the map has none of its own and photos enough; the map's figures after
     that, and the vocabulary if one was fitted."""
-    if stats["vocabulary"] not in ("foreign", None) or stats["total_images"] < FIT_FROM_PHOTOS:
+    if stats["vocabulary"] not in ("foreign", None) or stats["total_images"] < MIN_PHOTOS_TO_FIT:
         return stats, None
     vocabulary = fit_and_wait(client, {}, progress)
     return client.stats(), vocabulary
 
 
-def _upload_all(
-    client: Client, photos: list[FoundPhoto], update: bool
-) -> Iterator[tuple[FoundPhoto, Json | PlacewiseError]]:
-    def upload(photo: FoundPhoto) -> Json | PlacewiseError:
+def _upload_concurrently(
+    client: Client, photos: list[LocalPhoto], update: bool
+) -> Iterator[tuple[LocalPhoto, Json | PlacewiseError]]:
+    def upload(photo: LocalPhoto) -> Json | PlacewiseError:
         fields: dict[str, Any] = dict(photo.fields)
 
         def send() -> Json:
@@ -146,16 +152,16 @@ def _upload_all(
             except Conflict as error:
                 if error.code != "photo_differs" or not update:
                     raise
-                client.patch_photo(error.extra["file_id"], **_as_json(photo.fields))
+                client.patch_photo(error.extra["file_id"], **_patch_fields(photo.fields))
                 return send()
         except PlacewiseError as error:
             return error
 
-    with ThreadPoolExecutor(UPLOADS_AT_ONCE) as pool:
+    with ThreadPoolExecutor(UPLOAD_CONCURRENCY) as pool:
         yield from zip(photos, pool.map(upload, photos), strict=True)
 
 
-def _as_json(fields: dict[str, str]) -> Json:
+def _patch_fields(fields: dict[str, str]) -> Json:
     """The upload form's text fields as a PATCH takes them."""
     typed: Json = dict(fields)
     for name in ("latitude", "longitude", "heading"):
@@ -168,11 +174,11 @@ def _as_json(fields: dict[str, str]) -> Json:
     return typed
 
 
-def _wait_all(
-    client: Client, pending: Pending, failed: list[Json], progress: Progress, bar: TaskID
-) -> Pending:
+def _wait_for_jobs(
+    client: Client, pending: PendingJobs, failed: list[Json], progress: Progress, bar: TaskID
+) -> PendingJobs:
     """Wait for the jobs; returns those that wait for a vocabulary and can't end before it."""
-    waiting: Pending = []
+    waiting: PendingJobs = []
     for photo, job_id in pending:
         wait_seconds = 0.0
         while True:
@@ -181,12 +187,12 @@ def _wait_all(
             except NotFound:  # a journal's photo, deleted since: that was meant
                 progress.advance(bar)
                 break
-            wait_seconds = LOOK_SECONDS
+            wait_seconds = POLL_SECONDS
             if job["state"] in FINISHED:
                 progress.advance(bar)
                 if job["state"] != "succeeded":
                     error: Json = job["error"] or {}
-                    failed.append(_fault(photo, str(error.get("detail", job["state"]))))
+                    failed.append(_photo_failure(photo, str(error.get("detail", job["state"]))))
                 break
             if job["waiting_for"]:
                 waiting.append((photo, job_id))
@@ -194,6 +200,6 @@ def _wait_all(
     return waiting
 
 
-def _fault(photo: FoundPhoto, reason: str) -> Json:
+def _photo_failure(photo: LocalPhoto, reason: str) -> Json:
     named = {"filename": photo.name} if photo.name else {}
-    return {"path": shown(photo.path), **named, "reason": reason}
+    return {"path": printable_path(photo.path), **named, "reason": reason}

@@ -17,18 +17,18 @@ from services.cli.output import (
     KeyOption,
     MapOption,
     ServerOption,
-    answers,
-    explained,
-    print_faults,
+    console,
+    print_failures,
     print_json,
+    printable_path,
     progress_bar,
-    shown,
+    report_errors,
 )
-from services.cli.wait import wait_with_bar
-from services.cli.whole_file import whole_or_nothing
+from services.cli.wait import wait_for_job
+from services.cli.whole_file import atomic_write
 from shared.client import Client, Json
 from shared.errors import InvalidRequest
-from shared.recipes import MOST_CLUSTERS
+from shared.recipes import MAX_CLUSTERS
 
 app = typer.Typer(help="VLAD's cluster centres: fit them on the map's own photos, import, list.")
 
@@ -52,7 +52,7 @@ def fit(
     ] = None,
     clusters: Annotated[
         int | None,
-        typer.Option(min=1, max=MOST_CLUSTERS, help="Cluster centres; default: the extractor's."),
+        typer.Option(min=1, max=MAX_CLUSTERS, help="Cluster centres; default: the extractor's."),
     ] = None,
     sample: Annotated[
         int | None, typer.Option(min=1, help="Photos to learn from at most; default 1000.")
@@ -67,20 +67,20 @@ def fit(
 
     With DIR: learn it from a folder, and write it to a file that `import` takes.
     """
-    with explained(as_json):
+    with report_errors(as_json):
         if folder is not None:
             # Not --server and --key: the environment may hold them for all commands.
-            _only_for("a map", {"--map": map_name})
+            _reject_options("a map", {"--map": map_name})
             if out is None:
                 raise InvalidRequest("bad_out", "Say where to write: --out FILE.npz")
             _fit_folder(folder, out, extractor, clusters, sample, seed, as_json)
             return
-        _only_for("a folder (vocabulary fit DIR)", {"--out": out, "--extractor": extractor})
+        _reject_options("a folder (vocabulary fit DIR)", {"--out": out, "--extractor": extractor})
         wanted = {"clusters": clusters, "sample": sample, "seed": seed}
         given = {name: value for name, value in wanted.items() if value is not None}
         with connect(server, map_name, key) as client, progress_bar() as progress:
             job = fit_and_wait(client, given, progress)
-        _print_change(job, as_json)
+        _print_generation(job, as_json)
 
 
 @app.command("import")
@@ -101,7 +101,7 @@ def import_(
     """Bring a vocabulary, describe all photos with it, switch."""
     from shared.vision.vocabulary_file import read_vocabulary  # torch takes seconds
 
-    with explained(as_json):
+    with report_errors(as_json):
         brought = read_vocabulary(file)
         with (
             tempfile.TemporaryDirectory() as folder,
@@ -111,8 +111,8 @@ def import_(
             checked = Path(folder, f"{file.stem}{brought.suffix}")
             checked.write_bytes(brought.encode())
             started = client.import_vocabulary(checked)
-            job = wait_with_bar(client, started["job_id"], progress, "vocabulary")
-        _print_change(job, as_json)
+            job = wait_for_job(client, started["job_id"], progress, "vocabulary")
+        _print_generation(job, as_json)
 
 
 @app.command("export")
@@ -127,21 +127,23 @@ def export(
     as_json: JsonOption = False,
 ) -> None:
     """Write one of the map's vocabularies to a file: .npz, or .npy where its origin is unknown."""
-    with explained(as_json):
-        _check_id(vocabulary_id)
+    with report_errors(as_json):
+        _validate_id(vocabulary_id)
         with connect(server, map_name, key) as client:
             data = client.vocabulary_file(vocabulary_id)
         suffix = ".npz" if data.startswith(b"PK") else ".npy"
         if out.suffix != suffix:
             raise InvalidRequest(
-                "bad_out", f"{shown(out)}: this vocabulary's file ends in {suffix}."
+                "bad_out", f"{printable_path(out)}: this vocabulary's file ends in {suffix}."
             )
-        with whole_or_nothing(out) as file:
+        with atomic_write(out) as file:
             file.write(data)
         if as_json:
-            print_json({"file": shown(out), "vocabulary_id": vocabulary_id, "bytes": len(data)})
+            print_json(
+                {"file": printable_path(out), "vocabulary_id": vocabulary_id, "bytes": len(data)}
+            )
             return
-        answers.print(f"{shown(out)}: {len(data)} bytes.", soft_wrap=True, markup=False)
+        console.print(f"{printable_path(out)}: {len(data)} bytes.", soft_wrap=True, markup=False)
 
 
 @app.command("list")
@@ -152,7 +154,7 @@ def list_(
     as_json: JsonOption = False,
 ) -> None:
     """The map's vocabularies, newest first; the one that answers is marked."""
-    with explained(as_json):
+    with report_errors(as_json):
         with connect(server, map_name, key) as client:
             found = client.vocabularies()
             answering = {
@@ -168,18 +170,18 @@ def list_(
         for v in found:
             table.add_row(
                 "*" if v["vocabulary_id"] in active else "",
-                f"{v['vocabulary_id']}\n{_learnt_with(v['provenance'])}\nsha256 {v['sha256'][:12]}"
-                + _shortened(answering.get(v["vocabulary_id"])),
+                f"{v['vocabulary_id']}\n{_format_provenance(v['provenance'])}\nsha256 {v['sha256'][:12]}"
+                + _format_pca(answering.get(v["vocabulary_id"])),
                 v["origin"],
                 str(v["clusters"]),
                 str(v["dimension"]),
                 str(v["provenance"].get("photos", "")),
                 v["created_at"],
             )
-        answers.print(table)
+        console.print(table)
 
 
-def _check_id(vocabulary_id: str) -> None:
+def _validate_id(vocabulary_id: str) -> None:
     """InvalidRequest (`bad_id`): what is no id would be another path."""
     try:
         UUID(vocabulary_id)
@@ -189,7 +191,7 @@ def _check_id(vocabulary_id: str) -> None:
         ) from None
 
 
-def _learnt_with(provenance: Json) -> str:
+def _format_provenance(provenance: Json) -> str:
     if "backbone" not in provenance:
         return "of unknown origin"
     pixels = provenance["preprocessing"]
@@ -197,16 +199,18 @@ def _learnt_with(provenance: Json) -> str:
     return " ".join(str(part) for part in parts if part is not None)
 
 
-def _shortened(generation: Json | None) -> str:
+def _format_pca(generation: Json | None) -> str:
     if generation is None or generation["pca_from"] is None:
         return ""
     return f"\nPCA: {generation['dimension']} of {generation['pca_from']} dimensions"
 
 
-def _only_for(what: str, options: dict[str, object]) -> None:
+def _reject_options(source: str, options: dict[str, object]) -> None:
     """InvalidRequest (`options_contradict`) where one is given."""
     if wrong := [name for name, value in options.items() if value is not None]:
-        raise InvalidRequest("options_contradict", f"{', '.join(wrong)}: only for a fit on {what}.")
+        raise InvalidRequest(
+            "options_contradict", f"{', '.join(wrong)}: only for a fit on {source}."
+        )
 
 
 def _fit_folder(
@@ -218,10 +222,10 @@ def _fit_folder(
     seed: int | None,
     as_json: bool,
 ) -> None:
-    from services.cli.fit_folder import fit_folder  # torch takes seconds
+    from services.cli.fit_folder import fit_vocabulary_on_folder  # torch takes seconds
 
     with progress_bar() as progress:
-        fitted = fit_folder(
+        fitted = fit_vocabulary_on_folder(
             folder,
             out,
             extractor=extractor,
@@ -233,9 +237,9 @@ def _fit_folder(
     if as_json:
         print_json(fitted)
         return
-    print_faults(fitted, "refused")
+    print_failures(fitted, "refused")
     about = fitted["provenance"]
-    answers.print(
+    console.print(
         f"{fitted['file']}: {fitted['clusters']} clusters of {fitted['dimension']} dimensions from "
         f"{about['photos']} photos, mean cosine {about['mean_cosine']:.4f}.",
         soft_wrap=True,
@@ -243,17 +247,19 @@ def _fit_folder(
     )
 
 
-def fit_and_wait(client: Client, wanted: dict[str, int], progress: Progress) -> Json:
+def fit_and_wait(client: Client, parameters: dict[str, int], progress: Progress) -> Json:
     """Fit on the map's photos and wait until the new generation answers."""
-    return wait_with_bar(client, client.fit_vocabulary(**wanted)["job_id"], progress, "vocabulary")
+    return wait_for_job(
+        client, client.fit_vocabulary(**parameters)["job_id"], progress, "vocabulary"
+    )
 
 
-def _print_change(job: Json, as_json: bool) -> None:
+def _print_generation(job: Json, as_json: bool) -> None:
     if as_json:
         print_json(job)
         return
     result = job["result"]
-    answers.print(
+    console.print(
         f"Generation {result['generation_id']} answers: {result['photos']} photos, "
         f"{result['clusters']} clusters, {result['failed']} failed.",
         soft_wrap=True,

@@ -10,26 +10,26 @@ from shared.errors import PlacewiseError, Unprocessable
 POLL_SECONDS = 1.0  # so that the bar moves
 
 
-def wait_with_bar(client: Client, job_id: str, progress: Progress, what: str) -> Json:
+def wait_for_job(client: Client, job_id: str, progress: Progress, label: str) -> Json:
     """The job once it has succeeded; its stored reason as an error when it has not."""
-    bar = progress.add_task(what, total=None)
+    bar = progress.add_task(label, total=None)
 
     def show(job: Json) -> None:
         done = job["progress"]
         progress.update(
             bar,
-            description=f"{what}: {job['stage'] or job['state']}",
+            description=f"{label}: {job['stage'] or job['state']}",
             completed=done["done"],
             total=done["total"],
         )
 
     job = client.wait_for(job_id, show, poll_seconds=POLL_SECONDS)
     if job["state"] != "succeeded":
-        raise _reason(job)
+        raise _job_error(job)
     return job
 
 
-def _reason(job: Json) -> PlacewiseError:
+def _job_error(job: Json) -> PlacewiseError:
     error = job["error"] or {}
     return Unprocessable(
         error.get("code", "job_ended"), error.get("detail", f"The job is {job['state']}.")

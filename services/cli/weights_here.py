@@ -6,15 +6,15 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from services.cli.fingerprints import Known, file_key, remember, remembered
+from services.cli.fingerprints import WeightsRecord, file_key, load_record, save_record
 from shared.errors import Misconfigured
-from shared.recipes import RECIPES, Recipe, get_recipe
+from shared.recipes import EXTRACTOR_CONFIGS, ExtractorConfig, get_extractor_config
 from shared.settings import Settings
-from shared.torchhub_names import HubEntry
+from shared.torchhub_names import TorchHubEntry
 
 
 @dataclass(frozen=True, slots=True)
-class Weights:
+class LocalWeights:
     """The weights of one extractor, as `placewise models list` shows them."""
 
     extractor: str
@@ -31,74 +31,93 @@ class Weights:
     """As `backbone_fingerprint` in an extractor spec."""
 
 
-def listed(settings: Settings) -> Iterator[Recipe]:
+def list_recipes(settings: Settings) -> Iterator[ExtractorConfig]:
     """Every extractor by its own name, that of new maps, and the torch.hub entries that are
     allowed; not those for tests, nor models that were added, which lie in the object store.
     """
-    names = dict.fromkeys((*RECIPES, settings.new_map_extractor, *settings.allowed_hub_extractors))
-    recipes = (get_recipe(name, allow_test_extractors=True) for name in names)
+    names = dict.fromkeys(
+        (*EXTRACTOR_CONFIGS, settings.new_map_extractor, *settings.allowed_hub_extractors)
+    )
+    recipes = (get_extractor_config(name, allow_test_extractors=True) for name in names)
     yield from (recipe for recipe in recipes if not recipe.for_tests and recipe.trained is None)
 
 
-def look(
-    recipe: Recipe, settings: Settings, on_reading: Callable[[Path], object] = lambda _path: None
-) -> Weights:
+def inspect_weights(
+    recipe: ExtractorConfig,
+    settings: Settings,
+    on_reading: Callable[[Path], object] = lambda _path: None,
+) -> LocalWeights:
     """What is here of the extractor; asks no network and loads no network.
 
     A fingerprint that is not known yet is computed, which reads the file: `on_reading` is told.
     """
     if recipe.hub is not None:
-        return _of_torchhub(recipe.hub)
+        return _torchhub_weights(recipe.hub)
     if recipe.depth is not None:
-        return _of_dinov2(recipe, settings.dino_weights, on_reading)
-    return _of_package(recipe, on_reading)
+        return _dinov2_weights(recipe, settings.dino_weights, on_reading)
+    return _packaged_weights(recipe, on_reading)
 
 
-def hub_key(hub: HubEntry, code_fingerprint: str) -> str:
+def torchhub_key(hub: TorchHubEntry, code_fingerprint: str) -> str:
     """Under which the weights of a torch.hub entry are remembered once they were loaded."""
     return f"{hub.module} {code_fingerprint}"
 
 
-def _of_package(recipe: Recipe, on_reading: Callable[[Path], object]) -> Weights:
+def _packaged_weights(
+    recipe: ExtractorConfig, on_reading: Callable[[Path], object]
+) -> LocalWeights:
     from shared.vision.backbones.efficientnet_lite0 import PACKAGE, EfficientNetLite0, weights_path
     from shared.vision.download import file_sha256
 
-    source, licence = f"the package {PACKAGE}", EfficientNetLite0.licence
+    source, find_licence = f"the package {PACKAGE}", EfficientNetLite0.licence
     try:
         path = weights_path()
     except Misconfigured as error:
-        return Weights(recipe.name, source, False, error.detail, None, None, licence, None)
-    known = _known(recipe.backbone, path, file_sha256, on_reading)
-    return Weights(
-        recipe.name, source, True, None, str(path), known.size_bytes, licence, known.fingerprint
+        return LocalWeights(
+            recipe.name, source, False, error.detail, None, None, find_licence, None
+        )
+    known = _cached_record(recipe.backbone, path, file_sha256, on_reading)
+    return LocalWeights(
+        recipe.name,
+        source,
+        True,
+        None,
+        str(path),
+        known.size_bytes,
+        find_licence,
+        known.fingerprint,
     )
 
 
-def _of_dinov2(recipe: Recipe, given: Path | None, on_reading: Callable[[Path], object]) -> Weights:
-    from shared.vision.backbones.dinov2 import Dinov2, check_weights, weights_fingerprint
+def _dinov2_weights(
+    recipe: ExtractorConfig, weights_file: Path | None, on_reading: Callable[[Path], object]
+) -> LocalWeights:
+    from shared.vision.backbones.dinov2 import Dinov2, check_dinov2_weights, dinov2_fingerprint
     from shared.vision.backbones.dinov2_weights import (
+        find_local_weights,
         hub_repository,
         open_weights,
-        weights_at_hand,
     )
 
     layer, facet = recipe.layer, recipe.facet
     assert layer is not None
     assert facet is not None
     size = recipe.backbone.removeprefix("dinov2-")
-    source = f"Hugging Face: {hub_repository(size)}" if given is None else "DINO_WEIGHTS"
+    source = f"Hugging Face: {hub_repository(size)}" if weights_file is None else "DINO_WEIGHTS"
     try:
-        path = weights_at_hand(size, given)
-        check_weights(size, layer, facet, open_weights(path, size))
+        path = find_local_weights(size, weights_file)
+        check_dinov2_weights(size, layer, facet, open_weights(path, size))
     except Misconfigured as error:
-        return Weights(recipe.name, source, False, error.detail, None, None, Dinov2.licence, None)
+        return LocalWeights(
+            recipe.name, source, False, error.detail, None, None, Dinov2.licence, None
+        )
 
     def fingerprint(file: Path) -> str:
-        return weights_fingerprint(size, layer, facet, open_weights(file, size))
+        return dinov2_fingerprint(size, layer, facet, open_weights(file, size))
 
     # The layer and the facet say which of the file's tensors are in use.
-    known = _known(f"{recipe.backbone} {layer} {facet}", path, fingerprint, on_reading)
-    return Weights(
+    known = _cached_record(f"{recipe.backbone} {layer} {facet}", path, fingerprint, on_reading)
+    return LocalWeights(
         recipe.name,
         source,
         True,
@@ -110,35 +129,35 @@ def _of_dinov2(recipe: Recipe, given: Path | None, on_reading: Callable[[Path], 
     )
 
 
-def _of_torchhub(hub: HubEntry) -> Weights:
+def _torchhub_weights(hub: TorchHubEntry) -> LocalWeights:
     """Where its weights lie, only its code knows: they are here once it was loaded as it is now."""
-    from shared.vision.torchhub_code import code_at_hand, code_fingerprint, licence
+    from shared.vision.torchhub_code import code_fingerprint, find_licence, find_local_code
 
     source = f"the folder {hub.folder}" if hub.folder else f"github.com/{hub.source}"
     try:
-        folder = code_at_hand(hub)
+        folder = find_local_code(hub)
     except Misconfigured as error:
-        return Weights(hub.name, source, False, error.detail, None, None, "unknown", None)
-    known = remembered(hub_key(hub, code_fingerprint(folder)))
-    return Weights(
+        return LocalWeights(hub.name, source, False, error.detail, None, None, "unknown", None)
+    known = load_record(torchhub_key(hub, code_fingerprint(folder)))
+    return LocalWeights(
         hub.name,
         source,
         known is not None,
         None if known else "its code is here, but was never loaded: `placewise models fetch`",
         str(folder),
         known.size_bytes if known else None,
-        licence(folder),
+        find_licence(folder),
         known.fingerprint if known else None,
     )
 
 
-def _known(
-    what: str, path: Path, fingerprint: Callable[[Path], str], on_reading: Callable[[Path], object]
-) -> Known:
-    key = file_key(what, path)
-    known = remembered(key)
+def _cached_record(
+    name: str, path: Path, fingerprint: Callable[[Path], str], on_reading: Callable[[Path], object]
+) -> WeightsRecord:
+    key = file_key(name, path)
+    known = load_record(key)
     if known is None:
         on_reading(path)
-        known = Known(fingerprint(path), path.stat().st_size)
-        remember(key, known)
+        known = WeightsRecord(fingerprint(path), path.stat().st_size)
+        save_record(key, known)
     return known

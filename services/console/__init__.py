@@ -8,5 +8,5 @@ from __future__ import annotations
 
 from pathlib import Path
 
-PAGE = Path(__file__).parent / "page"
+PAGE_FOLDER = Path(__file__).parent / "page"
 """index.html, docs.html, redoc.html, and below them what those load from `/console/`."""

@@ -12,26 +12,26 @@ from typing import Any
 
 import torch
 
-from shared.catalog.added_models import NewModel, add_model
+from shared.catalog.added_models import ModelRegistration, register_model
 from shared.catalog.session import Catalog
 from shared.errors import NotFound, Unprocessable
 from shared.ids import new_id
 from shared.jobs import Job
-from shared.jobs.finish import succeed
-from shared.jobs.leases import held
-from shared.model_names import PREFIX
+from shared.jobs.finish import succeed_job
+from shared.jobs.leases import lock_leased_jobs
+from shared.model_names import TRAINED_MODEL_PREFIX
 from shared.objects import ObjectStore
 from shared.objects.keys import new_model_key
 from shared.private_files import create_private_file, make_private_folder
-from shared.vision.backbones.trained import TrainedModel
+from shared.vision.backbones.trained import TrainedBackbone
 from shared.vision.place_models.checkpoint import Checkpoint, load_checkpoint
-from shared.vision.place_models.model_file import encode_model
+from shared.vision.place_models.model_file import encode_model_file
 
-MOST_ABOUT_CHARACTERS = 20_000  # of JSON: what the training said of itself
-PIECE_BYTES = 1 << 20
+MAX_CARD_CHARACTERS = 20_000  # of JSON: what the training said of itself
+COPY_BYTES = 1 << 20
 
 
-class AddModel:
+class ModelImporter:
     """One piece of work, on the CPU: nothing is described with the model yet."""
 
     def __init__(self, catalog: Catalog, store: ObjectStore, folder: Path) -> None:
@@ -42,32 +42,32 @@ class AddModel:
         self._store = store
         self._folder = folder
 
-    def from_checkpoint(self, job: Job) -> None:
+    def import_checkpoint(self, job: Job) -> None:
         """Check the checkpoint under `object_key`, store what describes photos, add its row.
 
         Unprocessable: those of `load_checkpoint`, `model_unfit`, `checkpoint_lost`; Conflict
         (`model_name_taken`).
         """
         filename = job.params["filename"]
-        with self._file(job.params["object_key"]) as path:
+        with self._local_file(job.params["object_key"]) as path:
             try:
                 checkpoint = load_checkpoint(path)
             except Unprocessable as error:  # it speaks of the file as it is called here
                 said = error.detail.replace(path.name, filename)
                 raise Unprocessable(error.code, said, **error.extra) from error
-        card = {"source": filename, **about(checkpoint)}
+        card = {"source": filename, **training_card(checkpoint)}
         name = job.params["name"]
-        TrainedModel(
-            f"{PREFIX}{name}",
+        TrainedBackbone(
+            f"{TRAINED_MODEL_PREFIX}{name}",
             checkpoint.model,
             checkpoint.fingerprint,
             torch.device("cpu"),
             licence="",
             card=card,
         ).check()
-        data = encode_model(checkpoint)
+        data = encode_model_file(checkpoint)
         sha256 = hashlib.sha256(data).hexdigest()
-        new = NewModel(
+        new = ModelRegistration(
             name=name,
             fingerprint=checkpoint.fingerprint,
             object_key=new_model_key(sha256),
@@ -82,14 +82,14 @@ class AddModel:
         self._store.put(new.object_key, data)
         self._commit(job, new)
 
-    def _commit(self, job: Job, new: NewModel) -> None:
+    def _commit(self, job: Job, new: ModelRegistration) -> None:
         """The row and the job's end. A file that stays without row is an orphan, and collected."""
         token = job.lease_token
         assert token is not None, "a claimed job carries a token"
         with self._catalog.write() as session:
-            for mine in held(session, token, [job]):
-                model, added = add_model(session, new)
-                succeed(
+            for mine in lock_leased_jobs(session, token, [job]):
+                model, added = register_model(session, new)
+                succeed_job(
                     mine,
                     {
                         "name": new.name,
@@ -102,7 +102,7 @@ class AddModel:
                 )
 
     @contextlib.contextmanager
-    def _file(self, key: str) -> Iterator[Path]:
+    def _local_file(self, key: str) -> Iterator[Path]:
         """The object as a file of this machine."""
         there = self._store.file(key)
         if there is not None:
@@ -112,16 +112,16 @@ class AddModel:
         path = self._folder / f"{new_id()}.partial"
         try:
             with self._store.open(key) as source, create_private_file(path) as file:
-                while piece := source.read(PIECE_BYTES):
+                while piece := source.read(COPY_BYTES):
                     file.write(piece)
             yield path
         except NotFound as error:
-            raise _lost() from error
+            raise _checkpoint_lost_error() from error
         finally:
             path.unlink(missing_ok=True)
 
 
-def about(checkpoint: Checkpoint) -> dict[str, Any]:
+def training_card(checkpoint: Checkpoint) -> dict[str, Any]:
     """What the checkpoint says of its training, as JSON that every database keeps.
 
     What is no JSON becomes text; of more than MOST_ABOUT_CHARACTERS only how long it was trained
@@ -129,7 +129,7 @@ def about(checkpoint: Checkpoint) -> dict[str, Any]:
     """
     try:
         said: dict[str, Any] = _Plain().of(checkpoint.about)
-        if len(json.dumps(said)) <= MOST_ABOUT_CHARACTERS:
+        if len(json.dumps(said)) <= MAX_CARD_CHARACTERS:
             return said
     except _TooLong:
         pass
@@ -147,7 +147,7 @@ class _Plain:
     a few bytes of a pickle can name the same long value any number of times."""
 
     def __init__(self) -> None:
-        self._left = MOST_ABOUT_CHARACTERS
+        self._left = MAX_CARD_CHARACTERS
 
     def of(self, value: Any, depth: int = -1) -> Any:
         self._take(1)
@@ -164,7 +164,7 @@ class _Plain:
     def _text(self, value: Any) -> str:
         if isinstance(value, str):
             self._take(len(value))
-        return _text(value)
+        return _to_json_text(value)
 
     def _take(self, characters: int) -> None:
         self._left -= characters
@@ -177,13 +177,13 @@ def _is_short(value: Any) -> bool:
     return isinstance(value, int) and value.bit_length() < 64
 
 
-def _text(value: Any) -> str:
+def _to_json_text(value: Any) -> str:
     # PostgreSQL keeps no NUL, and no half of a character.
     text = value if isinstance(value, str) else f"<{type(value).__name__}>"
     return text.replace("\x00", "").encode("utf-8", "replace").decode("utf-8")
 
 
-def _lost() -> Unprocessable:
+def _checkpoint_lost_error() -> Unprocessable:
     return Unprocessable(
         "checkpoint_lost", "The checkpoint is gone from the object store. Send it again."
     )

@@ -21,57 +21,57 @@ import torch
 
 from services.extractor.candidates import CandidateFeatures
 from services.extractor.decoding import DecoderPool
-from services.extractor.loaded import LoadedModels
-from services.extractor.publish import Published
-from services.extractor.stored_rows import stored_rows
-from services.extractor.target import Target, find_target
-from shared.catalog.photos import Photo, get_photo, live_photos
+from services.extractor.loaded import ModelRegistry
+from services.extractor.publish import PublishResult
+from services.extractor.stored_rows import read_stored_rows
+from services.extractor.target import ResolvedGeneration, resolve_generation
+from shared.catalog.photos import Photo, get_live_photos, get_photo
 from shared.catalog.session import Catalog
 from shared.comparison import (
-    Candidate,
-    ClusterShare,
-    Compared,
-    ComparedCandidate,
-    Comparison,
-    Explanation,
-    check_can_explain,
-    check_can_rerank,
-    query_expired,
+    ClusterContribution,
+    CompareRequest,
+    CompareResult,
+    RerankCandidate,
+    RerankedCandidate,
+    SimilarityExplanation,
+    check_explainable,
+    check_rerankable,
+    query_expired_error,
 )
 from shared.errors import Gone, NotFound, PlacewiseError
 from shared.jobs import Job
-from shared.jobs.finish import succeed
-from shared.jobs.leases import held, token_of
+from shared.jobs.finish import succeed_job
+from shared.jobs.leases import get_lease_token, lock_leased_jobs
 from shared.objects import ObjectStore
 from shared.objects.keys import comparison_key, query_key
 from shared.settings import Settings
-from shared.vision.decode import Decoded
-from shared.vision.explain import Shared, explain
-from shared.vision.extractors import not_finite
+from shared.vision.decode import DecodedPhoto
+from shared.vision.explain import SimilarityShares, explain_similarities
+from shared.vision.extractors import not_finite_error
 from shared.vision.local_features import LocalFeatures
 from shared.vision.matching import rerank_score
 from shared.vision.overlay import draw_overlay
 
 
 @dataclass(frozen=True, slots=True)
-class Prepared:
+class PreparedComparison:
     """A claimed compare job whose query is decoded."""
 
     job: Job
-    asked: Comparison
-    target: Target
-    query: Decoded
+    request: CompareRequest
+    target: ResolvedGeneration
+    query: DecodedPhoto
     seconds: dict[str, float] = field(default_factory=dict)
 
 
-class Comparisons:
+class ComparisonRunner:
     """Does compare jobs."""
 
     def __init__(
         self,
         catalog: Catalog,
         store: ObjectStore,
-        models: LoadedModels,
+        models: ModelRegistry,
         decoders: DecoderPool,
         settings: Settings,
     ) -> None:
@@ -81,66 +81,66 @@ class Comparisons:
         self._decoders = decoders
         self._candidates = CandidateFeatures(store, decoders, settings)
 
-    def prepare(self, job: Job) -> Prepared:
+    def prepare(self, job: Job) -> PreparedComparison:
         """PlacewiseError when the job can't be done: what it needs is gone, or was never there."""
-        asked = Comparison.model_validate(job.params["request"])
-        target = find_target(self._catalog, self._store, self._models, job)
+        asked = CompareRequest.model_validate(job.params["request"])
+        target = resolve_generation(self._catalog, self._store, self._models, job)
         assert target is not None, "a compare job names a generation that has answered"
         if asked.rerank:
-            check_can_rerank(target.extractor.recipe)
+            check_rerankable(target.extractor.recipe)
         if asked.explain:
-            check_can_explain(target.extractor.recipe, target.generation.spec)
+            check_explainable(target.extractor.recipe, target.generation.spec)
         data = self._read_query(job, asked)
         (query,) = self._decoders.decode([data], target.extractor.preprocessing)
         if isinstance(query, PlacewiseError):
             raise query
-        return Prepared(job, asked, target, query)
+        return PreparedComparison(job, asked, target, query)
 
-    def finish(self, prepared: Prepared) -> Published:
+    def run(self, prepared: PreparedComparison) -> PublishResult:
         """Compare, store the result and end the job."""
         started = time.perf_counter()
         job, result = prepared.job, self._compare(prepared)
         prepared.seconds["compare"] = time.perf_counter() - started
         self._store.put(comparison_key(job.id), result.model_dump_json().encode())
         with self._catalog.write() as session:
-            mine = held(session, token_of(job), [job])
+            mine = lock_leased_jobs(session, get_lease_token(job), [job])
             for own in mine:
-                succeed(own, {"candidates": len(result.candidates)})
-        return Published(succeeded=len(mine), lost=1 - len(mine))
+                succeed_job(own, {"candidates": len(result.candidates)})
+        return PublishResult(succeeded=len(mine), lost=1 - len(mine))
 
-    def _read_query(self, job: Job, asked: Comparison) -> bytes:
-        if asked.query_photo_id is None:
-            assert asked.query_job_id is not None, "a query is one or the other"
+    def _read_query(self, job: Job, request: CompareRequest) -> bytes:
+        if request.query_photo_id is None:
+            assert request.query_job_id is not None, "a query is one or the other"
             try:
-                return self._store.get(query_key(asked.query_job_id))
+                return self._store.get(query_key(request.query_job_id))
             except NotFound as error:
-                raise query_expired() from error
+                raise query_expired_error() from error
         with self._catalog.read() as session:
-            photo = get_photo(session, job.map_id, asked.query_photo_id)
+            photo = get_photo(session, job.map_id, request.query_photo_id)
         return self._store.get(photo.object_key)
 
-    def _compare(self, prepared: Prepared) -> Compared:
-        asked, target = prepared.asked, prepared.target
+    def _compare(self, prepared: PreparedComparison) -> CompareResult:
+        asked, target = prepared.request, prepared.target
         (features,) = target.extractor.local_features([prepared.query.pixels])
         if not bool(features.isfinite().all()):
-            raise not_finite()
+            raise not_finite_error()
         grid = target.extractor.backbone.grid(*prepared.query.pixels.shape[:2])
         with self._catalog.read() as session:
-            live = live_photos(session, [found.photo_id for found in asked.candidates])
+            live = get_live_photos(session, [found.photo_id for found in asked.candidates])
         there = [found for found in asked.candidates if found.photo_id in live]
         first, rest = there[: asked.rerank], there[asked.rerank :]
-        query = LocalFeatures.of(features, grid)
+        query = LocalFeatures.from_features(features, grid)
         scores = self._rerank(target, query, first, [live[one.photo_id] for one in first])
         # The sort is stable: of equal scores, and without one, the more similar photo comes first.
         first.sort(key=lambda one: -scores.get(one.photo_id, -np.inf))
         ordered = [one.photo_id for one in first + rest]
         shares = self._explain(target, features, ordered[: asked.explain], asked.word_weights)
-        return Compared(
+        return CompareResult(
             candidates=tuple(
-                ComparedCandidate(
+                RerankedCandidate(
                     photo_id=photo_id,
                     rerank_score=scores.get(photo_id),
-                    explanation=_explanation(shares[photo_id], grid)
+                    explanation=_build_explanation(shares[photo_id], grid)
                     if photo_id in shares
                     else None,
                 )
@@ -150,9 +150,9 @@ class Comparisons:
 
     def _rerank(
         self,
-        target: Target,
+        target: ResolvedGeneration,
         query: LocalFeatures,
-        candidates: Sequence[Candidate],
+        candidates: Sequence[RerankCandidate],
         photos: Sequence[Photo],
     ) -> dict[UUID, float]:
         """The rerank score of each candidate that can be read, by its photo."""
@@ -160,21 +160,21 @@ class Comparisons:
         device = target.extractor.backbone.device
         return {
             photo_id: rerank_score(similarity[photo_id], query, features, device)
-            for photo_id, features in self._candidates.of(target, photos)
+            for photo_id, features in self._candidates.load(target, photos)
         }
 
     def _explain(
         self,
-        target: Target,
+        target: ResolvedGeneration,
         features: torch.Tensor,
         photo_ids: Sequence[UUID],
         word_weights: Sequence[float],
-    ) -> dict[UUID, Shared]:
+    ) -> dict[UUID, SimilarityShares]:
         """The shares of each of the photos; of none when none is asked for."""
         if not photo_ids:
             return {}
         generation_id = target.generation.id
-        found = stored_rows(self._catalog, self._store, generation_id, photo_ids)
+        found = read_stored_rows(self._catalog, self._store, generation_id, photo_ids)
         if not found:
             raise Gone(
                 "query_expired",
@@ -182,21 +182,23 @@ class Comparisons:
                 "answered. Ask again.",
             )
         rows = np.stack(list(found.values()))
-        shares = explain(target.extractor.recipe, features, target.centres, rows, word_weights)
+        shares = explain_similarities(
+            target.extractor.recipe, features, target.centres, rows, word_weights
+        )
         return dict(zip(found, shares, strict=True))
 
 
-def _explanation(shared: Shared, grid: tuple[int, int]) -> Explanation:
+def _build_explanation(shared: SimilarityShares, grid: tuple[int, int]) -> SimilarityExplanation:
     overlay, full_share = draw_overlay(shared.patches.reshape(grid))
     clusters = None
     if shared.clusters is not None:
         strongest = np.argsort(-shared.clusters, kind="stable")
         clusters = tuple(
-            ClusterShare(cluster=int(cluster), share=float(shared.clusters[cluster]))
+            ClusterContribution(cluster=int(cluster), share=float(shared.clusters[cluster]))
             for cluster in strongest
             if shared.clusters[cluster]
         )
-    return Explanation(
+    return SimilarityExplanation(
         clusters=clusters,
         rows=grid[0],
         columns=grid[1],

@@ -7,7 +7,7 @@ import resource
 from PIL import Image
 
 # Of Pillow's blocks, 16 MiB at most each, kept by a child between two photos.
-KEPT_BLOCKS = 8
+PILLOW_CACHED_BLOCKS = 8
 
 
 def limit_memory(limit_bytes: int) -> None:
@@ -15,4 +15,4 @@ def limit_memory(limit_bytes: int) -> None:
     resource.setrlimit(resource.RLIMIT_AS, (limit_bytes, limit_bytes))
     # Otherwise the memory of each picture comes page by page from the system, and goes back: that
     # took almost half of the time of decoding one.
-    Image.core.set_blocks_max(KEPT_BLOCKS)  # type: ignore[attr-defined]
+    Image.core.set_blocks_max(PILLOW_CACHED_BLOCKS)  # type: ignore[attr-defined]

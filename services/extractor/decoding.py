@@ -20,19 +20,19 @@ from pebble import ProcessExpired, ProcessFuture, ProcessPool
 from services.extractor.decoder_process import limit_memory
 from shared.errors import PlacewiseError, Unavailable, Unprocessable
 from shared.settings import Settings
-from shared.vision.decode import Decoded, decode
+from shared.vision.decode import DecodedPhoto, decode_photo
 from shared.vision.preprocessing import Preprocessing
 
 log = logging.getLogger(__name__)
 
-LOOK_SECONDS = 1.0  # how often a waiting batch looks whether the pool still lives
+POOL_POLL_SECONDS = 1.0  # how often a waiting batch looks whether the pool still lives
 
 # Photos of a batch that a child has before it: one under way and the next. All of them at once
 # would keep a query's photo, which comes from another thread, waiting behind the whole batch.
-SCHEDULED_EACH = 2
+SCHEDULED_PER_PROCESS = 2
 
 # A child may be killed for reasons of the machine (memory); a photo gets a second one.
-TRIES = 2
+MAX_DECODE_ATTEMPTS = 2
 
 
 class DecoderPool:
@@ -40,22 +40,22 @@ class DecoderPool:
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
-        self._renewing = threading.Lock()
-        self._pool = self._new_pool()
+        self._restart_lock = threading.Lock()
+        self._pool = self._start_pool()
 
     def decode(
         self, photos: Sequence[bytes], preprocessing: Preprocessing
-    ) -> list[Decoded | PlacewiseError]:
+    ) -> list[DecodedPhoto | PlacewiseError]:
         """Each photo decoded, or the reason why it can't be."""
-        with self._renewing:  # batches and model changes decode from different threads
+        with self._restart_lock:  # batches and model changes decode from different threads
             if not self._pool.active:
                 log.error("the decoder pool broke; starting a new one")
                 self.close()
-                self._pool = self._new_pool()
-        outcomes: list[Decoded | PlacewiseError] = []
-        pending: deque[tuple[ProcessFuture[Decoded], bytes]] = deque()
+                self._pool = self._start_pool()
+        outcomes: list[DecodedPhoto | PlacewiseError] = []
+        pending: deque[tuple[ProcessFuture[DecodedPhoto], bytes]] = deque()
         for data in photos:
-            if len(pending) == self._settings.decode_processes * SCHEDULED_EACH:
+            if len(pending) == self._settings.decode_processes * SCHEDULED_PER_PROCESS:
                 outcomes.append(self._result(*pending.popleft(), preprocessing))
             pending.append((self._schedule(data, preprocessing), data))
         outcomes += [self._result(future, data, preprocessing) for future, data in pending]
@@ -66,7 +66,7 @@ class DecoderPool:
         self._pool.stop()  # type: ignore[no-untyped-call]
         self._pool.join()
 
-    def _new_pool(self) -> ProcessPool:
+    def _start_pool(self) -> ProcessPool:
         return ProcessPool(
             max_workers=self._settings.decode_processes,
             # Fork would copy a process that holds torch's threads and locks.
@@ -75,20 +75,20 @@ class DecoderPool:
             initargs=[self._settings.decode_memory_bytes],
         )
 
-    def _schedule(self, data: bytes, preprocessing: Preprocessing) -> ProcessFuture[Decoded]:
+    def _schedule(self, data: bytes, preprocessing: Preprocessing) -> ProcessFuture[DecodedPhoto]:
         try:
             return self._pool.schedule(
-                decode,
+                decode_photo,
                 args=[data, preprocessing, self._settings.max_image_pixels],
                 timeout=self._settings.decode_timeout_seconds,
             )
         except RuntimeError as error:  # how pebble says that the pool no longer runs
-            raise _broke() from error
+            raise _pool_broken_error() from error
 
     def _result(
-        self, future: ProcessFuture[Decoded], data: bytes, preprocessing: Preprocessing
-    ) -> Decoded | PlacewiseError:
-        for attempt in range(1, TRIES + 1):
+        self, future: ProcessFuture[DecodedPhoto], data: bytes, preprocessing: Preprocessing
+    ) -> DecodedPhoto | PlacewiseError:
+        for attempt in range(1, MAX_DECODE_ATTEMPTS + 1):
             try:
                 return self._await(future)
             except PlacewiseError as error:
@@ -102,27 +102,27 @@ class DecoderPool:
                     f"{self._settings.decode_timeout_seconds:g} s.",
                 )
             except (ProcessExpired, MemoryError) as error:
-                if attempt == TRIES:
+                if attempt == MAX_DECODE_ATTEMPTS:
                     return Unprocessable(
                         "undecodable_photo",
-                        f"The decoder crashed on this photo {TRIES} times "
+                        f"The decoder crashed on this photo {MAX_DECODE_ATTEMPTS} times "
                         f"({type(error).__name__}).",
                     )
                 future = self._schedule(data, preprocessing)
         raise AssertionError("the last try returns")
 
-    def _await(self, future: ProcessFuture[Decoded]) -> Decoded:
+    def _await(self, future: ProcessFuture[DecodedPhoto]) -> DecodedPhoto:
         """The future's result; Unavailable when the pool broke, and no result will ever come."""
         while True:
-            done, _ = wait([future], timeout=LOOK_SECONDS)
+            done, _ = wait([future], timeout=POOL_POLL_SECONDS)
             if done:
                 try:
                     return future.result()
                 except BrokenProcessPool as error:  # a child was killed between two photos
-                    raise _broke() from error
+                    raise _pool_broken_error() from error
             if not self._pool.active:
-                raise _broke()
+                raise _pool_broken_error()
 
 
-def _broke() -> Unavailable:
+def _pool_broken_error() -> Unavailable:
     return Unavailable("decoders_broke", "The decoder processes broke; trying again.")

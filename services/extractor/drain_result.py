@@ -6,11 +6,11 @@ from collections import defaultdict
 from dataclasses import dataclass, field
 from typing import Any
 
-from services.extractor.publish import Published
+from services.extractor.publish import PublishResult
 
 
 @dataclass(slots=True)
-class DrainResult:
+class DrainStats:
     """What one drain did: this is what the operator sees."""
 
     maps: set[str] = field(default_factory=set)
@@ -18,10 +18,10 @@ class DrainResult:
     succeeded: int = 0
     failed: int = 0
     seconds: defaultdict[str, float] = field(default_factory=lambda: defaultdict(float))
-    more: bool = False
+    interrupted: bool = False
     """It ended before the work did."""
 
-    def add(self, other: DrainResult) -> None:
+    def merge(self, other: DrainStats) -> None:
         """Count what another one has counted, too."""
         self.maps |= other.maps
         self.claimed += other.claimed
@@ -30,7 +30,7 @@ class DrainResult:
         for stage, took in other.seconds.items():
             self.seconds[stage] += took
 
-    def count(self, outcome: Published, seconds: dict[str, float]) -> None:
+    def add_batch(self, outcome: PublishResult, seconds: dict[str, float]) -> None:
         """Count what a batch came to, and the time of its stages."""
         self.succeeded += outcome.succeeded
         self.failed += outcome.failed

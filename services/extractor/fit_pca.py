@@ -17,45 +17,45 @@ from uuid import UUID
 import numpy as np
 from sqlalchemy import select
 
-from services.extractor.loaded import LoadedModels, Made
-from services.extractor.new_generation import begin_whitened, go_on
-from services.extractor.slices import FIT_UNITS, do_steps, slice_of_work
-from services.extractor.stored_rows import stored_rows
+from services.extractor.loaded import DescriptorPipeline, ModelRegistry
+from services.extractor.new_generation import checkpoint_and_release, start_whitened_generation
+from services.extractor.slices import FIT_PROGRESS_UNITS, run_fit_steps, time_slice
+from services.extractor.stored_rows import read_stored_rows
 from shared.catalog.chunks import Descriptor
 from shared.catalog.generations import Generation
 from shared.catalog.photos import Photo, PhotoRole
 from shared.catalog.session import Catalog
 from shared.catalog.vocabularies import Vocabulary
-from shared.catalog.whitenings import generation_to_whiten
+from shared.catalog.whitenings import get_pca_source_generation
 from shared.errors import Conflict
 from shared.jobs import Job
 from shared.objects import ObjectStore
-from shared.objects.keys import work_key
-from shared.vision.pca import Projection
-from shared.vision.pca_file import WhiteningFile
-from shared.vision.pca_fit import Part, PcaFit, check_can_fit
+from shared.objects.keys import job_work_key
+from shared.vision.pca import PcaProjection
+from shared.vision.pca_file import PcaWhiteningFile
+from shared.vision.pca_fit import PcaBlock, PcaFit, check_pca_fittable
 from shared.vision.pca_rows import (
     StoredColumns,
+    block_count,
     block_width,
-    blocks_of,
-    choose_rows,
+    sample_rows,
     sample_size,
-    usable,
+    usable_rows,
 )
 
-READ_BYTES = 16_000_000  # of rows that are read together
+READ_BATCH_BYTES = 16_000_000  # of rows that are read together
 SEED = 0
 
 
-class FitPca:
+class PcaFitJob:
     """Does one slice of a PCA at a time."""
 
-    def __init__(self, catalog: Catalog, store: ObjectStore, models: LoadedModels) -> None:
+    def __init__(self, catalog: Catalog, store: ObjectStore, models: ModelRegistry) -> None:
         self._catalog = catalog
         self._store = store
         self._models = models
 
-    def slice(self, job: Job) -> None:
+    def run_step(self, job: Job) -> None:
         """The next slice, by the job's stage; PlacewiseError when it can't go on."""
         if job.stage is None:
             self._plan(job)
@@ -67,7 +67,7 @@ class FitPca:
     def _plan(self, job: Job) -> None:
         """Choose the rows to learn from: those of database photos alone, never of queries."""
         with self._catalog.read() as session:
-            source = generation_to_whiten(session, job.map_id)
+            source = get_pca_source_generation(session, job.map_id)
             photo_ids = session.scalars(
                 select(Descriptor.photo_id)
                 .join(Photo, Photo.id == Descriptor.photo_id)
@@ -78,13 +78,13 @@ class FitPca:
                 )
                 .order_by(Descriptor.photo_id)
             ).all()
-        self._check_unchanged(source)
+        self._check_spec_unchanged(source)
         kept = job.params["pca"]
-        check_can_fit(len(photo_ids), source.dimension, kept)
-        chosen = choose_rows(len(photo_ids), sample_size(source.dimension, kept), SEED)
+        check_pca_fittable(len(photo_ids), source.dimension, kept)
+        chosen = sample_rows(len(photo_ids), sample_size(source.dimension, kept), SEED)
         plan = [str(photo_ids[number]) for number in chosen]
-        self._store.put(work_key(job.id, "plan.json"), json.dumps(plan).encode())
-        go_on(
+        self._store.put(job_work_key(job.id, "plan.json"), json.dumps(plan).encode())
+        checkpoint_and_release(
             self._catalog,
             job,
             stage="gather",
@@ -96,14 +96,14 @@ class FitPca:
                 "looked_at": 0,
                 "rows": 0,
             },
-            progress_total=len(plan) + FIT_UNITS + len(photo_ids),
+            progress_total=len(plan) + FIT_PROGRESS_UNITS + len(photo_ids),
         )
 
-    def _check_unchanged(self, source: Generation) -> None:
+    def _check_spec_unchanged(self, source: Generation) -> None:
         """Conflict (`spec_differs`) where this worker would not describe photos as the rows were:
         they and the new ones would not belong together.
         """
-        made = self._made(source)
+        made = self._source_pipeline(source)
         if made.spec != source.spec:
             raise Conflict(
                 "spec_differs",
@@ -112,30 +112,30 @@ class FitPca:
                 generation_id=str(source.id),
             )
 
-    def _made(self, source: Generation) -> Made:
+    def _source_pipeline(self, source: Generation) -> DescriptorPipeline:
         vocabulary = None
         if source.vocabulary_id is not None:
             with self._catalog.read() as session:
                 vocabulary = session.get_one(Vocabulary, source.vocabulary_id)
-        return self._models.made_of(source, vocabulary, None)
+        return self._models.pipeline_of_generation(source, vocabulary, None)
 
     def _gather(self, job: Job) -> None:
         """The next rows of the plan, for about a second."""
         params = job.params
-        plan = json.loads(self._store.get(work_key(job.id, "plan.json")))
-        at_once = max(1, READ_BYTES // (4 * params["dimension"]))
-        sample = self._sample(job)
+        plan = json.loads(self._store.get(job_work_key(job.id, "plan.json")))
+        at_once = max(1, READ_BATCH_BYTES // (4 * params["dimension"]))
+        sample = self._gathered_rows(job)
         looked_at = params["looked_at"]
-        for _ in slice_of_work():
+        for _ in time_slice():
             if looked_at >= len(plan):
                 break
             wanted = [UUID(photo_id) for photo_id in plan[looked_at : looked_at + at_once]]
-            found = stored_rows(self._catalog, self._store, UUID(params["source"]), wanted)
+            found = read_stored_rows(self._catalog, self._store, UUID(params["source"]), wanted)
             if found:
                 rows = np.stack([found[photo_id] for photo_id in wanted if photo_id in found])
-                sample.add(rows[usable(rows)])
+                sample.add(rows[usable_rows(rows)])
             looked_at += len(wanted)
-        go_on(
+        checkpoint_and_release(
             self._catalog,
             job,
             stage="gather" if looked_at < len(plan) else "reduce",
@@ -146,52 +146,54 @@ class FitPca:
     def _reduce(self, job: Job) -> None:
         """Steps for about a second; when they are done, the whitening and its generation."""
         params = job.params
-        sample = self._sample(job)
+        sample = self._gathered_rows(job)
         fit = PcaFit(sample, params["pca"])
 
         def step() -> None:
             part = fit.step()
             if part is not None:
-                self._keep(job, fit.parts - 1, part)
+                self._write_part(job, fit.parts - 1, part)
 
-        if not do_steps(
+        if not run_fit_steps(
             self._catalog,
             self._store,
             job,
             fit,
             step,
-            begun="reducing",
+            resumed_param="reducing",
             progress_done=params["looked_at"],
         ):
             return
         with self._catalog.read() as session:
             source = session.get_one(Generation, UUID(params["source"]))
-        found = fit.whitening([self._kept(job, number) for number in range(blocks_of(sample))])
-        made = self._made(source)
-        whole = Projection(found, made.extractor.backbone.device)
-        begin_whitened(
+        found = fit.whitening(
+            [self._read_part(job, number) for number in range(block_count(sample))]
+        )
+        made = self._source_pipeline(source)
+        whole = PcaProjection(found, made.extractor.backbone.device)
+        start_whitened_generation(
             self._catalog,
             self._store,
             job,
-            Made(made.extractor, made.centres, whole),
-            WhiteningFile(found, source.spec),
+            DescriptorPipeline(made.extractor, made.centres, whole),
+            PcaWhiteningFile(found, source.spec),
             source.vocabulary_id,
-            progress_done=params["looked_at"] + FIT_UNITS,
+            progress_done=params["looked_at"] + FIT_PROGRESS_UNITS,
         )
 
-    def _sample(self, job: Job) -> StoredColumns:
+    def _gathered_rows(self, job: Job) -> StoredColumns:
         params = job.params
-        prefix = work_key(job.id, "rows-")
+        prefix = job_work_key(job.id, "rows-")
         return StoredColumns(
             self._store, prefix, params["dimension"], params["width"], params["rows"]
         )
 
-    def _keep(self, job: Job, number: int, part: Part) -> None:
+    def _write_part(self, job: Job, number: int, part: PcaBlock) -> None:
         buffer = io.BytesIO()
         np.savez(buffer, allow_pickle=False, mean=part.mean, directions=part.directions)
-        self._store.put(work_key(job.id, f"part-{number:05d}.npz"), buffer.getvalue())
+        self._store.put(job_work_key(job.id, f"part-{number:05d}.npz"), buffer.getvalue())
 
-    def _kept(self, job: Job, number: int) -> Part:
-        data = self._store.get(work_key(job.id, f"part-{number:05d}.npz"))
+    def _read_part(self, job: Job, number: int) -> PcaBlock:
+        data = self._store.get(job_work_key(job.id, f"part-{number:05d}.npz"))
         with np.load(io.BytesIO(data), allow_pickle=False) as saved:
-            return Part(saved["mean"], saved["directions"])
+            return PcaBlock(saved["mean"], saved["directions"])

@@ -15,31 +15,35 @@ from uuid import UUID
 from sqlalchemy import select
 
 from services.extractor.decoding import DecoderPool
-from services.extractor.loaded import LoadedModels
-from services.extractor.new_generation import begin_with_new, extractor_of, go_on
-from services.extractor.slices import FIT_UNITS, do_steps
-from shared.catalog.photos import Photo, PhotoRole, live_photos
+from services.extractor.loaded import ModelRegistry
+from services.extractor.new_generation import (
+    checkpoint_and_release,
+    map_extractor,
+    start_generation_with_new_vocabulary,
+)
+from services.extractor.slices import FIT_PROGRESS_UNITS, run_fit_steps
+from shared.catalog.photos import Photo, PhotoRole, get_live_photos
 from shared.catalog.session import Catalog
 from shared.catalog.vocabularies import VocabularyOrigin
 from shared.errors import Conflict, NotFound, PlacewiseError, Unprocessable
 from shared.jobs import Job
 from shared.objects import ObjectStore
-from shared.objects.keys import work_key
+from shared.objects.keys import job_work_key
 from shared.settings import Settings
 from shared.vision.extractors import Extractor
-from shared.vision.fit import Fit
-from shared.vision.patches import PatchStore, choose_photos
-from shared.vision.provenance import of_fit
+from shared.vision.fit import VocabularyFit
+from shared.vision.patches import PatchStore, sample_photos
+from shared.vision.provenance import fit_provenance
 
 
-class FitVocabulary:
+class VocabularyFitJob:
     """Does one slice of a fit at a time."""
 
     def __init__(
         self,
         catalog: Catalog,
         store: ObjectStore,
-        models: LoadedModels,
+        models: ModelRegistry,
         decoders: DecoderPool,
         settings: Settings,
     ) -> None:
@@ -49,9 +53,9 @@ class FitVocabulary:
         self._decoders = decoders
         self._settings = settings
 
-    def slice(self, job: Job) -> None:
+    def run_step(self, job: Job) -> None:
         """The next slice, by the job's stage; PlacewiseError when it can't go on."""
-        extractor = extractor_of(self._catalog, self._models, job)
+        extractor = map_extractor(self._catalog, self._models, job)
         if not extractor.recipe.needs_vocabulary:
             raise Unprocessable(
                 "vocabulary_unfit",
@@ -82,35 +86,35 @@ class FitVocabulary:
                 "no_photos",
                 "The map has no photos to learn a vocabulary from. Upload some first.",
             )
-        chosen = choose_photos(
+        chosen = sample_photos(
             len(photo_ids), job.params["sample"], extractor.backbone.width, job.params["seed"]
         )
         plan = [str(photo_ids[number]) for number in chosen]
-        self._store.put(work_key(job.id, "plan.json"), json.dumps(plan).encode())
+        self._store.put(job_work_key(job.id, "plan.json"), json.dumps(plan).encode())
         clusters = job.params["clusters"] or extractor.recipe.clusters
-        go_on(
+        checkpoint_and_release(
             self._catalog,
             job,
             stage="sample",
             params={**job.params, "clusters": clusters, "sampled": 0, "described": 0},
-            progress_total=len(plan) + FIT_UNITS + len(photo_ids),
+            progress_total=len(plan) + FIT_PROGRESS_UNITS + len(photo_ids),
         )
 
     def _sample(self, job: Job, extractor: Extractor) -> None:
         """Patches of the next few photos of the plan."""
-        plan = json.loads(self._store.get(work_key(job.id, "plan.json")))
+        plan = json.loads(self._store.get(job_work_key(job.id, "plan.json")))
         begin = job.params["sampled"]
         chosen = [UUID(photo_id) for photo_id in plan[begin : begin + self._settings.batch_photos]]
         decoded = [
             outcome
-            for outcome in self._decoders.decode(self._read(chosen), extractor.preprocessing)
+            for outcome in self._decoders.decode(self._read_photos(chosen), extractor.preprocessing)
             if not isinstance(outcome, PlacewiseError)
         ]
         if decoded:
             features = extractor.local_features([photo.pixels for photo in decoded])
-            self._patches(job, extractor).add(features, begin, len(plan), job.params["seed"])
+            self._patch_store(job, extractor).add(features, begin, len(plan), job.params["seed"])
         sampled = begin + len(chosen)
-        go_on(
+        checkpoint_and_release(
             self._catalog,
             job,
             stage="sample" if sampled < len(plan) else "cluster",
@@ -122,10 +126,10 @@ class FitVocabulary:
             progress_done=sampled,
         )
 
-    def _read(self, photo_ids: list[UUID]) -> list[bytes]:
+    def _read_photos(self, photo_ids: list[UUID]) -> list[bytes]:
         """The photos that are there: a sample does not depend on those deleted since."""
         with self._catalog.read() as session:
-            live = live_photos(session, photo_ids)
+            live = get_live_photos(session, photo_ids)
         photos = []
         for photo_id in photo_ids:
             if photo_id in live:
@@ -138,28 +142,28 @@ class FitVocabulary:
     def _cluster(self, job: Job, extractor: Extractor) -> None:
         """Steps for about a second; when they are done, the vocabulary and its generation."""
         params = job.params
-        patches = self._patches(job, extractor).open()
-        fit = Fit(patches, params["clusters"], params["seed"])
-        if not do_steps(
+        patches = self._patch_store(job, extractor).open()
+        fit = VocabularyFit(patches, params["clusters"], params["seed"])
+        if not run_fit_steps(
             self._catalog,
             self._store,
             job,
             fit,
             fit.step,
-            begun="clustering",
+            resumed_param="clustering",
             progress_done=params["sampled"],
         ):
             return
         centres = fit.centres()
-        provenance = of_fit(
+        provenance = fit_provenance(
             extractor,
             centres,
             fit,
-            clusters_asked=params["clusters"],
+            requested_clusters=params["clusters"],
             photos=params["described"],
             seed=params["seed"],
         )
-        begin_with_new(
+        start_generation_with_new_vocabulary(
             self._catalog,
             self._store,
             job,
@@ -167,8 +171,8 @@ class FitVocabulary:
             centres,
             VocabularyOrigin.FITTED,
             provenance,
-            progress_done=params["sampled"] + FIT_UNITS,
+            progress_done=params["sampled"] + FIT_PROGRESS_UNITS,
         )
 
-    def _patches(self, job: Job, extractor: Extractor) -> PatchStore:
-        return PatchStore(self._store, work_key(job.id, "patches-"), extractor.backbone.width)
+    def _patch_store(self, job: Job, extractor: Extractor) -> PatchStore:
+        return PatchStore(self._store, job_work_key(job.id, "patches-"), extractor.backbone.width)

@@ -13,52 +13,52 @@ from uuid import UUID
 import torch
 from sqlalchemy.orm import Session
 
-from services.extractor.lately_used import LatelyUsed
-from shared.catalog.added_models import model_to_load
+from services.extractor.lately_used import LruCache
+from shared.catalog.added_models import get_model_for_loading
 from shared.catalog.generations import Generation
-from shared.catalog.models import Model, ensure_model
+from shared.catalog.models import Model, get_or_create_model
 from shared.catalog.vocabularies import Vocabulary
 from shared.catalog.whitenings import StoredWhitening
 from shared.errors import Unavailable
 from shared.objects import ObjectStore
-from shared.recipes import Recipe
+from shared.recipes import ExtractorConfig
 from shared.settings import Settings
 from shared.vision.backbones import Backbone
 from shared.vision.extractors import Extractor, choose_device, spec_fingerprint
-from shared.vision.passes import PassLimit
-from shared.vision.pca import Projection
+from shared.vision.passes import BatchSizeLimit
+from shared.vision.pca import PcaProjection
 from shared.vision.pca_file import decode_whitening
 from shared.vision.precision import PRECISIONS, Precision, choose_precision
-from shared.vision.vocabulary import Centres, decode_centres
+from shared.vision.vocabulary import ClusterCentres, decode_centres
 
-LoadAdded = Callable[[str, torch.device], Backbone]
+LoadAddedModel = Callable[[str, torch.device], Backbone]
 
-MOST_EXTRACTORS = 2  # a large backbone takes gigabytes of GPU memory
-MOST_VOCABULARIES = 16
-MOST_WHITENINGS = 2  # one from 98,304 to 512 dimensions takes 201 MB of the device's memory
+MAX_EXTRACTORS = 2  # a large backbone takes gigabytes of GPU memory
+MAX_VOCABULARIES = 16
+MAX_WHITENINGS = 2  # one from 98,304 to 512 dimensions takes 201 MB of the device's memory
 
 
 @dataclass(frozen=True, slots=True)
-class Made:
+class DescriptorPipeline:
     """What makes the descriptors of a generation."""
 
     extractor: Extractor
-    centres: Centres | None = None
-    projection: Projection | None = None
+    centres: ClusterCentres | None = None
+    projection: PcaProjection | None = None
 
     @property
     def spec(self) -> dict[str, Any]:
         return self.extractor.spec(self.centres, self.projection)
 
 
-class LoadedModels:
+class ModelRegistry:
     """Small LRU caches, shared by the thread that prepares and the one that describes."""
 
     def __init__(
         self,
         store: ObjectStore,
         settings: Settings,
-        load_added: LoadAdded,
+        load_added: LoadAddedModel,
         on_load: Callable[[float], object] = lambda seconds: None,
     ) -> None:
         """`load_added` is that of AddedModels; `on_load` is told how many seconds the loading of an
@@ -69,11 +69,13 @@ class LoadedModels:
         self._settings = settings
         self._lock = threading.RLock()
         self._device = choose_device(settings.device)
-        self._extractors: LatelyUsed[str, Extractor] = LatelyUsed(MOST_EXTRACTORS)
+        self._extractors: LruCache[str, Extractor] = LruCache(MAX_EXTRACTORS)
         # Of what was loaded once: to run out of memory again for each time would cost photos time.
-        self._limits: defaultdict[tuple[object, ...], PassLimit] = defaultdict(PassLimit)
-        self._centres: LatelyUsed[UUID, Centres] = LatelyUsed(MOST_VOCABULARIES)
-        self._projections: LatelyUsed[UUID, Projection] = LatelyUsed(MOST_WHITENINGS)
+        self._pass_limits: defaultdict[tuple[object, ...], BatchSizeLimit] = defaultdict(
+            BatchSizeLimit
+        )
+        self._centres: LruCache[UUID, ClusterCentres] = LruCache(MAX_VOCABULARIES)
+        self._projections: LruCache[UUID, PcaProjection] = LruCache(MAX_WHITENINGS)
 
     def extractor(self, name: str, precision: Precision | None = None) -> Extractor:
         """The extractor called `name`, its weights loaded.
@@ -88,7 +90,7 @@ class LoadedModels:
             found = self._extractors.get(recipe.name, lambda: self._load(recipe, precision))
             return found.at(precision)
 
-    def of_generation(self, generation: Generation) -> Extractor:
+    def extractor_of_generation(self, generation: Generation) -> Extractor:
         """The extractor of a generation in the precision that it was begun in, whatever PRECISION
         says and whatever device this is: rows of two precisions never mix.
 
@@ -105,8 +107,8 @@ class LoadedModels:
             )
         return self.extractor(generation.extractor, precision)
 
-    def _load(self, recipe: Recipe, precision: Precision) -> Extractor:
-        limit = self._limits[recipe.local_features]
+    def _load(self, recipe: ExtractorConfig, precision: Precision) -> Extractor:
+        limit = self._pass_limits[recipe.local_features]
         for loaded in self._extractors.values():
             if loaded.recipe.local_features == recipe.local_features:
                 return Extractor(
@@ -131,12 +133,12 @@ class LoadedModels:
         self._on_load(time.perf_counter() - started)
         return made
 
-    def centres(self, vocabulary: Vocabulary) -> Centres:
+    def centres(self, vocabulary: Vocabulary) -> ClusterCentres:
         """The vocabulary's centres, checked against the catalog's hash."""
         with self._lock:
             return self._centres.get(vocabulary.id, lambda: self._read_centres(vocabulary))
 
-    def _read_centres(self, vocabulary: Vocabulary) -> Centres:
+    def _read_centres(self, vocabulary: Vocabulary) -> ClusterCentres:
         found = decode_centres(self._store.get(vocabulary.object_key))
         if found.sha256 != vocabulary.sha256:
             raise Unavailable(
@@ -146,14 +148,14 @@ class LoadedModels:
             )
         return found
 
-    def projection(self, whitening: StoredWhitening) -> Projection:
+    def projection(self, whitening: StoredWhitening) -> PcaProjection:
         """The whitening on the device, checked against the catalog's hash."""
         with self._lock:
             return self._projections.get(whitening.id, lambda: self._read_projection(whitening))
 
-    def _read_projection(self, whitening: StoredWhitening) -> Projection:
+    def _read_projection(self, whitening: StoredWhitening) -> PcaProjection:
         stored = decode_whitening(self._store.get(whitening.object_key))
-        found = Projection(stored.whitening, self._device)
+        found = PcaProjection(stored.whitening, self._device)
         if found.sha256 != whitening.sha256:
             raise Unavailable(
                 "whitening_corrupt",
@@ -162,24 +164,24 @@ class LoadedModels:
             )
         return found
 
-    def made_of(
+    def pipeline_of_generation(
         self,
         generation: Generation,
         vocabulary: Vocabulary | None,
         whitening: StoredWhitening | None,
-    ) -> Made:
+    ) -> DescriptorPipeline:
         """What makes the generation's descriptors, of the vocabulary and whitening that it names.
 
         Raises as `of_generation`, `centres` and `projection` do.
         """
-        return Made(
-            self.of_generation(generation),
+        return DescriptorPipeline(
+            self.extractor_of_generation(generation),
             self.centres(vocabulary) if vocabulary else None,
             self.projection(whitening) if whitening else None,
         )
 
 
-def register(session: Session, extractor: Extractor) -> Model:
+def ensure_model_row(session: Session, extractor: Extractor) -> Model:
     """The catalog's row of the extractor's weights; Misconfigured (`model_missing`) for an added
     model that has been removed meanwhile.
     """
@@ -187,22 +189,22 @@ def register(session: Session, extractor: Extractor) -> Model:
     trained = extractor.recipe.trained
     if trained is not None and trained.registered is not None:
         # Locked: from this transaction on a generation uses it, and it is removed no more.
-        return model_to_load(session, trained.registered, lock=True)
-    return ensure_model(
+        return get_model_for_loading(session, trained.registered, lock=True)
+    return get_or_create_model(
         session, backbone.name, backbone.fingerprint, backbone.licence, backbone.card
     )
 
 
-def spec_columns(
+def generation_spec_columns(
     model: Model,
-    made: Made,
+    pipeline: DescriptorPipeline,
     vocabulary_id: UUID | None,
     whitening_id: UUID | None = None,
 ) -> dict[str, object]:
     """The columns of a generation that say how its descriptors are made."""
-    spec = made.spec
+    spec = pipeline.spec
     return {
-        "extractor": made.extractor.recipe.name,
+        "extractor": pipeline.extractor.recipe.name,
         "spec": spec,
         "spec_fingerprint": spec_fingerprint(spec),
         "dimension": spec["dimension"],
@@ -212,9 +214,11 @@ def spec_columns(
     }
 
 
-def check_spec(generation: Generation, made: Made, *, decoder_matters: bool = True) -> None:
+def check_spec_matches(
+    generation: Generation, pipeline: DescriptorPipeline, *, decoder_matters: bool = True
+) -> None:
     """Unavailable (`spec_differs`) when this worker does not reproduce the generation's spec."""
-    spec = made.spec
+    spec = pipeline.spec
     differing = sorted(
         key
         for key in spec.keys() | generation.spec.keys()

@@ -21,18 +21,18 @@ from shared.private_files import create_private_file, make_private_folder
 
 log = logging.getLogger(__name__)
 
-PIECE_BYTES = 1 << 20
-LEFT_OVER_SECONDS = 3600.0  # a file that is still being fetched then: its process was killed
+COPY_BYTES = 1 << 20
+STALE_PARTIAL_SECONDS = 3600.0  # a file that is still being fetched then: its process was killed
 
 
-class ModelCache:
+class ModelFileCache:
     def __init__(self, store: ObjectStore, folder: Path, max_bytes: int) -> None:
         """`folder` is made when something is fetched. `max_bytes` of models that are not in use."""
         self._store = store
         self._folder = folder
         self._max_bytes = max_bytes
 
-    def file(self, key: str, sha256: str) -> Path:
+    def local_path(self, key: str, sha256: str) -> Path:
         """The object as a file of this machine, to be opened soon: a later call may remove it.
 
         Unavailable (`model_corrupt`) when it is not what was stored; NotFound and Unavailable of
@@ -41,24 +41,24 @@ class ModelCache:
         there = self._store.file(key)
         if there is not None:
             with self._store.open(key) as opened:
-                _check(opened, key, sha256)
+                _verify_hash(opened, key, sha256)
             return there
         path = self._folder / f"{sha256}.safetensors"
         with contextlib.suppress(FileNotFoundError, Unavailable):
             with path.open("rb") as opened:
-                _check(opened, key, sha256)
+                _verify_hash(opened, key, sha256)
             os.utime(path)  # used just now
             return path
-        self._fetch(key, sha256, path)
-        self._make_room(path)
+        self._download(key, sha256, path)
+        self._evict(path)
         return path
 
-    def _fetch(self, key: str, sha256: str, path: Path) -> None:
+    def _download(self, key: str, sha256: str, path: Path) -> None:
         make_private_folder(self._folder)
         partial = self._folder / f"{new_id()}.partial"
         try:
             with self._store.open(key) as source, create_private_file(partial) as file:
-                _check(source, key, sha256, file)
+                _verify_hash(source, key, sha256, file)
                 file.flush()
                 os.fsync(file.fileno())
             partial.replace(path)
@@ -66,9 +66,9 @@ class ModelCache:
             partial.unlink(missing_ok=True)
         log.info("the model %s was fetched (%d bytes)", sha256[:12], path.stat().st_size)
 
-    def _make_room(self, fetched: Path) -> None:
+    def _evict(self, fetched: Path) -> None:
         """Remove what was used least lately, until the rest beside `fetched` fits."""
-        long_ago = time.time() - LEFT_OVER_SECONDS
+        long_ago = time.time() - STALE_PARTIAL_SECONDS
         found: list[tuple[float, int, Path]] = []
         for path in self._folder.iterdir():
             with contextlib.suppress(FileNotFoundError):  # another process makes room, too
@@ -85,10 +85,10 @@ class ModelCache:
                 path.unlink(missing_ok=True)
 
 
-def _check(source: BinaryIO, key: str, sha256: str, copy: BinaryIO | None = None) -> None:
+def _verify_hash(source: BinaryIO, key: str, sha256: str, copy: BinaryIO | None = None) -> None:
     """Read it whole, into `copy` if there is one; Unavailable when its hash is another."""
     digest = hashlib.sha256()
-    while piece := source.read(PIECE_BYTES):
+    while piece := source.read(COPY_BYTES):
         digest.update(piece)
         if copy is not None:
             copy.write(piece)

@@ -13,44 +13,44 @@ take the next one.
 
 from __future__ import annotations
 
-from services.extractor.add_model import AddModel
-from services.extractor.added_models import cache_folder
+from services.extractor.add_model import ModelImporter
+from services.extractor.added_models import model_cache_folder
 from services.extractor.decoding import DecoderPool
-from services.extractor.fit_pca import FitPca
-from services.extractor.fit_vocabulary import FitVocabulary
-from services.extractor.loaded import LoadedModels
-from services.extractor.take_vocabulary import TakeVocabulary
+from services.extractor.fit_pca import PcaFitJob
+from services.extractor.fit_vocabulary import VocabularyFitJob
+from services.extractor.loaded import ModelRegistry
+from services.extractor.take_vocabulary import VocabularySwitchJob
 from shared.catalog.session import Catalog
 from shared.jobs import Job, JobKind
 from shared.objects import ObjectStore
 from shared.settings import Settings
 
 
-class ModelChanges:
+class ModelChangeRunner:
     """Does one slice of a model change at a time."""
 
     def __init__(
         self,
         catalog: Catalog,
         store: ObjectStore,
-        models: LoadedModels,
+        models: ModelRegistry,
         decoders: DecoderPool,
         settings: Settings,
     ) -> None:
-        self._fit = FitVocabulary(catalog, store, models, decoders, settings)
-        self._take = TakeVocabulary(catalog, store, models)
-        self._pca = FitPca(catalog, store, models)
-        self._add = AddModel(catalog, store, cache_folder(settings))
+        self._fit = VocabularyFitJob(catalog, store, models, decoders, settings)
+        self._take = VocabularySwitchJob(catalog, store, models)
+        self._pca = PcaFitJob(catalog, store, models)
+        self._add = ModelImporter(catalog, store, model_cache_folder(settings))
 
-    def slice(self, job: Job) -> None:
+    def run_step(self, job: Job) -> None:
         """The next piece of work of the claimed job; PlacewiseError when it can't go on."""
         if job.kind == JobKind.ADD_MODEL:
-            self._add.from_checkpoint(job)
+            self._add.import_checkpoint(job)
         elif job.kind == JobKind.IMPORT:
-            self._take.from_file(job)
+            self._take.import_file(job)
         elif job.kind == JobKind.SWITCH:
-            self._take.of_map(job)
+            self._take.switch_vocabulary(job)
         elif job.kind == JobKind.PCA:
-            self._pca.slice(job)
+            self._pca.run_step(job)
         else:
-            self._fit.slice(job)
+            self._fit.run_step(job)

@@ -15,18 +15,18 @@ import numpy as np
 from sqlalchemy import insert, select
 from sqlalchemy.orm import Session
 
-from services.extractor.prepare import Batch, photo_of
-from shared.catalog.chunks import Chunk, Descriptor, take_slot
+from services.extractor.prepare import DescribeBatch, photo_id_of
+from shared.catalog.chunks import Chunk, Descriptor, allocate_slot
 from shared.catalog.generations import GenerationState, lock_generation
-from shared.catalog.maps import bump_version, lock_map
-from shared.catalog.photos import live_photos
+from shared.catalog.maps import increment_map_version, lock_map
+from shared.catalog.photos import get_live_photos
 from shared.catalog.session import Catalog
 from shared.chunks import Rows, encode_rows, write_chunk
 from shared.ids import new_id
 from shared.jobs import JobKind
-from shared.jobs.finish import cancel, fail, release, succeed
-from shared.jobs.leases import held
-from shared.jobs.on_behalf import request_ids
+from shared.jobs.finish import cancel_job, fail_job, release_job, succeed_job
+from shared.jobs.leases import lock_leased_jobs
+from shared.jobs.on_behalf import distinct_request_ids
 from shared.objects import ObjectStore
 from shared.objects.keys import query_vector_key
 
@@ -34,7 +34,7 @@ log = logging.getLogger(__name__)
 
 
 @dataclass(slots=True)
-class Published:
+class PublishResult:
     succeeded: int = 0
     failed: int = 0
     lost: int = 0
@@ -42,11 +42,11 @@ class Published:
 
 
 def publish(
-    catalog: Catalog, store: ObjectStore, batch: Batch, rows: Rows, slot_rows: int
-) -> Published:
+    catalog: Catalog, store: ObjectStore, batch: DescribeBatch, rows: Rows, slot_rows: int
+) -> PublishResult:
     """Commit what the batch has come to; `rows` belong to `batch.ready`."""
     started = time.perf_counter()
-    rows = batch.refuse_not_finite(rows)
+    rows = batch.reject_non_finite(rows)
     if batch.kind == JobKind.DESCRIBE:
         outcome, chunk = _publish_queries(catalog, store, batch, rows), None
     else:
@@ -61,7 +61,7 @@ def publish(
             "map_id": str(batch.jobs[0].map_id),
             "generation_id": str(batch.target.generation.id),
             "job_ids": [str(job.id) for job in batch.jobs],
-            "request_ids": request_ids(batch.jobs),
+            "request_ids": distinct_request_ids(batch.jobs),
             "chunk": chunk,
         },
     )
@@ -69,8 +69,8 @@ def publish(
 
 
 def _publish_photos(
-    catalog: Catalog, store: ObjectStore, batch: Batch, rows: Rows, slot_rows: int
-) -> tuple[Published, str | None]:
+    catalog: Catalog, store: ObjectStore, batch: DescribeBatch, rows: Rows, slot_rows: int
+) -> tuple[PublishResult, str | None]:
     """What it has come to, and the key of the chunk."""
     generation_id = batch.target.generation.id
     chunk_id = new_id()
@@ -81,30 +81,30 @@ def _publish_photos(
             generation_id=generation_id,
             chunk_id=chunk_id,
             rows=rows,
-            photo_ids=[photo_of(job) for job in batch.ready],
+            photo_ids=[photo_id_of(job) for job in batch.ready],
             spec=batch.target.generation.spec,
         )
 
-    def commit(session: Session) -> Published:
-        outcome = Published()
+    def commit(session: Session) -> PublishResult:
+        outcome = PublishResult()
         lock_map(session, batch.jobs[0].map_id)
         generation = lock_generation(session, generation_id)
-        mine = {job.id: job for job in held(session, batch.token, batch.jobs)}
+        mine = {job.id: job for job in lock_leased_jobs(session, batch.token, batch.jobs)}
         outcome.lost = len(batch.jobs) - len(mine)
-        if generation.state not in _wanted_states(batch.kind):
+        if generation.state not in _accepted_generation_states(batch.kind):
             # A model change was switched in (or given up) while the batch was computed.
             for job in mine.values():
-                cancel(job) if batch.kind == JobKind.REINDEX else release(job)
+                cancel_job(job) if batch.kind == JobKind.REINDEX else release_job(job)
             return outcome
-        live = live_photos(session, [photo_of(job) for job in mine.values()])
-        done = _described(session, generation_id, list(live))
+        live = get_live_photos(session, [photo_id_of(job) for job in mine.values()])
+        done = _already_described(session, generation_id, list(live))
         for job in mine.values():
             if job.photo_id not in live:
-                cancel(job)
+                cancel_job(job)
         for stale, error in batch.failed:
             own = mine.get(stale.id)
             if own is not None and own.photo_id in live:
-                fail(own, error.as_problem())
+                fail_job(own, error.as_problem())
                 outcome.failed += 1
         fresh = []
         for row, stale in enumerate(batch.ready):
@@ -113,14 +113,14 @@ def _publish_photos(
                 continue  # a dead row
             if own.photo_id not in done:
                 fresh.append({"photo_id": own.photo_id, "row": row})
-            succeed(own, {"file_id": str(own.photo_id), "generation_id": str(generation_id)})
+            succeed_job(own, {"file_id": str(own.photo_id), "generation_id": str(generation_id)})
             outcome.succeeded += 1
         if fresh and written is not None:
             session.add(
                 Chunk(
                     id=chunk_id,
                     generation_id=generation_id,
-                    slot=take_slot(generation, written.rows, slot_rows),
+                    slot=allocate_slot(generation, written.rows, slot_rows),
                     object_key=written.object_key,
                     rows=written.rows,
                     size_bytes=written.size_bytes,
@@ -132,23 +132,25 @@ def _publish_photos(
                 insert(Descriptor),
                 [{"generation_id": generation_id, "chunk_id": chunk_id, **new} for new in fresh],
             )
-            bump_version(session, generation.map_id)
+            increment_map_version(session, generation.map_id)
         return outcome
 
     return catalog.run(commit), written.object_key if written else None
 
 
-def _publish_queries(catalog: Catalog, store: ObjectStore, batch: Batch, rows: Rows) -> Published:
+def _publish_queries(
+    catalog: Catalog, store: ObjectStore, batch: DescribeBatch, rows: Rows
+) -> PublishResult:
     for job, row in zip(batch.ready, rows, strict=True):
         store.put(query_vector_key(job.id), encode_rows(row[np.newaxis]))
 
-    def commit(session: Session) -> Published:
-        outcome = Published()
-        mine = {job.id: job for job in held(session, batch.token, batch.jobs)}
+    def commit(session: Session) -> PublishResult:
+        outcome = PublishResult()
+        mine = {job.id: job for job in lock_leased_jobs(session, batch.token, batch.jobs)}
         outcome.lost = len(batch.jobs) - len(mine)
         for stale, error in batch.failed:
             if stale.id in mine:
-                fail(mine[stale.id], error.as_problem())
+                fail_job(mine[stale.id], error.as_problem())
                 outcome.failed += 1
         for stale in batch.ready:
             if stale.id in mine:
@@ -157,20 +159,20 @@ def _publish_queries(catalog: Catalog, store: ObjectStore, batch: Batch, rows: R
                     "object_key": query_vector_key(stale.id),
                     "row": 0,
                 }
-                succeed(mine[stale.id], reference)
+                succeed_job(mine[stale.id], reference)
                 outcome.succeeded += 1
         return outcome
 
     return catalog.run(commit)
 
 
-def _wanted_states(kind: JobKind) -> tuple[GenerationState, ...]:
+def _accepted_generation_states(kind: JobKind) -> tuple[GenerationState, ...]:
     if kind == JobKind.INDEX:
         return (GenerationState.ACTIVE,)
     return (GenerationState.BUILDING, GenerationState.ACTIVE)
 
 
-def _described(session: Session, generation_id: UUID, photo_ids: list[UUID]) -> set[UUID]:
+def _already_described(session: Session, generation_id: UUID, photo_ids: list[UUID]) -> set[UUID]:
     """Photos that have their row already: described by a batch that lost its lease too late."""
     return set(
         session.scalars(

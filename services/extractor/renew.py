@@ -11,7 +11,7 @@ import logging
 
 from sqlalchemy import select
 
-from services.extractor.loaded import LoadedModels
+from services.extractor.loaded import ModelRegistry
 from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.maps import Map
 from shared.catalog.session import Catalog
@@ -25,7 +25,7 @@ from shared.vision.extractors import spec_fingerprint
 log = logging.getLogger(__name__)
 
 
-def renew_outdated_generations(catalog: Catalog, models: LoadedModels) -> int:
+def reindex_outdated_generations(catalog: Catalog, models: ModelRegistry) -> int:
     """Start a switch to the same vocabulary and whitening in every outdated map; how many."""
     with catalog.read() as session:
         found = session.execute(
@@ -38,7 +38,7 @@ def renew_outdated_generations(catalog: Catalog, models: LoadedModels) -> int:
     started = 0
     for generation, vocabulary, whitening in found:
         try:
-            made = models.made_of(generation, vocabulary, whitening)
+            made = models.pipeline_of_generation(generation, vocabulary, whitening)
         except PlacewiseError as error:
             log.error("generation %s can't be checked: %s", generation.id, error.detail)
             continue

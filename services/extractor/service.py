@@ -17,18 +17,18 @@ from celery import signals
 from prometheus_client import CollectorRegistry
 from sqlalchemy.exc import SQLAlchemyError
 
-from services.extractor.drain_result import DrainResult
-from services.extractor.setbacks import AWAY_SECONDS
+from services.extractor.drain_result import DrainStats
+from services.extractor.setbacks import UNAVAILABLE_RETRY_SECONDS
 from services.extractor.worker import ExtractorWorker
-from shared.catalog.away import Outage
+from shared.catalog.away import OutageLog
 from shared.catalog.session import Catalog
 from shared.heartbeat import Heartbeat
-from shared.jobs.celery_app import DRAIN_TASK, make_celery
-from shared.jobs.celery_hints import CeleryHints
-from shared.jobs.hints import Lane
+from shared.jobs.celery_app import DRAIN_TASK, create_celery_app
+from shared.jobs.celery_hints import CeleryWakeups
+from shared.jobs.hints import WakeupQueue
 from shared.objects import ObjectStore
 from shared.settings import Settings
-from shared.telemetry.metrics_server import serving_metrics
+from shared.telemetry.metrics_server import serve_metrics
 
 log = logging.getLogger(__name__)
 
@@ -43,27 +43,27 @@ def serve_extractor(
 
     `on_ready` is called when the model is loaded and hints are listened for.
     """
-    app = make_celery(settings)
-    hints = CeleryHints(app, settings)
+    app = create_celery_app(settings)
+    hints = CeleryWakeups(app, settings)
     name = f"extractor-{socket.gethostname()}-{os.getpid()}"
     registry = CollectorRegistry()
     worker = ExtractorWorker(catalog, store, settings, name, registry=registry)
     heartbeat = Heartbeat(settings.heartbeat_file)
     stop = threading.Event()
 
-    outage = Outage("extractor")
+    outage = OutageLog("extractor")
 
     def drain() -> dict[str, Any]:
         try:
             result = worker.drain(stop, settings.drain_seconds)
         except SQLAlchemyError as error:
-            outage.met(error)
-            stop.wait(AWAY_SECONDS)
-            hints.send(Lane.BULK)  # what lies there is still to be done
-            return DrainResult().as_dict()
-        outage.over()
-        if result.more and not stop.is_set():
-            hints.send(Lane.BULK)
+            outage.record_error(error)
+            stop.wait(UNAVAILABLE_RETRY_SECONDS)
+            hints.send(WakeupQueue.BULK)  # what lies there is still to be done
+            return DrainStats().as_dict()
+        outage.record_success()
+        if result.interrupted and not stop.is_set():
+            hints.send(WakeupQueue.BULK)
         elif result.claimed:
             log.info("drained: %s", result.as_dict())
         return result.as_dict()
@@ -89,9 +89,9 @@ def serve_extractor(
     # Celery would set up handlers and formats of its own. (`--loglevel` has no effect then.)
     signals.setup_logging.connect(leave_logs_alone, weak=False)
     try:
-        with serving_metrics(settings, registry):
+        with serve_metrics(settings, registry):
             worker.warm_up()
-            for lane in Lane:
+            for lane in WakeupQueue:
                 hints.send(lane)  # what was queued before this worker came
             app.worker_main(
                 [
@@ -99,7 +99,7 @@ def serve_extractor(
                     "--pool=solo",
                     "--concurrency=1",
                     f"--hostname={name}@%h",
-                    f"--queues={','.join(Lane)}",
+                    f"--queues={','.join(WakeupQueue)}",
                     "--without-gossip",
                     "--without-mingle",
                 ]

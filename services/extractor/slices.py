@@ -6,17 +6,17 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Protocol
 
-from services.extractor.new_generation import go_on
+from services.extractor.new_generation import checkpoint_and_release
 from shared.catalog.session import Catalog
 from shared.jobs import Job
 from shared.objects import ObjectStore
-from shared.objects.keys import work_key
+from shared.objects.keys import job_work_key
 
-SLICE_SECONDS = 1.0  # about the time of a batch: what a query may have to wait
-FIT_UNITS = 100  # of the job's progress: the steps of its fit, in per cent
+STEP_SECONDS = 1.0  # about the time of a batch: what a query may have to wait
+FIT_PROGRESS_UNITS = 100  # of the job's progress: the steps of its fit, in per cent
 
 
-class Steps(Protocol):
+class IncrementalFit(Protocol):
     """A fit that is done step by step, and saved between two of them."""
 
     @property
@@ -31,34 +31,34 @@ class Steps(Protocol):
     def resume(self, data: bytes) -> None: ...
 
 
-def slice_of_work() -> Iterator[None]:
+def time_slice() -> Iterator[None]:
     """Once, however slow the first round of the loop is, and again for about a second."""
-    until = time.monotonic() + SLICE_SECONDS
+    until = time.monotonic() + STEP_SECONDS
     while True:
         yield
         if time.monotonic() >= until:
             return
 
 
-def do_steps(
+def run_fit_steps(
     catalog: Catalog,
     store: ObjectStore,
     job: Job,
-    fit: Steps,
+    fit: IncrementalFit,
     step: Callable[[], object],
     *,
-    begun: str,
+    resumed_param: str,
     progress_done: int,
 ) -> bool:
     """A slice of steps; True when the fit is done.
 
-    Else it is saved and the job goes on. `begun` is the parameter of the job that says that there
+    Else it is saved and the job goes on. `resumed_param` is the parameter of the job that says that there
     is a saved one, `progress_done` the job's progress before the fit.
     """
-    saved = work_key(job.id, "fit.npz")
-    if job.params.get(begun):
+    saved = job_work_key(job.id, "fit.npz")
+    if job.params.get(resumed_param):
         fit.resume(store.get(saved))
-    for _ in slice_of_work():
+    for _ in time_slice():
         if fit.done:
             break
         step()
@@ -66,10 +66,10 @@ def do_steps(
         return True
     store.put(saved, fit.save())
     done, most = fit.progress
-    go_on(
+    checkpoint_and_release(
         catalog,
         job,
-        params={**job.params, begun: True},
-        progress_done=progress_done + FIT_UNITS * done // most,
+        params={**job.params, resumed_param: True},
+        progress_done=progress_done + FIT_PROGRESS_UNITS * done // most,
     )
     return False

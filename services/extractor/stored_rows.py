@@ -13,12 +13,12 @@ from uuid import UUID
 
 import numpy as np
 
-from services.extractor.target import Target
-from shared.catalog.chunks import rows_of
+from services.extractor.target import ResolvedGeneration
+from shared.catalog.chunks import find_descriptor_rows
 from shared.catalog.generations import active_generation
-from shared.catalog.photos import live_photos
+from shared.catalog.photos import get_live_photos
 from shared.catalog.session import Catalog
-from shared.chunks import Row, Rows, are_whole, read_row
+from shared.chunks import Row, Rows, read_row, rows_are_valid
 from shared.errors import NotFound
 from shared.jobs import Job, JobKind
 from shared.objects import ObjectStore
@@ -26,7 +26,7 @@ from shared.objects import ObjectStore
 log = logging.getLogger(__name__)
 
 
-def stored_rows(
+def read_stored_rows(
     catalog: Catalog, store: ObjectStore, generation_id: UUID, photo_ids: Sequence[UUID]
 ) -> dict[UUID, Row]:
     """The rows, (dimension,), of those photos that are live and described in the generation.
@@ -35,8 +35,8 @@ def stored_rows(
     be described anew.
     """
     with catalog.read() as session:
-        live = live_photos(session, photo_ids)
-        located = rows_of(session, generation_id, list(live))
+        live = get_live_photos(session, photo_ids)
+        located = find_descriptor_rows(session, generation_id, list(live))
     rows = {}
     for object_key in sorted(located):
         for number, photo_id in located[object_key]:
@@ -45,15 +45,15 @@ def stored_rows(
             except (NotFound, IndexError, ValueError) as error:
                 log.error("row %d of the chunk %s can't be read: %s", number, object_key, error)
                 continue
-            if are_whole(row[np.newaxis]).all():
+            if rows_are_valid(row[np.newaxis]).all():
                 rows[photo_id] = row
             else:
                 log.error("row %d of the chunk %s is no descriptor any more", number, object_key)
     return rows
 
 
-def rows_to_project(
-    catalog: Catalog, store: ObjectStore, jobs: list[Job], target: Target
+def read_rows_to_project(
+    catalog: Catalog, store: ObjectStore, jobs: list[Job], target: ResolvedGeneration
 ) -> tuple[list[Job], Rows] | None:
     """REINDEX jobs into a generation with PCA, and their photos' whole rows, (jobs, dimension).
 
@@ -65,10 +65,10 @@ def rows_to_project(
     photo_ids = [job.photo_id for job in jobs if job.photo_id is not None]
     with catalog.read() as session:
         source = active_generation(session, jobs[0].map_id)
-        live = live_photos(session, photo_ids).keys()
-    if source is None or source.spec != whole_spec(target):
+        live = get_live_photos(session, photo_ids).keys()
+    if source is None or source.spec != unprojected_spec(target):
         return None
-    rows = stored_rows(catalog, store, source.id, photo_ids)
+    rows = read_stored_rows(catalog, store, source.id, photo_ids)
     if live - rows.keys():
         return None
     wanted = [(job, rows[job.photo_id]) for job in jobs if job.photo_id in rows]
@@ -77,6 +77,6 @@ def rows_to_project(
     return [job for job, _ in wanted], np.stack([row for _, row in wanted])
 
 
-def whole_spec(target: Target) -> dict[str, Any]:
+def unprojected_spec(target: ResolvedGeneration) -> dict[str, Any]:
     """Of the target's descriptors before they are projected."""
     return target.extractor.spec(target.centres)

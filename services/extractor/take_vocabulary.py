@@ -4,8 +4,12 @@ from __future__ import annotations
 
 from uuid import UUID
 
-from services.extractor.loaded import LoadedModels, Made
-from services.extractor.new_generation import begin_with_known, begin_with_new, extractor_of
+from services.extractor.loaded import DescriptorPipeline, ModelRegistry
+from services.extractor.new_generation import (
+    map_extractor,
+    start_generation_with_new_vocabulary,
+    start_generation_with_stored_vocabulary,
+)
 from shared.catalog.session import Catalog
 from shared.catalog.vocabularies import VocabularyOrigin, get_vocabulary
 from shared.catalog.whitenings import StoredWhitening
@@ -14,27 +18,27 @@ from shared.jobs import Job
 from shared.objects import ObjectStore
 from shared.vision.extractors import Extractor
 from shared.vision.pca_file import decode_whitening
-from shared.vision.provenance import check_fits
-from shared.vision.vocabulary import Centres
+from shared.vision.provenance import check_vocabulary_fits
+from shared.vision.vocabulary import ClusterCentres
 from shared.vision.vocabulary_file import decode_vocabulary
 
 
-class TakeVocabulary:
+class VocabularySwitchJob:
     """One slice each: nothing is calculated."""
 
-    def __init__(self, catalog: Catalog, store: ObjectStore, models: LoadedModels) -> None:
+    def __init__(self, catalog: Catalog, store: ObjectStore, models: ModelRegistry) -> None:
         self._catalog = catalog
         self._store = store
         self._models = models
 
-    def from_file(self, job: Job) -> None:
+    def import_file(self, job: Job) -> None:
         """IMPORT: the vocabulary in the file under `object_key`; Unprocessable
         (`vocabulary_unfit`) when the map's extractor can't use it.
         """
-        extractor = extractor_of(self._catalog, self._models, job)
+        extractor = map_extractor(self._catalog, self._models, job)
         brought = decode_vocabulary(self._store.get(job.params["object_key"]))
-        check_fits(brought.provenance, brought.centres, extractor)
-        begin_with_new(
+        check_vocabulary_fits(brought.provenance, brought.centres, extractor)
+        start_generation_with_new_vocabulary(
             self._catalog,
             self._store,
             job,
@@ -44,19 +48,19 @@ class TakeVocabulary:
             {**brought.provenance, "imported_from": job.params["filename"]},
         )
 
-    def of_map(self, job: Job) -> None:
+    def switch_vocabulary(self, job: Job) -> None:
         """SWITCH: the vocabulary `vocabulary_id` of the map, or None for extractors without one;
         with `extractor` to that one, where None takes the vocabulary that comes with it.
         """
         if job.params.get("extractor") is None:
-            extractor = extractor_of(self._catalog, self._models, job)
+            extractor = map_extractor(self._catalog, self._models, job)
             shipped = None
         else:
             extractor = self._models.extractor(job.params["extractor"])
             shipped = extractor.shipped_vocabulary()
         if job.params["vocabulary_id"] is None:
             if shipped is not None:
-                begin_with_new(
+                start_generation_with_new_vocabulary(
                     self._catalog,
                     self._store,
                     job,
@@ -71,27 +75,33 @@ class TakeVocabulary:
                     "vocabulary_unfit",
                     f"The extractor {extractor.recipe.name} needs a vocabulary.",
                 )
-            self._begin(job, extractor, None, None)
+            self._start_generation(job, extractor, None, None)
             return
         with self._catalog.read() as session:
             vocabulary = get_vocabulary(session, job.map_id, UUID(job.params["vocabulary_id"]))
         centres = self._models.centres(vocabulary)
-        check_fits(vocabulary.provenance, centres, extractor)
-        self._begin(job, extractor, centres, vocabulary.id)
+        check_vocabulary_fits(vocabulary.provenance, centres, extractor)
+        self._start_generation(job, extractor, centres, vocabulary.id)
 
-    def _begin(
-        self, job: Job, extractor: Extractor, centres: Centres | None, vocabulary_id: UUID | None
+    def _start_generation(
+        self,
+        job: Job,
+        extractor: Extractor,
+        centres: ClusterCentres | None,
+        vocabulary_id: UUID | None,
     ) -> None:
         """The generation, with the whitening that the job names, if any: a renewed generation keeps
         its own. Unprocessable (`pca_unfit`) when the descriptors have become others.
         """
         whitening_id = job.params.get("whitening_id")
         if whitening_id is None:
-            begin_with_known(self._catalog, job, Made(extractor, centres), vocabulary_id)
+            start_generation_with_stored_vocabulary(
+                self._catalog, job, DescriptorPipeline(extractor, centres), vocabulary_id
+            )
             return
         with self._catalog.read() as session:
             stored = session.get_one(StoredWhitening, UUID(whitening_id))
         kept = decode_whitening(self._store.get(stored.object_key))
-        kept.check_fits(extractor.spec(centres))
-        made = Made(extractor, centres, self._models.projection(stored))
-        begin_with_known(self._catalog, job, made, vocabulary_id, stored.id)
+        kept.check_compatible(extractor.spec(centres))
+        made = DescriptorPipeline(extractor, centres, self._models.projection(stored))
+        start_generation_with_stored_vocabulary(self._catalog, job, made, vocabulary_id, stored.id)

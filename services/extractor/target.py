@@ -6,16 +6,22 @@ import logging
 from dataclasses import dataclass
 from uuid import UUID
 
-from services.extractor.loaded import LoadedModels, Made, check_spec, register, spec_columns
+from services.extractor.loaded import (
+    DescriptorPipeline,
+    ModelRegistry,
+    check_spec_matches,
+    ensure_model_row,
+    generation_spec_columns,
+)
 from shared.catalog.base import db_now
 from shared.catalog.generations import Generation, GenerationState, active_generation
-from shared.catalog.maps import Map, bump_version, lock_map
+from shared.catalog.maps import Map, increment_map_version, lock_map
 from shared.catalog.session import Catalog
 from shared.catalog.vocabularies import Vocabulary, VocabularyOrigin, add_vocabulary
 from shared.catalog.whitenings import StoredWhitening
 from shared.ids import new_id
 from shared.jobs import Job
-from shared.jobs.model_changes import release_vocabulary_waiters
+from shared.jobs.model_changes import wake_vocabulary_waiters
 from shared.jobs.table import QUERY_JOBS
 from shared.objects import ObjectStore
 from shared.objects.keys import new_vocabulary_key
@@ -26,13 +32,13 @@ log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Target(Made):
+class ResolvedGeneration(DescriptorPipeline):
     generation: Generation
 
 
-def find_target(
-    catalog: Catalog, store: ObjectStore, models: LoadedModels, job: Job
-) -> Target | None:
+def resolve_generation(
+    catalog: Catalog, store: ObjectStore, models: ModelRegistry, job: Job
+) -> ResolvedGeneration | None:
     """Where the batch of `job` goes; None while the map has no vocabulary.
 
     A job that names a generation goes there; the others go to the map's active one, which is made
@@ -50,18 +56,22 @@ def find_target(
             whitening = session.get(StoredWhitening, generation.whitening_id)
         map_extractor = session.get_one(Map, job.map_id).extractor
     if generation is None:
-        first = _make_first_generation(catalog, store, models.extractor(map_extractor), job.map_id)
+        first = _create_first_generation(
+            catalog, store, models.extractor(map_extractor), job.map_id
+        )
         if first is None:
             return None
         generation, vocabulary = first
-    made = models.made_of(generation, vocabulary, whitening)
-    target = Target(made.extractor, made.centres, made.projection, generation=generation)
+    made = models.pipeline_of_generation(generation, vocabulary, whitening)
+    target = ResolvedGeneration(
+        made.extractor, made.centres, made.projection, generation=generation
+    )
     # A query is compared once and thrown away: another decoder release is close enough.
-    check_spec(generation, target, decoder_matters=job.kind not in QUERY_JOBS)
+    check_spec_matches(generation, target, decoder_matters=job.kind not in QUERY_JOBS)
     return target
 
 
-def _make_first_generation(
+def _create_first_generation(
     catalog: Catalog, store: ObjectStore, extractor: Extractor, map_id: UUID
 ) -> tuple[Generation, Vocabulary | None] | None:
     """The map's first generation, with the shipped vocabulary if one is needed."""
@@ -96,15 +106,15 @@ def _make_first_generation(
             map_id=map_id,
             state=GenerationState.ACTIVE,
             activated_at=db_now(),
-            **spec_columns(
-                register(session, extractor),
-                Made(extractor, centres),
+            **generation_spec_columns(
+                ensure_model_row(session, extractor),
+                DescriptorPipeline(extractor, centres),
                 vocabulary.id if vocabulary else None,
             ),
         )
         session.add(generation)
         session.flush()
-        release_vocabulary_waiters(session, map_id)
-        bump_version(session, map_id)
+        wake_vocabulary_waiters(session, map_id)
+        increment_map_version(session, map_id)
     log.info("generation %s begins with %s", generation.id, extractor.recipe.name)
     return generation, vocabulary

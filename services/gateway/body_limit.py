@@ -14,16 +14,16 @@ from shared.problems import problem_response
 MAX_JSON_BYTES = 1_000_000
 
 
-class BodyLimit:
+class BodySizeLimitMiddleware:
     """Answers 413 (`body_too_large`) to a JSON body over the limit, without reading its rest."""
 
-    def __init__(self, app: ASGIApp, streamed: Container[str] = ()) -> None:
-        """Paths in `streamed` have a limit of their own for every kind of body."""
+    def __init__(self, app: ASGIApp, exempt_paths: Container[str] = ()) -> None:
+        """Paths in `exempt_paths` have a limit of their own for every kind of body."""
         self._app = app
-        self._streamed = streamed
+        self._exempt_paths = exempt_paths
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http" or _is_form(scope) or scope["path"] in self._streamed:
+        if scope["type"] != "http" or _is_multipart(scope) or scope["path"] in self._exempt_paths:
             await self._app(scope, receive, send)
             return
         size = 0
@@ -47,7 +47,7 @@ class BodyLimit:
         await self._app(scope, counted, guarded)
 
 
-def _is_form(scope: Scope) -> bool:
+def _is_multipart(scope: Scope) -> bool:
     return any(
         name == b"content-type" and value.lower().startswith(b"multipart/")
         for name, value in scope["headers"]

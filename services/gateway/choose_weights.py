@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 from shared.catalog.generations import Generation
 from shared.estimate.calibration import Calibration
-from shared.search_protocol import Hit
+from shared.search_protocol import SearchHit
 from shared.settings import Settings
-from shared.word_weights.record import WordWeights, stored_word_weights
+from shared.word_weights.record import WordWeights, parse_word_weights
 
 
 @dataclass(frozen=True, slots=True)
-class ChosenWeights:
+class RankingWeights:
     """What a search is asked with, and what that says of its answer."""
 
     generation: Generation
@@ -21,25 +21,27 @@ class ChosenWeights:
     values: tuple[float, ...]
     """Empty: rank by the plain cosine."""
 
-    def state(self, hits: Sequence[Hit]) -> str:
+    def state(self, hits: Sequence[SearchHit]) -> str:
         """`applied`, `none` or `off`."""
         if self.values:
-            return "applied" if self._have_ranked(hits) else "none"
+            return "applied" if self._ranked_by_weights(hits) else "none"
         return "off" if self.record and self.record.applied else "none"
 
-    def calibration(self, hits: Sequence[Hit]) -> Calibration | None:
+    def calibration(self, hits: Sequence[SearchHit]) -> Calibration | None:
         """What the generation's evaluations have learnt of rankings like this one."""
-        if self.values and self.record and self._have_ranked(hits):
+        if self.values and self.record and self._ranked_by_weights(hits):
             return self.record.calibration
         stored = self.generation.calibration
         return Calibration.model_validate(stored) if stored else None
 
-    def _have_ranked(self, hits: Sequence[Hit]) -> bool:
+    def _ranked_by_weights(self, hits: Sequence[SearchHit]) -> bool:
         return not hits or hits[0].weighted_score is not None
 
 
-def choose_weights(generation: Generation, wanted: bool, settings: Settings) -> ChosenWeights:
+def select_ranking_weights(
+    generation: Generation, enabled: bool, settings: Settings
+) -> RankingWeights:
     """Those of the generation, unless the call or the settings turn them off."""
-    record = stored_word_weights(generation.word_weights)
-    on = wanted and settings.word_weights
-    return ChosenWeights(generation, record, record.applied if record and on else ())
+    record = parse_word_weights(generation.word_weights)
+    on = enabled and settings.word_weights
+    return RankingWeights(generation, record, record.applied if record and on else ())

@@ -12,147 +12,161 @@ from uuid import UUID
 from pydantic import BaseModel, ConfigDict
 from sqlalchemy.orm import Session
 
-from services.gateway.context import Gateway
-from services.gateway.find_similar import Query, search
-from services.gateway.once import Once
+from services.gateway.context import GatewayContext
+from services.gateway.find_similar import SimilarityQuery, run_similarity_search
+from services.gateway.once import IdempotentRequest
 from services.gateway.schemas import (
-    ExplanationAnswer,
-    PhotoAnswer,
-    SimilarityAnswer,
-    SimilarPhoto,
+    ExplanationResponse,
+    PhotoResponse,
+    SimilarityResponse,
+    SimilarPhotoResponse,
 )
-from services.gateway.wanted import Wanted
+from services.gateway.wanted import SearchParams
 from shared.catalog.generations import active_generation
 from shared.catalog.maps import get_map
-from shared.catalog.photos import live_photos
+from shared.catalog.photos import get_live_photos
 from shared.catalog.searches import Search
 from shared.comparison import (
-    Candidate,
-    Compared,
-    ComparedCandidate,
-    Comparison,
-    check_can_explain,
-    check_can_rerank,
-    query_expired,
+    CompareRequest,
+    CompareResult,
+    RerankCandidate,
+    RerankedCandidate,
+    check_explainable,
+    check_rerankable,
+    query_expired_error,
 )
 from shared.errors import NotFound
 from shared.ids import new_id
 from shared.jobs import Job, JobKind, Priority
-from shared.jobs.hints import Lane
+from shared.jobs.hints import WakeupQueue
 from shared.objects.keys import comparison_key
 
-OF_QUERY = "compare_job_id"
+COMPARE_JOB_PARAM = "compare_job_id"
 """In the params of a describe job: the job that compares its photo."""
 
 
-class Params(BaseModel):
+class CompareJobParams(BaseModel):
     """What a compare job carries: what is asked of the extractor, and the rest of the answer."""
 
     model_config = ConfigDict(frozen=True)
 
-    request: Comparison
+    request: CompareRequest
     top_k: int
-    frame: SimilarityAnswer
+    frame: SimilarityResponse
 
 
-def check_closely(gateway: Gateway, map_name: str, wanted: Wanted) -> None:
+def check_comparison_supported(
+    gateway: GatewayContext, map_name: str, search_params: SearchParams
+) -> None:
     """Unprocessable (`not_rerankable`, `not_explainable`) for what the map's extractor can't do."""
-    if not wanted.closely:
+    if not search_params.needs_comparison:
         return
     with gateway.catalog.read() as session:
         map_ = get_map(session, map_name)
         generation = active_generation(session, map_.id)
     recipe = gateway.settings.recipe(generation.extractor if generation else map_.extractor)
-    if wanted.rerank is not None:
-        check_can_rerank(recipe)
-    if wanted.explain:
-        check_can_explain(recipe, generation.spec if generation else None)
+    if search_params.rerank is not None:
+        check_rerankable(recipe)
+    if search_params.explain:
+        check_explainable(recipe, generation.spec if generation else None)
 
 
-def compare_stored(gateway: Gateway, query: Query, wanted: Wanted, once: Once) -> Job:
+def start_comparison_of_stored_photo(
+    gateway: GatewayContext,
+    query: SimilarityQuery,
+    search_params: SearchParams,
+    idempotent: IdempotentRequest,
+) -> Job:
     """Search for a stored photo, and queue the comparison."""
-    job, history = _make_job(gateway, query, wanted, None)
+    job, history = _build_compare_job(gateway, query, search_params, None)
     with gateway.catalog.write() as session:
         session.add_all([job, history])
         session.flush()
-        once.keep_job(session, job)
-    gateway.hints.send(Lane.QUERY)
+        idempotent.store_job_response(session, job)
+    gateway.hints.send(WakeupQueue.QUERY)
     return job
 
 
-def compare_described(gateway: Gateway, described: Job, query: Query, wanted: Wanted) -> Job:
+def start_comparison_of_query_photo(
+    gateway: GatewayContext, describe_job: Job, query: SimilarityQuery, search_params: SearchParams
+) -> Job:
     """The one comparison of a described query photo: the one that there is, or else a new one."""
     with gateway.catalog.read() as session:
-        found = _comparison_of(session, described)
+        found = _find_compare_job(session, describe_job)
     if found is not None:
         return found
-    job, history = _make_job(gateway, query, wanted, described.id)
+    job, history = _build_compare_job(gateway, query, search_params, describe_job.id)
     with gateway.catalog.write() as session:
-        current = session.get(Job, described.id, with_for_update=True, populate_existing=True)
+        current = session.get(Job, describe_job.id, with_for_update=True, populate_existing=True)
         if current is None:
-            raise query_expired()
-        found = _comparison_of(session, current)
+            raise query_expired_error()
+        found = _find_compare_job(session, current)
         if found is not None:  # another call was first
             return found
-        current.params = {**current.params, OF_QUERY: str(job.id)}
+        current.params = {**current.params, COMPARE_JOB_PARAM: str(job.id)}
         session.add_all([job, history])
-    gateway.hints.send(Lane.QUERY)
+    gateway.hints.send(WakeupQueue.QUERY)
     return job
 
 
-def compared_answer(gateway: Gateway, job: Job, map_name: str) -> SimilarityAnswer:
-    """The answer of a compare job that has succeeded; Gone (`query_expired`) once it has gone."""
-    params = Params.model_validate(job.params)
+def comparison_response(gateway: GatewayContext, job: Job, map_name: str) -> SimilarityResponse:
+    """The answer of a compare job that has succeeded; Gone (`query_expired_error`) once it has gone."""
+    params = CompareJobParams.model_validate(job.params)
     try:
         data = gateway.store.get(comparison_key(job.id))
     except NotFound:
-        raise query_expired() from None
-    candidates = Compared.model_validate_json(data).candidates
+        raise query_expired_error() from None
+    candidates = CompareResult.model_validate_json(data).candidates
     scores = {one.photo_id: one for one in params.request.candidates}
     with gateway.catalog.read() as session:
-        photos = live_photos(session, scores)
+        photos = get_live_photos(session, scores)
     live = [one for one in candidates if one.photo_id in photos]
     assert job.finished_at is not None
     took_ms = (job.finished_at - job.created_at).total_seconds() * 1000
     return params.frame.model_copy(
         update={"processing_time_ms": params.frame.processing_time_ms + took_ms}
     ).with_photos(
-        SimilarPhoto(
+        SimilarPhotoResponse(
             similarity_score=scores[one.photo_id].score,
             weighted_score=scores[one.photo_id].weighted_score,
             rerank_score=one.rerank_score,
-            explanation=_explanation(one),
-            **PhotoAnswer.fields_of(photos[one.photo_id], map_name),
+            explanation=_explanation_response(one),
+            **PhotoResponse.fields_of(photos[one.photo_id], map_name),
         )
         for one in live[: params.top_k]
     )
 
 
-def _comparison_of(session: Session, described: Job) -> Job | None:
-    known = described.params.get(OF_QUERY)
+def _find_compare_job(session: Session, describe_job: Job) -> Job | None:
+    known = describe_job.params.get(COMPARE_JOB_PARAM)
     return session.get(Job, UUID(known)) if known else None
 
 
-def _make_job(
-    gateway: Gateway, query: Query, wanted: Wanted, described: UUID | None
+def _build_compare_job(
+    gateway: GatewayContext,
+    query: SimilarityQuery,
+    search_params: SearchParams,
+    describe_job_id: UUID | None,
 ) -> tuple[Job, Search]:
     """A job to be queued, and the history's row: of each question one, however often its answer is
     fetched."""
-    found = search(gateway, query, wanted)
-    params = Params(
-        request=Comparison(
+    found = run_similarity_search(gateway, query, search_params)
+    params = CompareJobParams(
+        request=CompareRequest(
             query_photo_id=query.photo_id,
-            query_job_id=described,
+            query_job_id=describe_job_id,
             candidates=tuple(
-                Candidate(photo_id=hit.photo_id, score=hit.score, weighted_score=hit.weighted_score)
+                RerankCandidate(
+                    photo_id=hit.photo_id, score=hit.score, weighted_score=hit.weighted_score
+                )
                 for hit in found.hits
             ),
-            rerank=wanted.rerank or 0,
-            explain=wanted.top_k if wanted.explain else 0,
+            rerank=search_params.rerank or 0,
+            explain=search_params.top_k if search_params.explain else 0,
             word_weights=found.word_weights,
         ),
-        top_k=wanted.top_k,
-        frame=found.frame,
+        top_k=search_params.top_k,
+        frame=found.response_without_photos,
     )
     job = Job(
         id=new_id(),
@@ -162,10 +176,12 @@ def _make_job(
         generation_id=query.generation.id,
         params=params.model_dump(mode="json"),
     )
-    return job, found.history
+    return job, found.history_row
 
 
-def _explanation(one: ComparedCandidate) -> ExplanationAnswer | None:
+def _explanation_response(candidate: RerankedCandidate) -> ExplanationResponse | None:
     return (
-        ExplanationAnswer.model_validate(one.explanation.model_dump()) if one.explanation else None
+        ExplanationResponse.model_validate(candidate.explanation.model_dump())
+        if candidate.explanation
+        else None
     )

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 
 from fastapi import Request
 
-from services.gateway.key_check import caller_of
+from services.gateway.key_check import get_caller
 from services.http_connections import address_group
 from shared.errors import TooManyRequests
 
@@ -59,7 +59,7 @@ class ConcurrencyLimit:
 
 def _callers(request: Request) -> list[str]:
     """The call's key and address. ADMIN_KEY is no row of the catalog, and counts by address."""
-    key_id = caller_of(request).key_id
+    key_id = get_caller(request).key_id
     callers = [] if key_id is None else [f"key {key_id}"]
     if request.client is not None:
         callers.append(f"address {address_group(request.client.host)}")

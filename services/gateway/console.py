@@ -15,16 +15,16 @@ from urllib.parse import urlsplit
 from fastapi import APIRouter, Request
 from fastapi.responses import Response
 
-from services.console import PAGE
-from services.gateway.assets import Asset, read_assets
-from services.gateway.health import ServiceAnswer, service
+from services.console import PAGE_FOLDER
+from services.gateway.assets import StaticAsset, load_assets
+from services.gateway.health import ServiceResponse, service_info
 from shared.errors import NotFound
 from shared.settings import Settings
 
-PREFIX = "/console/"
-PAGES = ("index.html", "docs.html", "redoc.html")
+ASSET_PREFIX = "/console/"
+HTML_PAGES = ("index.html", "docs.html", "redoc.html")
 # From packages: the folder's name on this server, the package, the folder in it, and its files.
-LIBRARIES = (
+VENDORED_PACKAGES = (
     ("leaflet", "xstatic.pkg.leaflet", "data", ("leaflet.js", "leaflet.css")),
     (
         "api",
@@ -34,50 +34,54 @@ LIBRARIES = (
     ),
 )
 # Swagger UI and ReDoc write style elements and run their search in a worker of a blob.
-OF_DESCRIPTIONS = "; style-src 'self' 'unsafe-inline'; worker-src blob:"
+API_DOCS_CSP = "; style-src 'self' 'unsafe-inline'; worker-src blob:"
 
 
-def console_router(settings: Settings) -> APIRouter:
+def create_web_page_router(settings: Settings) -> APIRouter:
     """The routes of the page."""
-    assets = dict(_files())
-    pages = {name: assets.pop(name) for name in PAGES}
-    assets["settings.json"] = Asset.of(".json", json.dumps(_said_to_the_page(settings)).encode())
+    assets = dict(_load_page_assets())
+    pages = {name: assets.pop(name) for name in HTML_PAGES}
+    assets["settings.json"] = StaticAsset.from_bytes(
+        ".json", json.dumps(_page_settings(settings)).encode()
+    )
 
-    of_page = _headers(settings)
+    of_page = _page_headers(settings)
     policy = of_page["Content-Security-Policy"]
-    of_descriptions = {**of_page, "Content-Security-Policy": policy + OF_DESCRIPTIONS}
+    of_descriptions = {**of_page, "Content-Security-Policy": policy + API_DOCS_CSP}
     router = APIRouter()
 
     @router.head("/", include_in_schema=False)
-    @router.get("/", operation_id="service", response_model=ServiceAnswer, tags=["operations"])
+    @router.get("/", operation_id="service", response_model=ServiceResponse, tags=["operations"])
     def first(request: Request) -> Response:
         """What this is and where to look; to browsers, which ask for HTML, the page."""
         if "text/html" in request.headers.get("accept", ""):
-            answer = pages["index.html"].answer(request, of_page)
+            answer = pages["index.html"].to_response(request, of_page)
         else:
-            answer = Response(service().model_dump_json(), media_type="application/json")
+            answer = Response(service_info().model_dump_json(), media_type="application/json")
         answer.headers["Vary"] = "Accept, Accept-Encoding"
         return answer
 
     @router.api_route("/docs", methods=["GET", "HEAD"], include_in_schema=False)
     def docs(request: Request) -> Response:
-        return pages["docs.html"].answer(request, of_descriptions)
+        return pages["docs.html"].to_response(request, of_descriptions)
 
     @router.api_route("/redoc", methods=["GET", "HEAD"], include_in_schema=False)
     def redoc(request: Request) -> Response:
-        return pages["redoc.html"].answer(request, of_descriptions)
+        return pages["redoc.html"].to_response(request, of_descriptions)
 
-    @router.api_route(PREFIX + "{path:path}", methods=["GET", "HEAD"], include_in_schema=False)
+    @router.api_route(
+        ASSET_PREFIX + "{path:path}", methods=["GET", "HEAD"], include_in_schema=False
+    )
     def asset(request: Request, path: str) -> Response:
         found = assets.get(path)
         if found is None:
-            raise NotFound("path_not_found", f"There is no {PREFIX}{path}.")
-        return found.answer(request, {"X-Content-Type-Options": "nosniff"})
+            raise NotFound("path_not_found", f"There is no {ASSET_PREFIX}{path}.")
+        return found.to_response(request, {"X-Content-Type-Options": "nosniff"})
 
     return router
 
 
-def _said_to_the_page(settings: Settings) -> dict[str, str | int | None]:
+def _page_settings(settings: Settings) -> dict[str, str | int | None]:
     """Open to everyone, before any key: nothing of what is stored."""
     return {
         "map_tiles": settings.map_tiles,
@@ -86,7 +90,7 @@ def _said_to_the_page(settings: Settings) -> dict[str, str | int | None]:
     }
 
 
-def _headers(settings: Settings) -> dict[str, str]:
+def _page_headers(settings: Settings) -> dict[str, str]:
     pictures = ["'self'", "blob:", "data:"]
     if settings.map_tiles is not None:
         tiles = urlsplit(settings.map_tiles)
@@ -108,11 +112,13 @@ def _headers(settings: Settings) -> dict[str, str]:
 
 
 @functools.cache
-def _files() -> dict[str, Asset]:
+def _load_page_assets() -> dict[str, StaticAsset]:
     """All that pages load, by its path on this server: read, and compressed, once."""
-    found = dict(read_assets(PAGE))
-    for folder, package, inner, names in LIBRARIES:
+    found = dict(load_assets(PAGE_FOLDER))
+    for folder, package, inner, names in VENDORED_PACKAGES:
         there = Path(str(files(package))) / inner
         for name in names:
-            found[f"{folder}/{name}"] = Asset.of(Path(name).suffix, (there / name).read_bytes())
+            found[f"{folder}/{name}"] = StaticAsset.from_bytes(
+                Path(name).suffix, (there / name).read_bytes()
+            )
     return found

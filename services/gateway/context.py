@@ -11,48 +11,48 @@ from fastapi import Depends, Query, Request
 from prometheus_client import CollectorRegistry
 from pydantic import BeforeValidator
 
-from services.gateway.job_watch import JobWatch
-from services.gateway.keys import Keys
+from services.gateway.job_watch import JobNotifier
+from services.gateway.keys import Authenticator
 from services.http_connections import ConnectionLimits, Connections
 from shared.catalog.maps import DEFAULT_MAP
 from shared.catalog.session import Catalog
-from shared.errors import NotFound, invalid_field
-from shared.jobs import Hints
+from shared.errors import NotFound, invalid_field_error
+from shared.jobs import Wakeups
 from shared.objects import ObjectStore
-from shared.search_protocol import SearchPort
+from shared.search_protocol import SearchBackend
 from shared.settings import Settings
 
-API = "/api/v1"
-NO_NUL = r"^[^\x00]*$"  # PostgreSQL has no text with a NUL
+API_PREFIX = "/api/v1"
+NO_NUL_PATTERN = r"^[^\x00]*$"  # PostgreSQL has no text with a NUL
 
 
 @dataclass(frozen=True, slots=True)
-class Gateway:
+class GatewayContext:
     """The ports that the gateway speaks to."""
 
     catalog: Catalog
     store: ObjectStore
-    hints: Hints
-    search: SearchPort
+    hints: Wakeups
+    search: SearchBackend
     settings: Settings
-    keys: Keys
+    authenticator: Authenticator
     registry: CollectorRegistry = field(default_factory=CollectorRegistry)
     """Of the process's figures: in the embedded Placewise, of all of its parts."""
-    started: float = field(default_factory=time.monotonic)
-    job_watch: JobWatch = field(init=False)
+    started_monotonic: float = field(default_factory=time.monotonic)
+    job_notifier: JobNotifier = field(init=False)
     connections: Connections = field(init=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "job_watch", JobWatch(self.catalog))
+        object.__setattr__(self, "job_watch", JobNotifier(self.catalog))
         object.__setattr__(self, "connections", Connections(ConnectionLimits.of(self.settings)))
 
 
-def get_gateway(request: Request) -> Gateway:
-    gateway: Gateway = request.app.state.gateway
+def get_gateway_context(request: Request) -> GatewayContext:
+    gateway: GatewayContext = request.app.state.gateway
     return gateway
 
 
-def _known_shape(noun: str):  # type: ignore[no-untyped-def]
+def _uuid_or_not_found(noun: str):  # type: ignore[no-untyped-def]
     def parse(value: object) -> UUID:
         try:
             return UUID(str(value))
@@ -63,15 +63,15 @@ def _known_shape(noun: str):  # type: ignore[no-untyped-def]
     return BeforeValidator(parse)
 
 
-def read_cursor(cursor: str | None) -> UUID | None:
+def parse_cursor(cursor: str | None) -> UUID | None:
     """The id that a page ended with; 422 for a cursor that no call has given."""
     try:
         return UUID(cursor) if cursor else None
     except ValueError:
-        raise invalid_field("cursor", "is not one that this call has given") from None
+        raise invalid_field_error("cursor", "is not one that this call has given") from None
 
 
-GatewayDep = Annotated[Gateway, Depends(get_gateway)]
+GatewayDep = Annotated[GatewayContext, Depends(get_gateway_context)]
 MapName = Annotated[
     str,
     Query(
@@ -79,22 +79,22 @@ MapName = Annotated[
         description="The map that is meant.",
         min_length=1,
         max_length=100,
-        pattern=NO_NUL,
+        pattern=NO_NUL_PATTERN,
     ),
 ]
-FileId = Annotated[UUID, _known_shape("photo")]
-UploadId = Annotated[UUID, _known_shape("upload")]
-JobId = Annotated[UUID, _known_shape("job")]
-GenerationId = Annotated[UUID, _known_shape("generation")]
-KeyId = Annotated[UUID, _known_shape("key")]
-WebhookId = Annotated[UUID, _known_shape("webhook")]
+FileId = Annotated[UUID, _uuid_or_not_found("photo")]
+UploadId = Annotated[UUID, _uuid_or_not_found("upload")]
+JobId = Annotated[UUID, _uuid_or_not_found("job")]
+GenerationId = Annotated[UUID, _uuid_or_not_found("generation")]
+KeyId = Annotated[UUID, _uuid_or_not_found("key")]
+WebhookId = Annotated[UUID, _uuid_or_not_found("webhook")]
 
 __all__ = [
-    "API",
+    "API_PREFIX",
     "DEFAULT_MAP",
-    "NO_NUL",
+    "NO_NUL_PATTERN",
     "FileId",
-    "Gateway",
+    "GatewayContext",
     "GatewayDep",
     "GenerationId",
     "JobId",
@@ -102,5 +102,5 @@ __all__ = [
     "MapName",
     "UploadId",
     "WebhookId",
-    "read_cursor",
+    "parse_cursor",
 ]

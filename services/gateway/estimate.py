@@ -5,48 +5,52 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from uuid import UUID
 
-from services.gateway.schemas import EstimateAnswer
+from services.gateway.schemas import EstimateResponse
 from shared.catalog.photos import Photo
 from shared.estimate.calibration import Calibration
-from shared.estimate.evidence import Ranked, locate, weigh
-from shared.estimate.places import Spot
-from shared.search_protocol import Hit
+from shared.estimate.evidence import RankedPhoto, compute_evidence, estimate_location
+from shared.estimate.places import PhotoLocation
+from shared.search_protocol import SearchHit
 
 
-def rank(hits: Sequence[Hit], photos: Mapping[UUID, Photo]) -> list[Ranked]:
+def locate_hits(hits: Sequence[SearchHit], photos: Mapping[UUID, Photo]) -> list[RankedPhoto]:
     """Hits with the places of their photos."""
-    return [Ranked(hit.ranked_by, _spot(photos[hit.photo_id])) for hit in hits]
+    return [RankedPhoto(hit.ranked_by, _photo_location(photos[hit.photo_id])) for hit in hits]
 
 
-def estimate(
+def estimate_place(
     calibration: Calibration | None,
-    ranking: Sequence[Ranked],
-    everything: Sequence[Ranked],
+    ranking: Sequence[RankedPhoto],
+    unfiltered_ranking: Sequence[RankedPhoto],
     radius_m: float,
-) -> EstimateAnswer:
+) -> EstimateResponse:
     """Where the ranking points to, and what the generation's evaluations say of that place.
 
-    `calibration` is what rankings of this kind, plain or by word weights, have taught. `everything`
+    `calibration` is what rankings of this kind, plain or by word weights, have taught. `unfiltered_ranking`
     is the ranking without a filter: the place has to stand up to all others, as it had to when the
     evaluations learnt what is in the map.
     """
     state = calibration.state if calibration else "uncalibrated"
-    evidence = weigh(everything, radius_m, ranking[0].spot) if ranking else None
+    evidence = compute_evidence(unfiltered_ranking, radius_m, ranking[0].spot) if ranking else None
     if evidence is None:
         reason = (
             "No photo of the map passes the filter."
             if not ranking
             else "The most similar photo has neither coordinates nor a place."
         )
-        return EstimateAnswer(calibration=state, reason=reason)
+        return EstimateResponse(calibration=state, reason=reason)
     accepted = calibration.accepts(evidence) if calibration else None
     confidence = (
         calibration.confidence.probability(evidence)
         if calibration and calibration.confidence
         else None
     )
-    spot = locate(ranking, radius_m) if accepted is not False else Spot(None, None, None)
-    return EstimateAnswer(
+    spot = (
+        estimate_location(ranking, radius_m)
+        if accepted is not False
+        else PhotoLocation(None, None, None)
+    )
+    return EstimateResponse(
         in_map=accepted,
         latitude=spot.latitude,
         longitude=spot.longitude,
@@ -54,11 +58,11 @@ def estimate(
         place=spot.place,
         confidence=confidence,
         calibration=state,
-        reason=_reason(accepted, evidence.support, calibration),
+        reason=_estimate_reason(accepted, evidence.support, calibration),
     )
 
 
-def _reason(accepted: bool | None, support: float, calibration: Calibration | None) -> str:
+def _estimate_reason(accepted: bool | None, support: float, calibration: Calibration | None) -> str:
     if accepted is None or calibration is None or calibration.support_threshold is None:
         return (
             "Whether the place is in the map can't be told yet: first an evaluation has to see at "
@@ -71,5 +75,5 @@ def _reason(accepted: bool | None, support: float, calibration: Calibration | No
     return compared if accepted else f"Not in this map, as far as can be told. {compared}"
 
 
-def _spot(photo: Photo) -> Spot:
-    return Spot(photo.latitude, photo.longitude, photo.place)
+def _photo_location(photo: Photo) -> PhotoLocation:
+    return PhotoLocation(photo.latitude, photo.longitude, photo.place)

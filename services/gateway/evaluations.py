@@ -10,12 +10,12 @@ from fastapi import APIRouter, Query, Response
 from pydantic import BaseModel, ConfigDict, Field
 from sqlalchemy.orm import Session
 
-from services.gateway.context import DEFAULT_MAP, GatewayDep, MapName, read_cursor
+from services.gateway.context import DEFAULT_MAP, GatewayDep, MapName, parse_cursor
 from services.gateway.key_check import READ, WRITE
-from services.gateway.once import Once, OnceDep
-from services.gateway.room import ROOM_FOR_JOBS
-from services.gateway.schemas import Answer, JobStarted, started_job
-from shared.catalog.chunks import has_located
+from services.gateway.once import IdempotentDep, IdempotentRequest
+from services.gateway.room import ADMIT_JOB
+from services.gateway.schemas import JobAcceptedResponse, ResponseModel, accept_job
+from shared.catalog.chunks import has_geotagged
 from shared.catalog.evaluations import Evaluation, list_evaluations
 from shared.catalog.generations import Generation, active_generation
 from shared.catalog.maps import get_map
@@ -38,7 +38,7 @@ class EvaluationRequest(BaseModel):
     seed: int = Field(0, ge=0, le=2**31 - 1)
 
 
-class EvaluationAnswer(Answer):
+class EvaluationResponse(ResponseModel):
     evaluation_id: UUID
     generation_id: UUID
     automatic: bool = Field(description="made because the map had changed")
@@ -52,7 +52,7 @@ class EvaluationAnswer(Answer):
     evaluated_at: datetime
 
     @classmethod
-    def of(cls, evaluation: Evaluation) -> EvaluationAnswer:
+    def of(cls, evaluation: Evaluation) -> EvaluationResponse:
         return cls(
             evaluation_id=evaluation.id,
             generation_id=evaluation.generation_id,
@@ -63,8 +63,8 @@ class EvaluationAnswer(Answer):
         )
 
 
-class EvaluationsAnswer(Answer):
-    evaluations: list[EvaluationAnswer]
+class EvaluationsResponse(ResponseModel):
+    evaluations: list[EvaluationResponse]
     next_cursor: str | None
 
 
@@ -72,54 +72,59 @@ class EvaluationsAnswer(Answer):
     "/evaluations",
     operation_id="evaluate",
     status_code=202,
-    response_model=JobStarted,
-    dependencies=[WRITE, ROOM_FOR_JOBS],
+    response_model=JobAcceptedResponse,
+    dependencies=[WRITE, ADMIT_JOB],
 )
-def evaluate(
+def start_evaluation(
     gateway: GatewayDep,
     response: Response,
-    once: OnceDep,
-    wanted: EvaluationRequest | None = None,
+    idempotent: IdempotentDep,
+    options: EvaluationRequest | None = None,
     map_name: MapName = DEFAULT_MAP,
-) -> JobStarted:
+) -> JobAcceptedResponse:
     """Measure the active generation: leave-one-out on the map's own photos whose place is known,
     and recall on its labelled queries. The job's `result` has the figures."""
-    params = (wanted or EvaluationRequest.model_validate({})).model_dump()
+    params = (options or EvaluationRequest.model_validate({})).model_dump()
     with gateway.catalog.write() as session:
         map_ = get_map(session, map_name)
         generation = active_generation(session, map_.id)
-        job = queue_asking(
-            session, once, map_.id, generation, JobKind.EVALUATE, {**params, "automatic": False}
+        job = queue_evaluation_job(
+            session,
+            idempotent,
+            map_.id,
+            generation,
+            JobKind.EVALUATE,
+            {**params, "automatic": False},
         )
-    return started_job(response, job, map_name)
+    return accept_job(response, job, map_name)
 
 
 @router.get(
     "/evaluations",
     operation_id="list_evaluations",
-    response_model=EvaluationsAnswer,
+    response_model=EvaluationsResponse,
     dependencies=[READ],
 )
-def evaluations(
+def read_evaluations(
     gateway: GatewayDep,
     limit: Annotated[int, Query(ge=1, le=1000)] = 50,
     cursor: Annotated[str | None, Query()] = None,
     map_name: MapName = DEFAULT_MAP,
-) -> EvaluationsAnswer:
+) -> EvaluationsResponse:
     """Newest first, those made by themselves as well: before and after a vocabulary, in numbers."""
-    before = read_cursor(cursor)
+    before = parse_cursor(cursor)
     with gateway.catalog.read() as session:
         found = list_evaluations(session, get_map(session, map_name).id, limit + 1, before)
     page = found[:limit]
-    return EvaluationsAnswer(
-        evaluations=[EvaluationAnswer.of(evaluation) for evaluation in page],
+    return EvaluationsResponse(
+        evaluations=[EvaluationResponse.of(evaluation) for evaluation in page],
         next_cursor=str(page[-1].id) if len(found) > limit else None,
     )
 
 
-def queue_asking(
+def queue_evaluation_job(
     session: Session,
-    once: Once,
+    idempotent: IdempotentRequest,
     map_id: UUID,
     generation: Generation | None,
     kind: JobKind,
@@ -127,7 +132,7 @@ def queue_asking(
 ) -> Job:
     """A job that asks the generation with the map's own photos; Conflict (`nothing_to_evaluate`)
     where none of them has a place."""
-    if generation is None or not has_located(session, generation.id, PhotoRole.DATABASE):
+    if generation is None or not has_geotagged(session, generation.id, PhotoRole.DATABASE):
         raise Conflict(
             "nothing_to_evaluate",
             "The map has no described photo with coordinates or a place. Upload some, and wait "
@@ -136,5 +141,5 @@ def queue_asking(
     job = Job(id=new_id(), map_id=map_id, kind=kind, priority=Priority.EVALUATION, params=params)
     session.add(job)
     session.flush()
-    once.keep_job(session, job)
+    idempotent.store_job_response(session, job)
     return job

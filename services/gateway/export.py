@@ -23,7 +23,7 @@ from sqlalchemy.orm import Session
 
 from services.gateway.context import DEFAULT_MAP, GatewayDep, GenerationId, MapName
 from services.gateway.key_check import READ
-from shared.catalog.chunks import Descriptor, live_chunks
+from shared.catalog.chunks import Descriptor, list_live_chunks
 from shared.catalog.generations import Generation, get_generation
 from shared.catalog.maps import get_map
 from shared.catalog.photos import Photo
@@ -32,9 +32,9 @@ from shared.objects import ObjectStore
 
 router = APIRouter(tags=["models"])
 
-KEPT_BYTES = 8 * 1024 * 1024  # of a table; more goes to a temporary file
-READ_BYTES = 256 * 1024
-COLUMNS = (
+SPOOL_BYTES = 8 * 1024 * 1024  # of a table; more goes to a temporary file
+STREAM_READ_BYTES = 256 * 1024
+CSV_COLUMNS = (
     "row",
     "image_id",
     "filename",
@@ -45,7 +45,7 @@ COLUMNS = (
     "place",
     "role",
 )
-TAR: dict[int | str, dict[str, Any]] = {
+TAR_RESPONSE: dict[int | str, dict[str, Any]] = {
     200: {
         "content": {"application/x-tar": {"schema": {"type": "string", "format": "binary"}}},
         "description": "A tar with `photos.csv`, `names.txt` and `descriptors.npy`.",
@@ -54,7 +54,7 @@ TAR: dict[int | str, dict[str, Any]] = {
 
 
 @dataclass(frozen=True, slots=True)
-class _Part:
+class _ChunkRows:
     """The live rows of one chunk."""
 
     object_key: str
@@ -67,9 +67,9 @@ class _Part:
     dependencies=[READ],
     operation_id="export_descriptors",
     response_class=StreamingResponse,
-    responses=TAR,
+    responses=TAR_RESPONSE,
 )
-def descriptors(
+def export_descriptors(
     gateway: GatewayDep,
     generation_id: GenerationId,
     map_name: MapName = DEFAULT_MAP,
@@ -79,8 +79,8 @@ def descriptors(
     """
     with contextlib.ExitStack() as files, gateway.catalog.read() as session:
         generation = get_generation(session, get_map(session, map_name).id, generation_id)
-        table = files.enter_context(tempfile.SpooledTemporaryFile(KEPT_BYTES))
-        names = files.enter_context(tempfile.SpooledTemporaryFile(KEPT_BYTES))
+        table = files.enter_context(tempfile.SpooledTemporaryFile(SPOOL_BYTES))
+        names = files.enter_context(tempfile.SpooledTemporaryFile(SPOOL_BYTES))
         parts = _write_tables(session, generation, table, names)
         header = _npy_header(sum(len(part.rows) for part in parts), generation.dimension)
         files = files.pop_all()  # now the stream's, which closes them
@@ -92,7 +92,11 @@ def descriptors(
         with files:
             for (name, size_bytes), content in zip(
                 members,
-                (_pieces(table), _pieces(names), _rows(gateway.store, header, parts)),
+                (
+                    _read_blocks(table),
+                    _read_blocks(names),
+                    _stream_rows(gateway.store, header, parts),
+                ),
                 strict=True,
             ):
                 about = tarfile.TarInfo(name)
@@ -102,7 +106,7 @@ def descriptors(
                 yield bytes(-size_bytes % tarfile.BLOCKSIZE)
             yield bytes(2 * tarfile.BLOCKSIZE)
 
-    length = sum(_padded(size_bytes) + tarfile.BLOCKSIZE for _, size_bytes in members)
+    length = sum(_padded_to_block(size_bytes) + tarfile.BLOCKSIZE for _, size_bytes in members)
     return StreamingResponse(
         stream(),
         media_type="application/x-tar",
@@ -116,10 +120,10 @@ def descriptors(
 
 def _write_tables(
     session: Session, generation: Generation, table: IO[bytes], names: IO[bytes]
-) -> list[_Part]:
-    parts: list[_Part] = []
+) -> list[_ChunkRows]:
+    parts: list[_ChunkRows] = []
     number = 0
-    for chunk in live_chunks(session, generation.id):
+    for chunk in list_live_chunks(session, generation.id):
         found = session.execute(
             select(
                 Descriptor.row,
@@ -139,7 +143,7 @@ def _write_tables(
         lines = io.StringIO(newline="")
         writer = csv.writer(lines)
         if not parts:
-            writer.writerow(COLUMNS)
+            writer.writerow(CSV_COLUMNS)
         for _, photo_id, name, latitude, longitude, heading, at, place, role in found:
             taken = at.isoformat() if at else None
             writer.writerow(
@@ -149,9 +153,9 @@ def _write_tables(
             names.write(" ".join(name.splitlines()).encode() + b"\n")
             number += 1
         table.write(lines.getvalue().encode())
-        parts.append(_Part(chunk.object_key, chunk.sha256, [row[0] for row in found]))
+        parts.append(_ChunkRows(chunk.object_key, chunk.sha256, [row[0] for row in found]))
     if not parts:
-        table.write(",".join(COLUMNS).encode() + b"\r\n")
+        table.write(",".join(CSV_COLUMNS).encode() + b"\r\n")
     return parts
 
 
@@ -162,7 +166,7 @@ def _npy_header(rows: int, dimension: int) -> bytes:
     return buffer.getvalue()
 
 
-def _rows(store: ObjectStore, header: bytes, parts: list[_Part]) -> Iterator[bytes]:
+def _stream_rows(store: ObjectStore, header: bytes, parts: list[_ChunkRows]) -> Iterator[bytes]:
     yield header
     for part in parts:
         if part.rows:
@@ -171,11 +175,11 @@ def _rows(store: ObjectStore, header: bytes, parts: list[_Part]) -> Iterator[byt
                 yield rows[row].tobytes()
 
 
-def _pieces(file: IO[bytes]) -> Iterator[bytes]:
+def _read_blocks(file: IO[bytes]) -> Iterator[bytes]:
     file.seek(0)
-    while piece := file.read(READ_BYTES):
+    while piece := file.read(STREAM_READ_BYTES):
         yield piece
 
 
-def _padded(size_bytes: int) -> int:
+def _padded_to_block(size_bytes: int) -> int:
     return size_bytes + -size_bytes % tarfile.BLOCKSIZE

@@ -10,17 +10,17 @@ from sqlalchemy import func, select
 
 from services.gateway.context import DEFAULT_MAP, GatewayDep, MapName
 from services.gateway.key_check import READ
-from services.gateway.schemas import Answer
+from services.gateway.schemas import ResponseModel
 from shared.catalog.chunks import Chunk
-from shared.catalog.figures import figures_of
+from shared.catalog.figures import get_map_statistics
 from shared.catalog.generations import active_generation
 from shared.catalog.maps import get_map
-from shared.catalog.vocabularies import standing_of
+from shared.catalog.vocabularies import vocabulary_standing
 
 router = APIRouter(tags=["operations"])
 
 
-class StatsAnswer(Answer):
+class StatsResponse(ResponseModel):
     map: str
     map_version: int
     total_images: int
@@ -44,16 +44,16 @@ class StatsAnswer(Answer):
 @router.get(
     "/database/stats",
     operation_id="database_stats",
-    response_model=StatsAnswer,
+    response_model=StatsResponse,
     dependencies=[READ],
 )
-def stats(gateway: GatewayDep, map_name: MapName = DEFAULT_MAP) -> StatsAnswer:
+def read_stats(gateway: GatewayDep, map_name: MapName = DEFAULT_MAP) -> StatsResponse:
     """Figures of one map; search times are those of the last seven days. Those of a map with more
     than 10,000 photos, jobs or searches may be as old as `counted_at` says."""
     with gateway.catalog.read() as session:
         map_ = get_map(session, map_name)
         generation = active_generation(session, map_.id)
-        figures, counted_at = figures_of(session, map_.id)
+        figures, counted_at = get_map_statistics(session, map_.id)
         chunks, chunk_bytes = 0, 0
         if generation is not None:
             chunks, chunk_bytes = session.execute(
@@ -61,7 +61,7 @@ def stats(gateway: GatewayDep, map_name: MapName = DEFAULT_MAP) -> StatsAnswer:
                     Chunk.generation_id == generation.id, Chunk.superseded_at.is_(None)
                 )
             ).one()
-        return StatsAnswer(
+        return StatsResponse(
             map=map_.name,
             map_version=map_.version,
             total_images=figures.photos,
@@ -72,7 +72,7 @@ def stats(gateway: GatewayDep, map_name: MapName = DEFAULT_MAP) -> StatsAnswer:
             feature_dimension=generation.dimension if generation else None,
             max_images_per_chunk=gateway.settings.slot_rows,
             extractor=generation.extractor if generation else map_.extractor,
-            vocabulary=standing_of(session, generation) if generation else None,
+            vocabulary=vocabulary_standing(session, generation) if generation else None,
             total_searches=figures.searches,
             recent_uploads_24h=figures.uploads_24h,
             recent_searches_24h=figures.searches_24h,

@@ -17,34 +17,34 @@ from uuid import UUID
 from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.orm import Session
 
-from services.gateway.choose_weights import choose_weights
-from services.gateway.context import Gateway
-from services.gateway.estimate import estimate, rank
+from services.gateway.choose_weights import select_ranking_weights
+from services.gateway.context import GatewayContext
+from services.gateway.estimate import estimate_place, locate_hits
 from services.gateway.schemas import (
-    PhotoAnswer,
-    SimilarityAnswer,
-    SimilarPhoto,
+    PhotoResponse,
+    SimilarityResponse,
+    SimilarPhotoResponse,
     job_url,
 )
-from services.gateway.wanted import Wanted
-from shared.catalog.away import as_unavailable
-from shared.catalog.chunks import descriptor_of
+from services.gateway.wanted import SearchParams
+from shared.catalog.away import to_unavailable
+from shared.catalog.chunks import find_descriptor
 from shared.catalog.generations import Generation, active_generation
 from shared.catalog.maps import Map, get_map
-from shared.catalog.photos import Photo, get_photo, live_photos
+from shared.catalog.photos import Photo, get_live_photos, get_photo
 from shared.catalog.searches import Search
-from shared.catalog.vocabularies import standing_of
+from shared.catalog.vocabularies import vocabulary_standing
 from shared.errors import Conflict, Gone, StorageFull
-from shared.estimate.evidence import DEPTH
+from shared.estimate.evidence import EVIDENCE_DEPTH
 from shared.jobs import Job, JobState
-from shared.photo_filter import EVERYTHING, PhotoFilter
-from shared.search_protocol import Hit, SearchRequest, SearchResponse
+from shared.photo_filter import NO_FILTER, PhotoFilter
+from shared.search_protocol import SearchHit, SearchRequest, SearchResponse
 
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
-class Query:
+class SimilarityQuery:
     """What is compared, with what, and what the answer says about it."""
 
     map_id: UUID
@@ -59,36 +59,36 @@ class Query:
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class SimilarityResult:
     """What the search tier has found: the answer but for its photos, and their scores."""
 
-    frame: SimilarityAnswer
+    response_without_photos: SimilarityResponse
     """Without photos."""
-    hits: list[Hit]
+    hits: list[SearchHit]
     """Live, wanted, most similar first: `top_k`, or as many more as are to be reranked."""
     photos: dict[UUID, Photo]
     word_weights: tuple[float, ...]
     """By which the hits are ranked, one for each word; () for the plain ranking."""
-    history: Search
+    history_row: Search
     """The row to be added."""
 
 
-def query_by_photo(gateway: Gateway, map_name: str, photo_id: UUID) -> Query:
+def query_from_photo(gateway: GatewayContext, map_name: str, photo_id: UUID) -> SimilarityQuery:
     """A stored photo as a query; 404 for an unknown one, 409 while it is not searchable."""
     with gateway.catalog.read() as session:
         map_ = get_map(session, map_name)
         photo = get_photo(session, map_.id, photo_id)
         generation = active_generation(session, map_.id)
-        found = descriptor_of(session, generation.id, photo.id) if generation else None
+        found = find_descriptor(session, generation.id, photo.id) if generation else None
         if generation is None or found is None:
-            raise _not_searchable(session, photo, map_name)
+            raise _not_searchable_error(session, photo, map_name)
         descriptor, chunk = found
-        return Query(
+        return SimilarityQuery(
             map_id=map_.id,
             map_name=map_.name,
             min_version=map_.version,
             generation=generation,
-            vocabulary=standing_of(session, generation),
+            vocabulary=vocabulary_standing(session, generation),
             object_key=chunk.object_key,
             row=descriptor.row,
             photo_id=photo.id,
@@ -96,7 +96,7 @@ def query_by_photo(gateway: Gateway, map_name: str, photo_id: UUID) -> Query:
         )
 
 
-def query_by_job(gateway: Gateway, job: Job) -> Query:
+def query_from_job(gateway: GatewayContext, job: Job) -> SimilarityQuery:
     """A described query photo; 410 when what it was described into has gone."""
     result: dict[str, Any] = job.result or {}
     with gateway.catalog.read() as session:
@@ -107,12 +107,12 @@ def query_by_job(gateway: Gateway, job: Job) -> Query:
                 "query_expired",
                 "The query's generation is gone. Ask with the photo again.",
             )
-        return Query(
+        return SimilarityQuery(
             map_id=map_.id,
             map_name=map_.name,
             min_version=map_.version,
             generation=generation,
-            vocabulary=standing_of(session, generation),
+            vocabulary=vocabulary_standing(session, generation),
             object_key=result["object_key"],
             row=result["row"],
             photo_id=None,
@@ -120,49 +120,57 @@ def query_by_job(gateway: Gateway, job: Job) -> Query:
         )
 
 
-def find_similar(gateway: Gateway, query: Query, wanted: Wanted) -> SimilarityAnswer:
+def find_similar(
+    gateway: GatewayContext, query: SimilarityQuery, search_params: SearchParams
+) -> SimilarityResponse:
     """The most similar live photos that are wanted, without the query itself, and the place that
     they point to; noted in the history."""
-    found = search(gateway, query, wanted)
+    found = run_similarity_search(gateway, query, search_params)
     try:
         with gateway.catalog.write() as session:
-            session.add(found.history)
+            session.add(found.history_row)
     except SQLAlchemyError as error:
-        if not isinstance(as_unavailable(error), StorageFull):
+        if not isinstance(to_unavailable(error), StorageFull):
             raise
         log.warning("the disk of the catalog is full: the search is not added to the history")
-    return found.frame.with_photos(
-        SimilarPhoto(
+    return found.response_without_photos.with_photos(
+        SimilarPhotoResponse(
             similarity_score=hit.score,
             weighted_score=hit.weighted_score,
-            **PhotoAnswer.fields_of(found.photos[hit.photo_id], query.map_name),
+            **PhotoResponse.fields_of(found.photos[hit.photo_id], query.map_name),
         )
         for hit in found.hits
     )
 
 
-def search(gateway: Gateway, query: Query, wanted: Wanted) -> Found:
+def run_similarity_search(
+    gateway: GatewayContext, query: SimilarityQuery, search_params: SearchParams
+) -> SimilarityResult:
     """Ask the search tier. Whoever answers with what it has found adds the history's row."""
     started = time.perf_counter()
-    weights = choose_weights(query.generation, wanted.word_weights, gateway.settings)
-    shown = max(wanted.top_k, wanted.rerank or 0)
+    weights = select_ranking_weights(query.generation, search_params.word_weights, gateway.settings)
+    shown = max(search_params.top_k, search_params.rerank or 0)
     # The estimate looks deeper than most answers, and also at what is below the least score.
-    search = partial(_search_live, gateway, query, wanted, weights=weights.values)
-    hits, photos, response = search(wanted.photos, max(shown, DEPTH))
-    ranking = everything = rank(hits, photos)
-    if not wanted.photos.is_empty:
-        everything = rank(*search(EVERYTHING, DEPTH)[:2])
-    found = estimate(
+    run_similarity_search = partial(
+        _search_live_photos, gateway, query, search_params, weights=weights.values
+    )
+    hits, photos, response = run_similarity_search(search_params.photos, max(shown, EVIDENCE_DEPTH))
+    ranking = everything = locate_hits(hits, photos)
+    if not search_params.photos.is_empty:
+        everything = locate_hits(*run_similarity_search(NO_FILTER, EVIDENCE_DEPTH)[:2])
+    found = estimate_place(
         weights.calibration(hits), ranking, everything, gateway.settings.estimate_radius_m
     )
     similar = hits[:shown]
-    if wanted.min_score is not None and weights.values:
+    if search_params.min_score is not None and weights.values:
         # The least score is of the plain cosine: there may be more of them far down the ranking.
-        similar, photos, response = search(wanted.photos, shown, min_score=wanted.min_score)
-    elif wanted.min_score is not None:
-        similar = [hit for hit in similar if hit.score >= wanted.min_score]
+        similar, photos, response = run_similarity_search(
+            search_params.photos, shown, min_score=search_params.min_score
+        )
+    elif search_params.min_score is not None:
+        similar = [hit for hit in similar if hit.score >= search_params.min_score]
     took_ms = (time.perf_counter() - started) * 1000
-    frame = SimilarityAnswer(
+    frame = SimilarityResponse(
         query_file_id=query.photo_id,
         query_filename=query.filename,
         processing_time_ms=took_ms,
@@ -173,7 +181,7 @@ def search(gateway: Gateway, query: Query, wanted: Wanted) -> Found:
         word_weights=weights.state(hits),
         generation_id=query.generation.id,
         certificate=response.certificate,
-        certified_k=_certain(similar[: wanted.top_k], response),
+        certified_k=_count_certified(similar[: search_params.top_k], response),
         max_z=response.max_z,
         rows_scanned=response.rows_scanned,
         rows_reranked=response.rows_reranked,
@@ -186,32 +194,32 @@ def search(gateway: Gateway, query: Query, wanted: Wanted) -> Found:
         generation_id=query.generation.id,
         query_photo_id=query.photo_id,
         query_filename=query.filename,
-        top_k=wanted.top_k,
-        results=min(len(similar), wanted.top_k),
+        top_k=search_params.top_k,
+        results=min(len(similar), search_params.top_k),
         processing_ms=took_ms,
         best_score=hits[0].score if hits else None,
         in_map=found.in_map,
     )
     weighted = any(hit.weighted_score is not None for hit in similar)
-    return Found(frame, similar, photos, weights.values if weighted else (), history)
+    return SimilarityResult(frame, similar, photos, weights.values if weighted else (), history)
 
 
-def _certain(hits: list[Hit], response: SearchResponse) -> int:
+def _count_certified(hits: list[SearchHit], response: SearchResponse) -> int:
     """How many of the first of these hits the search is certain of."""
     sure = {hit.photo_id for hit in response.hits[: response.certified_k]}
     return sum(1 for _ in itertools.takewhile(lambda hit: hit.photo_id in sure, hits))
 
 
-def _search_live(
-    gateway: Gateway,
-    query: Query,
-    wanted: Wanted,
+def _search_live_photos(
+    gateway: GatewayContext,
+    query: SimilarityQuery,
+    search_params: SearchParams,
     photos: PhotoFilter,
     depth: int,
     *,
     weights: tuple[float, ...],
     min_score: float | None = None,
-) -> tuple[list[Hit], dict[UUID, Photo], SearchResponse]:
+) -> tuple[list[SearchHit], dict[UUID, Photo], SearchResponse]:
     """The first `depth` live photos, fewer when there are no more."""
     k = depth
     while True:
@@ -227,20 +235,20 @@ def _search_live(
                 min_score=min_score,
                 exclude=(query.photo_id,) if query.photo_id else (),
                 word_weights=weights,
-                mode=wanted.mode,
-                most_rows=wanted.most_rows,
-                most_seconds=wanted.most_seconds,
+                mode=search_params.mode,
+                most_rows=search_params.most_rows,
+                most_seconds=search_params.most_seconds,
             )
         )
         with gateway.catalog.read() as session:
-            live = live_photos(session, [hit.photo_id for hit in response.hits])
+            live = get_live_photos(session, [hit.photo_id for hit in response.hits])
         hits = [hit for hit in response.hits if hit.photo_id in live]
         if len(hits) >= depth or len(response.hits) < k:
             return hits[:depth], live, response
         k *= 2
 
 
-def _not_searchable(session: Session, photo: Photo, map_name: str) -> Conflict:
+def _not_searchable_error(session: Session, photo: Photo, map_name: str) -> Conflict:
     """Why the photo can't be asked with, and what to wait for."""
     job = session.get(Job, photo.job_id) if photo.job_id else None
     extra: dict[str, Any] = {"file_id": str(photo.id)}

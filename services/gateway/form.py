@@ -16,7 +16,7 @@ MAX_FIELDS_BYTES = 256 * 1024  # all text fields together
 OVERHEAD_BYTES = MAX_FIELDS_BYTES + 64 * 1024
 
 
-class Parts(Protocol):
+class PartHandler(Protocol):
     """Who takes the parts; what it raises ends the reading."""
 
     def begin(self, name: str, filename: str | None) -> None:
@@ -29,11 +29,15 @@ class Parts(Protocol):
         """The part is whole."""
 
 
-class Form:
+class MultipartFormParser:
     """A form that is fed piece by piece and calls `parts`."""
 
     def __init__(
-        self, request: Request, parts: Parts, max_bytes: int, too_large: Callable[[], Exception]
+        self,
+        request: Request,
+        handler: PartHandler,
+        max_bytes: int,
+        too_large: Callable[[], Exception],
     ) -> None:
         """`max_bytes` of body, for which `too_large` makes the refusal.
 
@@ -42,14 +46,14 @@ class Form:
         """
         self._max_bytes = max_bytes
         self._too_large = too_large
-        self._parts = parts
+        self._handler = handler
         self._body_bytes = 0
         self._header_name = b""
         self._header_value = b""
         self._disposition = b""
         self._ended = False
         self._parser = MultipartParser(
-            _boundary(request),
+            _parse_boundary(request),
             {
                 "on_part_begin": self._on_part_begin,
                 "on_header_field": self._on_header_field,
@@ -57,7 +61,7 @@ class Form:
                 "on_header_end": self._on_header_end,
                 "on_headers_finished": self._on_headers_finished,
                 "on_part_data": self._on_part_data,
-                "on_part_end": parts.end,
+                "on_part_end": handler.end,
                 "on_end": self._on_end,
             },
         )
@@ -74,12 +78,12 @@ class Form:
         try:
             self._parser.write(piece)
         except MultipartParseError as error:
-            raise malformed(str(error)) from error
+            raise malformed_body_error(str(error)) from error
 
     def finish(self) -> None:
         """The body has ended: is it whole?"""
         if not self._ended:
-            raise malformed("it ends before its last boundary")
+            raise malformed_body_error("it ends before its last boundary")
 
     def _on_part_begin(self) -> None:
         self._disposition = b""
@@ -99,28 +103,28 @@ class Form:
         _, options = parse_options_header(self._disposition)
         name = options.get(b"name", b"").decode("utf-8", "replace")
         if not name:
-            raise malformed("a part has no name")
+            raise malformed_body_error("a part has no name")
         filename = options.get(b"filename")
-        self._parts.begin(name, None if filename is None else filename.decode("utf-8", "replace"))
+        self._handler.begin(name, None if filename is None else filename.decode("utf-8", "replace"))
 
     def _on_part_data(self, data: bytes, start: int, end: int) -> None:
-        self._parts.data(data[start:end])
+        self._handler.data(data[start:end])
 
     def _on_end(self) -> None:
         self._ended = True
 
 
-def malformed(reason: str) -> PlacewiseError:
+def malformed_body_error(reason: str) -> PlacewiseError:
     return InvalidRequest("malformed_body", f"The multipart body can't be read: {reason}.")
 
 
-def media_type_of(request: Request) -> str:
+def body_media_type(request: Request) -> str:
     """The body's media type, in small letters and without parameters; "" when none is said."""
     media_type, _ = parse_options_header(request.headers.get("content-type", ""))
     return media_type.decode("latin-1").lower()
 
 
-def _boundary(request: Request) -> bytes:
+def _parse_boundary(request: Request) -> bytes:
     media_type, options = parse_options_header(request.headers.get("content-type", ""))
     if media_type != b"multipart/form-data":
         if not media_type:
@@ -132,5 +136,5 @@ def _boundary(request: Request) -> bytes:
         )
     boundary = options.get(b"boundary", b"")
     if not 0 < len(boundary) <= 70:
-        raise malformed("its boundary is missing or too long")
+        raise malformed_body_error("its boundary is missing or too long")
     return boundary

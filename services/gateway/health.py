@@ -10,26 +10,26 @@ from pydantic import Field
 from sqlalchemy import select
 from sqlalchemy.exc import SQLAlchemyError
 
-from services.gateway.context import Gateway, GatewayDep
+from services.gateway.context import GatewayContext, GatewayDep
 from services.gateway.key_check import READ
-from services.gateway.room import Kind, Room, RoomDep
-from services.gateway.schemas import Answer
-from shared.catalog.away import as_unavailable
+from services.gateway.room import AdmissionControl, AdmissionDep, UploadKind
+from services.gateway.schemas import ResponseModel
+from shared.catalog.away import to_unavailable
 from shared.catalog.maps import Map
 from shared.errors import PlacewiseError, StorageFull
 from shared.settings import Settings
 
-probes = APIRouter(tags=["operations"])
+probe_router = APIRouter(tags=["operations"])
 router = APIRouter(tags=["operations"])
 
-WORST_FIRST = ("unhealthy", "degraded", "healthy")
+STATUSES_WORST_FIRST = ("unhealthy", "degraded", "healthy")
 
 MAX_NAMED_CHUNKS = 10
 
 VERSION = version("placewise")
 
 
-class ServiceAnswer(Answer):
+class ServiceResponse(ResponseModel):
     service: str
     version: str
     status: str
@@ -40,16 +40,16 @@ class ServiceAnswer(Answer):
     api: str
 
 
-class ProbeAnswer(Answer):
+class ProbeResponse(ResponseModel):
     status: str
 
 
-class PartAnswer(Answer):
+class ComponentStatus(ResponseModel):
     status: str
     detail: str | None = None
 
 
-class LoadAnswer(Answer):
+class LoadResponse(ResponseModel):
     """How full things are; a full one is refused more (429, 507), and is not unhealthy."""
 
     waiting_jobs: int = Field(description="without queries, and what a model change queued")
@@ -64,17 +64,17 @@ class LoadAnswer(Answer):
     min_free_bytes: int
 
 
-class HealthAnswer(Answer):
+class HealthResponse(ResponseModel):
     status: str
     version: str
     uptime_seconds: float
-    parts: dict[str, PartAnswer]
-    load: LoadAnswer | None = Field(description="null while the catalog is away")
+    parts: dict[str, ComponentStatus]
+    load: LoadResponse | None = Field(description="null while the catalog is away")
 
 
-def service() -> ServiceAnswer:
+def service_info() -> ServiceResponse:
     """What this is and where to look."""
-    return ServiceAnswer(
+    return ServiceResponse(
         service="Placewise",
         version=VERSION,
         status="running",
@@ -86,91 +86,95 @@ def service() -> ServiceAnswer:
     )
 
 
-@probes.head("/livez", include_in_schema=False)
-@probes.get("/livez", operation_id="livez", response_model=ProbeAnswer)
-def livez() -> ProbeAnswer:
+@probe_router.head("/livez", include_in_schema=False)
+@probe_router.get("/livez", operation_id="livez", response_model=ProbeResponse)
+def livez() -> ProbeResponse:
     """The process answers; nothing else is looked at."""
-    return ProbeAnswer(status="alive")
+    return ProbeResponse(status="alive")
 
 
-@probes.head("/readyz", include_in_schema=False)
-@probes.get("/readyz", operation_id="readyz", response_model=ProbeAnswer)
-def readyz(gateway: GatewayDep, room: RoomDep, response: Response) -> ProbeAnswer:
+@probe_router.head("/readyz", include_in_schema=False)
+@probe_router.get("/readyz", operation_id="readyz", response_model=ProbeResponse)
+def readyz(gateway: GatewayDep, room: AdmissionDep, response: Response) -> ProbeResponse:
     """503 while a part that every call needs is away. What is only degraded is ready: without some
     shards or chunks the rest still answers, and on a full disk photos can be deleted."""
-    ready = all(part.status != "unhealthy" for part in _parts(gateway, room).values())
+    ready = all(part.status != "unhealthy" for part in _check_components(gateway, room).values())
     response.status_code = 200 if ready else 503
-    return ProbeAnswer(status="ready" if ready else "not ready")
+    return ProbeResponse(status="ready" if ready else "not ready")
 
 
 @router.head("/health", include_in_schema=False, dependencies=[READ])
-@router.get("/health", operation_id="health", response_model=HealthAnswer, dependencies=[READ])
-def health(gateway: GatewayDep, room: RoomDep, response: Response) -> HealthAnswer:
+@router.get("/health", operation_id="health", response_model=HealthResponse, dependencies=[READ])
+def read_health(gateway: GatewayDep, admission: AdmissionDep, response: Response) -> HealthResponse:
     """The state of each part; 503 when one is away, or `degraded`: chunks or shards of the map
     can't be searched, or uploads are refused because the disk is full."""
-    parts = _parts(gateway, room)
+    parts = _check_components(gateway, admission)
     states = {part.status for part in parts.values()}
     response.status_code = 200 if states == {"healthy"} else 503
-    return HealthAnswer(
-        status=next(state for state in WORST_FIRST if state in states),
+    return HealthResponse(
+        status=next(state for state in STATUSES_WORST_FIRST if state in states),
         version=VERSION,
-        uptime_seconds=time.monotonic() - gateway.started,
+        uptime_seconds=time.monotonic() - gateway.started_monotonic,
         parts=parts,
-        load=_load(gateway.settings, room) if parts["catalog"].status == "healthy" else None,
+        load=_load_response(gateway.settings, admission)
+        if parts["catalog"].status == "healthy"
+        else None,
     )
 
 
-def _load(settings: Settings, room: Room) -> LoadAnswer:
-    waiting = room.look()
-    return LoadAnswer(
+def _load_response(settings: Settings, admission: AdmissionControl) -> LoadResponse:
+    waiting = admission.queue_depth()
+    return LoadResponse(
         waiting_jobs=waiting.jobs,
         max_queued_jobs=settings.max_queued_jobs,
         waiting_queries=waiting.queries,
         max_queued_queries=settings.max_queued_queries,
         finished_per_second=waiting.finished_per_second,
-        receiving_uploads=room.being_received(Kind.UPLOAD),
-        receiving_queries=room.being_received(Kind.QUERY),
+        receiving_uploads=admission.active_uploads(UploadKind.UPLOAD),
+        receiving_queries=admission.active_uploads(UploadKind.QUERY),
         max_concurrent_uploads=settings.max_concurrent_uploads,
-        free_bytes=room.disk.free_bytes(),
+        free_bytes=admission.disk.free_bytes(),
         min_free_bytes=settings.min_free_bytes,
     )
 
 
-def _parts(gateway: Gateway, room: Room) -> dict[str, PartAnswer]:
+def _check_components(
+    gateway: GatewayContext, room: AdmissionControl
+) -> dict[str, ComponentStatus]:
     return {
-        "catalog": _catalog(gateway),
-        "object_store": _object_store(gateway, room),
-        "search": _search(gateway),
+        "catalog": _check_catalog(gateway),
+        "object_store": _check_object_store(gateway, room),
+        "search": _check_search(gateway),
     }
 
 
-def _catalog(gateway: Gateway) -> PartAnswer:
+def _check_catalog(gateway: GatewayContext) -> ComponentStatus:
     try:
         with gateway.catalog.read() as session:
             session.scalar(select(Map.id).limit(1))
     except SQLAlchemyError as error:
-        unavailable = as_unavailable(error)
+        unavailable = to_unavailable(error)
         detail = unavailable.detail if unavailable else "the catalog can't be reached"
-        return PartAnswer(status="unhealthy", detail=detail)
-    return PartAnswer(status="healthy")
+        return ComponentStatus(status="unhealthy", detail=detail)
+    return ComponentStatus(status="healthy")
 
 
-def _object_store(gateway: Gateway, room: Room) -> PartAnswer:
+def _check_object_store(gateway: GatewayContext, room: AdmissionControl) -> ComponentStatus:
     try:
         gateway.store.check()
         room.disk.check()
     except StorageFull as error:
-        return PartAnswer(status="degraded", detail=f"uploads are refused: {error.detail}")
+        return ComponentStatus(status="degraded", detail=f"uploads are refused: {error.detail}")
     except PlacewiseError as error:
-        return PartAnswer(status="unhealthy", detail=error.detail)
-    return PartAnswer(status="healthy")
+        return ComponentStatus(status="unhealthy", detail=error.detail)
+    return ComponentStatus(status="healthy")
 
 
-def _search(gateway: Gateway) -> PartAnswer:
+def _check_search(gateway: GatewayContext) -> ComponentStatus:
     try:
         status = gateway.search.status()
     except PlacewiseError as error:
-        return PartAnswer(status="unhealthy", detail=error.detail)
+        return ComponentStatus(status="unhealthy", detail=error.detail)
     wrong = []
     if status.away:
         wrong.append(f"no search worker answers for: {', '.join(status.away)}")
@@ -183,5 +187,5 @@ def _search(gateway: Gateway) -> PartAnswer:
             + " (placewise verify --repair)"
         )
     if wrong:
-        return PartAnswer(status="degraded", detail="; ".join(wrong))
-    return PartAnswer(status="healthy", detail=f"{status.rows} rows in memory")
+        return ComponentStatus(status="degraded", detail="; ".join(wrong))
+    return ComponentStatus(status="healthy", detail=f"{status.rows} rows in memory")

@@ -9,16 +9,16 @@ from uuid import UUID
 from fastapi import APIRouter, Query
 from pydantic import Field
 
-from services.gateway.context import DEFAULT_MAP, GatewayDep, MapName, read_cursor
+from services.gateway.context import DEFAULT_MAP, GatewayDep, MapName, parse_cursor
 from services.gateway.key_check import READ
-from services.gateway.schemas import Answer
+from services.gateway.schemas import ResponseModel
 from shared.catalog.maps import get_map
 from shared.catalog.searches import Search, list_searches
 
 router = APIRouter(tags=["operations"])
 
 
-class SearchAnswer(Answer):
+class SearchHistoryEntry(ResponseModel):
     search_id: UUID
     query_file_id: UUID | None = Field(description="null when the query photo is not stored")
     query_filename: str
@@ -31,7 +31,7 @@ class SearchAnswer(Answer):
     searched_at: datetime
 
     @classmethod
-    def of(cls, search: Search) -> SearchAnswer:
+    def of(cls, search: Search) -> SearchHistoryEntry:
         return cls(
             search_id=search.id,
             query_file_id=search.query_photo_id,
@@ -46,26 +46,29 @@ class SearchAnswer(Answer):
         )
 
 
-class SearchesAnswer(Answer):
-    searches: list[SearchAnswer]
+class SearchHistoryResponse(ResponseModel):
+    searches: list[SearchHistoryEntry]
     next_cursor: str | None
 
 
 @router.get(
-    "/searches", operation_id="list_searches", response_model=SearchesAnswer, dependencies=[READ]
+    "/searches",
+    operation_id="list_searches",
+    response_model=SearchHistoryResponse,
+    dependencies=[READ],
 )
-def searches(
+def read_searches(
     gateway: GatewayDep,
     limit: Annotated[int, Query(ge=1, le=1000)] = 50,
     cursor: Annotated[str | None, Query()] = None,
     map_name: MapName = DEFAULT_MAP,
-) -> SearchesAnswer:
+) -> SearchHistoryResponse:
     """Similarity searches, newest first; kept for SEARCH_HISTORY_DAYS."""
     with gateway.catalog.read() as session:
         map_id = get_map(session, map_name).id
-        found = list_searches(session, map_id, limit + 1, read_cursor(cursor))
+        found = list_searches(session, map_id, limit + 1, parse_cursor(cursor))
     page = found[:limit]
-    return SearchesAnswer(
-        searches=[SearchAnswer.of(search) for search in page],
+    return SearchHistoryResponse(
+        searches=[SearchHistoryEntry.of(search) for search in page],
         next_cursor=str(page[-1].id) if len(found) > limit else None,
     )

@@ -19,13 +19,13 @@ from starlette.concurrency import run_in_threadpool
 
 from shared.catalog.session import Catalog
 from shared.jobs import Job
-from shared.jobs.table import UNFINISHED
+from shared.jobs.table import UNFINISHED_STATES
 
-LOOK_SECONDS = 0.02  # while someone waits for an end
+NOTIFIER_POLL_SECONDS = 0.02  # while someone waits for an end
 CHANGE_LOOK_SECONDS = 0.25  # while someone waits for a change
 LOOK_SHARE = 10  # a look that takes long is taken seldom: one part in so many of the time
 # Of a server that stops: most queries end within it, and the others still get an answer.
-LAST_SECONDS = 5.0
+SHUTDOWN_WAIT_SECONDS = 5.0
 
 # What changes when a job does. Less than the whole row: it is read often, and of many jobs.
 MARKS = (
@@ -58,7 +58,7 @@ class _Waiter:
     future: asyncio.Future[Change | None]
 
 
-class JobWatch:
+class JobNotifier:
     """Used from one event loop; looks only while someone waits."""
 
     def __init__(self, catalog: Catalog) -> None:
@@ -66,20 +66,20 @@ class JobWatch:
         self._waiters: set[_Waiter] = set()
         self._looks: asyncio.Task[None] | None = None
         self._next_change_look = 0.0
-        self._last_moment = math.inf
+        self._shutdown_deadline = math.inf
 
-    def end_soon(self) -> None:
+    def begin_shutdown(self) -> None:
         """The server stops: nobody waits for a change any more, and for an end not longer than
         LAST_SECONDS from now."""
-        self._last_moment = time.monotonic() + LAST_SECONDS
+        self._shutdown_deadline = time.monotonic() + SHUTDOWN_WAIT_SECONDS
         _release(waiter for waiter in self._waiters if waiter.mark is not None)
 
-    async def wait_for_end(self, job_id: UUID, seconds: float) -> None:
+    async def wait_until_finished(self, job_id: UUID, seconds: float) -> None:
         """Returns when the job has ended or is gone, at the latest after so many seconds.
 
         Raises what the catalog raises while it is away.
         """
-        left = min(seconds, self._last_moment - time.monotonic())
+        left = min(seconds, self._shutdown_deadline - time.monotonic())
         try:
             await self._wait(job_id, None, left)
         except TimeoutError:
@@ -90,7 +90,7 @@ class JobWatch:
 
         Raises TimeoutError after so many seconds, and what the catalog raises while it is away.
         """
-        if self._last_moment < math.inf:
+        if self._shutdown_deadline < math.inf:
             return None
         return await self._wait(job_id, mark, seconds)
 
@@ -105,20 +105,20 @@ class JobWatch:
             self._waiters.discard(waiter)
 
     async def _look_while_awaited(self) -> None:
-        pause = LOOK_SECONDS
+        pause = NOTIFIER_POLL_SECONDS
         try:
             while self._waiters:
                 await asyncio.sleep(pause)
                 began = time.monotonic()
-                await self._look(began)
+                await self._pending_poll(began)
                 took = time.monotonic() - began
                 ends = any(waiter.mark is None for waiter in self._waiters)
-                least = LOOK_SECONDS if ends else CHANGE_LOOK_SECONDS
+                least = NOTIFIER_POLL_SECONDS if ends else CHANGE_LOOK_SECONDS
                 pause = max(least, LOOK_SHARE * took)
         finally:
             self._looks = None
 
-    async def _look(self, now: float) -> None:
+    async def _pending_poll(self, now: float) -> None:
         """Wake whose job has ended, or has changed."""
         due = set(self._waiters)
         if now >= self._next_change_look:
@@ -141,7 +141,7 @@ class JobWatch:
             if not waiter.future.done():
                 job = jobs.get(waiter.job_id)
                 waiter.future.set_result(None if job is None else Change(job, marks[job.id]))
-        if now >= self._last_moment:
+        if now >= self._shutdown_deadline:
             _release(self._waiters)
 
 
@@ -155,7 +155,7 @@ def _is_ready(waiter: _Waiter, mark: Mark | None) -> bool:
     """Has the job ended or changed? `mark` is None for one that is gone."""
     if mark is None:
         return True
-    return mark[0] not in UNFINISHED if waiter.mark is None else mark != waiter.mark
+    return mark[0] not in UNFINISHED_STATES if waiter.mark is None else mark != waiter.mark
 
 
 def _marks(catalog: Catalog, job_ids: set[UUID]) -> dict[UUID, Mark]:

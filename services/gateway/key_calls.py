@@ -9,36 +9,40 @@ from uuid import UUID
 from fastapi import APIRouter
 from pydantic import BaseModel, ConfigDict, Field
 
-from services.gateway.context import NO_NUL, GatewayDep, KeyId
+from services.gateway.context import NO_NUL_PATTERN, GatewayDep, KeyId
 from services.gateway.key_check import ADMIN
-from services.gateway.schemas import Answer
+from services.gateway.schemas import ResponseModel
 from shared.api_keys import Scope
-from shared.catalog.keys import ApiKey, KeyLimits, list_keys, make_key, revoke_key
+from shared.catalog.keys import ApiKey, KeyLimits, create_api_key, list_api_keys, revoke_api_key
 
 router = APIRouter(tags=["administration"])
 
 DAY_SECONDS = 86_400
-MOST_DAYS = 36_500
+MAX_KEY_DAYS = 36_500
 
-Limit = Annotated[int | None, Field(ge=1, le=2**53)]
+KeyLimit = Annotated[int | None, Field(ge=1, le=2**53)]
 
 
-class NewKey(BaseModel):
+class CreateKeyRequest(BaseModel):
     """The key to make. A limit that is left out is the one of the server's settings."""
 
     model_config = ConfigDict(extra="forbid")
 
-    name: str = Field(min_length=1, max_length=200, pattern=NO_NUL)
+    name: str = Field(min_length=1, max_length=200, pattern=NO_NUL_PATTERN)
     scopes: list[Scope] = Field(min_length=1, max_length=len(Scope))
     days: float | None = Field(
-        None, gt=0, le=MOST_DAYS, allow_inf_nan=False, description="until it expires; null: never"
+        None,
+        gt=0,
+        le=MAX_KEY_DAYS,
+        allow_inf_nan=False,
+        description="until it expires; null: never",
     )
     requests_per_minute: Annotated[int | None, Field(ge=1, le=10**9)] = None
-    upload_bytes_per_day: Limit = None
-    max_photos: Limit = None
+    upload_bytes_per_day: KeyLimit = None
+    max_photos: KeyLimit = None
 
 
-class KeyAnswer(Answer):
+class KeyResponse(ResponseModel):
     id: UUID
     name: str
     prefix: str = Field(description="the key's first characters")
@@ -53,43 +57,47 @@ class KeyAnswer(Answer):
 
     @classmethod
     def fields_of(cls, key: ApiKey) -> dict[str, object]:
-        return {name: getattr(key, name) for name in KeyAnswer.model_fields}
+        return {name: getattr(key, name) for name in KeyResponse.model_fields}
 
 
-class KeyMade(KeyAnswer):
+class CreatedKeyResponse(KeyResponse):
     key: str = Field(description="the key itself: it is shown this once")
 
 
-@router.get("/keys", operation_id="list_keys", response_model=list[KeyAnswer], dependencies=[ADMIN])
-def keys(gateway: GatewayDep) -> list[KeyAnswer]:
+@router.get(
+    "/keys", operation_id="list_keys", response_model=list[KeyResponse], dependencies=[ADMIN]
+)
+def read_keys(gateway: GatewayDep) -> list[KeyResponse]:
     """Every key that was ever made, newest first; the keys themselves are kept nowhere."""
     with gateway.catalog.read() as session:
-        return [KeyAnswer.model_validate(KeyAnswer.fields_of(key)) for key in list_keys(session)]
+        return [
+            KeyResponse.model_validate(KeyResponse.fields_of(key)) for key in list_api_keys(session)
+        ]
 
 
 @router.post(
     "/keys",
     operation_id="create_key",
     status_code=201,
-    response_model=KeyMade,
+    response_model=CreatedKeyResponse,
     dependencies=[ADMIN],
 )
-def create_key(gateway: GatewayDep, wanted: NewKey) -> KeyMade:
+def create_key(gateway: GatewayDep, body: CreateKeyRequest) -> CreatedKeyResponse:
     """Make a key. It stands in this answer and nowhere else, so this call takes no
     `Idempotency-Key`: when the answer got lost, revoke the key and make another one."""
-    limits = KeyLimits(wanted.requests_per_minute, wanted.upload_bytes_per_day, wanted.max_photos)
-    life_seconds = None if wanted.days is None else wanted.days * DAY_SECONDS
+    limits = KeyLimits(body.requests_per_minute, body.upload_bytes_per_day, body.max_photos)
+    life_seconds = None if body.days is None else body.days * DAY_SECONDS
     with gateway.catalog.write() as session:
-        made, key = make_key(
-            session, wanted.name, set(wanted.scopes), life_seconds=life_seconds, limits=limits
+        made, key = create_api_key(
+            session, body.name, set(body.scopes), life_seconds=life_seconds, limits=limits
         )
-        return KeyMade.model_validate({**KeyAnswer.fields_of(made), "key": key})
+        return CreatedKeyResponse.model_validate({**KeyResponse.fields_of(made), "key": key})
 
 
 @router.delete(
-    "/keys/{key_id}", operation_id="revoke_key", response_model=KeyAnswer, dependencies=[ADMIN]
+    "/keys/{key_id}", operation_id="revoke_key", response_model=KeyResponse, dependencies=[ADMIN]
 )
-def revoke(gateway: GatewayDep, key_id: KeyId) -> KeyAnswer:
+def revoke_key_by_id(gateway: GatewayDep, key_id: KeyId) -> KeyResponse:
     """From now on the key opens nothing, on no gateway. It stays in the list."""
     with gateway.catalog.write() as session:
-        return KeyAnswer.model_validate(KeyAnswer.fields_of(revoke_key(session, key_id)))
+        return KeyResponse.model_validate(KeyResponse.fields_of(revoke_api_key(session, key_id)))

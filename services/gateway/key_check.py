@@ -16,7 +16,7 @@ from fastapi.routing import APIRoute
 from fastapi.security import HTTPBearer, SecurityScopes
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from services.gateway.keys import Caller, Keys
+from services.gateway.keys import Authenticator, Caller
 from shared.api_keys import Scope as KeyScope
 from shared.errors import Forbidden, PlacewiseError
 from shared.problems import problem_response
@@ -24,7 +24,7 @@ from shared.problems import problem_response
 log = logging.getLogger(__name__)
 
 # Probes, and descriptions of the service: none of them tells what is stored.
-OPEN_PATHS = frozenset(
+PUBLIC_PATHS = frozenset(
     {
         "/",
         "/livez",
@@ -34,10 +34,10 @@ OPEN_PATHS = frozenset(
         "/openapi.json",
     }
 )
-OPEN_FOLDER = "/console/"  # the page's own files, which has a field for the key
+PUBLIC_PATH_PREFIX = "/console/"  # the page's own files, which has a field for the key
 
-# Only describes: `KeyCheck` is what asks for the key, before a route is looked for.
-BEARER = HTTPBearer(
+# Only describes: `AuthenticationMiddleware` is what asks for the key, before a route is looked for.
+BEARER_SCHEME = HTTPBearer(
     auto_error=False,
     scheme_name="key",
     description="A key with the scope that the call names. The embedded Placewise on loopback "
@@ -45,22 +45,22 @@ BEARER = HTTPBearer(
 )
 
 
-class KeyCheck:
+class AuthenticationMiddleware:
     """Answers 401 to a call without a key, whatever it asks for: not even which paths exist. Where
     none is needed, 403 to a page of elsewhere.
     """
 
-    def __init__(self, app: ASGIApp, keys: Keys) -> None:
+    def __init__(self, app: ASGIApp, authenticator: Authenticator) -> None:
         self._app = app
-        self._keys = keys
+        self._authenticator = authenticator
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http" or _is_open(scope["path"]):
+        if scope["type"] != "http" or _is_public(scope["path"]):
             await self._app(scope, receive, send)
             return
         request = Request(scope)
         try:
-            caller = await self._keys.check(request.headers)
+            caller = await self._authenticator.authenticate(request.headers)
         except PlacewiseError as error:
             log.debug("%s %s: %s", request.method, request.url.path, error.code)
             await problem_response(error, request)(scope, receive, send)
@@ -69,28 +69,30 @@ class KeyCheck:
         try:
             await self._app(scope, receive, send)
         finally:
-            await self._keys.note_use(caller)
+            await self._authenticator.record_use(caller)
 
 
-def _is_open(path: str) -> bool:
-    return path in OPEN_PATHS or path.startswith(OPEN_FOLDER)
+def _is_public(path: str) -> bool:
+    return path in PUBLIC_PATHS or path.startswith(PUBLIC_PATH_PREFIX)
 
 
-def caller_of(request: Request) -> Caller:
+def get_caller(request: Request) -> Caller:
     """Who makes the call."""
     caller: Caller = request.state.caller
     return caller
 
 
 def _require_scope(
-    request: Request, scopes: SecurityScopes, _described: Annotated[object, Security(BEARER)]
+    request: Request,
+    scopes: SecurityScopes,
+    _documented_scheme: Annotated[object, Security(BEARER_SCHEME)],
 ) -> None:
-    lacking = set(scopes.scopes) - caller_of(request).scopes
+    lacking = set(scopes.scopes) - get_caller(request).scopes
     if lacking:
         raise Forbidden(
             "scope_missing",
             f"This call needs a key with the scope {', '.join(sorted(lacking))}; yours may "
-            f"{', '.join(sorted(caller_of(request).scopes))}. An admin makes one: placewise keys "
+            f"{', '.join(sorted(get_caller(request).scopes))}. An admin makes one: placewise keys "
             "create.",
             needed=sorted(lacking),
         )
@@ -101,7 +103,7 @@ WRITE = Security(_require_scope, scopes=[KeyScope.WRITE.value])
 ADMIN = Security(_require_scope, scopes=[KeyScope.ADMIN.value])
 
 
-def check_scopes(router: APIRouter) -> None:
+def check_declared_scopes(router: APIRouter) -> None:
     """Every call declares its one scope: a route that forgets it can't be served."""
     for route in router.routes:
         if not isinstance(route, APIRoute):

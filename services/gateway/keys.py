@@ -17,27 +17,34 @@ from sqlalchemy.exc import SQLAlchemyError
 from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import Headers
 
-from shared.api_keys import EVERYTHING, Scope, granted, hash_key, is_loopback
-from shared.catalog.away import as_unavailable
-from shared.catalog.keys import USE_NOTED_SECONDS, KeyLimits, find_key, note_use
+from shared.api_keys import ALL_SCOPES, Scope, expand_scopes, hash_api_key, is_loopback
+from shared.catalog.away import to_unavailable
+from shared.catalog.keys import (
+    LAST_USED_RESOLUTION_SECONDS,
+    KeyLimits,
+    authenticate_api_key,
+    record_key_use,
+)
 from shared.catalog.session import Catalog
 from shared.errors import Forbidden, Unauthorized
 
 log = logging.getLogger(__name__)
 
 # RFC 6750 in one line; a scheme's name is written in any case (RFC 9110).
-BEARER = re.compile(r"bearer +(?P<key>[!-~]+) *", re.IGNORECASE)
-HOW = "send the header `Authorization: Bearer KEY` (the commands: PLACEWISE_KEY=KEY)"
+BEARER_HEADER = re.compile(r"bearer +(?P<key>[!-~]+) *", re.IGNORECASE)
+HOW_TO_AUTHENTICATE = (
+    "send the header `Authorization: Bearer KEY` (the commands: PLACEWISE_KEY=KEY)"
+)
 # What proxies add (RFC 9110, RFC 7239, and the usual ones before them).
 FORWARDED = ("Forwarded", "Via", "X-Forwarded-For", "X-Forwarded-Host", "X-Real-IP")
-USES_REMEMBERED = 10_000  # keys whose last use this process knows; above that it forgets all
+MAX_REMEMBERED_USES = 10_000  # keys whose last use this process knows; above that it forgets all
 
 
 @dataclass(frozen=True, slots=True)
 class Caller:
     """Whoever makes a call."""
 
-    who: str
+    identity: str
     """The same for the same key, and no secret."""
     scopes: frozenset[Scope]
     key_id: UUID | None = None
@@ -45,24 +52,24 @@ class Caller:
     limits: KeyLimits = field(default=KeyLimits())
 
 
-class Keys(Protocol):
+class Authenticator(Protocol):
     """Decides about every call before it reaches a route."""
 
-    async def check(self, headers: Headers) -> Caller:
+    async def authenticate(self, headers: Headers) -> Caller:
         """Raise Unauthorized (`key_missing`, `key_unknown`, `key_revoked`, `key_expired`) unless
         `Authorization` holds a key, Forbidden (`foreign_page`, `forwarded_request`) where none is
         asked for and a browser's page of elsewhere or a proxy calls, and Unavailable while the
         catalog can't be asked.
         """
 
-    async def note_use(self, caller: Caller) -> None:
+    async def record_use(self, caller: Caller) -> None:
         """Called once the call has been answered."""
 
 
-class NoKeys:
+class LocalhostAuthenticator:
     """This machine's users may call: only they reach the server, and pages in their browsers.
 
-    A page of elsewhere must not. What it sends names it in `Origin`; where it has its own name lead
+    A page of elsewhere must not. What it sends names it in `ContextFilter`; where it has its own name lead
     to this machine (DNS rebinding), that name is in `Host`. Nor must whoever is behind a proxy on
     this machine: to the server, everyone behind it comes from loopback.
     """
@@ -71,7 +78,7 @@ class NoKeys:
         """`trusted_origins` (CORS_ORIGINS) name pages of elsewhere that may call."""
         self._trusted = trusted_origins
 
-    async def check(self, headers: Headers) -> Caller:
+    async def authenticate(self, headers: Headers) -> Caller:
         for name in FORWARDED:
             if name in headers:
                 raise Forbidden(
@@ -81,7 +88,7 @@ class NoKeys:
                     "proxy. Set ADMIN_KEY and restart Placewise; then every call needs a key.",
                 )
         host = headers.get("host", "")
-        if not is_loopback(_name(host)):
+        if not is_loopback(_host_name(host)):
             raise Forbidden(
                 "foreign_page",
                 "Without a key only calls to localhost are answered; this one is to "
@@ -94,13 +101,13 @@ class NoKeys:
                 f"Without a key no page of another site may call; this one is of {origin[:100]!r} "
                 "(its Origin header). Name the page in CORS_ORIGINS, or set ADMIN_KEY.",
             )
-        return Caller("this machine", EVERYTHING)
+        return Caller("this machine", ALL_SCOPES)
 
-    async def note_use(self, caller: Caller) -> None:
+    async def record_use(self, caller: Caller) -> None:
         pass
 
 
-def _name(host: str) -> str:
+def _host_name(host: str) -> str:
     """The name or the address in a `Host` header."""
     try:
         return (urlsplit(f"//{host}").hostname or "").rstrip(".")
@@ -108,7 +115,7 @@ def _name(host: str) -> str:
         return ""
 
 
-class CatalogKeys:
+class ApiKeyAuthenticator:
     """The catalog's keys, and a few beside them that may do everything (ADMIN_KEY).
 
     The catalog is asked at each call: a revoked key opens nothing from that commit on, whichever
@@ -116,57 +123,63 @@ class CatalogKeys:
     """
 
     def __init__(self, catalog: Catalog, *admin_sha256: str) -> None:
-        """`admin_sha256` in hexadecimal, as `hash_key` makes it."""
+        """`admin_sha256` in hexadecimal, as `hash_api_key` makes it."""
         self._catalog = catalog
         self._admins = admin_sha256
-        self._noted: dict[UUID, float] = {}
+        self._use_recorded_at: dict[UUID, float] = {}
 
-    async def check(self, headers: Headers) -> Caller:
-        shown = hash_key(read_bearer(headers.get("authorization")))
+    async def authenticate(self, headers: Headers) -> Caller:
+        shown = hash_api_key(parse_bearer(headers.get("authorization")))
         # In constant time: how long a refusal takes says nothing of how near a guess was.
         if any(hmac.compare_digest(shown, known) for known in self._admins):
-            return Caller("admin", EVERYTHING)
-        return await run_in_threadpool(self._find, shown)
+            return Caller("admin", ALL_SCOPES)
+        return await run_in_threadpool(self._find_caller, shown)
 
-    def _find(self, sha256: str) -> Caller:
+    def _find_caller(self, sha256: str) -> Caller:
         try:
             with self._catalog.read() as session:
-                key = find_key(session, sha256)
+                key = authenticate_api_key(session, sha256)
         except Unauthorized as error:
-            raise Unauthorized(error.code, f"{error.detail} To call: {HOW}.") from None
+            raise Unauthorized(
+                error.code, f"{error.detail} To call: {HOW_TO_AUTHENTICATE}."
+            ) from None
         except SQLAlchemyError as error:
-            unavailable = as_unavailable(error)
+            unavailable = to_unavailable(error)
             if unavailable is None:
                 raise
             raise unavailable from error
         return Caller(
-            who=f"key {key.id}",
-            scopes=granted([Scope(scope) for scope in key.scopes]),
+            identity=f"key {key.id}",
+            scopes=expand_scopes([Scope(scope) for scope in key.scopes]),
             key_id=key.id,
             limits=KeyLimits(key.requests_per_minute, key.upload_bytes_per_day, key.max_photos),
         )
 
-    async def note_use(self, caller: Caller) -> None:
+    async def record_use(self, caller: Caller) -> None:
         """`last_used_at`, at most once a minute for a key; no reason to fail a call."""
         key_id, now = caller.key_id, time.monotonic()
-        if key_id is None or now - self._noted.get(key_id, -USE_NOTED_SECONDS) < USE_NOTED_SECONDS:
+        if (
+            key_id is None
+            or now - self._use_recorded_at.get(key_id, -LAST_USED_RESOLUTION_SECONDS)
+            < LAST_USED_RESOLUTION_SECONDS
+        ):
             return
-        if len(self._noted) >= USES_REMEMBERED:
-            self._noted.clear()
-        self._noted[key_id] = now
+        if len(self._use_recorded_at) >= MAX_REMEMBERED_USES:
+            self._use_recorded_at.clear()
+        self._use_recorded_at[key_id] = now
         try:
-            await run_in_threadpool(self._note, key_id)
+            await run_in_threadpool(self._write_use, key_id)
         except SQLAlchemyError as error:
             log.warning("the use of the key %s was not noted: %s", key_id, error.__class__.__name__)
 
-    def _note(self, key_id: UUID) -> None:
+    def _write_use(self, key_id: UUID) -> None:
         with self._catalog.write() as session:
-            note_use(session, key_id)
+            record_key_use(session, key_id)
 
 
-def read_bearer(authorization: str | None) -> str:
+def parse_bearer(authorization: str | None) -> str:
     """The key in an `Authorization` header; Unauthorized (`key_missing`) when there is none."""
-    found = BEARER.fullmatch(authorization or "")
+    found = BEARER_HEADER.fullmatch(authorization or "")
     if found is None:
-        raise Unauthorized("key_missing", f"This server wants its key: {HOW}.")
+        raise Unauthorized("key_missing", f"This server wants its key: {HOW_TO_AUTHENTICATE}.")
     return found["key"]

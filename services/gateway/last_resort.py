@@ -9,10 +9,10 @@ from __future__ import annotations
 from fastapi import Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from shared.problems import on_any_error
+from shared.problems import handle_unexpected_error
 
 
-class LastResort:
+class ExceptionHandlerMiddleware:
     """Answers for a route that has failed before it began to answer."""
 
     def __init__(self, app: ASGIApp) -> None:
@@ -32,7 +32,7 @@ class LastResort:
         try:
             await self._app(scope, receive, watched)
         except Exception as error:
-            answer = await on_any_error(Request(scope), error)
+            answer = await handle_unexpected_error(Request(scope), error)
             if begun:  # half an answer can't be taken back: the connection ends with it
                 raise
             await answer(scope, receive, send)

@@ -10,36 +10,42 @@ from pydantic import BaseModel, ConfigDict, Field
 from sqlalchemy.orm import Session
 from starlette.concurrency import run_in_threadpool
 
-from services.gateway.context import DEFAULT_MAP, NO_NUL, Gateway, GatewayDep, MapName
-from services.gateway.key_check import READ, WRITE
-from services.gateway.once import Once, OnceDep, OnceFormDep
-from services.gateway.receive import describe_form, receive_file
-from services.gateway.room import ROOM_FOR_JOBS, Kind, RoomDep
-from services.gateway.schemas import (
-    GenerationAnswer,
-    JobStarted,
-    VocabularyAnswer,
-    started_job,
+from services.gateway.context import (
+    DEFAULT_MAP,
+    NO_NUL_PATTERN,
+    GatewayContext,
+    GatewayDep,
+    MapName,
 )
-from shared.catalog.added_models import check_model
-from shared.catalog.chunks import about_described
+from services.gateway.key_check import READ, WRITE
+from services.gateway.once import IdempotentDep, IdempotentFormDep, IdempotentRequest
+from services.gateway.receive import multipart_schema, store_form_file
+from services.gateway.room import ADMIT_JOB, AdmissionDep, UploadKind
+from services.gateway.schemas import (
+    GenerationResponse,
+    JobAcceptedResponse,
+    VocabularyResponse,
+    accept_job,
+)
+from shared.catalog.added_models import check_model_registered
+from shared.catalog.chunks import estimate_described
 from shared.catalog.generations import list_generations
 from shared.catalog.maps import get_map
-from shared.catalog.photos import PhotoRole, has_live
+from shared.catalog.photos import PhotoRole, has_live_photo
 from shared.catalog.vocabularies import get_vocabulary, list_vocabularies
-from shared.catalog.whitenings import generation_to_whiten
-from shared.errors import Conflict, Misconfigured, PlacewiseError, invalid_field
+from shared.catalog.whitenings import get_pca_source_generation
+from shared.errors import Conflict, Misconfigured, PlacewiseError, invalid_field_error
 from shared.jobs import Job, JobKind
 from shared.jobs.model_changes import start_model_change
 from shared.objects.keys import new_vocabulary_key
-from shared.recipes import MOST_CLUSTERS, MOST_PCA, Recipe
+from shared.recipes import MAX_CLUSTERS, MAX_PCA_DIMENSION, ExtractorConfig
 from shared.settings import Settings
 from shared.vocabulary_npz import encode_vocabulary_file
 
 router = APIRouter(tags=["model changes"])
 
 
-class FitRequest(BaseModel):
+class FitVocabularyRequest(BaseModel):
     """How to learn the vocabulary; {} is a good choice."""
 
     model_config = ConfigDict(extra="forbid")
@@ -47,7 +53,7 @@ class FitRequest(BaseModel):
     clusters: int | None = Field(
         None,
         ge=1,
-        le=MOST_CLUSTERS,
+        le=MAX_CLUSTERS,
         description="null: as many as the extractor's name says (64 unless it says otherwise); "
         "fewer are made when the photos bear fewer",
     )
@@ -55,7 +61,7 @@ class FitRequest(BaseModel):
     seed: int = Field(0, ge=0, le=2**31 - 1)
 
 
-class SwitchRequest(BaseModel):
+class StartGenerationRequest(BaseModel):
     """What the new generation is made with."""
 
     model_config = ConfigDict(extra="forbid")
@@ -63,7 +69,7 @@ class SwitchRequest(BaseModel):
     extractor: str | None = Field(
         None,
         max_length=200,
-        pattern=NO_NUL,
+        pattern=NO_NUL_PATTERN,
         description="another extractor, such as gsv:NAME of a model that was added; null: the "
         "map's own",
     )
@@ -75,7 +81,7 @@ class SwitchRequest(BaseModel):
     pca: int | None = Field(
         None,
         ge=1,
-        le=MOST_PCA,
+        le=MAX_PCA_DIMENSION,
         description="bring the map's descriptors to so many dimensions; their vocabulary stays. "
         "null: whole descriptors",
     )
@@ -85,79 +91,81 @@ class SwitchRequest(BaseModel):
     "/vocabularies",
     operation_id="fit_vocabulary",
     status_code=202,
-    response_model=JobStarted,
-    dependencies=[WRITE, ROOM_FOR_JOBS],
+    response_model=JobAcceptedResponse,
+    dependencies=[WRITE, ADMIT_JOB],
 )
-def fit_vocabulary(
+def start_vocabulary_fit(
     gateway: GatewayDep,
     response: Response,
-    once: OnceDep,
-    wanted: FitRequest | None = None,
+    idempotent: IdempotentDep,
+    options: FitVocabularyRequest | None = None,
     map_name: MapName = DEFAULT_MAP,
-) -> JobStarted:
+) -> JobAcceptedResponse:
     """Learn a vocabulary from the map's own photos and switch to it.
 
     All photos are described again in the background while search goes on; the job has succeeded
     when the new generation answers.
     """
-    params = (wanted or FitRequest.model_validate({})).model_dump()
+    params = (options or FitVocabularyRequest.model_validate({})).model_dump()
     with gateway.catalog.write() as session:
         map_id = get_map(session, map_name).id
-        if not has_live(session, map_id, PhotoRole.DATABASE):
+        if not has_live_photo(session, map_id, PhotoRole.DATABASE):
             raise Conflict("no_photos", "The map has no photos to learn from. Upload some first.")
         job = start_model_change(session, map_id, JobKind.FIT, params)
-        once.keep_job(session, job)
-    return _started(gateway, response, job, map_name)
+        idempotent.store_job_response(session, job)
+    return _model_change_response(gateway, response, job, map_name)
 
 
 @router.post(
     "/vocabularies/import",
     operation_id="import_vocabulary",
     status_code=202,
-    response_model=JobStarted,
-    openapi_extra=describe_form(
+    response_model=JobAcceptedResponse,
+    openapi_extra=multipart_schema(
         "a `.npz` file of `placewise vocabulary fit DIR`, or a `.npy` file of "
         "(clusters, dimension) floats"
     ),
-    dependencies=[WRITE, ROOM_FOR_JOBS],
+    dependencies=[WRITE, ADMIT_JOB],
 )
-async def import_vocabulary(
+async def start_vocabulary_import(
     request: Request,
     response: Response,
     gateway: GatewayDep,
-    once: OnceFormDep,
-    room: RoomDep,
+    idempotent: IdempotentFormDep,
+    admission: AdmissionDep,
     map_name: MapName = DEFAULT_MAP,
-) -> JobStarted:
+) -> JobAcceptedResponse:
     """Bring a vocabulary, a `.npz` or `.npy` file, and switch to it.
 
     The extractor checks it; one that does not fit, or that a `.npz` says was learnt from other
     features than the extractor makes, ends the job as `failed` with the reason.
     """
-    with room.receiving(Kind.UPLOAD, request):
-        received = await receive_file(
+    with admission.admit_upload(UploadKind.UPLOAD, request):
+        received = await store_form_file(
             request,
             gateway.store,
             new_vocabulary_key(),
             gateway.settings.max_vocabulary_bytes,
         )
-    await once.begin_form(gateway.store, received)
+    await idempotent.claim_form(gateway.store, received)
     params = {"object_key": received.key, "filename": received.filename}
-    job = await run_in_threadpool(_queue_import, gateway, map_name, params, once)
-    return _started(gateway, response, job, map_name)
+    job = await run_in_threadpool(_queue_import, gateway, map_name, params, idempotent)
+    return _model_change_response(gateway, response, job, map_name)
 
 
 @router.get(
     "/vocabularies",
     operation_id="list_vocabularies",
-    response_model=list[VocabularyAnswer],
+    response_model=list[VocabularyResponse],
     dependencies=[READ],
 )
-def vocabularies(gateway: GatewayDep, map_name: MapName = DEFAULT_MAP) -> list[VocabularyAnswer]:
+def read_vocabularies(
+    gateway: GatewayDep, map_name: MapName = DEFAULT_MAP
+) -> list[VocabularyResponse]:
     """The map's vocabularies, newest first, with their provenance."""
     with gateway.catalog.read() as session:
         found = list_vocabularies(session, get_map(session, map_name).id)
-    return [VocabularyAnswer.of(vocabulary) for vocabulary in found]
+    return [VocabularyResponse.of(vocabulary) for vocabulary in found]
 
 
 @router.get(
@@ -174,7 +182,7 @@ def vocabularies(gateway: GatewayDep, map_name: MapName = DEFAULT_MAP) -> list[V
     },
     dependencies=[READ],
 )
-def vocabulary_file(
+def read_vocabulary_file(
     gateway: GatewayDep,
     vocabulary_id: UUID,
     map_name: MapName = DEFAULT_MAP,
@@ -197,14 +205,16 @@ def vocabulary_file(
 @router.get(
     "/generations",
     operation_id="list_generations",
-    response_model=list[GenerationAnswer],
+    response_model=list[GenerationResponse],
     dependencies=[READ],
 )
-def generations(gateway: GatewayDep, map_name: MapName = DEFAULT_MAP) -> list[GenerationAnswer]:
+def read_generations(
+    gateway: GatewayDep, map_name: MapName = DEFAULT_MAP
+) -> list[GenerationResponse]:
     """The map's generations, newest first."""
     with gateway.catalog.read() as session:
         return [
-            GenerationAnswer.of(generation, about_described(session, generation.id))
+            GenerationResponse.of(generation, estimate_described(session, generation.id))
             for generation in list_generations(session, get_map(session, map_name).id)
         ]
 
@@ -213,92 +223,100 @@ def generations(gateway: GatewayDep, map_name: MapName = DEFAULT_MAP) -> list[Ge
     "/generations",
     operation_id="start_generation",
     status_code=202,
-    response_model=JobStarted,
-    dependencies=[WRITE, ROOM_FOR_JOBS],
+    response_model=JobAcceptedResponse,
+    dependencies=[WRITE, ADMIT_JOB],
 )
 def start_generation(
     gateway: GatewayDep,
     response: Response,
-    once: OnceDep,
-    wanted: Annotated[SwitchRequest, Field()],
+    idempotent: IdempotentDep,
+    body: Annotated[StartGenerationRequest, Field()],
     map_name: MapName = DEFAULT_MAP,
-) -> JobStarted:
+) -> JobAcceptedResponse:
     """Describe all photos anew with a vocabulary that the map has or with another extractor, and
     switch to it; or shorten their descriptors by PCA whitening, fitted on those that the map has,
     and switch to these.
     """
-    recipe = _other_extractor(gateway.settings, wanted)
+    recipe = _validate_new_extractor(gateway.settings, body)
     with gateway.catalog.write() as session:
         map_id = get_map(session, map_name).id
-        if wanted.pca is not None:
-            job = _queue_pca(session, map_id, wanted.pca, wanted.vocabulary_id)
+        if body.pca is not None:
+            job = _queue_pca(session, map_id, body.pca, body.vocabulary_id)
         else:
-            job = _queue_switch(session, map_id, recipe, wanted.vocabulary_id)
-        once.keep_job(session, job)
-    return _started(gateway, response, job, map_name)
+            job = _queue_switch(session, map_id, recipe, body.vocabulary_id)
+        idempotent.store_job_response(session, job)
+    return _model_change_response(gateway, response, job, map_name)
 
 
-def _other_extractor(settings: Settings, wanted: SwitchRequest) -> Recipe | None:
+def _validate_new_extractor(
+    settings: Settings, body: StartGenerationRequest
+) -> ExtractorConfig | None:
     """The extractor that is asked for; 422 for one that can't be had, or not with the rest."""
-    if wanted.extractor is None:
+    if body.extractor is None:
         return None
-    if wanted.pca is not None:
-        raise invalid_field(
+    if body.pca is not None:
+        raise invalid_field_error(
             "pca", "is fitted on descriptors that are there: switch to the extractor first"
         )
     try:
-        recipe = settings.recipe(wanted.extractor)
+        recipe = settings.recipe(body.extractor)
     except Misconfigured as error:
-        raise invalid_field("extractor", error.detail) from None
+        raise invalid_field_error("extractor", error.detail) from None
     if recipe.needs_vocabulary:
-        if wanted.vocabulary_id is None and recipe.shipped_vocabulary is None:
-            raise invalid_field(
+        if body.vocabulary_id is None and recipe.shipped_vocabulary is None:
+            raise invalid_field_error(
                 "vocabulary_id",
                 f"no vocabulary comes with {recipe.name}: name one that the map has "
                 "(GET /api/v1/vocabularies), or fit one in a map of its own",
             )
-    elif wanted.vocabulary_id is not None:
-        raise invalid_field("vocabulary_id", f"{recipe.name} uses none: leave it out")
+    elif body.vocabulary_id is not None:
+        raise invalid_field_error("vocabulary_id", f"{recipe.name} uses none: leave it out")
     return recipe
 
 
 def _queue_switch(
-    session: Session, map_id: UUID, recipe: Recipe | None, vocabulary_id: UUID | None
+    session: Session, map_id: UUID, recipe: ExtractorConfig | None, vocabulary_id: UUID | None
 ) -> Job:
     params: dict[str, Any] = {"vocabulary_id": str(vocabulary_id) if vocabulary_id else None}
     if vocabulary_id is not None:
         get_vocabulary(session, map_id, vocabulary_id)
     if recipe is not None:
-        check_model(session, recipe)
+        check_model_registered(session, recipe)
         params["extractor"] = recipe.name
     return start_model_change(session, map_id, JobKind.SWITCH, params)
 
 
 def _queue_pca(session: Session, map_id: UUID, pca: int, vocabulary_id: UUID | None) -> Job:
-    source = generation_to_whiten(session, map_id)
+    source = get_pca_source_generation(session, map_id)
     if vocabulary_id is not None and vocabulary_id != source.vocabulary_id:
-        raise invalid_field(
+        raise invalid_field_error(
             "vocabulary_id",
             "PCA is fitted on the descriptors that answer: leave it out, or switch"
             " to that vocabulary first",
         )
     if pca > source.dimension:
-        raise invalid_field("pca", f"the map's descriptors have {source.dimension} dimensions")
+        raise invalid_field_error(
+            "pca", f"the map's descriptors have {source.dimension} dimensions"
+        )
     return start_model_change(session, map_id, JobKind.PCA, {"pca": pca})
 
 
-def _queue_import(gateway: Gateway, map_name: str, params: dict[str, Any], once: Once) -> Job:
+def _queue_import(
+    gateway: GatewayContext, map_name: str, params: dict[str, Any], idempotent: IdempotentRequest
+) -> Job:
     try:
         with gateway.catalog.write() as session:
             map_id = get_map(session, map_name).id
             job = start_model_change(session, map_id, JobKind.IMPORT, params)
-            once.keep_job(session, job)
+            idempotent.store_job_response(session, job)
             return job
     except PlacewiseError:
         gateway.store.delete(params["object_key"])
         raise
 
 
-def _started(gateway: Gateway, response: Response, job: Job, map_name: str) -> JobStarted:
+def _model_change_response(
+    gateway: GatewayContext, response: Response, job: Job, map_name: str
+) -> JobAcceptedResponse:
     gateway.hints.send()
-    return started_job(response, job, map_name)
+    return accept_job(response, job, map_name)

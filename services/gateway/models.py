@@ -15,45 +15,56 @@ from pydantic import Field
 from sqlalchemy.orm import Session
 from starlette.concurrency import run_in_threadpool
 
-from services.gateway.context import DEFAULT_MAP, NO_NUL, Gateway, GatewayDep, MapName
+from services.gateway.context import (
+    DEFAULT_MAP,
+    NO_NUL_PATTERN,
+    GatewayContext,
+    GatewayDep,
+    MapName,
+)
 from services.gateway.key_check import ADMIN, READ
-from services.gateway.once import Once, OnceFormDep
-from services.gateway.receive import describe_form, receive_file
-from services.gateway.room import ROOM_FOR_JOBS, Kind, RoomDep
-from services.gateway.schemas import Answer, JobStarted, started_job
-from shared.catalog.added_models import get_model, list_models, maps_using, remove_model
+from services.gateway.once import IdempotentFormDep, IdempotentRequest
+from services.gateway.receive import multipart_schema, store_form_file
+from services.gateway.room import ADMIT_JOB, AdmissionDep, UploadKind
+from services.gateway.schemas import JobAcceptedResponse, ResponseModel, accept_job
+from shared.catalog.added_models import (
+    get_registered_model,
+    list_maps_using_model,
+    list_registered_models,
+    remove_model,
+)
 from shared.catalog.maps import get_map
 from shared.catalog.models import Model
-from shared.errors import PlacewiseError, TooLarge, invalid_field
+from shared.errors import PlacewiseError, TooLarge, invalid_field_error
 from shared.ids import new_id
 from shared.jobs import Job, JobKind, Priority
-from shared.model_names import MODEL_NAME, MODEL_NAME_RULE
+from shared.model_names import MODEL_NAME_PATTERN, MODEL_NAME_RULE
 from shared.objects.keys import new_checkpoint_key
 
-MOST_LICENCE_CHARACTERS = 1000
-MOST_NOTE_CHARACTERS = 4000
-FIELDS: dict[str, dict[str, Any]] = {
+MAX_LICENCE_CHARACTERS = 1000
+MAX_NOTE_CHARACTERS = 4000
+MODEL_FORM_FIELDS: dict[str, dict[str, Any]] = {
     "name": {
         "type": "string",
-        "pattern": MODEL_NAME,
+        "pattern": MODEL_NAME_PATTERN,
         "description": "what maps call it: gsv:NAME. Given once, it never means other weights",
     },
     "licence": {
         "type": "string",
-        "maxLength": MOST_LICENCE_CHARACTERS,
+        "maxLength": MAX_LICENCE_CHARACTERS,
         "description": "of the weights",
     },
-    "note": {"type": "string", "maxLength": MOST_NOTE_CHARACTERS, "description": "for people"},
+    "note": {"type": "string", "maxLength": MAX_NOTE_CHARACTERS, "description": "for people"},
 }
 
 router = APIRouter(tags=["models"])
 
-ModelPath = Annotated[
-    str, Path(description="the model's name", min_length=1, max_length=100, pattern=NO_NUL)
+ModelNamePath = Annotated[
+    str, Path(description="the model's name", min_length=1, max_length=100, pattern=NO_NUL_PATTERN)
 ]
 
 
-class ModelAnswer(Answer):
+class ModelResponse(ResponseModel):
     name: str
     extractor: str = Field(description="what maps are described with: gsv:NAME")
     fingerprint: str = Field(description="sha256 of its configuration and weights")
@@ -69,7 +80,7 @@ class ModelAnswer(Answer):
     maps: list[str] = Field(description="maps that are described with it")
 
     @classmethod
-    def of(cls, session: Session, model: Model) -> ModelAnswer:
+    def of(cls, session: Session, model: Model) -> ModelResponse:
         assert model.added_name is not None
         assert model.config is not None
         height, width = model.config["image_size"]
@@ -86,15 +97,15 @@ class ModelAnswer(Answer):
             note=model.note,
             about=model.card,
             added_at=model.added_at,
-            maps=maps_using(session, model),
+            maps=list_maps_using_model(session, model),
         )
 
 
-class ModelsAnswer(Answer):
-    models: list[ModelAnswer]
+class ModelsResponse(ResponseModel):
+    models: list[ModelResponse]
 
 
-class ModelRemoved(Answer):
+class RemovedModelResponse(ResponseModel):
     success: bool
     message: str
     removed_model: str
@@ -104,97 +115,101 @@ class ModelRemoved(Answer):
     "/models",
     operation_id="add_model",
     status_code=202,
-    response_model=JobStarted,
-    openapi_extra=describe_form(
+    response_model=JobAcceptedResponse,
+    openapi_extra=multipart_schema(
         "a checkpoint (`.ckpt`) of `placewise train`",
         ["name"],
-        **FIELDS,
+        **MODEL_FORM_FIELDS,
     ),
-    dependencies=[ADMIN, ROOM_FOR_JOBS],
+    dependencies=[ADMIN, ADMIT_JOB],
 )
-async def add_model(
+async def upload_model(
     request: Request,
     response: Response,
     gateway: GatewayDep,
-    once: OnceFormDep,
-    room: RoomDep,
+    idempotent: IdempotentFormDep,
+    admission: AdmissionDep,
     map_name: MapName = DEFAULT_MAP,
-) -> JobStarted:
+) -> JobAcceptedResponse:
     """Add a trained model: send a checkpoint, and a `name` for it.
 
     An extractor checks it, in a job of the map: that it can be read without executing anything,
     that its weights are finite and make a descriptor of a photo. One that can't be used ends the
     job as `failed` with the reason, and so does a name that belongs to other weights.
     """
-    with room.receiving(Kind.UPLOAD, request):
-        received = await receive_file(
+    with admission.admit_upload(UploadKind.UPLOAD, request):
+        received = await store_form_file(
             request,
             gateway.store,
             new_checkpoint_key(),
             gateway.settings.max_model_bytes,
-            too_large=_too_large,
+            too_large=_checkpoint_too_large_error,
         )
     try:
-        said = _read_fields(received.fields)
+        said = _parse_model_fields(received.fields)
     except PlacewiseError:
         await run_in_threadpool(gateway.store.delete, received.key)
         raise
-    await once.begin_form(gateway.store, received)
+    await idempotent.claim_form(gateway.store, received)
     params = {
         "object_key": received.key,
         "filename": received.filename,
         "checkpoint_sha256": received.sha256,
         **said,
     }
-    job = await run_in_threadpool(_queue, gateway, map_name, params, once)
+    job = await run_in_threadpool(_queue_add_model, gateway, map_name, params, idempotent)
     gateway.hints.send()
-    return started_job(response, job, map_name)
-
-
-@router.get("/models", operation_id="list_models", response_model=ModelsAnswer, dependencies=[READ])
-def models(gateway: GatewayDep) -> ModelsAnswer:
-    """Every model that was added, by name."""
-    with gateway.catalog.read() as session:
-        found = [ModelAnswer.of(session, model) for model in list_models(session)]
-    return ModelsAnswer(models=found)
+    return accept_job(response, job, map_name)
 
 
 @router.get(
-    "/models/{name}", operation_id="get_model", response_model=ModelAnswer, dependencies=[READ]
+    "/models", operation_id="list_models", response_model=ModelsResponse, dependencies=[READ]
 )
-def one_model(gateway: GatewayDep, name: ModelPath) -> ModelAnswer:
+def read_models(gateway: GatewayDep) -> ModelsResponse:
+    """Every model that was added, by name."""
+    with gateway.catalog.read() as session:
+        found = [ModelResponse.of(session, model) for model in list_registered_models(session)]
+    return ModelsResponse(models=found)
+
+
+@router.get(
+    "/models/{name}", operation_id="get_model", response_model=ModelResponse, dependencies=[READ]
+)
+def read_model(gateway: GatewayDep, name: ModelNamePath) -> ModelResponse:
     """One model."""
     with gateway.catalog.read() as session:
-        return ModelAnswer.of(session, get_model(session, name))
+        return ModelResponse.of(session, get_registered_model(session, name))
 
 
 @router.delete(
     "/models/{name}",
     operation_id="remove_model",
-    response_model=ModelRemoved,
+    response_model=RemovedModelResponse,
     dependencies=[ADMIN],
 )
-def delete_model(gateway: GatewayDep, name: ModelPath) -> ModelRemoved:
+def delete_model(gateway: GatewayDep, name: ModelNamePath) -> RemovedModelResponse:
     """Remove a model; 409 (`model_in_use`) while a map is described with it.
 
     Its name stays taken, unless the same weights are added again.
     """
     new_map_extractor = gateway.settings.new_map_extractor
     gateway.catalog.run(lambda session: remove_model(session, name, new_map_extractor))
-    return ModelRemoved(success=True, message=f"The model {name} is removed.", removed_model=name)
+    return RemovedModelResponse(
+        success=True, message=f"The model {name} is removed.", removed_model=name
+    )
 
 
-def _read_fields(fields: dict[str, str]) -> dict[str, str | None]:
+def _parse_model_fields(fields: dict[str, str]) -> dict[str, str | None]:
     """The name, the licence and the note that the form gives; 422 for what can't be taken."""
-    for field in fields.keys() - FIELDS.keys():
-        raise invalid_field(field, f"is none of {', '.join(FIELDS)}")
+    for field in fields.keys() - MODEL_FORM_FIELDS.keys():
+        raise invalid_field_error(field, f"is none of {', '.join(MODEL_FORM_FIELDS)}")
     name = fields.get("name", "")
-    if not re.fullmatch(MODEL_NAME, name):
-        raise invalid_field("name", MODEL_NAME_RULE)
-    for field, most in (("licence", MOST_LICENCE_CHARACTERS), ("note", MOST_NOTE_CHARACTERS)):
+    if not re.fullmatch(MODEL_NAME_PATTERN, name):
+        raise invalid_field_error("name", MODEL_NAME_RULE)
+    for field, most in (("licence", MAX_LICENCE_CHARACTERS), ("note", MAX_NOTE_CHARACTERS)):
         value = fields.get(field, "")
         if len(value) > most or "\x00" in value:
-            raise invalid_field(field, f"has up to {most} characters, none of them NUL")
+            raise invalid_field_error(field, f"has up to {most} characters, none of them NUL")
     return {
         "name": name,
         "licence": fields.get("licence") or None,
@@ -202,7 +217,9 @@ def _read_fields(fields: dict[str, str]) -> dict[str, str | None]:
     }
 
 
-def _queue(gateway: Gateway, map_name: str, params: dict[str, Any], once: Once) -> Job:
+def _queue_add_model(
+    gateway: GatewayContext, map_name: str, params: dict[str, Any], idempotent: IdempotentRequest
+) -> Job:
     try:
         with gateway.catalog.write() as session:
             job = Job(
@@ -214,14 +231,14 @@ def _queue(gateway: Gateway, map_name: str, params: dict[str, Any], once: Once) 
             )
             session.add(job)
             session.flush()
-            once.keep_job(session, job)
+            idempotent.store_job_response(session, job)
             return job
     except PlacewiseError:
         gateway.store.delete(params["object_key"])
         raise
 
 
-def _too_large(max_bytes: int) -> PlacewiseError:
+def _checkpoint_too_large_error(max_bytes: int) -> PlacewiseError:
     return TooLarge(
         "file_too_large",
         f"The checkpoint is larger than {max_bytes} bytes (MAX_MODEL_BYTES).",

@@ -7,8 +7,8 @@ A route takes part with one dependency, and one line in the transaction that mak
             ...
             once.keep(session, 201, answer)
 
-A form's bytes are known only once they have come: there it is `OnceFormDep`, and
-`await once.begin_form(gateway.store, received)` after `receive_file`.
+A form's bytes are known only once they have come: there it is `IdempotentFormDep`, and
+`await once.begin_form(gateway.store, received)` after `store_form_file`.
 
 Kept are answers to what was done, and refusals (4xx) that would be the same again; never a 5xx, nor
 what depends on who asks and when (401, 403, 408, 429). A call without a key costs nothing.
@@ -29,110 +29,112 @@ from pydantic import BaseModel
 from sqlalchemy.orm import Session
 from starlette.concurrency import run_in_threadpool
 
-from services.gateway.context import DEFAULT_MAP, Gateway, GatewayDep
-from services.gateway.key_check import caller_of
-from services.gateway.schemas import job_started
+from services.gateway.context import DEFAULT_MAP, GatewayContext, GatewayDep
+from services.gateway.key_check import get_caller
+from services.gateway.schemas import to_job_accepted
 from shared.catalog.idempotency import (
-    CallMade,
-    KeptAnswer,
-    claim_key,
-    keep_answer,
-    release_key,
+    RequestIdentity,
+    StoredResponse,
+    claim_idempotency_key,
+    release_idempotency_key,
+    store_response,
 )
-from shared.errors import Conflict, PlacewiseError, invalid_field
-from shared.intake.received import Received
+from shared.errors import Conflict, PlacewiseError, invalid_field_error
+from shared.intake.received import StoredUpload
 from shared.jobs import Job
 from shared.objects import ObjectStore
 from shared.problems import problem_response
 
-HEADER = "Idempotency-Key"
-REPLAYED = "Idempotent-Replayed"
-KEY = r"[!-~]{1,255}"
+IDEMPOTENCY_HEADER = "Idempotency-Key"
+REPLAYED_HEADER = "Idempotent-Replayed"
+IDEMPOTENCY_KEY_PATTERN = r"[!-~]{1,255}"
 LEASE_SECONDS = 30.0  # more than passes between a whole request and its committed effect
-NOT_KEPT = (401, 403, 408, 429)
+UNSTORED_STATUSES = (401, 403, 408, 429)
 
-KeyHeader = Annotated[
+IdempotencyKeyHeader = Annotated[
     str | None,
     Header(
-        alias=HEADER,
+        alias=IDEMPOTENCY_HEADER,
         description="a new one for each call (a UUID, say): repeated with it, the call is done "
         "once and answered the same, for 24 hours; 1 to 255 printable ASCII characters",
     ),
 ]
 
 
-class Replay(Exception):
+class IdempotentReplay(Exception):
     """The call was done already; this is its answer."""
 
-    def __init__(self, answer: KeptAnswer) -> None:
+    def __init__(self, answer: StoredResponse) -> None:
         super().__init__(answer.status)
-        self.answer = answer
+        self.stored_response = answer
 
 
-async def answer_again(request: Request, replay: Exception) -> Response:
+async def replay_response(request: Request, replay: Exception) -> Response:
     """The handler of Replay."""
-    assert isinstance(replay, Replay)
-    kept = replay.answer
+    assert isinstance(replay, IdempotentReplay)
+    kept = replay.stored_response
     return Response(
         kept.body,
         kept.status,
-        {**kept.headers, REPLAYED: "true"},
+        {**kept.headers, REPLAYED_HEADER: "true"},
         media_type="application/problem+json" if kept.status >= 400 else "application/json",
     )
 
 
-class Once:
+class IdempotentRequest:
     """One request under its key; without one, everything here does nothing."""
 
-    def __init__(self, gateway: Gateway, request: Request, key: str | None) -> None:
-        if key is not None and not re.fullmatch(KEY, key):
-            raise invalid_field(HEADER, "has 1 to 255 printable ASCII characters and no blanks")
+    def __init__(self, gateway: GatewayContext, request: Request, key: str | None) -> None:
+        if key is not None and not re.fullmatch(IDEMPOTENCY_KEY_PATTERN, key):
+            raise invalid_field_error(
+                IDEMPOTENCY_HEADER, "has 1 to 255 printable ASCII characters and no blanks"
+            )
         self._gateway = gateway
         self._request = request
         self._key = key
         self._token: UUID | None = None
-        self._kept = False
+        self._response_stored = False
 
-    async def begin_form(
-        self, store: ObjectStore, received: Received, *, life_seconds: float | None = None
+    async def claim_form(
+        self, store: ObjectStore, received: StoredUpload, *, life_seconds: float | None = None
     ) -> None:
         """`begin` with what a form said. Received bytes that the call won't need are removed."""
         content = [received.filename, received.sha256, received.fields]
         try:
-            await run_in_threadpool(self.begin, content, life_seconds)
-        except (PlacewiseError, Replay):
+            await run_in_threadpool(self.claim_key, content, life_seconds)
+        except (PlacewiseError, IdempotentReplay):
             await run_in_threadpool(store.delete, received.key)
             raise
 
-    def begin(self, content: Any, life_seconds: float | None = None) -> None:
+    def claim_key(self, content: Any, life_seconds: float | None = None) -> None:
         """The call is this one's to do from here on. `content` is what it says, as JSON.
 
-        Raises Replay when it was done already, and as `claim_key` does.
+        Raises Replay when it was done already, and as `claim_idempotency_key` does.
         """
         if self._key is None:
             return
         request = self._request
         asked = [item for item in request.query_params.multi_items() if item[0] != "map"]
         said = [request.url.path, sorted(asked), content]
-        made = CallMade(
-            scope=_scope(request),
+        made = RequestIdentity(
+            scope=_key_scope(request),
             key=self._key,
             call=f"{request.method} {request.scope['route'].path_format}",
             fingerprint=hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest(),
         )
         life = self._gateway.settings.idempotency_key_seconds
         with self._gateway.catalog.write() as session:
-            claimed = claim_key(
+            claimed = claim_idempotency_key(
                 session,
                 made,
                 lease_seconds=LEASE_SECONDS,
                 life_seconds=min(life, life_seconds or life),
             )
-        if isinstance(claimed, KeptAnswer):
-            raise Replay(claimed)
+        if isinstance(claimed, StoredResponse):
+            raise IdempotentReplay(claimed)
         self._token = claimed
 
-    def keep(
+    def store_response(
         self,
         session: Session,
         status: int,
@@ -142,65 +144,74 @@ class Once:
         """What the call is answered, in the transaction that makes its effect. Kept again, it
         replaces what was kept before."""
         if self._token is not None:
-            kept = KeptAnswer(status, headers or {}, answer.model_dump_json())
-            keep_answer(session, self._token, kept)
-            self._kept = True
+            kept = StoredResponse(status, headers or {}, answer.model_dump_json())
+            store_response(session, self._token, kept)
+            self._response_stored = True
 
-    def keep_job(self, session: Session, job: Job) -> None:
+    def store_job_response(self, session: Session, job: Job) -> None:
         """The 202 of a job that this transaction queues."""
-        started = job_started(job, _map_name(self._request))
-        self.keep(session, 202, started, {"Location": started.status_url, "Retry-After": "1"})
+        started = to_job_accepted(job, _map_name(self._request))
+        self.store_response(
+            session, 202, started, {"Location": started.status_url, "Retry-After": "1"}
+        )
 
-    def replace(
+    def replace_response(
         self, status: int, answer: BaseModel, headers: dict[str, str] | None = None
     ) -> None:
         """`keep` in a transaction of its own, once an effect that was kept has come further."""
         if self._token is not None:
             with self._gateway.catalog.write() as session:
-                self.keep(session, status, answer, headers)
+                self.store_response(session, status, answer, headers)
 
-    def keep_refusal(self, error: PlacewiseError) -> None:
+    def store_refusal(self, error: PlacewiseError) -> None:
         """The call is refused, and would be again."""
-        if self._token is None or self._kept or error.status >= 500 or error.status in NOT_KEPT:
+        if (
+            self._token is None
+            or self._response_stored
+            or error.status >= 500
+            or error.status in UNSTORED_STATUSES
+        ):
             return
         response = problem_response(error, self._request)
-        kept = KeptAnswer(error.status, {}, bytes(response.body).decode())
+        kept = StoredResponse(error.status, {}, bytes(response.body).decode())
         # Whoever took the call over meanwhile has the last word.
         with contextlib.suppress(Conflict), self._gateway.catalog.write() as session:
-            keep_answer(session, self._token, kept)
-            self._kept = True
+            store_response(session, self._token, kept)
+            self._response_stored = True
 
-    def end(self) -> None:
+    def release_key(self) -> None:
         """Give back a key under which nothing was done."""
-        if self._token is not None and not self._kept:
+        if self._token is not None and not self._response_stored:
             with self._gateway.catalog.write() as session:
-                release_key(session, self._token)
+                release_idempotency_key(session, self._token)
 
 
-async def once_of_form(
-    request: Request, gateway: GatewayDep, key: KeyHeader = None
-) -> AsyncIterator[Once]:
+async def idempotent_form_request(
+    request: Request, gateway: GatewayDep, key: IdempotencyKeyHeader = None
+) -> AsyncIterator[IdempotentRequest]:
     """A call whose content is known later: the route calls `begin_form`."""
-    once = Once(gateway, request, key)
+    once = IdempotentRequest(gateway, request, key)
     try:
         yield once
     except PlacewiseError as error:
-        await run_in_threadpool(once.keep_refusal, error)
+        await run_in_threadpool(once.store_refusal, error)
         raise
     finally:
-        await run_in_threadpool(once.end)
+        await run_in_threadpool(once.release_key)
 
 
-async def once_of_body(request: Request, once: Annotated[Once, Depends(once_of_form)]) -> Once:
+async def idempotent_request(
+    request: Request, idempotent: Annotated[IdempotentRequest, Depends(idempotent_form_request)]
+) -> IdempotentRequest:
     """A call with a JSON body, or none: begun already."""
     body = await request.body()
-    await run_in_threadpool(once.begin, hashlib.sha256(body).hexdigest())
-    return once
+    await run_in_threadpool(idempotent.claim_key, hashlib.sha256(body).hexdigest())
+    return idempotent
 
 
-def _scope(request: Request) -> str:
+def _key_scope(request: Request) -> str:
     """Whose key it is: the caller's, in one map."""
-    whose = [caller_of(request).who, _map_name(request)]
+    whose = [get_caller(request).identity, _map_name(request)]
     return hashlib.sha256(json.dumps(whose).encode()).hexdigest()
 
 
@@ -208,5 +219,5 @@ def _map_name(request: Request) -> str:
     return request.query_params.get("map", DEFAULT_MAP)
 
 
-OnceDep = Annotated[Once, Depends(once_of_body)]
-OnceFormDep = Annotated[Once, Depends(once_of_form)]
+IdempotentDep = Annotated[IdempotentRequest, Depends(idempotent_request)]
+IdempotentFormDep = Annotated[IdempotentRequest, Depends(idempotent_form_request)]

@@ -16,35 +16,35 @@ from fastapi.responses import Response, StreamingResponse
 from pydantic import BaseModel, ConfigDict, Field
 from sqlalchemy.orm import Session
 
-from services.gateway.context import DEFAULT_MAP, NO_NUL, FileId, GatewayDep, MapName
+from services.gateway.context import DEFAULT_MAP, NO_NUL_PATTERN, FileId, GatewayDep, MapName
 from services.gateway.filters import FilterDep
 from services.gateway.key_check import READ, WRITE
 from services.gateway.schemas import (
-    DeleteAnswer,
-    MetadataAnswer,
-    OnePhotoAnswer,
-    PhotoAnswer,
+    DeletedPhotoResponse,
+    MetadataSearchResponse,
+    PhotoDetailResponse,
+    PhotoResponse,
 )
-from shared.catalog.chunks import descriptor_of
+from shared.catalog.chunks import find_descriptor
 from shared.catalog.generations import active_generation
-from shared.catalog.maps import bump_version, get_map, lock_map
-from shared.catalog.metadata_search import COUNTED_AT_MOST, MetadataFilter, search_metadata
-from shared.catalog.photos import Photo, PhotoRole, get_photo, mark_deleted
-from shared.errors import NotFound, invalid_field
+from shared.catalog.maps import get_map, increment_map_version, lock_map
+from shared.catalog.metadata_search import MAX_COUNTED_MATCHES, MetadataFilter, search_photos
+from shared.catalog.photos import Photo, PhotoRole, get_photo, mark_photo_deleted
+from shared.errors import NotFound, invalid_field_error
 from shared.intake.photo_fields import (
+    check_coordinate_pair,
     check_metadata,
-    check_pair,
     parse_tags,
     parse_time,
 )
 from shared.jobs import Job
-from shared.jobs.finish import cancel_all
+from shared.jobs.finish import cancel_jobs
 from shared.objects.keys import thumbnail_key
 
 router = APIRouter(tags=["photos"])
 
-READ_BYTES = 256 * 1024
-PICTURE: dict[int | str, dict[str, Any]] = {
+STREAM_READ_BYTES = 256 * 1024
+IMAGE_RESPONSE: dict[int | str, dict[str, Any]] = {
     200: {"content": {"image/*": {}}, "description": "The picture."}
 }
 
@@ -52,17 +52,19 @@ PICTURE: dict[int | str, dict[str, Any]] = {
 @router.get(
     "/uploads/{file_id}",
     operation_id="get_photo",
-    response_model=OnePhotoAnswer,
+    response_model=PhotoDetailResponse,
     dependencies=[READ],
 )
-def photo(gateway: GatewayDep, file_id: FileId, map_name: MapName = DEFAULT_MAP) -> OnePhotoAnswer:
+def read_photo(
+    gateway: GatewayDep, file_id: FileId, map_name: MapName = DEFAULT_MAP
+) -> PhotoDetailResponse:
     """What is known of one photo."""
     with gateway.catalog.read() as session:
         found = get_photo(session, get_map(session, map_name).id, file_id)
-        return _one(session, found, map_name)
+        return _photo_detail_response(session, found, map_name)
 
 
-class PhotoPatch(BaseModel):
+class PhotoUpdate(BaseModel):
     """What to change; what is left out stays, null clears."""
 
     model_config = ConfigDict(extra="forbid")
@@ -71,12 +73,12 @@ class PhotoPatch(BaseModel):
     longitude: Annotated[float | None, Field(ge=-180, le=180, allow_inf_nan=False)] = None
     heading: Annotated[float | None, Field(ge=0, le=360, allow_inf_nan=False)] = None
     captured_at: str | None = None
-    place: Annotated[str | None, Field(max_length=500, pattern=NO_NUL)] = None
-    tags: list[Annotated[str, Field(pattern=NO_NUL)]] | None = None
+    place: Annotated[str | None, Field(max_length=500, pattern=NO_NUL_PATTERN)] = None
+    tags: list[Annotated[str, Field(pattern=NO_NUL_PATTERN)]] | None = None
     metadata: dict[str, Any] | None = None
     role: PhotoRole | None = None
 
-    def columns(self) -> dict[str, Any]:
+    def to_columns(self) -> dict[str, Any]:
         """The photo's columns that are said, with their new values."""
         said = self.model_dump(exclude_unset=True)
         if said.get("captured_at") is not None:
@@ -98,58 +100,60 @@ class PhotoPatch(BaseModel):
 @router.patch(
     "/uploads/{file_id}",
     operation_id="patch_photo",
-    response_model=OnePhotoAnswer,
+    response_model=PhotoDetailResponse,
     dependencies=[WRITE],
 )
 def patch_photo(
     gateway: GatewayDep,
     file_id: FileId,
-    patch: PhotoPatch,
+    patch: PhotoUpdate,
     map_name: MapName = DEFAULT_MAP,
-) -> OnePhotoAnswer:
+) -> PhotoDetailResponse:
     """Change where, when and what of a photo; its descriptor stays."""
-    columns = patch.columns()
+    columns = patch.to_columns()
     with gateway.catalog.write() as session:
         map_ = lock_map(session, get_map(session, map_name).id)
         found = get_photo(session, map_.id, file_id)
         for name, value in columns.items():
             setattr(found, name, value)
-        check_pair(found.latitude, found.longitude)
-        found.changed_version = bump_version(session, map_.id)
+        check_coordinate_pair(found.latitude, found.longitude)
+        found.changed_version = increment_map_version(session, map_.id)
         session.flush()
-        return _one(session, found, map_name)
+        return _photo_detail_response(session, found, map_name)
 
 
 @router.delete(
     "/uploads/{file_id}",
     operation_id="delete_photo",
-    response_model=DeleteAnswer,
+    response_model=DeletedPhotoResponse,
     dependencies=[WRITE],
 )
 def delete_photo(
     gateway: GatewayDep, file_id: FileId, map_name: MapName = DEFAULT_MAP
-) -> DeleteAnswer:
+) -> DeletedPhotoResponse:
     """Gone from every answer at once; the bytes follow within seconds."""
 
     def remove(session: Session) -> str:
         map_ = lock_map(session, get_map(session, map_name).id)
         found = get_photo(session, map_.id, file_id)
-        mark_deleted(session, found, bump_version(session, map_.id))
-        cancel_all(session, Job.photo_id == found.id)
+        mark_photo_deleted(session, found, increment_map_version(session, map_.id))
+        cancel_jobs(session, Job.photo_id == found.id)
         return found.filename
 
     filename = gateway.catalog.run(remove)
-    return DeleteAnswer(success=True, message=f"{filename} is deleted.", deleted_file_id=file_id)
+    return DeletedPhotoResponse(
+        success=True, message=f"{filename} is deleted.", deleted_file_id=file_id
+    )
 
 
 @router.get(
     "/uploads/{file_id}/image",
     operation_id="get_image",
     response_class=Response,
-    responses=PICTURE,
+    responses=IMAGE_RESPONSE,
     dependencies=[READ],
 )
-def image(
+def read_image(
     request: Request,
     gateway: GatewayDep,
     file_id: FileId,
@@ -162,7 +166,7 @@ def image(
     if request.headers.get("if-none-match") == etag:
         return Response(status_code=304, headers={"ETag": etag})
     return StreamingResponse(
-        _pieces(gateway.store.open(found.object_key)),
+        _read_blocks(gateway.store.open(found.object_key)),
         media_type=found.media_type,
         headers={
             "Content-Length": str(found.size_bytes),
@@ -177,10 +181,12 @@ def image(
     "/uploads/{file_id}/thumbnail",
     operation_id="get_thumbnail",
     response_class=Response,
-    responses=PICTURE,
+    responses=IMAGE_RESPONSE,
     dependencies=[READ],
 )
-def thumbnail(gateway: GatewayDep, file_id: FileId, map_name: MapName = DEFAULT_MAP) -> Response:
+def read_thumbnail(
+    gateway: GatewayDep, file_id: FileId, map_name: MapName = DEFAULT_MAP
+) -> Response:
     """A small JPEG without any metadata; it is there once the photo has been described."""
     with gateway.catalog.read() as session:
         found = get_photo(session, get_map(session, map_name).id, file_id)
@@ -195,9 +201,12 @@ def thumbnail(gateway: GatewayDep, file_id: FileId, map_name: MapName = DEFAULT_
 
 
 @router.get(
-    "/search", operation_id="search_metadata", response_model=MetadataAnswer, dependencies=[READ]
+    "/search",
+    operation_id="search_metadata",
+    response_model=MetadataSearchResponse,
+    dependencies=[READ],
 )
-def search(
+def search_photos_by_metadata(
     gateway: GatewayDep,
     photos: FilterDep,
     filename: Annotated[
@@ -211,11 +220,11 @@ def search(
     limit: Annotated[int, Query(ge=1, le=1000)] = 100,
     cursor: Annotated[str | None, Query(description="`next_cursor` of the page before")] = None,
     map_name: MapName = DEFAULT_MAP,
-) -> MetadataAnswer:
+) -> MetadataSearchResponse:
     """Photos by what is known of them, newest first, a page at a time."""
     started = time.perf_counter()
     if filename is not None and "\0" in filename:
-        raise invalid_field("filename", "holds a NUL character")
+        raise invalid_field_error("filename", "holds a NUL character")
     wanted = MetadataFilter(
         filename=filename,
         upload_after=parse_time("upload_after", upload_after) if upload_after else None,
@@ -225,25 +234,25 @@ def search(
         photos=photos,
         role=role,
     )
-    after = _read_cursor(cursor) if cursor else None
+    after = _decode_cursor(cursor) if cursor else None
     with gateway.catalog.read() as session:
         map_id = get_map(session, map_name).id
-        found, total = search_metadata(session, map_id, wanted, limit + 1, after)
+        found, total = search_photos(session, map_id, wanted, limit + 1, after)
     page = found[:limit]
-    return MetadataAnswer(
+    return MetadataSearchResponse(
         total_found=total,
-        total_is_exact=total < COUNTED_AT_MOST,
-        images=[PhotoAnswer(**PhotoAnswer.fields_of(item, map_name)) for item in page],
-        next_cursor=_cursor(page[-1]) if len(found) > limit else None,
+        total_is_exact=total < MAX_COUNTED_MATCHES,
+        images=[PhotoResponse(**PhotoResponse.fields_of(item, map_name)) for item in page],
+        next_cursor=_encode_cursor(page[-1]) if len(found) > limit else None,
         query_time_ms=(time.perf_counter() - started) * 1000,
     )
 
 
-def _one(session: Session, found: Photo, map_name: str) -> OnePhotoAnswer:
+def _photo_detail_response(session: Session, found: Photo, map_name: str) -> PhotoDetailResponse:
     generation = active_generation(session, found.map_id)
-    searchable = generation is not None and descriptor_of(session, generation.id, found.id)
-    return OnePhotoAnswer(
-        **PhotoAnswer.fields_of(found, map_name),
+    searchable = generation is not None and find_descriptor(session, generation.id, found.id)
+    return PhotoDetailResponse(
+        **PhotoResponse.fields_of(found, map_name),
         job_id=found.job_id,
         media_type=found.media_type,
         sha256=found.sha256,
@@ -251,19 +260,19 @@ def _one(session: Session, found: Photo, map_name: str) -> OnePhotoAnswer:
     )
 
 
-def _pieces(file: BinaryIO) -> Iterator[bytes]:
+def _read_blocks(file: BinaryIO) -> Iterator[bytes]:
     with file:
-        while piece := file.read(READ_BYTES):
+        while piece := file.read(STREAM_READ_BYTES):
             yield piece
 
 
-def _cursor(last: Photo) -> str:
+def _encode_cursor(last: Photo) -> str:
     return base64.urlsafe_b64encode(f"{last.uploaded_at.isoformat()} {last.id}".encode()).decode()
 
 
-def _read_cursor(cursor: str) -> tuple[datetime, UUID]:
+def _decode_cursor(cursor: str) -> tuple[datetime, UUID]:
     try:
         uploaded_at, photo_id = base64.urlsafe_b64decode(cursor.encode()).decode().split(" ")
         return parse_time("cursor", uploaded_at), UUID(photo_id)
     except (ValueError, binascii.Error):
-        raise invalid_field("cursor", "is not one that this call has given") from None
+        raise invalid_field_error("cursor", "is not one that this call has given") from None

@@ -16,13 +16,13 @@ from shared.catalog.maps import Map
 from shared.catalog.session import Catalog
 from shared.jobs.table import Job, JobState
 
-LOOK_SECONDS = 5.0
-LOOK_SHARE = 20  # a look that takes long is taken seldom: one part in so many of the time
-COUNTED = (JobState.QUEUED, JobState.RUNNING, JobState.FAILED)
+QUEUE_POLL_SECONDS = 5.0
+POLL_COST_DIVISOR = 20  # a look that takes long is taken seldom: one part in so many of the time
+COUNTED_STATES = (JobState.QUEUED, JobState.RUNNING, JobState.FAILED)
 
 
 @dataclass(frozen=True, slots=True)
-class Group:
+class JobCount:
     """The jobs of one kind in one state; `waiting` are those that no worker may take yet."""
 
     kind: str
@@ -31,42 +31,42 @@ class Group:
     oldest_seconds: float
 
 
-class QueueLook:
+class QueueMetrics:
     """A look that is shared by all who ask within LOOK_SECONDS. Thread-safe."""
 
     def __init__(self, catalog: Catalog) -> None:
         self._catalog = catalog
-        self._looking = threading.Lock()
-        self._seen: Sequence[Group] | None = None
-        self._next_look = 0.0
+        self._lock = threading.Lock()
+        self._cached: Sequence[JobCount] | None = None
+        self._next_poll = 0.0
 
-    def look(self) -> Sequence[Group] | None:
+    def job_counts(self) -> Sequence[JobCount] | None:
         """None while the catalog is away."""
-        with self._looking:
+        with self._lock:
             began = time.monotonic()
-            if began < self._next_look:
-                return self._seen
+            if began < self._next_poll:
+                return self._cached
             try:
                 with self._catalog.read() as session:
-                    self._seen = count_jobs(session)
+                    self._cached = count_jobs(session)
             except SQLAlchemyError:
-                self._seen = None
+                self._cached = None
             took = time.monotonic() - began
-            self._next_look = began + max(LOOK_SECONDS, LOOK_SHARE * took)
-            return self._seen
+            self._next_poll = began + max(QUEUE_POLL_SECONDS, POLL_COST_DIVISOR * took)
+            return self._cached
 
 
-def count_jobs(session: Session) -> list[Group]:
+def count_jobs(session: Session) -> list[JobCount]:
     """Of all maps. The index of a map's jobs by state serves it: those that succeeded, by far the
     most, are not looked at."""
     state = case((Job.waiting_for.is_not(None), literal_column("'waiting'")), else_=Job.state)
     found = session.execute(
         select(Job.kind, state, func.count(), func.min(Job.created_at), db_now())
-        .join_from(Map, Job, and_(Job.map_id == Map.id, Job.state.in_(COUNTED)))
+        .join_from(Map, Job, and_(Job.map_id == Map.id, Job.state.in_(COUNTED_STATES)))
         .group_by(Job.kind, state)
         .order_by(Job.kind, state)
     )
     return [
-        Group(kind, now_state, count, max(0.0, (now - oldest).total_seconds()))
+        JobCount(kind, now_state, count, max(0.0, (now - oldest).total_seconds()))
         for kind, now_state, count, oldest, now in found
     ]

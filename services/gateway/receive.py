@@ -12,54 +12,61 @@ from typing import Any
 from fastapi import Request
 from starlette.concurrency import run_in_threadpool
 
-from services.gateway.form import MAX_FIELDS_BYTES, OVERHEAD_BYTES, Form, malformed
+from services.gateway.form import (
+    MAX_FIELDS_BYTES,
+    OVERHEAD_BYTES,
+    MultipartFormParser,
+    malformed_body_error,
+)
 from shared.errors import InvalidRequest, PlacewiseError, TooLarge
-from shared.intake.received import PassingFile, Received, base_name, file_too_large
+from shared.intake.received import StoredUpload, StreamValidator, base_name, file_too_large_error
 from shared.objects import ObjectStore, ObjectWriter
 
 FILE_FIELD = "file"
 # What is handed to the store at once: each time costs a change of thread.
-WRITE_BYTES = 512 * 1024
+STORE_WRITE_BYTES = 512 * 1024
 
 
-async def receive_file(
+async def store_form_file(
     request: Request,
     store: ObjectStore,
     key: str,
     max_bytes: int,
     check_begin: Callable[[bytes], object] = lambda begin: None,
     *,
-    too_large: Callable[[int], PlacewiseError] = file_too_large,
-) -> Received:
+    too_large: Callable[[int], PlacewiseError] = file_too_large_error,
+) -> StoredUpload:
     """The form's file, stored under `key`, with its text fields.
 
     `check_begin` sees the first bytes before anything else is read and may raise; `too_large` makes
     the refusal of more than `max_bytes`. Raises InvalidRequest (no multipart body, no file, an
-    empty file), TooLarge (`file_too_large`), and UnsupportedMedia for another kind of body. Nothing
+    empty file), TooLarge (`file_too_large_error`), and UnsupportedMedia for another kind of body. Nothing
     is left in the store when it raises.
     """
-    parts = _OneFile(PassingFile(max_bytes, check_begin, too_large=too_large))
-    form = Form(request, parts, max_bytes + OVERHEAD_BYTES, lambda: too_large(max_bytes))
+    parts = _SingleFileHandler(StreamValidator(max_bytes, check_begin, too_large=too_large))
+    form = MultipartFormParser(
+        request, parts, max_bytes + OVERHEAD_BYTES, lambda: too_large(max_bytes)
+    )
     writer: ObjectWriter | None = None
     try:
         async for piece in request.stream():
             form.feed(piece)
-            if parts.pending_bytes >= WRITE_BYTES:
+            if parts.pending_bytes >= STORE_WRITE_BYTES:
                 if writer is None:
                     writer = await run_in_threadpool(store.writer, key)
-                await run_in_threadpool(writer.write, parts.take())
+                await run_in_threadpool(writer.write, parts.take_pending())
         form.finish()
-        parts.check_seen()
-        rest = parts.take()
+        parts.require_file()
+        rest = parts.take_pending()
         whole = rest if writer is None else None
         if whole == b"":
             raise InvalidRequest("empty_file", f"The file in the field {FILE_FIELD!r} is empty.")
-        await run_in_threadpool(_finish, store, key, writer, rest)
+        await run_in_threadpool(_finish_object, store, key, writer, rest)
     except BaseException:
         if writer is not None:
             await run_in_threadpool(writer.abort)
         raise
-    return Received(
+    return StoredUpload(
         key=key,
         filename=parts.filename,
         size_bytes=parts.file.size_bytes,
@@ -70,7 +77,7 @@ async def receive_file(
     )
 
 
-def _finish(store: ObjectStore, key: str, writer: ObjectWriter | None, rest: bytes) -> None:
+def _finish_object(store: ObjectStore, key: str, writer: ObjectWriter | None, rest: bytes) -> None:
     """Write what is left, and make the object visible."""
     if writer is None:
         store.put(key, rest)
@@ -79,7 +86,7 @@ def _finish(store: ObjectStore, key: str, writer: ObjectWriter | None, rest: byt
     writer.commit()
 
 
-def describe_form(
+def multipart_schema(
     file: str, required: Sequence[str] = (), **fields: dict[str, Any]
 ) -> dict[str, Any]:
     """The OpenAPI description of a form with a file, and of `fields`, of which some are `required`,
@@ -95,10 +102,10 @@ def describe_form(
     }
 
 
-class _OneFile:
+class _SingleFileHandler:
     """Collects the text fields, passes on the file's bytes."""
 
-    def __init__(self, file: PassingFile) -> None:
+    def __init__(self, file: StreamValidator) -> None:
         self.file = file
         self.filename = ""
         self.fields: dict[str, str] = {}
@@ -109,14 +116,14 @@ class _OneFile:
         self.pending_bytes = 0
         self._pending: list[bytes] = []
 
-    def take(self) -> bytes:
+    def take_pending(self) -> bytes:
         """The file's bytes since the last call."""
         data = b"".join(self._pending)
         self._pending.clear()
         self.pending_bytes = 0
         return data
 
-    def check_seen(self) -> None:
+    def require_file(self) -> None:
         """Was there a file in the form?"""
         if not self._file_seen:
             raise InvalidRequest(
@@ -157,5 +164,5 @@ class _OneFile:
         try:
             self.fields[self._field] = self._value.decode("utf-8")
         except UnicodeDecodeError:
-            raise malformed(f"the field {self._field!r} is not UTF-8") from None
+            raise malformed_body_error(f"the field {self._field!r} is not UTF-8") from None
         self._value.clear()

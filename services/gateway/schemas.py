@@ -11,7 +11,7 @@ from uuid import UUID
 from fastapi import Response
 from pydantic import BaseModel, ConfigDict, Field
 
-from services.gateway.context import API, DEFAULT_MAP
+from services.gateway.context import API_PREFIX, DEFAULT_MAP
 from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.photos import Photo, PhotoRole
 from shared.catalog.vocabularies import Vocabulary, VocabularyOrigin
@@ -19,11 +19,11 @@ from shared.jobs import Job, JobKind, JobState
 from shared.jobs.table import QUERY_JOBS
 
 
-class Answer(BaseModel):
+class ResponseModel(BaseModel):
     model_config = ConfigDict(frozen=True)
 
 
-class PhotoAnswer(Answer):
+class PhotoResponse(ResponseModel):
     """A stored photo."""
 
     image_id: UUID
@@ -68,7 +68,7 @@ class PhotoAnswer(Answer):
         }
 
 
-class OnePhotoAnswer(PhotoAnswer):
+class PhotoDetailResponse(PhotoResponse):
     """A stored photo with the state of its job."""
 
     job_id: UUID | None
@@ -77,15 +77,15 @@ class OnePhotoAnswer(PhotoAnswer):
     searchable: bool = Field(description="whether the active generation has its descriptor")
 
 
-class ClusterShareAnswer(Answer):
+class ClusterShareResponse(ResponseModel):
     cluster: int = Field(description="of the generation's vocabulary, from 0")
     share: float = Field(description="what it adds to the similarity")
 
 
-class ExplanationAnswer(Answer):
+class ExplanationResponse(ResponseModel):
     """Where a similarity comes from, as shares that add up to it."""
 
-    clusters: list[ClusterShareAnswer] | None = Field(
+    clusters: list[ClusterShareResponse] | None = Field(
         description="of those that both photos use, largest share first; null without a vocabulary"
     )
     rows: int = Field(description="of the grid of the query's patches")
@@ -98,7 +98,7 @@ class ExplanationAnswer(Answer):
     full_share: float = Field(description="the share of a patch that is drawn opaque")
 
 
-class SimilarPhoto(PhotoAnswer):
+class SimilarPhotoResponse(PhotoResponse):
     similarity_score: float = Field(description="cosine similarity in [-1, 1]")
     weighted_score: float | None = Field(
         None,
@@ -110,12 +110,12 @@ class SimilarPhoto(PhotoAnswer):
         description="with `rerank`: the similarity, raised by half of the share of patches that "
         "match the query's and have moved alike (0 to 1); null where a photo was not compared",
     )
-    explanation: ExplanationAnswer | None = Field(
+    explanation: ExplanationResponse | None = Field(
         None, description="with `explain=true`, from the patches of the query"
     )
 
 
-class EstimateAnswer(Answer):
+class EstimateResponse(ResponseModel):
     """Which place the answer points to, and how far to believe it."""
 
     in_map: bool | None = Field(
@@ -132,15 +132,15 @@ class EstimateAnswer(Answer):
     reason: str
 
 
-class SimilarityAnswer(Answer):
+class SimilarityResponse(ResponseModel):
     """The most similar photos, best first, never the query itself."""
 
     query_file_id: UUID | None = Field(description="null when the query photo is not stored")
     query_filename: str
     processing_time_ms: float
     total_similar: int
-    similar_images: list[SimilarPhoto]
-    estimate: EstimateAnswer
+    similar_images: list[SimilarPhotoResponse]
+    estimate: EstimateResponse
     vocabulary: str = Field(
         description="`own`: learnt on this map's photos; `foreign`: on photos of elsewhere; "
         "`none`: the extractor uses none"
@@ -176,27 +176,27 @@ class SimilarityAnswer(Answer):
         "shards (`shard 1/3`) of which no search worker answers"
     )
 
-    def with_photos(self, photos: Iterable[SimilarPhoto]) -> SimilarityAnswer:
+    def with_photos(self, photos: Iterable[SimilarPhotoResponse]) -> SimilarityResponse:
         """The same answer with these photos."""
         images = list(photos)
         return self.model_copy(update={"similar_images": images, "total_similar": len(images)})
 
 
-class MetadataAnswer(Answer):
+class MetadataSearchResponse(ResponseModel):
     total_found: int = Field(description="all that match, not only this page; at most 10,000")
     total_is_exact: bool = Field(description="false: there may be more than `total_found`")
-    images: list[PhotoAnswer]
+    images: list[PhotoResponse]
     next_cursor: str | None
     query_time_ms: float
 
 
-class Progress(Answer):
+class JobProgress(ResponseModel):
     done: int
     total: int
     failed: int
 
 
-class JobAnswer(Answer):
+class JobResponse(ResponseModel):
     job_id: UUID
     kind: JobKind
     state: JobState
@@ -211,7 +211,7 @@ class JobAnswer(Answer):
     awaited: list[str] | None = Field(
         description="the search workers that it waits for, once they take longer than a minute"
     )
-    progress: Progress
+    progress: JobProgress
     attempts: int
     file_id: UUID | None
     result: dict[str, Any] | None
@@ -226,7 +226,7 @@ class JobAnswer(Answer):
     )
 
     @classmethod
-    def of(cls, job: Job, map_name: str) -> JobAnswer:
+    def of(cls, job: Job, map_name: str) -> JobResponse:
         query = job.kind in QUERY_JOBS
         return cls(
             job_id=job.id,
@@ -235,7 +235,7 @@ class JobAnswer(Answer):
             stage=job.stage,
             waiting_for=job.waiting_for,
             awaited=job.awaited,
-            progress=Progress(
+            progress=JobProgress(
                 done=job.progress_done,
                 total=job.progress_total,
                 failed=job.progress_failed,
@@ -253,12 +253,12 @@ class JobAnswer(Answer):
         )
 
 
-class JobsAnswer(Answer):
-    jobs: list[JobAnswer]
+class JobsResponse(ResponseModel):
+    jobs: list[JobResponse]
     next_cursor: str | None
 
 
-class JobStarted(Answer):
+class JobAcceptedResponse(ResponseModel):
     """202: the work is queued; poll `status_url`."""
 
     job_id: UUID
@@ -267,7 +267,7 @@ class JobStarted(Answer):
     result_url: str | None = None
 
 
-class UploadAnswer(Answer):
+class UploadResponse(ResponseModel):
     file_id: UUID
     job_id: UUID | None
     filename: str
@@ -279,13 +279,13 @@ class UploadAnswer(Answer):
     message: str
 
 
-class DeleteAnswer(Answer):
+class DeletedPhotoResponse(ResponseModel):
     success: bool
     message: str
     deleted_file_id: UUID
 
 
-class VocabularyAnswer(Answer):
+class VocabularyResponse(ResponseModel):
     vocabulary_id: UUID
     origin: VocabularyOrigin
     clusters: int
@@ -299,7 +299,7 @@ class VocabularyAnswer(Answer):
     created_at: datetime
 
     @classmethod
-    def of(cls, vocabulary: Vocabulary) -> VocabularyAnswer:
+    def of(cls, vocabulary: Vocabulary) -> VocabularyResponse:
         return cls(
             vocabulary_id=vocabulary.id,
             origin=VocabularyOrigin(vocabulary.origin),
@@ -311,7 +311,7 @@ class VocabularyAnswer(Answer):
         )
 
 
-class GenerationAnswer(Answer):
+class GenerationResponse(ResponseModel):
     generation_id: UUID
     state: GenerationState
     extractor: str
@@ -325,7 +325,7 @@ class GenerationAnswer(Answer):
     ended_at: datetime | None
 
     @classmethod
-    def of(cls, generation: Generation, photos: int) -> GenerationAnswer:
+    def of(cls, generation: Generation, photos: int) -> GenerationResponse:
         return cls(
             generation_id=generation.id,
             state=GenerationState(generation.state),
@@ -344,15 +344,17 @@ class GenerationAnswer(Answer):
 def url_in_map(path: str, map_name: str) -> str:
     """URL of a call of the API that finds what belongs to the map: with `?map=` unless the map is
     the default one."""
-    return f"{API}{path}" + ("" if map_name == DEFAULT_MAP else f"?{urlencode({'map': map_name})}")
+    return f"{API_PREFIX}{path}" + (
+        "" if map_name == DEFAULT_MAP else f"?{urlencode({'map': map_name})}"
+    )
 
 
 def job_url(job_id: UUID, map_name: str, part: str = "") -> str:
     return url_in_map(f"/jobs/{job_id}{part}", map_name)
 
 
-def job_started(job: Job, map_name: str) -> JobStarted:
-    return JobStarted(
+def to_job_accepted(job: Job, map_name: str) -> JobAcceptedResponse:
+    return JobAcceptedResponse(
         job_id=job.id,
         status=JobState(job.state),
         status_url=job_url(job.id, map_name),
@@ -360,9 +362,9 @@ def job_started(job: Job, map_name: str) -> JobStarted:
     )
 
 
-def started_job(response: Response, job: Job, map_name: str) -> JobStarted:
+def accept_job(response: Response, job: Job, map_name: str) -> JobAcceptedResponse:
     """What a 202 says of its job, in the body and in the headers of `response`."""
-    started = job_started(job, map_name)
+    started = to_job_accepted(job, map_name)
     response.headers["Location"] = started.status_url
     response.headers["Retry-After"] = "1"
     return started

@@ -12,69 +12,69 @@ from fastapi.responses import JSONResponse
 from starlette.concurrency import run_in_threadpool
 
 from services.gateway.compare import (
-    check_closely,
-    compare_described,
-    compare_stored,
-    compared_answer,
+    check_comparison_supported,
+    comparison_response,
+    start_comparison_of_query_photo,
+    start_comparison_of_stored_photo,
 )
 from services.gateway.context import (
     DEFAULT_MAP,
     FileId,
-    Gateway,
+    GatewayContext,
     GatewayDep,
     JobId,
     MapName,
 )
-from services.gateway.find_similar import find_similar, query_by_job, query_by_photo
+from services.gateway.find_similar import find_similar, query_from_job, query_from_photo
 from services.gateway.key_check import READ
-from services.gateway.once import Once, OnceFormDep
-from services.gateway.receive import describe_form, receive_file
-from services.gateway.room import ROOM_FOR_QUERIES, Kind, RoomDep
-from services.gateway.schemas import JobStarted, SimilarityAnswer, started_job
-from services.gateway.waiting import preferred_wait, wait_for_job
-from services.gateway.wanted import Wanted, WantedDep
+from services.gateway.once import IdempotentFormDep, IdempotentRequest
+from services.gateway.receive import multipart_schema, store_form_file
+from services.gateway.room import ADMIT_QUERY, AdmissionDep, UploadKind
+from services.gateway.schemas import JobAcceptedResponse, SimilarityResponse, accept_job
+from services.gateway.waiting import parse_prefer_wait, wait_for_job
+from services.gateway.wanted import SearchParams, SearchParamsDep
 from shared.catalog.maps import get_map
-from shared.comparison import query_expired
+from shared.comparison import query_expired_error
 from shared.errors import (
     Conflict,
     Gone,
     NotFound,
     PlacewiseError,
     Unprocessable,
-    invalid_field,
+    invalid_field_error,
 )
 from shared.ids import new_id
 from shared.intake.photo_header import read_photo_header
-from shared.intake.received import Received, check_photo_begin
+from shared.intake.received import StoredUpload, check_photo_signature
 from shared.jobs import Job, JobKind, JobState, Priority
-from shared.jobs.hints import Lane
-from shared.jobs.table import QUERY_JOBS, UNFINISHED, get_job
+from shared.jobs.hints import WakeupQueue
+from shared.jobs.table import QUERY_JOBS, UNFINISHED_STATES, get_job
 from shared.objects.keys import query_key
 
 router = APIRouter(tags=["similarity"])
 
-BEING_COMPARED: dict[int | str, dict[str, Any]] = {
-    202: {"model": JobStarted, "description": "Being compared; poll, then fetch."}
+COMPARISON_PENDING: dict[int | str, dict[str, Any]] = {
+    202: {"model": JobAcceptedResponse, "description": "Being compared; poll, then fetch."}
 }
 # Of a failed job's error; everything else is the photo's fault.
-OF_STATUS = {kind.status: kind for kind in (NotFound, Conflict, Gone)}
+ERROR_BY_STATUS = {kind.status: kind for kind in (NotFound, Conflict, Gone)}
 
 
 @router.post(
     "/similarity/{file_id}",
     operation_id="similar_to_stored",
-    response_model=SimilarityAnswer,
-    responses=BEING_COMPARED,
+    response_model=SimilarityResponse,
+    responses=COMPARISON_PENDING,
     dependencies=[READ],
 )
-async def similar_to_stored(
+async def search_by_stored_photo(
     request: Request,
     response: Response,
     gateway: GatewayDep,
-    once: OnceFormDep,
-    room: RoomDep,
+    idempotent: IdempotentFormDep,
+    admission: AdmissionDep,
     file_id: Annotated[FileId, PathParameter(description="a stored photo")],
-    wanted: WantedDep,
+    search_params: SearchParamsDep,
     map_name: MapName = DEFAULT_MAP,
 ) -> Any:
     """The photos most similar to a stored one, without itself.
@@ -84,37 +84,43 @@ async def similar_to_stored(
     `result_url`.
     """
 
-    def ask() -> SimilarityAnswer | Job:
-        if not wanted.closely:
-            return find_similar(gateway, query_by_photo(gateway, map_name, file_id), wanted)
-        check_closely(gateway, map_name, wanted)
-        room.take_query()
-        once.begin(None, gateway.settings.query_ttl_seconds)
-        return compare_stored(gateway, query_by_photo(gateway, map_name, file_id), wanted, once)
+    def ask() -> SimilarityResponse | Job:
+        if not search_params.needs_comparison:
+            return find_similar(
+                gateway, query_from_photo(gateway, map_name, file_id), search_params
+            )
+        check_comparison_supported(gateway, map_name, search_params)
+        admission.admit_query()
+        idempotent.claim_key(None, gateway.settings.query_ttl_seconds)
+        return start_comparison_of_stored_photo(
+            gateway, query_from_photo(gateway, map_name, file_id), search_params, idempotent
+        )
 
     asked = await run_in_threadpool(ask)
-    if isinstance(asked, SimilarityAnswer):
+    if isinstance(asked, SimilarityResponse):
         return asked
     settings = gateway.settings
-    wait = preferred_wait(request, settings.max_wait_seconds) or settings.compare_wait_seconds
-    return await _when_it_ends(gateway, response, asked, map_name, wait)
+    wait = parse_prefer_wait(request, settings.max_wait_seconds) or settings.compare_wait_seconds
+    return await _wait_for_result(gateway, response, asked, map_name, wait)
 
 
 @router.post(
     "/similarity",
     operation_id="similar_to_upload",
-    response_model=SimilarityAnswer,
-    responses={202: {"model": JobStarted, "description": "Being described; poll, then fetch."}},
-    openapi_extra=describe_form("the photo to ask with"),
-    dependencies=[READ, ROOM_FOR_QUERIES],
+    response_model=SimilarityResponse,
+    responses={
+        202: {"model": JobAcceptedResponse, "description": "Being described; poll, then fetch."}
+    },
+    openapi_extra=multipart_schema("the photo to ask with"),
+    dependencies=[READ, ADMIT_QUERY],
 )
-async def similar_to_upload(
+async def search_by_uploaded_photo(
     request: Request,
     response: Response,
     gateway: GatewayDep,
-    once: OnceFormDep,
-    room: RoomDep,
-    wanted: WantedDep,
+    idempotent: IdempotentFormDep,
+    admission: AdmissionDep,
+    search_params: SearchParamsDep,
     map_name: MapName = DEFAULT_MAP,
 ) -> Any:
     """The photos most similar to one that is not stored.
@@ -123,30 +129,34 @@ async def similar_to_upload(
     itself (200) when it takes no longer than N seconds. Repeated under an `Idempotency-Key`, it is
     answered with the 202 of its job.
     """
-    await run_in_threadpool(check_closely, gateway, map_name, wanted)
+    await run_in_threadpool(check_comparison_supported, gateway, map_name, search_params)
     job_id = new_id()
     key = query_key(job_id)
-    with room.receiving(Kind.QUERY, request):
-        received = await receive_file(
-            request, gateway.store, key, gateway.settings.max_file_size, check_photo_begin
+    with admission.admit_upload(UploadKind.QUERY, request):
+        received = await store_form_file(
+            request, gateway.store, key, gateway.settings.max_file_size, check_photo_signature
         )
-    await once.begin_form(gateway.store, received, life_seconds=gateway.settings.query_ttl_seconds)
-    params = {"filename": received.filename, "wanted": wanted.model_dump(mode="json")}
-    job = await run_in_threadpool(_queue, gateway, map_name, job_id, received, params, once)
-    wait = preferred_wait(request, gateway.settings.max_wait_seconds)
+    await idempotent.claim_form(
+        gateway.store, received, life_seconds=gateway.settings.query_ttl_seconds
+    )
+    params = {"filename": received.filename, "wanted": search_params.model_dump(mode="json")}
+    job = await run_in_threadpool(
+        _queue_query, gateway, map_name, job_id, received, params, idempotent
+    )
+    wait = parse_prefer_wait(request, gateway.settings.max_wait_seconds)
     if wait:
         response.headers["Preference-Applied"] = f"wait={wait:g}"
-    return await _when_it_ends(gateway, response, job, map_name, wait)
+    return await _wait_for_result(gateway, response, job, map_name, wait)
 
 
 @router.get(
     "/jobs/{job_id}/result",
     operation_id="similarity_result",
-    response_model=SimilarityAnswer,
-    responses=BEING_COMPARED,
+    response_model=SimilarityResponse,
+    responses=COMPARISON_PENDING,
     dependencies=[READ],
 )
-async def similarity_result(
+async def read_similarity_result(
     response: Response, gateway: GatewayDep, job_id: JobId, map_name: MapName = DEFAULT_MAP
 ) -> Any:
     """The answer to a query whose job has succeeded; 409 before that.
@@ -162,7 +172,7 @@ async def similarity_result(
     job = await run_in_threadpool(find)
     if job.kind not in QUERY_JOBS:
         raise Conflict("no_result", f"The job {job.id} ({job.kind}) has no similarity result.")
-    if job.state in UNFINISHED:
+    if job.state in UNFINISHED_STATES:
         raise Conflict(
             "job_unfinished",
             f"The job {job.id} is {job.state}.",
@@ -170,43 +180,43 @@ async def similarity_result(
             state=job.state,
         )
     wait = gateway.settings.compare_wait_seconds
-    return await _when_it_ends(gateway, response, job, map_name, wait)
+    return await _wait_for_result(gateway, response, job, map_name, wait)
 
 
-async def _when_it_ends(
-    gateway: Gateway, response: Response, job: Job, map_name: str, wait_seconds: float
-) -> SimilarityAnswer | JSONResponse:
+async def _wait_for_result(
+    gateway: GatewayContext, response: Response, job: Job, map_name: str, wait_seconds: float
+) -> SimilarityResponse | JSONResponse:
     """What the query's job and the one that follows it come to within the time; else a 202."""
     deadline = time.monotonic() + wait_seconds
     while True:
         left = deadline - time.monotonic()
-        if job.state in UNFINISHED and left > 0:
+        if job.state in UNFINISHED_STATES and left > 0:
             waited = await wait_for_job(gateway, job.id, left)
             if waited is None:
-                raise query_expired()
+                raise query_expired_error()
             job = waited
-        if job.state in UNFINISHED:
-            started = started_job(response, job, map_name)
+        if job.state in UNFINISHED_STATES:
+            started = accept_job(response, job, map_name)
             # As a response of its own: the route's model is that of the 200.
             return JSONResponse(started.model_dump(mode="json"), 202, dict(response.headers))
-        result = await run_in_threadpool(_result, gateway, job, map_name)
-        if isinstance(result, SimilarityAnswer):
+        result = await run_in_threadpool(_result_or_next_job, gateway, job, map_name)
+        if isinstance(result, SimilarityResponse):
             return result
         job = result
 
 
-def _queue(
-    gateway: Gateway,
+def _queue_query(
+    gateway: GatewayContext,
     map_name: str,
     job_id: UUID,
-    received: Received,
+    received: StoredUpload,
     params: dict[str, Any],
-    once: Once,
+    idempotent: IdempotentRequest,
 ) -> Job:
     try:
-        check_photo_begin(received.begin)
+        check_photo_signature(received.begin)
         for name in received.fields:
-            raise invalid_field(name, "is unknown here; filters belong into the address")
+            raise invalid_field_error(name, "is unknown here; filters belong into the address")
         with received.open(gateway.store) as file:
             read_photo_header(file, gateway.settings.max_image_pixels)
         with gateway.catalog.write() as session:
@@ -219,28 +229,30 @@ def _queue(
             )
             session.add(job)
             session.flush()
-            once.keep_job(session, job)
+            idempotent.store_job_response(session, job)
     except PlacewiseError:
         gateway.store.delete(received.key)
         raise
-    gateway.hints.send(Lane.QUERY)
+    gateway.hints.send(WakeupQueue.QUERY)
     return job
 
 
-def _result(gateway: Gateway, job: Job, map_name: str) -> SimilarityAnswer | Job:
+def _result_or_next_job(
+    gateway: GatewayContext, job: Job, map_name: str
+) -> SimilarityResponse | Job:
     """The answer of an ended job, or the job that goes on with it."""
     if job.state == JobState.SUCCEEDED:
         if job.kind == JobKind.COMPARE:
-            return compared_answer(gateway, job, map_name)
-        wanted = Wanted.model_validate(job.params["wanted"])
-        query = query_by_job(gateway, job)
-        if wanted.closely:
-            return compare_described(gateway, job, query, wanted)
+            return comparison_response(gateway, job, map_name)
+        wanted = SearchParams.model_validate(job.params["wanted"])
+        query = query_from_job(gateway, job)
+        if wanted.needs_comparison:
+            return start_comparison_of_query_photo(gateway, job, query, wanted)
         return find_similar(gateway, query, wanted)
     if job.state == JobState.CANCELLED:
         raise Conflict("job_cancelled", f"The job {job.id} was cancelled.", job_id=str(job.id))
     error = job.error or {}
-    kind = OF_STATUS.get(error.get("status", 0), Unprocessable)
+    kind = ERROR_BY_STATUS.get(error.get("status", 0), Unprocessable)
     raise kind(
         error.get("code", "query_failed"),
         error.get("detail", "The photo could not be described."),

@@ -8,22 +8,22 @@ from uuid import UUID
 from fastapi import Request
 from starlette.concurrency import run_in_threadpool
 
-from services.gateway.context import Gateway
+from services.gateway.context import GatewayContext
 from shared.jobs import Job
 
 
-def preferred_wait(request: Request, most_seconds: int) -> float:
-    """Seconds from `Prefer: wait=N` (RFC 7240), at most `most_seconds`; 0 when not asked."""
+def parse_prefer_wait(request: Request, max_seconds: int) -> float:
+    """Seconds from `Prefer: wait=N` (RFC 7240), at most `max_seconds`; 0 when not asked."""
     found = re.search(r"(?:^|[,;\s])wait\s*=\s*\"?(\d+)", request.headers.get("prefer", ""))
-    return min(float(found[1]), most_seconds) if found else 0.0
+    return min(float(found[1]), max_seconds) if found else 0.0
 
 
-def read_job(gateway: Gateway, job_id: UUID) -> Job | None:
+def load_job(gateway: GatewayContext, job_id: UUID) -> Job | None:
     with gateway.catalog.read() as session:
         return session.get(Job, job_id)
 
 
-async def wait_for_job(gateway: Gateway, job_id: UUID, seconds: float) -> Job | None:
+async def wait_for_job(gateway: GatewayContext, job_id: UUID, seconds: float) -> Job | None:
     """The job once it has ended, or as it is when the time is up; None when it is gone."""
-    await gateway.job_watch.wait_for_end(job_id, seconds)
-    return await run_in_threadpool(read_job, gateway, job_id)
+    await gateway.job_notifier.wait_until_finished(job_id, seconds)
+    return await run_in_threadpool(load_job, gateway, job_id)

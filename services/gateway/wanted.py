@@ -8,19 +8,19 @@ from fastapi import Depends, Query
 from pydantic import BaseModel, ConfigDict
 
 from services.gateway.filters import FilterDep
-from shared.comparison import MOST_RERANKED
-from shared.photo_filter import EVERYTHING, PhotoFilter
+from shared.comparison import MAX_RERANK_CANDIDATES
+from shared.photo_filter import NO_FILTER, PhotoFilter
 from shared.search_protocol import Mode
 
 
-class Wanted(BaseModel):
+class SearchParams(BaseModel):
     """What of the ranking is asked for. Kept with the job of a photo that is described first."""
 
     model_config = ConfigDict(frozen=True)
 
     top_k: int
     min_score: float | None = None
-    photos: PhotoFilter = EVERYTHING
+    photos: PhotoFilter = NO_FILTER
     word_weights: bool = True
     rerank: int | None = None
     explain: bool = False
@@ -29,7 +29,7 @@ class Wanted(BaseModel):
     most_seconds: float | None = None
 
     @property
-    def closely(self) -> bool:
+    def needs_comparison(self) -> bool:
         """Whether an extractor has to look at what the search finds."""
         return self.rerank is not None or self.explain
 
@@ -39,7 +39,7 @@ MinScore = Annotated[
     float | None,
     Query(ge=-1, le=1, description="Leave out photos less similar than this."),
 ]
-SearchMode = Annotated[
+ModeParam = Annotated[
     Mode,
     Query(
         alias="mode",
@@ -47,15 +47,15 @@ SearchMode = Annotated[
         "`deterministic`, leaving nothing to chance. The photos are the same.",
     ),
 ]
-MostRows = Annotated[
+MaxRows = Annotated[
     int | None,
     Query(ge=0, description="End the search once so many rows were read, and say so."),
 ]
-MostSeconds = Annotated[
+MaxSeconds = Annotated[
     float | None,
     Query(gt=0, description="End the search after so long, and say so."),
 ]
-WordWeightsWanted = Annotated[
+UseWordWeights = Annotated[
     bool,
     Query(
         alias="word_weights",
@@ -66,7 +66,7 @@ Rerank = Annotated[
     int | None,
     Query(
         ge=1,
-        le=MOST_RERANKED,
+        le=MAX_RERANK_CANDIDATES,
         description="Look at the first N photos patch by patch, and order them by what is seen.",
     ),
 ]
@@ -75,18 +75,18 @@ Explain = Annotated[
 ]
 
 
-def _read(
+def parse_search_params(
     photos: FilterDep,
     top_k: TopK = 10,
     min_score: MinScore = None,
-    word_weights: WordWeightsWanted = True,
+    word_weights: UseWordWeights = True,
     rerank: Rerank = None,
     explain: Explain = False,
-    mode: SearchMode = Mode.AUTO,
-    most_rows: MostRows = None,
-    most_seconds: MostSeconds = None,
-) -> Wanted:
-    return Wanted(
+    mode: ModeParam = Mode.AUTO,
+    most_rows: MaxRows = None,
+    most_seconds: MaxSeconds = None,
+) -> SearchParams:
+    return SearchParams(
         top_k=top_k,
         min_score=min_score,
         photos=photos,
@@ -99,4 +99,4 @@ def _read(
     )
 
 
-WantedDep = Annotated[Wanted, Depends(_read)]
+SearchParamsDep = Annotated[SearchParams, Depends(parse_search_params)]

@@ -9,27 +9,27 @@ from uuid import UUID
 from fastapi import APIRouter, Query
 from pydantic import BaseModel, ConfigDict, Field
 
-from services.gateway.context import GatewayDep, WebhookId, read_cursor
+from services.gateway.context import GatewayDep, WebhookId, parse_cursor
 from services.gateway.key_check import ADMIN
-from services.gateway.schemas import Answer
+from services.gateway.schemas import ResponseModel
 from shared.catalog.webhooks import (
     Delivery,
     DeliveryState,
     EventKind,
     Webhook,
+    create_webhook,
     delete_webhook,
     get_webhook,
     list_deliveries,
     list_webhooks,
-    make_webhook,
 )
-from shared.errors import PlacewiseError, invalid_field
-from shared.webhook_address import parse_target, resolve
+from shared.errors import PlacewiseError, invalid_field_error
+from shared.webhook_address import parse_webhook_url, resolve_webhook_target
 
 router = APIRouter(tags=["administration"])
 
 
-class NewWebhook(BaseModel):
+class CreateWebhookRequest(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
     url: str = Field(
@@ -38,14 +38,14 @@ class NewWebhook(BaseModel):
     events: list[EventKind] = Field(min_length=1, max_length=100)
 
 
-class WebhookAnswer(Answer):
+class WebhookResponse(ResponseModel):
     id: UUID
     url: str
     events: list[EventKind]
     created_at: datetime
 
     @classmethod
-    def of(cls, webhook: Webhook) -> WebhookAnswer:
+    def of(cls, webhook: Webhook) -> WebhookResponse:
         return cls(
             id=webhook.id,
             url=webhook.url,
@@ -54,11 +54,11 @@ class WebhookAnswer(Answer):
         )
 
 
-class WebhookMade(WebhookAnswer):
+class CreatedWebhookResponse(WebhookResponse):
     secret: str = Field(description="signs what is sent; it is shown this once")
 
 
-class DeliveryAnswer(Answer):
+class DeliveryResponse(ResponseModel):
     id: UUID
     event_id: UUID = Field(description="`webhook-id` is `msg_` and this, in every try")
     event: EventKind
@@ -71,7 +71,7 @@ class DeliveryAnswer(Answer):
     ended_at: datetime | None
 
     @classmethod
-    def of(cls, delivery: Delivery) -> DeliveryAnswer:
+    def of(cls, delivery: Delivery) -> DeliveryResponse:
         pending = delivery.state == DeliveryState.PENDING
         return cls(
             id=delivery.id,
@@ -87,76 +87,76 @@ class DeliveryAnswer(Answer):
         )
 
 
-class DeliveriesAnswer(Answer):
-    deliveries: list[DeliveryAnswer]
+class DeliveriesResponse(ResponseModel):
+    deliveries: list[DeliveryResponse]
     next_cursor: str | None
 
 
 @router.get(
     "/webhooks",
     operation_id="list_webhooks",
-    response_model=list[WebhookAnswer],
+    response_model=list[WebhookResponse],
     dependencies=[ADMIN],
 )
-def webhooks(gateway: GatewayDep) -> list[WebhookAnswer]:
+def read_webhooks(gateway: GatewayDep) -> list[WebhookResponse]:
     """Newest first, without their secrets."""
     with gateway.catalog.read() as session:
-        return [WebhookAnswer.of(webhook) for webhook in list_webhooks(session)]
+        return [WebhookResponse.of(webhook) for webhook in list_webhooks(session)]
 
 
 @router.post(
     "/webhooks",
     operation_id="create_webhook",
     status_code=201,
-    response_model=WebhookMade,
+    response_model=CreatedWebhookResponse,
     dependencies=[ADMIN],
 )
-def create_webhook(gateway: GatewayDep, wanted: NewWebhook) -> WebhookMade:
+def register_webhook(gateway: GatewayDep, body: CreateWebhookRequest) -> CreatedWebhookResponse:
     """Events are POSTed to the URL, signed with the answer's secret. It is shown this once, so this
     call takes no `Idempotency-Key`."""
     allow_private = gateway.settings.webhook_private_addresses
-    target = parse_target(wanted.url, allow_private=allow_private)
+    target = parse_webhook_url(body.url, allow_private=allow_private)
     try:
         # For whoever mistypes; what the name means when something is sent is looked up then.
-        resolve(target, allow_private=allow_private)
+        resolve_webhook_target(target, allow_private=allow_private)
     except PlacewiseError as error:
-        raise invalid_field("url", error.detail) from error
+        raise invalid_field_error("url", error.detail) from error
     with gateway.catalog.write() as session:
-        made = make_webhook(session, wanted.url, wanted.events)
-        answer = WebhookAnswer.of(made)
-        return WebhookMade(**answer.model_dump(), secret=made.secret)
+        made = create_webhook(session, body.url, body.events)
+        answer = WebhookResponse.of(made)
+        return CreatedWebhookResponse(**answer.model_dump(), secret=made.secret)
 
 
 @router.delete(
     "/webhooks/{webhook_id}",
     operation_id="delete_webhook",
-    response_model=WebhookAnswer,
+    response_model=WebhookResponse,
     dependencies=[ADMIN],
 )
-def remove_webhook(gateway: GatewayDep, webhook_id: WebhookId) -> WebhookAnswer:
+def remove_webhook_by_id(gateway: GatewayDep, webhook_id: WebhookId) -> WebhookResponse:
     """Nothing is sent to it any more, also not what waits; its log goes with it."""
     with gateway.catalog.write() as session:
-        return WebhookAnswer.of(delete_webhook(session, webhook_id))
+        return WebhookResponse.of(delete_webhook(session, webhook_id))
 
 
 @router.get(
     "/webhooks/{webhook_id}/deliveries",
     operation_id="list_deliveries",
-    response_model=DeliveriesAnswer,
+    response_model=DeliveriesResponse,
     dependencies=[ADMIN],
 )
-def deliveries(
+def read_deliveries(
     gateway: GatewayDep,
     webhook_id: WebhookId,
     limit: Annotated[int, Query(ge=1, le=1000)] = 50,
     cursor: Annotated[str | None, Query()] = None,
-) -> DeliveriesAnswer:
+) -> DeliveriesResponse:
     """What was sent and what waits, newest first; kept for JOB_RETENTION_DAYS."""
-    before = read_cursor(cursor)
+    before = parse_cursor(cursor)
     with gateway.catalog.read() as session:
         found = list_deliveries(session, get_webhook(session, webhook_id).id, limit + 1, before)
     page = found[:limit]
-    return DeliveriesAnswer(
-        deliveries=[DeliveryAnswer.of(delivery) for delivery in page],
+    return DeliveriesResponse(
+        deliveries=[DeliveryResponse.of(delivery) for delivery in page],
         next_cursor=str(page[-1].id) if len(found) > limit else None,
     )

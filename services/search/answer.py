@@ -13,26 +13,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.search import follow
-from services.search.scan import Query, exact_scores, scan, scan_at_least
+from services.search.scan import QueryRow, exact_scores, scan_min_score, scan_top_k
 from services.search.snapshot import Snapshot
-from services.search.together import Glances
-from shared.search_protocol import BOUND, EXHAUSTIVE, NONE, STATISTICAL, Hit, Mode
+from services.search.together import QueryBatcher
+from shared.search_protocol import BOUND, EXHAUSTIVE, NONE, STATISTICAL, Mode, SearchHit
 
 if TYPE_CHECKING:  # it leads to numba, which takes a while to load
     from services.search.bounded import Candidates
-    from services.search.rerank import Budget
+    from services.search.rerank import SearchBudget
 
 log = logging.getLogger(__name__)
 
 # One row in ten million is further off: then the codes are not trusted.
-MOST_Z = 5.5
+MAX_Z = 5.5
 
 # Equal rows are equal however they were added up, and then the photos' ids decide.
-DECIMALS = 12
+SCORE_DECIMALS = 12
 
-INT8_FIGURES_BYTES = 12  # scale, error and length, beside a code
+INT8_ROW_PARAMS_BYTES = 12  # scale, error and length, beside a code
 
-Rows = NDArray[np.int64]
+RowNumbers = NDArray[np.int64]
 Scores = NDArray[np.float64]
 
 NO_ROWS = np.empty(0, np.int64)
@@ -40,7 +40,7 @@ NO_SCORES = np.empty(0)
 
 
 @dataclass(frozen=True, slots=True)
-class Question:
+class SearchOptions:
     """The `k` most similar rows, of those that score at least `min_score`; and when to give up."""
 
     k: int
@@ -51,10 +51,10 @@ class Question:
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
+class SearchResult:
     """Hits in order, and how they were found, as `SearchResponse` tells it."""
 
-    hits: tuple[Hit, ...]
+    hits: tuple[SearchHit, ...]
     certificate: str
     certified_k: int
     rows_scanned: int
@@ -63,227 +63,245 @@ class Answer:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Compared:
+class _ScoredRows:
     """Rows with their exact scores, among them all that the answer needs."""
 
-    rows: Rows
+    rows: RowNumbers
     scores: Scores
     certificate: str
     scanned: int
     max_z: float | None = None
-    unseen: float = -math.inf
+    unseen_bound: float = -math.inf
     """What no other row exceeds."""
 
 
-def answer(
+def execute_query(
     snapshot: Snapshot,
-    query: Query,
-    asked: NDArray[np.bool_],
-    question: Question,
-    glances: Glances,
-) -> Answer:
-    """Ask with a row, (dimension,) of any length, for the snapshot's rows of `asked`, (n,).
+    query: QueryRow,
+    row_mask: NDArray[np.bool_],
+    options: SearchOptions,
+    batcher: QueryBatcher,
+) -> SearchResult:
+    """Ask with a row, (dimension,) of any length, for the snapshot's rows of `row_mask`, (n,).
 
     A query of zeros is similar to nothing.
     """
-    if not asked.any() or not query.any():
-        return Answer((), EXHAUSTIVE, 0, 0, 0)
-    found = _compare(snapshot, query, asked, question, glances)
-    hits = _ranked(snapshot, found.rows, found.scores, question)
-    return _answer([Hit(photo_id=photo_id, score=score) for photo_id, _, score in hits], found)
+    if not row_mask.any() or not query.any():
+        return SearchResult((), EXHAUSTIVE, 0, 0, 0)
+    found = _score_rows(snapshot, query, row_mask, options, batcher)
+    hits = _rank_photos(snapshot, found.rows, found.scores, options)
+    return _to_search_result(
+        [SearchHit(photo_id=photo_id, score=score) for photo_id, _, score in hits], found
+    )
 
 
-def weighted_answer(
+def execute_weighted_query(
     snapshot: Snapshot,
-    query: Query,
-    weighted: Query,
-    asked: NDArray[np.bool_],
-    question: Question,
-    glances: Glances,
-) -> Answer:
-    """The same in the order of the scores with the `weighted` query, each with its plain cosine
+    query: QueryRow,
+    weighted_query: QueryRow,
+    row_mask: NDArray[np.bool_],
+    options: SearchOptions,
+    batcher: QueryBatcher,
+) -> SearchResult:
+    """The same in the order of the scores with the `weighted_query` query, each with its plain cosine
     beside; `min_score` is of the plain one."""
-    scanned = int(np.count_nonzero(asked))
-    if question.min_score is not None and scanned:
-        asked = _at_least(snapshot, query, asked, question, glances)
-    if not asked.any():
-        return Answer((), EXHAUSTIVE, 0, scanned, 0)
-    found = _compare(snapshot, weighted, asked, replace(question, min_score=None), glances)
-    ranked = _ranked(snapshot, found.rows, found.scores, replace(question, min_score=None))
-    plain = _rounded(exact_scores(snapshot.chunks, query, np.array([row for _, row, _ in ranked])))
+    scanned = int(np.count_nonzero(row_mask))
+    if options.min_score is not None and scanned:
+        row_mask = _mask_min_score(snapshot, query, row_mask, options, batcher)
+    if not row_mask.any():
+        return SearchResult((), EXHAUSTIVE, 0, scanned, 0)
+    found = _score_rows(
+        snapshot, weighted_query, row_mask, replace(options, min_score=None), batcher
+    )
+    ranked = _rank_photos(snapshot, found.rows, found.scores, replace(options, min_score=None))
+    plain = _round_scores(
+        exact_scores(snapshot.chunks, query, np.array([row for _, row, _ in ranked]))
+    )
     hits = [
-        Hit(photo_id=photo_id, score=score, weighted_score=weighted_score)
+        SearchHit(photo_id=photo_id, score=score, weighted_score=weighted_score)
         for (photo_id, _, weighted_score), score in zip(ranked, plain.tolist(), strict=True)
     ]
-    return _answer(hits, replace(found, scanned=scanned))
+    return _to_search_result(hits, replace(found, scanned=scanned))
 
 
-def worth_codes(selected: int, k: int) -> bool:
+def sign_codes_pay_off(selected: int, k: int) -> bool:
     """Whether codes spare anything: they leave about twice k rows to compare, and cost as much as
     some dozens."""
     return selected > 64 + 4 * k
 
 
-def _compare(
+def _score_rows(
     snapshot: Snapshot,
-    query: Query,
+    query: QueryRow,
     asked: NDArray[np.bool_],
-    question: Question,
-    glances: Glances,
-) -> _Compared:
+    question: SearchOptions,
+    glances: QueryBatcher,
+) -> _ScoredRows:
     selected = int(np.count_nonzero(asked))
     found = None
-    if question.mode != Mode.DENSE and worth_codes(selected, question.k):
-        found = _on_device(snapshot, query, asked, question)
-        if found is None and question.mode == Mode.AUTO and snapshot.coded:
-            found = _by_codes(snapshot, query, asked, question, glances)
-    if found is None and _bounded(snapshot, question.mode, selected, question.k):
-        found = _by_bound(snapshot, query, asked, question)
+    if question.mode != Mode.DENSE and sign_codes_pay_off(selected, question.k):
+        found = _search_on_gpu(snapshot, query, asked, question)
+        if found is None and question.mode == Mode.AUTO and snapshot.has_sign_codes:
+            found = _search_by_sign_codes(snapshot, query, asked, question, glances)
+    if found is None and _uses_int8_codes(snapshot, question.mode, selected, question.k):
+        found = _search_by_int8(snapshot, query, asked, question)
     if found is None:
-        rows, scores = scan(snapshot.chunks, query, question.k, asked)
-        found = _Compared(rows, scores, EXHAUSTIVE, selected)
+        rows, scores = scan_top_k(snapshot.chunks, query, question.k, asked)
+        found = _ScoredRows(rows, scores, EXHAUSTIVE, selected)
     return found
 
 
-def _bounded(snapshot: Snapshot, mode: Mode, selected: int, k: int) -> bool:
+def _uses_int8_codes(snapshot: Snapshot, mode: Mode, selected: int, k: int) -> bool:
     """Whether int8 codes are there, wanted, and spare anything."""
-    wanted = mode == Mode.DETERMINISTIC or (mode == Mode.AUTO and not snapshot.coded)
-    return wanted and snapshot.bounded and worth_int8(selected, k, snapshot.dimension)
+    wanted = mode == Mode.DETERMINISTIC or (mode == Mode.AUTO and not snapshot.has_sign_codes)
+    return (
+        wanted and snapshot.has_int8_codes and int8_codes_pay_off(selected, k, snapshot.dimension)
+    )
 
 
-def _at_least(
+def _mask_min_score(
     snapshot: Snapshot,
-    query: Query,
+    query: QueryRow,
     asked: NDArray[np.bool_],
-    question: Question,
-    glances: Glances,
+    question: SearchOptions,
+    glances: QueryBatcher,
 ) -> NDArray[np.bool_]:
     """Of the rows that are asked for, those that score at least `min_score`."""
     assert question.min_score is not None
     found = None
-    if question.mode == Mode.AUTO and snapshot.coded and worth_codes(len(asked), 1):
-        everything = Question(len(asked), question.min_score)
-        found = _by_codes(snapshot, query, asked, everything, glances)
+    if question.mode == Mode.AUTO and snapshot.has_sign_codes and sign_codes_pay_off(len(asked), 1):
+        everything = SearchOptions(len(asked), question.min_score)
+        found = _search_by_sign_codes(snapshot, query, asked, everything, glances)
     if found is not None:
         rows, scores = found.rows, found.scores
     else:
-        rows, scores = scan_at_least(snapshot.chunks, query, question.min_score, asked)
+        rows, scores = scan_min_score(snapshot.chunks, query, question.min_score, asked)
     passing = np.zeros(len(asked), bool)
-    passing[rows[_rounded(scores) >= question.min_score]] = True
+    passing[rows[_round_scores(scores) >= question.min_score]] = True
     return passing
 
 
-def worth_int8(selected: int, k: int, dimension: int) -> bool:
+def int8_codes_pay_off(selected: int, k: int, dimension: int) -> bool:
     """Whether int8 codes, and about twice k rows to compare, are less to read than all rows."""
-    from shared.codes.rotation import rotation
+    from shared.codes.rotation import get_rotation
 
     row_bytes = 4 * dimension
-    code_bytes = rotation(dimension).padded + INT8_FIGURES_BYTES
+    code_bytes = get_rotation(dimension).padded + INT8_ROW_PARAMS_BYTES
     return selected * code_bytes + (2 * k + 16) * row_bytes < selected * row_bytes
 
 
-def lacks_int8(snapshot: Snapshot, asked: NDArray[np.bool_], k: int) -> bool:
+def needs_int8_codes(snapshot: Snapshot, row_mask: NDArray[np.bool_], k: int) -> bool:
     """Whether a search that leaves nothing to chance has to read every row, for want of codes."""
-    if snapshot.bounded or snapshot.resident or snapshot.row_bytes < follow.CODED_FROM_BYTES:
+    if (
+        snapshot.has_int8_codes
+        or snapshot.gpu_snapshot
+        or snapshot.row_bytes < follow.MIN_CODED_BYTES
+    ):
         return False
     if not snapshot.chunks:
         return False
-    return worth_int8(int(np.count_nonzero(asked)), k, snapshot.dimension)
+    return int8_codes_pay_off(int(np.count_nonzero(row_mask)), k, snapshot.dimension)
 
 
-def _on_device(
-    snapshot: Snapshot, query: Query, asked: NDArray[np.bool_], question: Question
-) -> _Compared | None:
+def _search_on_gpu(
+    snapshot: Snapshot, query: QueryRow, asked: NDArray[np.bool_], question: SearchOptions
+) -> _ScoredRows | None:
     """None where the snapshot lies on no GPU, or that fails."""
-    resident = snapshot.resident
+    resident = snapshot.gpu_snapshot
     if resident is None or resident.failure is not None:
         return None
-    from services.search.gpu import Asked, DeviceFailed
+    from services.search.gpu import GpuError, GpuQuery
 
-    budget = _budget(question)
+    budget = _search_budget(question)
     try:
-        (near,) = resident.candidates([Asked(query, asked, question.k, _least(question))])
-    except DeviceFailed as error:
+        (near,) = resident.candidates([GpuQuery(query, asked, question.k, _score_floor(question))])
+    except GpuError as error:
         log.error("generation %s is searched by the CPU: %s", snapshot.generation_id, error)
         return None
-    return _settled(snapshot, query, near, asked, question, budget)
+    return _rerank_candidates(snapshot, query, near, asked, question, budget)
 
 
-def _by_bound(
-    snapshot: Snapshot, query: Query, asked: NDArray[np.bool_], question: Question
-) -> _Compared:
-    from services.search.bounded import candidates
+def _search_by_int8(
+    snapshot: Snapshot, query: QueryRow, asked: NDArray[np.bool_], question: SearchOptions
+) -> _ScoredRows:
+    from services.search.bounded import find_candidates
     from shared.codes.int8 import Int8Query
 
-    budget = _budget(question)
-    coded = Int8Query.of(query)
-    near = candidates(snapshot.int8_blocks, coded, asked, question.k, _least(question), budget)
+    budget = _search_budget(question)
+    coded = Int8Query.from_row(query)
+    near = find_candidates(
+        snapshot.int8_blocks, coded, asked, question.k, _score_floor(question), budget
+    )
     if near is None:
-        return _Compared(NO_ROWS, NO_SCORES, NONE, int(np.count_nonzero(asked)), unseen=math.inf)
-    return _settled(snapshot, query, near, asked, question, budget)
+        return _ScoredRows(
+            NO_ROWS, NO_SCORES, NONE, int(np.count_nonzero(asked)), unseen_bound=math.inf
+        )
+    return _rerank_candidates(snapshot, query, near, asked, question, budget)
 
 
-def _settled(
+def _rerank_candidates(
     snapshot: Snapshot,
-    query: Query,
+    query: QueryRow,
     near: Candidates,
     asked: NDArray[np.bool_],
-    question: Question,
-    budget: Budget,
-) -> _Compared:
+    question: SearchOptions,
+    budget: SearchBudget,
+) -> _ScoredRows:
     """Compare what may be among the best exactly."""
-    from services.search.rerank import Rerank
+    from services.search.rerank import ExactReranker
 
     norm = float(np.linalg.norm(query.astype(np.float64)))
-    rerank = Rerank(snapshot.row_blocks, query, norm, question.k, snapshot.read_ahead)
-    found = rerank.best(near.rows, near.reach, near.floor, budget)
-    certificate = BOUND if found.whole else NONE
+    rerank = ExactReranker(snapshot.row_blocks, query, norm, question.k, snapshot.prefetch_rows)
+    found = rerank.find_best(near.rows, near.upper_bounds, near.floor, budget)
+    certificate = BOUND if found.is_complete else NONE
     scanned = int(np.count_nonzero(asked))
-    return _Compared(found.rows, found.scores, certificate, scanned, unseen=found.unseen)
+    return _ScoredRows(
+        found.rows, found.scores, certificate, scanned, unseen_bound=found.unseen_bound
+    )
 
 
-def _least(question: Question) -> float:
+def _score_floor(question: SearchOptions) -> float:
     return -math.inf if question.min_score is None else question.min_score
 
 
-def _budget(question: Question) -> Budget:
-    from services.search.rerank import Budget
+def _search_budget(question: SearchOptions) -> SearchBudget:
+    from services.search.rerank import SearchBudget
 
     until = question.most_seconds and time.monotonic() + question.most_seconds
-    return Budget(question.most_rows, until)
+    return SearchBudget(question.most_rows, until)
 
 
-def _by_codes(
+def _search_by_sign_codes(
     snapshot: Snapshot,
-    query: Query,
+    query: QueryRow,
     asked: NDArray[np.bool_],
-    question: Question,
-    glances: Glances,
-) -> _Compared | None:
+    question: SearchOptions,
+    glances: QueryBatcher,
+) -> _ScoredRows | None:
     """None when an estimate was further off than chance explains."""
-    from services.search.cascade import CodedQuery, Refinement
-    from shared.codes.rotation import rotation
+    from services.search.cascade import SignCodedQuery, SignCodeSearch
+    from shared.codes.rotation import get_rotation
 
-    budget = _budget(question)
-    coded = CodedQuery.of(query, rotation(len(query)))
-    first = glances.glance(snapshot.blocks, coded, asked)
-    refinement = Refinement(
-        snapshot.blocks, coded, question.k, question.min_score, snapshot.read_ahead
+    budget = _search_budget(question)
+    coded = SignCodedQuery.of(query, get_rotation(len(query)))
+    first = glances.scan(snapshot.sign_code_blocks, coded, asked)
+    refinement = SignCodeSearch(
+        snapshot.sign_code_blocks, coded, question.k, question.min_score, snapshot.prefetch_rows
     )
     found = refinement.search(first, budget)
-    if found.max_z > MOST_Z:
+    if found.max_z > MAX_Z:
         return None
-    certificate = STATISTICAL if found.whole else NONE
-    return _Compared(
-        found.rows, found.scores, certificate, found.scanned, found.max_z, found.unseen
+    certificate = STATISTICAL if found.is_complete else NONE
+    return _ScoredRows(
+        found.rows, found.scores, certificate, found.scanned, found.max_z, found.unseen_bound
     )
 
 
-def _ranked(
-    snapshot: Snapshot, rows: Rows, scores: Scores, question: Question
+def _rank_photos(
+    snapshot: Snapshot, rows: RowNumbers, scores: Scores, question: SearchOptions
 ) -> list[tuple[UUID, int, float]]:
     """(photo, row, score), highest score first, ties by photo id."""
-    scores = _rounded(scores)
+    scores = _round_scores(scores)
     if question.min_score is not None:
         enough = scores >= question.min_score
         rows, scores = rows[enough], scores[enough]
@@ -301,17 +319,17 @@ def _ranked(
     return [(photo_id, row, -score) for score, photo_id, row in ranked[: question.k]]
 
 
-def _answer(hits: list[Hit], found: _Compared) -> Answer:
-    return Answer(
+def _to_search_result(hits: list[SearchHit], found: _ScoredRows) -> SearchResult:
+    return SearchResult(
         hits=tuple(hits),
         certificate=found.certificate,
-        certified_k=sum(hit.ranked_by > found.unseen for hit in hits),
+        certified_k=sum(hit.ranked_by > found.unseen_bound for hit in hits),
         rows_scanned=found.scanned,
         rows_reranked=len(found.rows),
         max_z=found.max_z,
     )
 
 
-def _rounded(scores: Scores) -> Scores:
+def _round_scores(scores: Scores) -> Scores:
     # Rounding may not turn a cosine into 1.0000001, either.
-    return np.clip(np.round(scores, DECIMALS), -1.0, 1.0)
+    return np.clip(np.round(scores, SCORE_DECIMALS), -1.0, 1.0)

@@ -12,15 +12,15 @@ from fastapi import FastAPI, Response
 from prometheus_client import CollectorRegistry
 from pydantic import BaseModel
 
-from services.call_log import CallLog
-from services.search.metrics import SearchMetrics
+from services.call_log import RequestLogMiddleware
+from services.search.metrics import MeteredSearch
 from services.search.worker import SearchWorker
-from shared.problems import PROBLEM_RESPONSES, install_problem_handlers
-from shared.search_protocol import Lag, SearchRequest, SearchResponse, SearchStatus
-from shared.telemetry.metrics_server import CONTENT_TYPE
+from shared.problems import PROBLEM_RESPONSES, install_exception_handlers
+from shared.search_protocol import ReplicationLag, SearchRequest, SearchResponse, SearchStatus
+from shared.telemetry.metrics_server import METRICS_CONTENT_TYPE
 
 # Several looks at the catalog were missed, or loading takes that long.
-READY_LAG_SECONDS = 5.0
+MAX_READY_LAG_SECONDS = 5.0
 
 
 class Readiness(BaseModel):
@@ -30,20 +30,20 @@ class Readiness(BaseModel):
     status: str
     shard: str
     reasons: list[str]
-    lags: dict[UUID, Lag]
+    lags: dict[UUID, ReplicationLag]
     missing: list[str]
 
 
-def create_app(worker: SearchWorker, registry: CollectorRegistry | None = None) -> FastAPI:
+def create_search_app(worker: SearchWorker, registry: CollectorRegistry | None = None) -> FastAPI:
     """The HTTP form of one worker, which someone else makes follow the catalog."""
     app = FastAPI(
         title="Placewise search",
         description=f"Exact cosine top-k on shard {worker.shard} of every map.",
         responses=PROBLEM_RESPONSES,
     )
-    install_problem_handlers(app)
-    metrics = SearchMetrics(worker, registry)
-    app.add_middleware(CallLog, quiet=True)
+    install_exception_handlers(app)
+    metrics = MeteredSearch(worker, registry)
+    app.add_middleware(RequestLogMiddleware, quiet=True)
 
     @app.post("/search", operation_id="search", response_model=SearchResponse)
     def search(request: SearchRequest) -> Response:
@@ -66,28 +66,28 @@ def create_app(worker: SearchWorker, registry: CollectorRegistry | None = None) 
     async def readyz(response: Response) -> Readiness:
         """503 while what answers is behind the catalog. A chunk that can't be read makes the
         worker `degraded`, and the rest is answered: no restart would mend it."""
-        found = readiness(worker)
+        found = check_readiness(worker)
         response.status_code = 503 if found.reasons else 200
         return found
 
     @app.get("/metrics", operation_id="metrics", response_class=Response)
     async def read_metrics() -> Response:
         """Prometheus' text format."""
-        return Response(metrics.text(), media_type=CONTENT_TYPE)
+        return Response(metrics.render(), media_type=METRICS_CONTENT_TYPE)
 
     return app
 
 
-def readiness(worker: SearchWorker) -> Readiness:
+def check_readiness(worker: SearchWorker) -> Readiness:
     """A generation that is only being built may lag: no one asks for it yet."""
     status = worker.status()
     reasons = []
-    if not worker.lags.has_looked():
+    if not worker.replication_lag.has_read_catalog():
         reasons.append("the catalog was not read yet")
     for generation_id, lag in status.lags.items():
         if not lag.answers:
             continue
-        if lag.seconds > READY_LAG_SECONDS or generation_id not in status.versions:
+        if lag.seconds > MAX_READY_LAG_SECONDS or generation_id not in status.versions:
             reasons.append(
                 f"generation {generation_id} is {lag.versions} versions behind, "
                 f"level {lag.seconds:.1f} s ago"

@@ -20,26 +20,26 @@ class RowBlocks:
     """n rows in c blocks; who makes it keeps them alive."""
 
     dimension: int
-    first: Indices
+    first_rows: Indices
     """(c + 1,): the number of each block's first row; the last is n."""
-    rows: Addresses
+    row_addresses: Addresses
     """(c,): where the block's float32 rows begin."""
-    kept: object
+    keep_alive: object
     """What has to live as long."""
 
     @classmethod
     def of(cls, chunks: Sequence[LoadedChunk]) -> RowBlocks:
         return cls(
             dimension=chunks[0].rows.shape[1],
-            first=np.cumsum([0, *(len(chunk.rows) for chunk in chunks)]),
-            rows=addresses(chunk.rows for chunk in chunks),
-            kept=chunks,
+            first_rows=np.cumsum([0, *(len(chunk.rows) for chunk in chunks)]),
+            row_addresses=array_addresses(chunk.rows for chunk in chunks),
+            keep_alive=chunks,
         )
 
     def __len__(self) -> int:
-        return int(self.first[-1])
+        return int(self.first_rows[-1])
 
 
-def addresses(arrays: Iterable[NDArray[Any]]) -> Addresses:
+def array_addresses(arrays: Iterable[NDArray[Any]]) -> Addresses:
     """Where each array begins."""
     return np.array([array.ctypes.data for array in arrays], np.uint64)

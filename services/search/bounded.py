@@ -17,22 +17,24 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from services.search.blocks import Addresses, Indices, RowBlocks, addresses
-from services.search.kernels import above_floor
+from services.search.blocks import Addresses, Indices, RowBlocks, array_addresses
+from services.search.kernels import rows_above_floor
 from services.search.loaded_chunk import LoadedChunk
-from services.search.rerank import Budget, Scores
+from services.search.rerank import Scores, SearchBudget
 from shared.codes.int8 import Int8Query
 
-LOOK_BYTES = 1 << 28  # of codes between two looks at the clock: about a hundredth of a second
+BUDGET_CHECK_BYTES = (
+    1 << 28
+)  # of codes between two looks at the clock: about a hundredth of a second
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Int8Blocks(RowBlocks):
     """Where the int8 codes and the rows of n photos lie, in c blocks."""
 
-    numbers: Addresses
+    code_addresses: Addresses
     """(c,): where the block's bytes begin."""
-    figures: NDArray[np.float32]
+    row_params: NDArray[np.float32]
     """(3, n): scale, error and length of each row."""
 
     @classmethod
@@ -44,11 +46,11 @@ class Int8Blocks(RowBlocks):
         rows = RowBlocks.of(chunks)
         return cls(
             dimension=rows.dimension,
-            first=rows.first,
-            rows=rows.rows,
-            kept=rows.kept,
-            numbers=addresses(code.numbers for code in codes),
-            figures=np.concatenate(
+            first_rows=rows.first_rows,
+            row_addresses=rows.row_addresses,
+            keep_alive=rows.keep_alive,
+            code_addresses=array_addresses(code.numbers for code in codes),
+            row_params=np.concatenate(
                 [np.stack([code.scales, code.errors, code.lengths]) for code in codes], axis=1
             ),
         )
@@ -59,36 +61,36 @@ class Candidates:
     """Every row that may be among the k best."""
 
     rows: Indices
-    reach: Scores
+    upper_bounds: Scores
     """What each scores at most."""
     floor: float
     """What the k-th best scores at least; -inf where there are fewer."""
 
 
-def candidates(
+def find_candidates(
     blocks: Int8Blocks,
     query: Int8Query,
-    asked: NDArray[np.bool_],
+    row_mask: NDArray[np.bool_],
     k: int,
-    least: float,
-    budget: Budget,
+    min_score: float,
+    budget: SearchBudget,
 ) -> Candidates | None:
     """Of the rows asked for, (n,) bool, those that may be among the `k` best and score at least
-    `least`; None when the time is over before all were looked at."""
+    `min_score`; None when the time is over before all were looked at."""
     certain = np.full(k, -math.inf)
     rows, reach = np.empty(len(blocks), np.int64), np.empty(len(blocks))
-    step = max(1, LOOK_BYTES // len(query.numbers))
+    step = max(1, BUDGET_CHECK_BYTES // len(query.numbers))
     count = 0
     for begin in range(0, len(blocks), step):
-        if budget.spent(-1):
+        if budget.is_exhausted(-1):
             return None
-        count = above_floor(
-            blocks.numbers,
-            blocks.first,
-            asked,
-            blocks.figures,
+        count = rows_above_floor(
+            blocks.code_addresses,
+            blocks.first_rows,
+            row_mask,
+            blocks.row_params,
             query.numbers,
-            (query.scale, query.error, least),
+            (query.scale, query.error, min_score),
             begin,
             min(len(blocks), begin + step),
             certain,
@@ -96,6 +98,6 @@ def candidates(
             reach,
             count,
         )
-    floor = max(least, float(certain[0]))
+    floor = max(min_score, float(certain[0]))
     near = reach[:count] >= floor
     return Candidates(rows[:count][near], reach[:count][near], floor)

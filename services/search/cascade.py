@@ -22,40 +22,40 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from services.search.blocks import Addresses, Indices, RowBlocks, addresses
+from services.search.blocks import Addresses, Indices, RowBlocks, array_addresses
 from services.search.kernels import (
-    NOT_ASKED,
+    EXCLUDED_DISTANCE,
     PLANES,
-    distances,
-    distances_at,
-    in_planes,
-    squares,
-    weighted_at,
+    add_hamming_distances,
+    hamming_distances,
+    quantize_to_bit_planes,
+    squared_norm,
+    weighted_bit_sums,
 )
 from services.search.loaded_chunk import LoadedChunk
-from services.search.parts import in_parts
-from services.search.rerank import Budget, Rerank, Scores
-from shared.codes.rotation import Rotation, rotation
-from shared.codes.signs import WORD, Words, level_ends, sign_codes
+from services.search.parts import parallel_for
+from services.search.rerank import ExactReranker, Scores, SearchBudget
+from shared.codes.rotation import Rotation, get_rotation
+from shared.codes.signs import WORD_BITS, Words, encode_signs, level_ends
 
-BOUND = 6.0
-FIRST_LOOK = 64  # rows whose whole codes are looked at early, for a floor
-FEW = 4 * FIRST_LOOK
+BOUND_DEVIATIONS = 6.0
+SEED_ROWS = 64  # rows whose whole codes are looked at early, for a floor
+PRUNE_MIN_ROWS = 4 * SEED_ROWS
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Blocks(RowBlocks):
+class SignCodeBlocks(RowBlocks):
     """Where the sign codes and the rows of n photos lie, in c blocks."""
 
-    levels: Addresses
+    level_addresses: Addresses
     """(levels, c): where each block's codes of a level begin."""
     norms: NDArray[np.float32]
     """(n,): |x|_1 of each rotated row; 0 for a row of zeros."""
-    zeros: Indices
+    zero_rows: Indices
     """The rows of zeros."""
 
     @classmethod
-    def of(cls, chunks: Sequence[LoadedChunk]) -> Blocks:
+    def of(cls, chunks: Sequence[LoadedChunk]) -> SignCodeBlocks:
         """Those of chunks that have their codes."""
         codes = [chunk.codes for chunk in chunks if chunk.codes is not None]
         if len(codes) < len(chunks):
@@ -64,19 +64,19 @@ class Blocks(RowBlocks):
         norms = np.concatenate([code.norms for code in codes])
         return cls(
             dimension=rows.dimension,
-            first=rows.first,
-            rows=rows.rows,
-            kept=rows.kept,
-            levels=np.stack(
-                [addresses(parts) for parts in zip(*(c.levels for c in codes), strict=True)]
+            first_rows=rows.first_rows,
+            row_addresses=rows.row_addresses,
+            keep_alive=rows.keep_alive,
+            level_addresses=np.stack(
+                [array_addresses(parts) for parts in zip(*(c.levels for c in codes), strict=True)]
             ),
             norms=norms,
-            zeros=np.flatnonzero(norms == 0),
+            zero_rows=np.flatnonzero(norms == 0),
         )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class CodedQuery:
+class SignCodedQuery:
     """A query as the codes need it."""
 
     row: NDArray[np.float32]
@@ -92,18 +92,18 @@ class CodedQuery:
     """A whole number w stands for low + step * w."""
     total: float
     """The sum of what they stand for."""
-    share: float
+    query_product: float
     """Their product with the rotated unit query, by which products with them are divided."""
-    blur: float
+    quantization_error: float
     """How far off they are, squared, once they are divided so."""
 
     @classmethod
-    def of(cls, row: NDArray[np.float32], turn: Rotation) -> CodedQuery:
-        rotated = turn.rotate(row[np.newaxis])[0]
-        bits = np.empty(turn.padded // WORD, np.uint64)
+    def of(cls, row: NDArray[np.float32], row_rotation: Rotation) -> SignCodedQuery:
+        rotated = row_rotation.rotate(row[np.newaxis])[0]
+        bits = np.empty(row_rotation.padded // WORD_BITS, np.uint64)
         planes = np.empty((PLANES, len(bits)), np.uint64)
-        low, step, total, product, square = in_planes(rotated, bits, planes)
-        norm = math.sqrt(squares(row))
+        low, step, total, product, square = quantize_to_bit_planes(rotated, bits, planes)
+        norm = math.sqrt(squared_norm(row))
         return cls(
             row=row,
             norm=norm,
@@ -112,13 +112,13 @@ class CodedQuery:
             low=low,
             step=step,
             total=total,
-            share=product / norm,
-            blur=max(0.0, square * norm**2 / product**2 - 1.0),
+            query_product=product / norm,
+            quantization_error=max(0.0, square * norm**2 / product**2 - 1.0),
         )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Found:
+class SignCodeResult:
     """Every row that was compared exactly, and what is known of the others."""
 
     rows: Indices
@@ -127,23 +127,23 @@ class Found:
     scanned: int
     max_z: float
     """The largest error of an estimate, in its standard deviations, of the rows compared."""
-    unseen: float
+    unseen_bound: float
     """No other row reaches more than this (up to BOUND); -inf where none can matter."""
 
     @property
-    def whole(self) -> bool:
+    def is_complete(self) -> bool:
         """Whether it did not end early."""
-        return self.unseen == -math.inf
+        return self.unseen_bound == -math.inf
 
     @classmethod
-    def nothing(cls, first: Glance, unseen: float) -> Found:
+    def interrupted(cls, first: FirstLevelScan, unseen: float) -> SignCodeResult:
         """Given up before any row was compared exactly."""
         scanned = int(first.counts.sum())
         return cls(np.empty(0, np.int64), np.empty(0), scanned, 0.0, unseen)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Glance:
+class FirstLevelScan:
     """How many of the first bits of every row differ from a query's."""
 
     distances: NDArray[np.uint16]
@@ -151,52 +151,56 @@ class Glance:
     counts: NDArray[np.int64]
     """(bits + 1,): how many rows have each distance."""
 
-    def nearest(self, wanted: int) -> Indices:
+    def nearest_rows(self, wanted: int) -> Indices:
         """About `wanted` rows of the smallest distances: more where many are equal."""
         reached = np.searchsorted(np.cumsum(self.counts), min(wanted, int(self.counts.sum())))
         return np.flatnonzero(self.distances <= reached)[: 4 * wanted]
 
 
-def glance(
-    blocks: Blocks, queries: Sequence[CodedQuery], asked: Sequence[NDArray[np.bool_]]
-) -> list[Glance]:
+def scan_first_level(
+    blocks: SignCodeBlocks,
+    queries: Sequence[SignCodedQuery],
+    row_masks: Sequence[NDArray[np.bool_]],
+) -> list[FirstLevelScan]:
     """Compare the first bits of the rows that each query asks for, (n,) bool: one way through
     memory for all queries, each of which sees what it would see alone."""
-    words = int(level_ends(rotation(blocks.dimension).padded)[0])
+    words = int(level_ends(get_rotation(blocks.dimension).padded)[0])
     bits = np.stack([query.bits[:words] for query in queries])
-    masks = np.stack(asked)
+    masks = np.stack(row_masks)
     found = np.empty((len(queries), len(blocks)), np.uint16)
     counts: list[NDArray[np.int64]] = []
 
     def part(begin: int, end: int) -> None:
-        own = np.zeros((len(queries), words * WORD + 1), np.int64)
-        distances(blocks.levels[0], blocks.first, masks, bits, begin, end, found, own)
+        own = np.zeros((len(queries), words * WORD_BITS + 1), np.int64)
+        hamming_distances(
+            blocks.level_addresses[0], blocks.first_rows, masks, bits, begin, end, found, own
+        )
         counts.append(own)
 
-    in_parts(part, len(blocks), 8 * words)
+    parallel_for(part, len(blocks), 8 * words)
     total = np.sum(counts, axis=0)
-    return [Glance(distance, count) for distance, count in zip(found, total, strict=True)]
+    return [FirstLevelScan(distance, count) for distance, count in zip(found, total, strict=True)]
 
 
 @cache
-def warm_up() -> None:
+def compile_kernels() -> None:
     """Have everything compiled that a search calls, so that no query waits for it."""
     row = np.full(4096, 1 / 64, np.float32)
-    codes = sign_codes(row[np.newaxis])
-    blocks = Blocks(
+    codes = encode_signs(row[np.newaxis])
+    blocks = SignCodeBlocks(
         dimension=len(row),
-        first=np.array([0, 1]),
-        rows=addresses([row]),
-        kept=(codes, row),
-        levels=np.stack([addresses([level]) for level in codes.levels]),
+        first_rows=np.array([0, 1]),
+        row_addresses=array_addresses([row]),
+        keep_alive=(codes, row),
+        level_addresses=np.stack([array_addresses([level]) for level in codes.levels]),
         norms=codes.norms,
-        zeros=np.empty(0, np.int64),
+        zero_rows=np.empty(0, np.int64),
     )
-    query = CodedQuery.of(row, rotation(len(row)))
-    (first,) = glance(blocks, [query], [np.ones(1, bool)])
+    query = SignCodedQuery.of(row, get_rotation(len(row)))
+    (first,) = scan_first_level(blocks, [query], [np.ones(1, bool)])
     none = np.empty(0, np.int64)
-    distances_at(blocks.levels[0], blocks.first, none, query.bits, none)
-    Refinement(blocks, query, 1, None, lambda _: None).search(first, Budget())
+    add_hamming_distances(blocks.level_addresses[0], blocks.first_rows, none, query.bits, none)
+    SignCodeSearch(blocks, query, 1, None, lambda _: None).search(first, SearchBudget())
 
 
 def hamming_deviation(bits: int, padded: int) -> float:
@@ -208,101 +212,103 @@ def hamming_deviation(bits: int, padded: int) -> float:
     return math.pi / 2 * math.sqrt((1 - (2 / math.pi) ** 2 * bits / padded) / bits)
 
 
-class Refinement:
+class SignCodeSearch:
     """From a glance at every row to the k best."""
 
     def __init__(
         self,
-        blocks: Blocks,
-        query: CodedQuery,
+        blocks: SignCodeBlocks,
+        query: SignCodedQuery,
         k: int,
-        least: float | None,
-        read_ahead: Callable[[Indices], None],
+        min_score: float | None,
+        prefetch: Callable[[Indices], None],
     ) -> None:
-        """`least`: rows below this score are not wanted. `read_ahead` is told of rows before they
+        """`min_score`: rows below this score are not wanted. `prefetch` is told of rows before they
         are compared exactly."""
         self._blocks = blocks
         self._query = query
         self._k = k
-        self._floor = -math.inf if least is None else least  # what a row has to reach to matter
-        self._read_ahead = read_ahead
-        self._padded = rotation(blocks.dimension).padded
-        self._ends = level_ends(self._padded)
-        self._estimated = _Estimates.none()
+        self._floor = (
+            -math.inf if min_score is None else min_score
+        )  # what a row has to reach to matter
+        self._prefetch = prefetch
+        self._padded = get_rotation(blocks.dimension).padded
+        self._level_ends = level_ends(self._padded)
+        self._estimated = _Estimates.empty()
 
-    def search(self, first: Glance, budget: Budget) -> Found:
+    def search(self, first: FirstLevelScan, budget: SearchBudget) -> SignCodeResult:
         """Go through the levels with what the first one has shown."""
         if self._k < int(first.counts.sum()):  # else every row is wanted that is good enough
-            self._raise_floor(first.nearest(max(FIRST_LOOK, self._k)))
-        rows = np.flatnonzero(first.distances <= self._limit(0))
+            self._raise_floor(first.nearest_rows(max(SEED_ROWS, self._k)))
+        rows = np.flatnonzero(first.distances <= self._max_distance(0))
         differ = first.distances[rows].astype(np.int64)
-        last = len(self._ends) - 1
+        last = len(self._level_ends) - 1
         for level in range(1, last + 1):
-            if level == last and len(rows) <= FEW:
+            if level == last and len(rows) <= PRUNE_MIN_ROWS:
                 break  # weighing all their bits takes no longer than counting the rest of them
-            self._count(rows, level, differ)
+            self._add_distances(rows, level, differ)
             rows, differ = self._prune(rows, level, differ)
-            if len(rows) > FEW:  # a better floor spares more than it costs
-                best = np.argpartition(differ, FIRST_LOOK)[:FIRST_LOOK]
+            if len(rows) > PRUNE_MIN_ROWS:  # a better floor spares more than it costs
+                best = np.argpartition(differ, SEED_ROWS)[:SEED_ROWS]
                 self._raise_floor(rows[best])
                 rows, differ = self._prune(rows, level, differ)
-            if budget.spent(0):
-                return Found.nothing(first, self._reach(level, differ))
-        zeros = self._blocks.zeros
+            if budget.is_exhausted(0):
+                return SignCodeResult.interrupted(first, self._max_score(level, differ))
+        zeros = self._blocks.zero_rows
         if len(zeros):
-            rows = np.union1d(rows, zeros[first.distances[zeros] != NOT_ASKED])
-        return self._compare(self._estimate(rows), first, budget)
+            rows = np.union1d(rows, zeros[first.distances[zeros] != EXCLUDED_DISTANCE])
+        return self._rerank_exactly(self._estimate(rows), first, budget)
 
-    def _limit(self, level: int) -> int:
+    def _max_distance(self, level: int) -> int:
         """The largest number of differing bits that may still be a row above the floor."""
-        bits = int(self._ends[level]) * WORD
-        least = self._floor - BOUND * hamming_deviation(bits, self._padded)
+        bits = int(self._level_ends[level]) * WORD_BITS
+        least = self._floor - BOUND_DEVIATIONS * hamming_deviation(bits, self._padded)
         return int(bits / math.pi * math.acos(min(1.0, max(-1.0, least))))
 
-    def _reach(self, level: int, differ: Indices) -> float:
+    def _max_score(self, level: int, differ: Indices) -> float:
         """The most that rows with so many differing bits can score."""
         if not len(differ):
             return -math.inf
-        bits = int(self._ends[level]) * WORD
+        bits = int(self._level_ends[level]) * WORD_BITS
         nearest = math.cos(math.pi * int(differ.min()) / bits)
-        return nearest + BOUND * hamming_deviation(bits, self._padded)
+        return nearest + BOUND_DEVIATIONS * hamming_deviation(bits, self._padded)
 
-    def _count(self, rows: Indices, level: int, differ: Indices) -> None:
+    def _add_distances(self, rows: Indices, level: int, differ: Indices) -> None:
         """Add the bits of a level that differ."""
-        begin, end = int(self._ends[level - 1]), int(self._ends[level])
+        begin, end = int(self._level_ends[level - 1]), int(self._level_ends[level])
         bits = self._query.bits[begin:end]
-        codes, first = self._blocks.levels[level], self._blocks.first
-        in_parts(
-            lambda i, j: distances_at(codes, first, rows[i:j], bits, differ[i:j]),
+        codes, first = self._blocks.level_addresses[level], self._blocks.first_rows
+        parallel_for(
+            lambda i, j: add_hamming_distances(codes, first, rows[i:j], bits, differ[i:j]),
             len(rows),
             8 * len(bits),
         )
 
     def _prune(self, rows: Indices, level: int, differ: Indices) -> tuple[Indices, Indices]:
-        kept = differ <= self._limit(level)
+        kept = differ <= self._max_distance(level)
         return rows[kept], differ[kept]
 
     def _raise_floor(self, rows: Indices) -> None:
         """To what the k-th best of the rows estimated so far reaches at least."""
         self._estimate(rows)
-        least = self._estimated.scores - BOUND * self._estimated.deviations
+        least = self._estimated.scores - BOUND_DEVIATIONS * self._estimated.deviations
         if len(least) >= self._k:
             kth = float(np.partition(least, len(least) - self._k)[len(least) - self._k])
             self._floor = max(self._floor, kth)
 
     def _estimate(self, rows: Indices) -> _Estimates:
         """The scores of these rows, estimated from their whole codes, and kept."""
-        new = rows[~self._estimated.has(rows)]
+        new = rows[~self._estimated.contains(rows)]
         if len(new):
-            self._estimated = self._estimated.joined(self._weigh(new))
-        return self._estimated.of(rows)
+            self._estimated = self._estimated.merge(self._estimate_scores(new))
+        return self._estimated.select(rows)
 
-    def _weigh(self, rows: Indices) -> _Estimates:
-        query, blocks, ends = self._query, self._blocks, self._ends
+    def _estimate_scores(self, rows: Indices) -> _Estimates:
+        query, blocks, ends = self._query, self._blocks, self._level_ends
         sums = np.empty((len(rows), 2), np.int64)
-        in_parts(
-            lambda i, j: weighted_at(
-                blocks.levels, blocks.first, rows[i:j], ends, query.planes, sums[i:j]
+        parallel_for(
+            lambda i, j: weighted_bit_sums(
+                blocks.level_addresses, blocks.first_rows, rows[i:j], ends, query.planes, sums[i:j]
             ),
             len(rows),
             5 * self._padded // 8,  # five times the work of a glance at as many bytes
@@ -311,28 +317,32 @@ class Refinement:
         zero = norms == 0.0
         norms[zero] = 1.0
         signed = 2 * (query.low * sums[:, 0] + query.step * sums[:, 1]) - query.total
-        scores = signed / (query.share * norms)
+        scores = signed / (query.query_product * norms)
         flat = norms**2 / self._padded
-        variances = (1 / flat - 1) / (self._padded - 1) + query.blur / (flat * self._padded)
+        variances = (1 / flat - 1) / (self._padded - 1) + query.quantization_error / (
+            flat * self._padded
+        )
         deviations = np.sqrt(np.maximum(variances, 0.0))
         scores[zero] = deviations[zero] = 0.0
         return _Estimates(rows, scores, deviations)
 
-    def _compare(self, left: _Estimates, first: Glance, budget: Budget) -> Found:
+    def _rerank_exactly(
+        self, left: _Estimates, first: FirstLevelScan, budget: SearchBudget
+    ) -> SignCodeResult:
         """Compare what may matter exactly, best first."""
-        reach = left.scores + BOUND * left.deviations
+        reach = left.scores + BOUND_DEVIATIONS * left.deviations
         query = self._query
-        rerank = Rerank(self._blocks, query.row, query.norm, self._k, self._read_ahead)
-        compared = rerank.best(left.rows, reach, self._floor, budget)
-        estimated = left.of(compared.rows)
+        rerank = ExactReranker(self._blocks, query.row, query.norm, self._k, self._prefetch)
+        compared = rerank.find_best(left.rows, reach, self._floor, budget)
+        estimated = left.select(compared.rows)
         errors = np.abs(compared.scores - estimated.scores)
         sure = estimated.deviations
-        return Found(
+        return SignCodeResult(
             rows=compared.rows,
             scores=compared.scores,
             scanned=int(first.counts.sum()),
             max_z=float(np.max(errors / np.where(sure > 0, sure, np.inf), initial=0.0)),
-            unseen=compared.unseen,
+            unseen_bound=compared.unseen_bound,
         )
 
 
@@ -346,10 +356,10 @@ class _Estimates:
     deviations: Scores
 
     @classmethod
-    def none(cls) -> _Estimates:
+    def empty(cls) -> _Estimates:
         return cls(np.empty(0, np.int64), np.empty(0), np.empty(0))
 
-    def joined(self, others: _Estimates) -> _Estimates:
+    def merge(self, others: _Estimates) -> _Estimates:
         rows = np.concatenate([self.rows, others.rows])
         order = np.argsort(rows)
         return _Estimates(
@@ -358,7 +368,7 @@ class _Estimates:
             np.concatenate([self.deviations, others.deviations])[order],
         )
 
-    def has(self, rows: Indices) -> NDArray[np.bool_]:
+    def contains(self, rows: Indices) -> NDArray[np.bool_]:
         """Which of any rows are among these."""
         if not len(self.rows):
             return np.zeros(len(rows), bool)
@@ -366,7 +376,7 @@ class _Estimates:
         found: NDArray[np.bool_] = self.rows[at] == rows
         return found
 
-    def of(self, rows: Indices) -> _Estimates:
+    def select(self, rows: Indices) -> _Estimates:
         """Of some of these rows."""
         at = self.rows.searchsorted(rows)
         return _Estimates(rows, self.scores[at], self.deviations[at])

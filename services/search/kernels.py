@@ -14,14 +14,14 @@ from numba import types
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-from shared.codes.compiled import IN_LANES, compiled
+from shared.codes.compiled import REORDERED_FASTMATH, numba_jit
 
-NOT_ASKED = 65_535  # more than any distance
-EXACT_TERMS = 1024  # so many products of a byte and 15 bits add up to less than 2^31
+EXCLUDED_DISTANCE = 65_535  # more than any distance
+INT32_SAFE_TERMS = 1024  # so many products of a byte and 15 bits add up to less than 2^31
 ROUNDING = 1e-9  # more than what float64 loses of a score anywhere: 2^-53 for each of 100,000 terms
-PLANES = 4  # `weighted_at` is written for so many
-EACH_BYTE = np.uint64(0x0101010101010101)
-GATHER = np.uint64(0x0102040810204080)
+PLANES = 4  # `weighted_bit_sums` is written for so many
+LOW_BIT_OF_EACH_BYTE = np.uint64(0x0101010101010101)
+BIT_GATHER_FACTOR = np.uint64(0x0102040810204080)
 
 Words = NDArray[np.uint64]
 Addresses = NDArray[np.uint64]
@@ -56,11 +56,11 @@ _floats_at = _pointer_to(types.float32)
 _bytes_at = _pointer_to(types.int8)
 
 
-@compiled(IN_LANES)
-def distances(
+@numba_jit(REORDERED_FASTMATH)
+def hamming_distances(
     blocks: Addresses,
     first: NDArray[np.int64],
-    asked: NDArray[np.bool_],
+    row_masks: NDArray[np.bool_],
     queries: Words,
     begin: int,
     end: int,
@@ -82,8 +82,8 @@ def distances(
         for row in range(begin, upto):
             code = codes[row - first[block]]
             for number in range(queries.shape[0]):
-                if not asked[number, row]:
-                    out[number, row] = NOT_ASKED
+                if not row_masks[number, row]:
+                    out[number, row] = EXCLUDED_DISTANCE
                     continue
                 query = queries[number]
                 differ = np.uint64(0)
@@ -95,19 +95,19 @@ def distances(
         block += 1
 
 
-@compiled(IN_LANES)
+@numba_jit(REORDERED_FASTMATH)
 def _address(begins: Addresses, first: NDArray[np.int64], row: int, row_bytes: int) -> np.uint64:
     """Where a row lies: blocks begin at `begins` (c,), with the rows from `first` (c + 1,) on."""
     block = np.searchsorted(first, row, side="right") - 1
     return begins[block] + np.uint64((row - first[block]) * row_bytes)
 
 
-@compiled(IN_LANES)
-def product(row: NDArray[np.int8], query: NDArray[np.int16]) -> np.int64:
+@numba_jit(REORDERED_FASTMATH)
+def int8_product(row: NDArray[np.int8], query: NDArray[np.int16]) -> np.int64:
     """The product of whole numbers of at most 127 and 127 * 128 + 63: exact."""
     total = np.int64(0)
-    for begin in range(0, query.shape[0], EXACT_TERMS):
-        some, asked = row[begin : begin + EXACT_TERMS], query[begin : begin + EXACT_TERMS]
+    for begin in range(0, query.shape[0], INT32_SAFE_TERMS):
+        some, asked = row[begin : begin + INT32_SAFE_TERMS], query[begin : begin + INT32_SAFE_TERMS]
         part = np.int32(0)
         for j in range(asked.shape[0]):
             part = np.int32(part + np.int32(some[j]) * np.int32(asked[j]))
@@ -115,19 +115,19 @@ def product(row: NDArray[np.int8], query: NDArray[np.int16]) -> np.int64:
     return total
 
 
-@compiled(IN_LANES)
-def above_floor(
+@numba_jit(REORDERED_FASTMATH)
+def rows_above_floor(
     blocks: Addresses,
     first: NDArray[np.int64],
-    asked: NDArray[np.bool_],
-    figures: NDArray[np.float32],
+    row_mask: NDArray[np.bool_],
+    row_params: NDArray[np.float32],
     query: NDArray[np.int16],
-    query_figures: tuple[float, float, float],
+    query_params: tuple[float, float, float],
     begin: int,
     end: int,
-    least: NDArray[np.float64],
+    best_scores_heap: NDArray[np.float64],
     rows: NDArray[np.int64],
-    reach: NDArray[np.float64],
+    upper_bounds: NDArray[np.float64],
     count: int,
 ) -> int:
     """Of the rows `begin` to `end` of all blocks together, those that may reach the floor.
@@ -137,34 +137,34 @@ def above_floor(
     passed over. figures (3, rows): scale, error and length of each row; query_figures: scale and
     error of the query, and the lowest floor there is. least (k,): a heap, the least first, of the
     highest scores that rows have for certain; the floor is its least. Who passes is written to
-    `rows`, and to `reach` what it scores at most, from place `count` on; returns the next place.
+    `rows`, and to `upper_bounds` what it scores at most, from place `count` on; returns the next place.
     """
     words = query.shape[0]
-    scale, error, lowest = query_figures
-    floor = max(lowest, least[0])
+    scale, error, lowest = query_params
+    floor = max(lowest, best_scores_heap[0])
     block = np.searchsorted(first, begin, side="right") - 1
     while begin < end:
         upto = min(end, first[block + 1])
         numbers = nb.carray(_bytes_at(blocks[block]), (first[block + 1] - first[block], words))
         for row in range(begin, upto):
-            if not asked[row]:
+            if not row_mask[row]:
                 continue
-            whole = product(numbers[row - first[block]], query)
-            score = np.float64(figures[0, row]) * scale * np.float64(whole)
-            bound = figures[1, row] + figures[2, row] * error + ROUNDING
+            whole = int8_product(numbers[row - first[block]], query)
+            score = np.float64(row_params[0, row]) * scale * np.float64(whole)
+            bound = row_params[1, row] + row_params[2, row] * error + ROUNDING
             if score + bound >= floor:
-                rows[count], reach[count] = row, score + bound
+                rows[count], upper_bounds[count] = row, score + bound
                 count += 1
-                if score - bound > least[0]:
-                    _replace_least(least, score - bound)
-                    floor = max(lowest, least[0])
+                if score - bound > best_scores_heap[0]:
+                    _replace_heap_minimum(best_scores_heap, score - bound)
+                    floor = max(lowest, best_scores_heap[0])
         begin = upto
         block += 1
     return count
 
 
-@compiled(IN_LANES)
-def _replace_least(heap: NDArray[np.float64], value: float) -> None:
+@numba_jit(REORDERED_FASTMATH)
+def _replace_heap_minimum(heap: NDArray[np.float64], value: float) -> None:
     place, end = 0, heap.shape[0]
     while True:
         child = 2 * place + 1
@@ -177,8 +177,8 @@ def _replace_least(heap: NDArray[np.float64], value: float) -> None:
     heap[place] = value
 
 
-@compiled(IN_LANES)
-def distances_at(
+@numba_jit(REORDERED_FASTMATH)
+def add_hamming_distances(
     begins: Addresses,
     first: NDArray[np.int64],
     rows: NDArray[np.int64],
@@ -197,8 +197,8 @@ def distances_at(
         out[number] += np.int64(differ)
 
 
-@compiled(IN_LANES)
-def weighted_at(
+@numba_jit(REORDERED_FASTMATH)
+def weighted_bit_sums(
     begins: Addresses,
     first: NDArray[np.int64],
     rows: NDArray[np.int64],
@@ -230,8 +230,8 @@ def weighted_at(
         out[number, 1] = np.int64(units + 2 * twos + 4 * fours + 8 * eights)
 
 
-@compiled(IN_LANES)
-def products_at(
+@numba_jit(REORDERED_FASTMATH)
+def exact_products(
     begins: Addresses,
     first: NDArray[np.int64],
     rows: NDArray[np.int64],
@@ -249,8 +249,8 @@ def products_at(
         out[number] = total
 
 
-@compiled(IN_LANES)
-def squares(row: NDArray[np.float32]) -> float:
+@numba_jit(REORDERED_FASTMATH)
+def squared_norm(row: NDArray[np.float32]) -> float:
     """The sum of a row's squares, in float64."""
     total = 0.0
     for i in range(row.shape[0]):
@@ -258,8 +258,8 @@ def squares(row: NDArray[np.float32]) -> float:
     return total
 
 
-@compiled(IN_LANES)
-def in_planes(
+@numba_jit(REORDERED_FASTMATH)
+def quantize_to_bit_planes(
     numbers: NDArray[np.float32], signs: Words, planes: Words
 ) -> tuple[float, float, float, float, float]:
     """The signs of (64 n,) float32 numbers, and the numbers rounded to 2^PLANES steps.
@@ -274,7 +274,7 @@ def in_planes(
         low, high = min(low, numbers[i]), max(high, numbers[i])
     step = (high - low) / np.float32(2**PLANES - 1)
     inverse = np.float32(1.0) / step
-    total = product = square = 0.0
+    total = int8_product = square = 0.0
     whole = np.empty(64, np.uint8)
     eights = whole.view(np.uint64)
     for i in range(planes.shape[1]):
@@ -288,15 +288,15 @@ def in_planes(
             sums_of_products += rounded * part[j]
             sums_of_squares += rounded * rounded
         total += sums
-        product += sums_of_products
+        int8_product += sums_of_products
         square += sums_of_squares
         for plane in range(PLANES + 1):
             word = np.uint64(0)
             for j in range(8):  # the product gathers one bit of each byte in the highest byte
-                ones = (eights[j] >> np.uint64(plane)) & EACH_BYTE
-                word |= ((ones * GATHER) >> np.uint64(56)) << np.uint64(8 * j)
+                ones = (eights[j] >> np.uint64(plane)) & LOW_BIT_OF_EACH_BYTE
+                word |= ((ones * BIT_GATHER_FACTOR) >> np.uint64(56)) << np.uint64(8 * j)
             if plane < PLANES:
                 planes[plane, i] = word
             else:
                 signs[i] = word
-    return low, step, total, product, square
+    return low, step, total, int8_product, square

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 from uuid import UUID
 
-from services.search.local_files import Mapped
+from services.search.local_files import MappedFile
 from services.search.photo_columns import PhotoColumns
 from shared.chunks import Rows
 
@@ -34,19 +34,19 @@ class LoadedChunk:
         """Whether its file was damaged since it was mapped (`Mapped.was_changed`)."""
         return self.stored is not None and self.stored.file.was_changed()
 
-    def read_ahead(self, row: int) -> None:
+    def prefetch_row(self, row: int) -> None:
         """Say that a row is read next, where it is mapped from a file."""
         if self.stored is not None and self.rows is self.stored.rows:
             size_bytes = self.rows.strides[0]
             begin = self.stored.file.size_bytes - self.rows.nbytes  # a header goes before
-            self.stored.file.read_ahead(begin + row * size_bytes, size_bytes)
+            self.stored.file.prefetch(begin + row * size_bytes, size_bytes)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StoredChunk:
     """A chunk's files, mapped into memory."""
 
-    file: Mapped
+    file: MappedFile
     rows: Rows
     sha256: str
     codes: SignCodes | None = None

@@ -17,22 +17,22 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from pathlib import Path
 
-from shared.chunks import corrupt
+from shared.chunks import chunk_corrupt_error
 from shared.ids import new_id
 from shared.objects import ObjectStore
 from shared.private_files import create_private_file, make_private_folder
 
 log = logging.getLogger(__name__)
 
-PIECE_BYTES = 1 << 20
-LEFT_OVER_SECONDS = 3600.0  # a file that is still being written then: its writer was killed
+COPY_BYTES = 1 << 20
+STALE_PARTIAL_SECONDS = 3600.0  # a file that is still being written then: its writer was killed
 
 # From Python 3.13 on a mapping need not hold a file descriptor: many chunks would use them up.
-OPTIONS = {"trackfd": False} if sys.version_info >= (3, 13) else {}
+MMAP_OPTIONS = {"trackfd": False} if sys.version_info >= (3, 13) else {}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Mapped:
+class MappedFile:
     """A file's bytes; the file may be deleted or replaced while they are used."""
 
     memory: mmap.mmap
@@ -58,13 +58,13 @@ class Mapped:
     def size_bytes(self) -> int:
         return len(self.memory)
 
-    def read_ahead(self, begin: int, size_bytes: int) -> None:
+    def prefetch(self, begin: int, size_bytes: int) -> None:
         """Say that these bytes are read next: many at once cost little more than one."""
         first = begin - begin % mmap.PAGESIZE
         self.memory.madvise(mmap.MADV_WILLNEED, first, begin + size_bytes - first)
 
 
-class LocalFiles:
+class MappedFileCache:
     """The store's objects as mapped files."""
 
     def __init__(self, store: ObjectStore, folder: Path) -> None:
@@ -72,7 +72,7 @@ class LocalFiles:
         self._store = store
         self._folder = folder
 
-    def map(self, key: str, sha256: str) -> Mapped:
+    def map_object(self, key: str, sha256: str) -> MappedFile:
         """The object, whose hash was checked: when it was fetched, or now where it is a file.
 
         Unavailable (`chunk_corrupt`) when it is another; NotFound and Unavailable of the store.
@@ -81,12 +81,12 @@ class LocalFiles:
         if file is None:
             return self._cached(key, sha256)
         with self._store.open(key) as opened:
-            mapped = _map(opened.fileno(), file)
+            mapped = _map_file(opened.fileno(), file)
         if hashlib.sha256(mapped.memory).hexdigest() != sha256:
-            raise corrupt(key)
+            raise chunk_corrupt_error(key)
         return mapped
 
-    def _cached(self, key: str, sha256: str) -> Mapped:
+    def _cached(self, key: str, sha256: str) -> MappedFile:
         """The object from the cache; one that was damaged there is fetched again."""
         name = f"{sha256}.npy"
         fetched = False
@@ -94,43 +94,43 @@ class LocalFiles:
         def fetch(target: Path) -> None:
             nonlocal fetched
             fetched = True
-            self._fetch(key, sha256, target)
+            self._download(key, sha256, target)
 
         with contextlib.suppress(ValueError):  # an empty file can't be mapped
-            mapped = self.made(name, fetch)
+            mapped = self.map_or_create(name, fetch)
             if fetched or hashlib.sha256(mapped.memory).hexdigest() == sha256:
                 return mapped
         log.warning("the cached copy of %s is damaged, and is fetched again", key)
-        self.remove(name)
-        return self.made(name, fetch)
+        self.evict(name)
+        return self.map_or_create(name, fetch)
 
-    def made(self, name: str, make: Callable[[Path], None]) -> Mapped:
+    def map_or_create(self, name: str, make: Callable[[Path], None]) -> MappedFile:
         """The file of this name in the folder; where there is none, `make` writes one.
 
         It is there whole or not at all, also after a power cut.
         """
         path = self._folder / name
         with contextlib.suppress(FileNotFoundError), path.open("rb") as file:
-            return _map(file.fileno(), path)
+            return _map_file(file.fileno(), path)
         make_private_folder(self._folder)
         partial = self._folder / f"{new_id()}.partial"
         try:
             make(partial)
             with partial.open("rb") as file:
-                mapped = _map(file.fileno(), path)
+                mapped = _map_file(file.fileno(), path)
             partial.replace(path)
         finally:
             partial.unlink(missing_ok=True)
         return mapped
 
-    def remove(self, name: str) -> None:
+    def evict(self, name: str) -> None:
         (self._folder / name).unlink(missing_ok=True)
 
-    def keep_only(self, names: Collection[str]) -> None:
+    def evict_except(self, names: Collection[str]) -> None:
         """Remove what is in the folder under other names; what is mapped stays readable."""
         if not self._folder.is_dir():
             return
-        long_ago = time.time() - LEFT_OVER_SECONDS
+        long_ago = time.time() - STALE_PARTIAL_SECONDS
         for path in self._folder.iterdir():
             with contextlib.suppress(FileNotFoundError):
                 if path.suffix == ".partial":
@@ -140,18 +140,18 @@ class LocalFiles:
                 if unwanted:
                     path.unlink()
 
-    def _fetch(self, key: str, sha256: str, target: Path) -> None:
+    def _download(self, key: str, sha256: str, target: Path) -> None:
         digest = hashlib.sha256()
         with self._store.open(key) as source, create_private_file(target) as file:
-            while piece := source.read(PIECE_BYTES):
+            while piece := source.read(COPY_BYTES):
                 digest.update(piece)
                 file.write(piece)
             if digest.hexdigest() != sha256:
-                raise corrupt(key)
+                raise chunk_corrupt_error(key)
             file.flush()
             os.fsync(file.fileno())
 
 
-def _map(descriptor: int, path: Path) -> Mapped:
-    memory = mmap.mmap(descriptor, 0, access=mmap.ACCESS_READ, **OPTIONS)
-    return Mapped(memory, path, os.fstat(descriptor))
+def _map_file(descriptor: int, path: Path) -> MappedFile:
+    memory = mmap.mmap(descriptor, 0, access=mmap.ACCESS_READ, **MMAP_OPTIONS)
+    return MappedFile(memory, path, os.fstat(descriptor))

@@ -12,31 +12,31 @@ from collections.abc import Mapping, Sequence
 from uuid import UUID
 
 
-class Memory:
+class MemoryBudget:
     """The budget, and who has what of it. Thread-safe."""
 
     def __init__(self, budget_bytes: int) -> None:
         self._budget_bytes = budget_bytes
         self._lock = threading.Lock()
-        self._wanted: dict[UUID, Sequence[int]] = {}
+        self._requests: dict[UUID, Sequence[int]] = {}
 
-    def parts_held(self, generation_id: UUID, part_bytes: Sequence[int]) -> int:
+    def allocate(self, generation_id: UUID, part_bytes: Sequence[int]) -> int:
         """How many of the generation's parts, of these sizes, are to be held: the first so many."""
         with self._lock:
-            self._wanted[generation_id] = part_bytes
-            return held(self._wanted, self._budget_bytes)[generation_id]
+            self._requests[generation_id] = part_bytes
+            return allocate_parts(self._requests, self._budget_bytes)[generation_id]
 
-    def forget(self, generation_id: UUID) -> None:
+    def release_generation(self, generation_id: UUID) -> None:
         with self._lock:
-            self._wanted.pop(generation_id, None)
+            self._requests.pop(generation_id, None)
 
 
-def held(wanted: Mapping[UUID, Sequence[int]], budget_bytes: int) -> dict[UUID, int]:
+def allocate_parts(requests: Mapping[UUID, Sequence[int]], budget_bytes: int) -> dict[UUID, int]:
     """How many parts of each generation fit: everyone's first parts before anyone's second."""
-    counts = dict.fromkeys(wanted, 0)
+    counts = dict.fromkeys(requests, 0)
     left = budget_bytes
-    for part in range(max(map(len, wanted.values()), default=0)):
-        for generation_id, sizes in wanted.items():
+    for part in range(max(map(len, requests.values()), default=0)):
+        for generation_id, sizes in requests.items():
             if counts[generation_id] == part < len(sizes) and sizes[part] <= left:
                 left -= sizes[part]
                 counts[generation_id] += 1

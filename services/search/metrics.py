@@ -16,13 +16,27 @@ from shared.search_protocol import SearchRequest, SearchResponse, SearchStatus
 from shared.telemetry.traces import span
 
 # From a small map in memory to a scan of a full shard, and to the longest wait for a version.
-SECONDS = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0)
+LATENCY_BUCKETS_SECONDS = (
+    0.001,
+    0.0025,
+    0.005,
+    0.01,
+    0.025,
+    0.05,
+    0.1,
+    0.25,
+    0.5,
+    1.0,
+    2.5,
+    5.0,
+    10.0,
+)
 
 # An answer looks at some dozens of rows. From 5.5 on the codes are not trusted (`answer.py`).
-DEVIATIONS = (1.0, 2.0, 3.0, 4.0, 5.0, 5.5)
+MAX_Z_BUCKETS = (1.0, 2.0, 3.0, 4.0, 5.0, 5.5)
 
 
-class SearchMetrics:
+class MeteredSearch:
     """One worker's figures, and the search port on which they are counted.
 
     Unless `registry` is given, they are in one of their own: tests run several workers at once.
@@ -40,7 +54,7 @@ class SearchMetrics:
         self._seconds = Histogram(
             "placewise_search_seconds",
             "Seconds that an answered search took.",
-            buckets=SECONDS,
+            buckets=LATENCY_BUCKETS_SECONDS,
             registry=self._registry,
         )
         self._rows = Counter(
@@ -62,10 +76,10 @@ class SearchMetrics:
         self._deviations = Histogram(
             "placewise_search_max_z",
             "Largest error of an answer's estimates from codes, in standard deviations.",
-            buckets=DEVIATIONS,
+            buckets=MAX_Z_BUCKETS,
             registry=self._registry,
         )
-        self._registry.register(_Snapshots(worker))
+        self._registry.register(_SnapshotCollector(worker))
 
     def search(self, request: SearchRequest) -> SearchResponse:
         """The worker's answer, counted."""
@@ -76,13 +90,13 @@ class SearchMetrics:
         except PlacewiseError as error:
             self._searches.labels(error.code).inc()
             raise
-        self._count(response, time.perf_counter() - started)
+        self._observe(response, time.perf_counter() - started)
         return response
 
     def status(self) -> SearchStatus:
         return self._worker.status()
 
-    def _count(self, response: SearchResponse, seconds: float) -> None:
+    def _observe(self, response: SearchResponse, seconds: float) -> None:
         self._searches.labels("answered").inc()
         self._seconds.observe(seconds)
         self._rows.inc(response.rows_scanned)
@@ -91,12 +105,12 @@ class SearchMetrics:
         if response.max_z is not None:
             self._deviations.observe(response.max_z)
 
-    def text(self) -> bytes:
+    def render(self) -> bytes:
         """Prometheus' text format."""
         return generate_latest(self._registry)
 
 
-class _Snapshots(Collector):
+class _SnapshotCollector(Collector):
     """Read at each scrape, so that a generation that is gone leaves no figure behind."""
 
     def __init__(self, worker: SearchWorker) -> None:
@@ -127,12 +141,14 @@ class _Snapshots(Collector):
         yield on_device
         yield failed
         yield CounterMetricFamily(
-            f"{prefix}_code_scans", "Ways through the first codes.", self._worker.together.rounds
+            f"{prefix}_code_scans",
+            "Ways through the first codes.",
+            self._worker.query_batcher.batches_run,
         )
         yield CounterMetricFamily(
             f"{prefix}_code_scan_queries",
             "Queries that went through the first codes, together or alone.",
-            self._worker.together.queries,
+            self._worker.query_batcher.queries_run,
         )
         yield GaugeMetricFamily(f"{prefix}_rows", "Rows that can be answered.", status.rows)
         yield GaugeMetricFamily(

@@ -12,11 +12,11 @@ from uuid import UUID
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.catalog.photos import PhotoFacts
+from shared.catalog.photos import PhotoFilterValues
 
 EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
-NEVER = np.datetime64("NaT", "us")
-LOW = (1 << 64) - 1
+UNKNOWN_TIME = np.datetime64("NaT", "us")
+LOW_64_BITS = (1 << 64) - 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,28 +38,28 @@ class PhotoColumns:
     """A frozenset of texts a row."""
 
     @classmethod
-    def of(cls, rows: int, facts: Iterable[tuple[int, PhotoFacts]]) -> PhotoColumns:
+    def of(cls, rows: int, facts: Iterable[tuple[int, PhotoFilterValues]]) -> PhotoColumns:
         """(row, photo) pairs as columns of `rows` rows; rows without a photo are dead."""
         columns = cls(
             photo_id=np.full(rows, None, dtype=object),
             findable=np.zeros(rows, dtype=bool),
             latitude=np.full(rows, np.nan),
             longitude=np.full(rows, np.nan),
-            captured_at=np.full(rows, NEVER),
+            captured_at=np.full(rows, UNKNOWN_TIME),
             place=np.full(rows, None, dtype=object),
             tags=np.full(rows, frozenset(), dtype=object),
         )
         for row, photo in facts:
-            columns._set(row, photo)
+            columns._set_row(row, photo)
         return columns
 
     def __len__(self) -> int:
         return len(self.findable)
 
     @cached_property
-    def id_ends(self) -> NDArray[np.uint64]:
+    def id_low_bits(self) -> NDArray[np.uint64]:
         """The low 64 bits of each id, almost all of them drawn at random; 0 for dead rows."""
-        low = (0 if id_ is None else id_.int & LOW for id_ in self.photo_id)
+        low = (0 if id_ is None else id_.int & LOW_64_BITS for id_ in self.photo_id)
         return np.fromiter(low, np.uint64, len(self.photo_id))
 
     def ids(self, rows: NDArray[np.int64]) -> list[UUID | None]:
@@ -68,28 +68,30 @@ class PhotoColumns:
 
     @cached_property
     def rows_by_tag(self) -> Mapping[str, NDArray[np.int64]]:
-        return _rows_by((tag, row) for row, tags in enumerate(self.tags) for tag in tags)
+        return _group_rows((tag, row) for row, tags in enumerate(self.tags) for tag in tags)
 
     @cached_property
     def rows_by_place(self) -> Mapping[str, NDArray[np.int64]]:
-        return _rows_by((place, row) for row, place in enumerate(self.place) if place is not None)
+        return _group_rows(
+            (place, row) for row, place in enumerate(self.place) if place is not None
+        )
 
-    def changed(self, changes: Mapping[UUID, PhotoFacts]) -> PhotoColumns:
+    def with_changes(self, changes: Mapping[UUID, PhotoFilterValues]) -> PhotoColumns:
         """The columns with what has changed; itself when none of the photos is here."""
-        here = rows_of(self, changes)
+        here = find_rows(self, changes)
         if not len(here):
             return self
         copy = PhotoColumns(*(getattr(self, column.name).copy() for column in fields(self)))
         for row in here.tolist():
-            copy._set(row, changes[self.photo_id[row]])
+            copy._set_row(row, changes[self.photo_id[row]])
         return copy
 
-    def _set(self, row: int, photo: PhotoFacts) -> None:
+    def _set_row(self, row: int, photo: PhotoFilterValues) -> None:
         self.photo_id[row] = photo.photo_id
         self.findable[row] = photo.findable
         self.latitude[row] = np.nan if photo.latitude is None else photo.latitude
         self.longitude[row] = np.nan if photo.longitude is None else photo.longitude
-        self.captured_at[row] = as_microseconds(photo.captured_at)
+        self.captured_at[row] = to_datetime64(photo.captured_at)
         self.place[row] = photo.place
         self.tags[row] = frozenset(photo.tags)
 
@@ -101,10 +103,10 @@ class JoinedColumns:
     parts: Sequence[PhotoColumns]
 
     def __len__(self) -> int:
-        return int(self.first[-1])
+        return int(self.first_rows[-1])
 
     @cached_property
-    def first(self) -> NDArray[np.int64]:
+    def first_rows(self) -> NDArray[np.int64]:
         """(chunks + 1,): the number of each chunk's first row; the last is the number of rows."""
         return np.cumsum([0, *(len(part) for part in self.parts)])
 
@@ -122,24 +124,24 @@ class JoinedColumns:
 
     @cached_property
     def captured_at(self) -> NDArray[np.datetime64]:
-        return self._joined([part.captured_at for part in self.parts], NEVER.dtype)
+        return self._joined([part.captured_at for part in self.parts], UNKNOWN_TIME.dtype)
 
     @cached_property
-    def id_ends(self) -> NDArray[np.uint64]:
-        return self._joined([part.id_ends for part in self.parts], np.uint64)
+    def id_low_bits(self) -> NDArray[np.uint64]:
+        return self._joined([part.id_low_bits for part in self.parts], np.uint64)
 
     @cached_property
     def rows_by_tag(self) -> Mapping[str, NDArray[np.int64]]:
-        return _JoinedRows([part.rows_by_tag for part in self.parts], self.first)
+        return _JoinedRowIndex([part.rows_by_tag for part in self.parts], self.first_rows)
 
     @cached_property
     def rows_by_place(self) -> Mapping[str, NDArray[np.int64]]:
-        return _JoinedRows([part.rows_by_place for part in self.parts], self.first)
+        return _JoinedRowIndex([part.rows_by_place for part in self.parts], self.first_rows)
 
     def ids(self, rows: NDArray[np.int64]) -> list[UUID | None]:
         """The photos of these rows; None for dead ones."""
-        chunks = np.searchsorted(self.first, rows, side="right") - 1
-        inside = rows - self.first[chunks]
+        chunks = np.searchsorted(self.first_rows, rows, side="right") - 1
+        inside = rows - self.first_rows[chunks]
         return [
             self.parts[chunk].photo_id[row]
             for chunk, row in zip(chunks.tolist(), inside.tolist(), strict=True)
@@ -150,7 +152,7 @@ class JoinedColumns:
         return np.concatenate(parts) if parts else np.empty(0, dtype)
 
 
-class _JoinedRows(Mapping[str, NDArray[np.int64]]):
+class _JoinedRowIndex(Mapping[str, NDArray[np.int64]]):
     """Rows by a text, of several chunks: found chunk by chunk, when they are asked for."""
 
     def __init__(
@@ -176,28 +178,28 @@ class _JoinedRows(Mapping[str, NDArray[np.int64]]):
         return len(set().union(*self._parts))
 
 
-Columns = PhotoColumns | JoinedColumns
+AnyPhotoColumns = PhotoColumns | JoinedColumns
 
 
-def rows_of(photos: Columns, ids: Collection[UUID]) -> NDArray[np.int64]:
+def find_rows(photos: AnyPhotoColumns, ids: Collection[UUID]) -> NDArray[np.int64]:
     """The rows of these photos, rising."""
-    ends = np.fromiter((id_.int & LOW for id_ in ids), np.uint64, len(ids))
-    alike = np.flatnonzero(np.isin(photos.id_ends, ends))
+    ends = np.fromiter((id_.int & LOW_64_BITS for id_ in ids), np.uint64, len(ids))
+    alike = np.flatnonzero(np.isin(photos.id_low_bits, ends))
     wanted = frozenset(ids)
     meant = np.fromiter((id_ in wanted for id_ in photos.ids(alike)), bool, len(alike))
     rows: NDArray[np.int64] = alike[meant]
     return rows
 
 
-def _rows_by(pairs: Iterable[tuple[str, int]]) -> dict[str, NDArray[np.int64]]:
+def _group_rows(pairs: Iterable[tuple[str, int]]) -> dict[str, NDArray[np.int64]]:
     found: dict[str, list[int]] = {}
     for text, row in pairs:
         found.setdefault(text, []).append(row)
     return {text: np.array(rows, np.int64) for text, rows in found.items()}
 
 
-def as_microseconds(when: datetime | None) -> np.datetime64:
+def to_datetime64(when: datetime | None) -> np.datetime64:
     """An aware datetime as NumPy's UTC microseconds."""
     if when is None:
-        return NEVER
+        return UNKNOWN_TIME
     return np.datetime64(when.astimezone(UTC).replace(tzinfo=None), "us")

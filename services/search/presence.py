@@ -11,18 +11,18 @@ from uuid import UUID
 from sqlalchemy.exc import SQLAlchemyError
 
 from services.search.worker import SearchWorker
-from shared.catalog.away import Outage
-from shared.catalog.search_workers import forget_worker, tell_of_worker
+from shared.catalog.away import OutageLog
+from shared.catalog.search_workers import delete_search_worker, upsert_search_worker
 from shared.catalog.session import Catalog
 from shared.ids import new_id
 
 log = logging.getLogger(__name__)
 
-LOOK_SECONDS = 0.5  # between two looks at what is loaded: a switch waits for the news
+CHANGE_POLL_SECONDS = 0.5  # between two looks at what is loaded: a switch waits for the news
 HEARTBEAT_SECONDS = 2.0  # between two entries without news; DEAD_SECONDS is five of them
 
 
-class Presence:
+class WorkerHeartbeat:
     """Writes the entry. A thread of its own: loading may take minutes, and who loads lives."""
 
     def __init__(
@@ -33,31 +33,31 @@ class Presence:
         self._worker = worker
         self._name = name
         self._url = url
-        self._told: tuple[Mapping[UUID, int], Sequence[str]] | None = None
-        self._told_at = 0.0
+        self._sent_versions: tuple[Mapping[UUID, int], Sequence[str]] | None = None
+        self._sent_at = 0.0
 
     def run(self, stop: threading.Event) -> None:
         """Keep the entry until `stop` is set, and remove it then."""
-        outage = Outage("search worker's entry")
+        outage = OutageLog("search worker's entry")
         while not stop.is_set():
             try:
-                self.tell()
-                outage.over()
+                self.send_if_due()
+                outage.record_success()
             except SQLAlchemyError as error:
-                outage.met(error)
-            stop.wait(LOOK_SECONDS)
+                outage.record_error(error)
+            stop.wait(CHANGE_POLL_SECONDS)
         try:
             with self._catalog.write() as session:
-                forget_worker(session, self.id)
+                delete_search_worker(session, self.id)
         except SQLAlchemyError as error:
             log.warning("search could not sign off, the steward will: %s", error)
 
-    def tell(self) -> None:
+    def send_if_due(self) -> None:
         """Write what there is to tell: news at once, else a heartbeat when it is due."""
         status = self._worker.status()
         news = status.loaded, status.missing
-        if news == self._told and time.monotonic() - self._told_at < HEARTBEAT_SECONDS:
+        if news == self._sent_versions and time.monotonic() - self._sent_at < HEARTBEAT_SECONDS:
             return
         with self._catalog.write() as session:
-            tell_of_worker(session, self.id, self._name, self._url, self._worker.shard, *news)
-        self._told, self._told_at = news, time.monotonic()
+            upsert_search_worker(session, self.id, self._name, self._url, self._worker.shard, *news)
+        self._sent_versions, self._sent_at = news, time.monotonic()

@@ -13,68 +13,68 @@ from collections import OrderedDict
 import numpy as np
 
 from services.search.snapshot import Snapshot
-from shared.chunks import Row, are_whole, read_row
+from shared.chunks import Row, read_row, rows_are_valid
 from shared.errors import Gone, NotFound, Unavailable
 from shared.objects import ObjectStore
 from shared.objects.keys import QUERIES
 from shared.search_protocol import SearchRequest
 
-KEPT_ROWS = 64  # 25 MB at 98,304 dimensions
+CACHED_ROWS = 64  # 25 MB at 98,304 dimensions
 
 
-class QueryRows:
+class QueryRowReader:
     """Reads query rows; thread-safe."""
 
     def __init__(self, store: ObjectStore) -> None:
         self._store = store
         self._lock = threading.Lock()
-        self._kept: OrderedDict[tuple[str, int], Row] = OrderedDict()
+        self._cache: OrderedDict[tuple[str, int], Row] = OrderedDict()
 
-    def find(self, snapshot: Snapshot, request: SearchRequest) -> Row:
-        """The (dimension,) row. Gone (`query_expired`) when it is no longer kept, Unavailable
+    def read_query(self, snapshot: Snapshot, request: SearchRequest) -> Row:
+        """The (dimension,) row. Gone (`query_expired_error`) when it is no longer kept, Unavailable
         (`chunk_unreadable`) when it is damaged."""
         loaded = snapshot.by_key.get(request.object_key)
         if request.object_key in snapshot.missing:
-            raise _unreadable(request.object_key)
+            raise _unreadable_error(request.object_key)
         if loaded is None:
-            return self._read(request.object_key, request.row)
+            return self._read_cached(request.object_key, request.row)
         if request.row >= len(loaded.rows):
-            raise expired(f"row {request.row} of {request.object_key}")
+            raise query_expired_error(f"row {request.row} of {request.object_key}")
         row: Row = loaded.rows[request.row]
         return row
 
-    def _read(self, object_key: str, row: int) -> Row:
+    def _read_cached(self, object_key: str, row: int) -> Row:
         at = (object_key, row)
         with self._lock:
-            kept = self._kept.get(at)
+            kept = self._cache.get(at)
             if kept is not None:
-                self._kept.move_to_end(at)
+                self._cache.move_to_end(at)
                 return kept
         try:
             found = read_row(self._store, object_key, row)
         except NotFound:
-            raise expired(f"descriptor {object_key}") from None
+            raise query_expired_error(f"descriptor {object_key}") from None
         except IndexError:
-            raise expired(f"row {row} of {object_key}") from None
+            raise query_expired_error(f"row {row} of {object_key}") from None
         except ValueError as error:
-            raise _unreadable(object_key) from error
+            raise _unreadable_error(object_key) from error
         if object_key.startswith(QUERIES):
             return found  # not kept: it goes with its object, after QUERY_TTL_SECONDS
-        if not are_whole(found[np.newaxis]).all():
-            raise _unreadable(object_key)
+        if not rows_are_valid(found[np.newaxis]).all():
+            raise _unreadable_error(object_key)
         with self._lock:
-            self._kept[at] = found
-            while len(self._kept) > KEPT_ROWS:
-                self._kept.popitem(last=False)
+            self._cache[at] = found
+            while len(self._cache) > CACHED_ROWS:
+                self._cache.popitem(last=False)
         return found
 
 
-def expired(what: str) -> Gone:
+def query_expired_error(what: str) -> Gone:
     """What a query needs is no longer kept."""
     return Gone("query_expired", f"The {what} is no longer kept. Ask with the photo again.")
 
 
-def _unreadable(object_key: str) -> Unavailable:
+def _unreadable_error(object_key: str) -> Unavailable:
     return Unavailable(
         "chunk_unreadable",
         f"The descriptor in {object_key} can't be read: the object is missing or damaged. "

@@ -11,48 +11,48 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.search.blocks import Indices, RowBlocks
-from services.search.kernels import products_at
-from services.search.parts import in_parts
+from services.search.kernels import exact_products
+from services.search.parts import parallel_for
 
-STEP = 8  # rows compared exactly between two looks at the floor
+RERANK_STEP_ROWS = 8  # rows compared exactly between two looks at the floor
 
 Scores = NDArray[np.float64]
 
 
 @dataclass(slots=True)
-class Budget:
+class SearchBudget:
     """When to give up: an answer that was cut short says so."""
 
-    rows: int | None = None
+    max_rows: int | None = None
     """So many are compared exactly, and no more."""
-    until: float | None = None
+    deadline: float | None = None
     """Of time.monotonic()."""
 
-    def spent(self, rows: int) -> bool:
-        if self.rows is not None and rows >= self.rows:
+    def is_exhausted(self, rows: int) -> bool:
+        if self.max_rows is not None and rows >= self.max_rows:
             return True
-        return self.until is not None and time.monotonic() >= self.until
+        return self.deadline is not None and time.monotonic() >= self.deadline
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Compared:
+class RerankedRows:
     """Rows that were compared exactly, and what is known of the others."""
 
     rows: Indices
     """The first so many of those that were to be compared, in their order."""
     scores: Scores
     """Cosines, float64."""
-    unseen: float
+    unseen_bound: float
     """No other row reaches more than this; -inf where none can matter."""
 
     @property
-    def whole(self) -> bool:
+    def is_complete(self) -> bool:
         """Whether it did not end early."""
-        return self.unseen == -math.inf
+        return self.unseen_bound == -math.inf
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Rerank:
+class ExactReranker:
     """Exact comparison of rows with one query, for its `k` best."""
 
     blocks: RowBlocks
@@ -61,36 +61,42 @@ class Rerank:
     norm: float
     """Its length."""
     k: int
-    read_ahead: Callable[[Indices], None]
+    prefetch: Callable[[Indices], None]
     """Is told of rows before they are compared."""
 
-    def best(self, rows: Indices, reach: Scores, floor: float, budget: Budget) -> Compared:
-        """Compare `rows`, of which none scores more than its `reach`, highest reach first; until
+    def find_best(
+        self, rows: Indices, upper_bounds: Scores, floor: float, budget: SearchBudget
+    ) -> RerankedRows:
+        """Compare `rows`, of which none scores more than its `upper_bounds`, highest reach first; until
         no other reaches `floor`, which rises to the k-th score."""
-        order = np.argsort(-reach, kind="stable")
-        order = order[: np.count_nonzero(reach >= floor)]
-        rows, reach = rows[order], reach[order]
+        order = np.argsort(-upper_bounds, kind="stable")
+        order = order[: np.count_nonzero(upper_bounds >= floor)]
+        rows, upper_bounds = rows[order], upper_bounds[order]
         scores = np.empty(len(rows))
         done, unseen = 0, -math.inf
-        while done < len(rows) and reach[done] >= floor:
-            if budget.spent(done):
-                unseen = float(reach[done])
+        while done < len(rows) and upper_bounds[done] >= floor:
+            if budget.is_exhausted(done):
+                unseen = float(upper_bounds[done])
                 break
             # The first k are needed in any case.
-            upto = min(len(rows), max(self.k, done + STEP), budget.rows or len(rows))
-            self.read_ahead(rows[done:upto])
+            upto = min(
+                len(rows), max(self.k, done + RERANK_STEP_ROWS), budget.max_rows or len(rows)
+            )
+            self.prefetch(rows[done:upto])
             self._multiply(rows[done:upto], scores[done:upto])
             scores[done:upto] /= self.norm
             done = upto
             if done >= self.k:
                 kth = float(np.partition(scores[:done], done - self.k)[done - self.k])
                 floor = max(floor, kth)
-        return Compared(rows[:done], scores[:done], unseen)
+        return RerankedRows(rows[:done], scores[:done], unseen)
 
     def _multiply(self, rows: Indices, out: Scores) -> None:
         blocks = self.blocks
-        in_parts(
-            lambda i, j: products_at(blocks.rows, blocks.first, rows[i:j], self.query, out[i:j]),
+        parallel_for(
+            lambda i, j: exact_products(
+                blocks.row_addresses, blocks.first_rows, rows[i:j], self.query, out[i:j]
+            ),
             len(rows),
             4 * blocks.dimension,
         )

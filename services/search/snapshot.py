@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 
 from services.search.loaded_chunk import LoadedChunk
 from services.search.photo_columns import JoinedColumns
-from shared.search_protocol import Held, Part
+from shared.search_protocol import IndexPart, LoadedGeneration
 
 if TYPE_CHECKING:  # numba takes a while to load, and small maps need no codes
     from services.search.blocks import RowBlocks
     from services.search.bounded import Int8Blocks
-    from services.search.cascade import Blocks
-    from services.search.gpu import Resident
+    from services.search.cascade import SignCodeBlocks
+    from services.search.gpu import GpuSnapshot
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,9 +31,9 @@ class Snapshot:
     version: int
     chunks: tuple[LoadedChunk, ...]
     missing: tuple[str, ...] = ()
-    parts: tuple[Part, ...] = ()
+    parts: tuple[IndexPart, ...] = ()
     """What lies in memory, and what is mapped from files."""
-    resident: Resident | None = None
+    gpu_snapshot: GpuSnapshot | None = None
     """Its rows in a GPU's memory."""
 
     @cached_property
@@ -60,33 +60,33 @@ class Snapshot:
         return sum(chunk.rows.nbytes for chunk in self.chunks)
 
     @cached_property
-    def held(self) -> Held:
-        return Held(rows=len(self.photos), dimension=self.dimension, parts=self.parts)
+    def held(self) -> LoadedGeneration:
+        return LoadedGeneration(rows=len(self.photos), dimension=self.dimension, parts=self.parts)
 
     @cached_property
-    def coded(self) -> bool:
+    def has_sign_codes(self) -> bool:
         """Whether every chunk has its sign codes."""
         return bool(self.chunks) and all(chunk.codes is not None for chunk in self.chunks)
 
     @cached_property
-    def bounded(self) -> bool:
+    def has_int8_codes(self) -> bool:
         """Whether every chunk has its int8 codes."""
         return bool(self.chunks) and all(chunk.int8 is not None for chunk in self.chunks)
 
-    def read_ahead(self, rows: NDArray[np.int64]) -> None:
+    def prefetch_rows(self, rows: NDArray[np.int64]) -> None:
         """Say that these rows are read next, where they are mapped from a file."""
-        first = self.photos.first
+        first = self.photos.first_rows
         chunks = np.searchsorted(first, rows, side="right") - 1
         inside = rows - first[chunks]
         for number, row in zip(chunks.tolist(), inside.tolist(), strict=True):
             self.chunks[number].read_ahead(row)
 
     @cached_property
-    def blocks(self) -> Blocks:
+    def sign_code_blocks(self) -> SignCodeBlocks:
         """Where the sign codes and rows of a coded snapshot lie."""
-        from services.search.cascade import Blocks
+        from services.search.cascade import SignCodeBlocks
 
-        return Blocks.of(self.chunks)
+        return SignCodeBlocks.of(self.chunks)
 
     @cached_property
     def int8_blocks(self) -> Int8Blocks:

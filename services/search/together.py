@@ -14,64 +14,68 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from services.search.cascade import Blocks, CodedQuery, Glance
+    from services.search.cascade import FirstLevelScan, SignCodeBlocks, SignCodedQuery
 
-MOST_TOGETHER = 32
+MAX_BATCH_QUERIES = 32
 
 
 @dataclass(slots=True, eq=False)
-class _Waiting:
-    blocks: Blocks
-    query: CodedQuery
+class _QueuedQuery:
+    blocks: SignCodeBlocks
+    query: SignCodedQuery
     asked: NDArray[np.bool_]
-    turn: threading.Event = field(default_factory=threading.Event)
+    ready: threading.Event = field(default_factory=threading.Event)
     """Set when there is an answer, or when it is this one's turn to go for all."""
-    found: Glance | None = None
+    found: FirstLevelScan | None = None
     error: BaseException | None = None
 
 
-class Glances:
+class QueryBatcher:
     """`glance` for one query at a time, from many threads."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._waiting: list[_Waiting] = []
-        self._on_the_way = False
-        self.rounds = 0  # begun so far
-        self.queries = 0  # that went with them
+        self._queue: list[_QueuedQuery] = []
+        self._batch_running = False
+        self.batches_run = 0  # begun so far
+        self.queries_run = 0  # that went with them
 
     @property
-    def waiting(self) -> int:
+    def queue_length(self) -> int:
         """How many queries wait for the round that is on its way."""
-        return len(self._waiting)
+        return len(self._queue)
 
-    def glance(self, blocks: Blocks, query: CodedQuery, asked: NDArray[np.bool_]) -> Glance:
-        mine = _Waiting(blocks, query, asked)
+    def scan(
+        self, blocks: SignCodeBlocks, query: SignCodedQuery, asked: NDArray[np.bool_]
+    ) -> FirstLevelScan:
+        mine = _QueuedQuery(blocks, query, asked)
         with self._lock:
-            self._waiting.append(mine)
-            if not self._on_the_way:
-                self._on_the_way = True
-                mine.turn.set()
-        mine.turn.wait()
+            self._queue.append(mine)
+            if not self._batch_running:
+                self._batch_running = True
+                mine.ready.set()
+        mine.ready.wait()
         if mine.found is None and mine.error is None:
-            self._go(mine)
+            self._run_batch(mine)
         if mine.error is not None:
             raise mine.error
         assert mine.found is not None
         return mine.found
 
-    def _go(self, leader: _Waiting) -> None:
+    def _run_batch(self, leader: _QueuedQuery) -> None:
         """One round for all who wait for the same blocks; then it is the next one's turn."""
-        from services.search.cascade import glance
+        from services.search.cascade import scan_first_level
 
         with self._lock:
-            others = [w for w in self._waiting if w.blocks is leader.blocks and w is not leader]
-            together = [leader, *others[: MOST_TOGETHER - 1]]
-            self._waiting = [w for w in self._waiting if w not in together]
-            self.rounds += 1
-            self.queries += len(together)
+            others = [w for w in self._queue if w.blocks is leader.blocks and w is not leader]
+            together = [leader, *others[: MAX_BATCH_QUERIES - 1]]
+            self._queue = [w for w in self._queue if w not in together]
+            self.batches_run += 1
+            self.queries_run += len(together)
         try:
-            found = glance(leader.blocks, [w.query for w in together], [w.asked for w in together])
+            found = scan_first_level(
+                leader.blocks, [w.query for w in together], [w.asked for w in together]
+            )
             for one, glanced in zip(together, found, strict=True):
                 one.found = glanced
         except BaseException as error:
@@ -81,9 +85,9 @@ class Glances:
                 raise
         finally:
             with self._lock:
-                if self._waiting:
-                    self._waiting[0].turn.set()
+                if self._queue:
+                    self._queue[0].ready.set()
                 else:
-                    self._on_the_way = False
+                    self._batch_running = False
             for one in together:
-                one.turn.set()
+                one.ready.set()

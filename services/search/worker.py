@@ -12,18 +12,28 @@ from uuid import UUID
 import numpy as np
 from sqlalchemy.exc import SQLAlchemyError
 
-from services.search.answer import Question, answer, lacks_int8, weighted_answer
-from services.search.device import Residency, open_device
-from services.search.follow import FOLLOWED, advance, bounded, wanted_versions
-from services.search.lag import Lags
-from services.search.load import remove_others
-from services.search.make_int8 import Int8Maker
-from services.search.memory import Memory
-from services.search.query_row import QueryRows, expired
-from services.search.select import select
+from services.search.answer import (
+    SearchOptions,
+    execute_query,
+    execute_weighted_query,
+    needs_int8_codes,
+)
+from services.search.device import GpuResidency, open_search_device
+from services.search.follow import (
+    SYNCED_STATES,
+    read_generation_versions,
+    sync_snapshot,
+    with_int8_codes,
+)
+from services.search.lag import ReplicationLagTracker
+from services.search.load import remove_stale_folders
+from services.search.make_int8 import Int8CodeBuilder
+from services.search.memory import MemoryBudget
+from services.search.query_row import QueryRowReader, query_expired_error
+from services.search.select import build_row_mask
 from services.search.snapshot import Snapshot
-from services.search.together import Glances
-from shared.catalog.away import Outage
+from services.search.together import QueryBatcher
+from shared.catalog.away import OutageLog
 from shared.catalog.generations import GenerationState
 from shared.catalog.session import Catalog
 from shared.chunks import Row
@@ -32,16 +42,16 @@ from shared.objects import ObjectStore
 from shared.read_retries import ReadRetries
 from shared.search_protocol import NONE, Mode, SearchRequest, SearchResponse, SearchStatus
 from shared.settings import Settings
-from shared.shards import WHOLE, Shard
-from shared.word_weights.learn import weigh
+from shared.shards import SINGLE_SHARD, Shard
+from shared.word_weights.learn import apply_word_weights
 
 if TYPE_CHECKING:
-    from services.search.gpu import Device
+    from services.search.gpu import GpuDevice
     from shared.codes.int8 import Int8Codes
 
 log = logging.getLogger(__name__)
 
-WAIT_STEP_SECONDS = 0.01
+VERSION_POLL_SECONDS = 0.01
 FILE_CHECK_SECONDS = 5.0  # between two looks at whether mapped files were changed
 
 
@@ -58,70 +68,74 @@ class SearchWorker:
         catalog: Catalog,
         store: ObjectStore,
         settings: Settings,
-        shard: Shard = WHOLE,
-        device: Device | None = None,
+        shard: Shard = SINGLE_SHARD,
+        device: GpuDevice | None = None,
     ) -> None:
         """`device`: where rows are compared, instead of what the settings say."""
         self.shard = shard
-        self.lags = Lags()
+        self.replication_lag = ReplicationLagTracker()
         self._catalog = catalog
         self._settings = settings
         self._store = store
-        self._folder = settings.search_cache(shard)
-        self._glances = Glances()
-        self._memory = Memory(settings.search_memory_bytes)
-        self._rows = QueryRows(store)
+        self._folder = settings.search_cache_folder(shard)
+        self._batcher = QueryBatcher()
+        self._memory_budget = MemoryBudget(settings.search_memory_bytes)
+        self._query_rows = QueryRowReader(store)
         self._snapshots: dict[UUID, Snapshot] = {}
-        self._swap = threading.Lock()  # held for a moment, never while something is read
-        self._loading: dict[UUID, threading.Lock] = {}
-        self._residency = Residency(device or open_device(settings.search_device))
-        self._int8 = Int8Maker(store, self._folder, self._attach_int8)
+        self._snapshots_lock = threading.Lock()  # held for a moment, never while something is read
+        self._load_locks: dict[UUID, threading.Lock] = {}
+        self._residency = GpuResidency(device or open_search_device(settings.search_device))
+        self._int8 = Int8CodeBuilder(store, self._folder, self._attach_int8)
         self._unreadable = ReadRetries()
         self._files_due: dict[UUID, float] = {}  # when each generation's files are looked at next
 
     def run(self, stop: threading.Event) -> None:
         """Follow what answers until `stop` is set."""
-        self._run(stop, (GenerationState.ACTIVE,))
+        self._sync_until_stopped(stop, (GenerationState.ACTIVE,))
 
     def run_building(self, stop: threading.Event) -> None:
         """Follow what is being built until `stop` is set: it may take minutes to load, and what
         answers is not to wait for it."""
-        self._run(stop, (GenerationState.BUILDING,))
+        self._sync_until_stopped(stop, (GenerationState.BUILDING,))
 
-    def _run(self, stop: threading.Event, states: Collection[GenerationState]) -> None:
-        outage = Outage(f"search for what is {' or '.join(states)}")
+    def _sync_until_stopped(
+        self, stop: threading.Event, states: Collection[GenerationState]
+    ) -> None:
+        outage = OutageLog(f"search for what is {' or '.join(states)}")
         while not stop.is_set():
             try:
-                self.follow(states)
-                outage.over()
+                self.sync(states)
+                outage.record_success()
             except SQLAlchemyError as error:  # what is loaded goes on answering
-                outage.met(error)
+                outage.record_error(error)
             except (OSError, Unavailable) as error:
                 log.error("search can't load what is new; serving what is loaded: %s", error)
             stop.wait(self._settings.search_follow_seconds)
 
-    def follow(self, states: Collection[GenerationState] = FOLLOWED) -> None:
+    def sync(self, states: Collection[GenerationState] = SYNCED_STATES) -> None:
         """Bring every generation of these states to its map's version; forget those that are
         gone."""
         looked_at = time.monotonic()
-        wanted = wanted_versions(self._catalog)
-        self.lags.looked(wanted, looked_at)
+        wanted = read_generation_versions(self._catalog)
+        self.replication_lag.record_catalog_read(wanted, looked_at)
         for generation_id, now in wanted.items():
             if now.state not in states:
                 continue
             snapshot = self._snapshots.get(generation_id)
             if snapshot is None or snapshot.version < now.version:
-                self._advance(generation_id, now.version)
+                self._sync_generation(generation_id, now.version)
             elif self._can_mend(snapshot):
-                self._advance(generation_id, now.version, damaged=snapshot)
-            self._fill_device(generation_id)
-            self.lags.level(generation_id, looked_at)
+                self._sync_generation(generation_id, now.version, damaged=snapshot)
+            self._update_gpu(generation_id)
+            self.replication_lag.record_synced(generation_id, looked_at)
         for generation_id in self._snapshots.keys() - wanted.keys():
-            self._memory.forget(generation_id)
-        remove_others(self._folder, wanted.keys())
-        with self._swap:
+            self._memory_budget.release_generation(generation_id)
+        remove_stale_folders(self._folder, wanted.keys())
+        with self._snapshots_lock:
             self._snapshots = {k: v for k, v in self._snapshots.items() if k in wanted}
-            self._loading = {k: v for k, v in self._loading.items() if k in wanted or v.locked()}
+            self._load_locks = {
+                k: v for k, v in self._load_locks.items() if k in wanted or v.locked()
+            }
             self._files_due = {k: v for k, v in self._files_due.items() if k in wanted}
         self._unreadable.forget_others(
             {key for snapshot in self._snapshots.values() for key in snapshot.missing}
@@ -129,24 +143,26 @@ class SearchWorker:
 
     def search(self, request: SearchRequest) -> SearchResponse:
         snapshot = self.snapshot(request.generation_id, request.min_version)
-        query = self._rows.find(snapshot, request)
-        asked = select(snapshot.photos, request.photos, request.exclude)
-        if request.mode == Mode.DETERMINISTIC and lacks_int8(snapshot, asked, request.k):
-            self._int8.wait(snapshot, self._settings.search_wait_seconds)
+        query = self._query_rows.read_query(snapshot, request)
+        asked = build_row_mask(snapshot.photos, request.photos, request.exclude)
+        if request.mode == Mode.DETERMINISTIC and needs_int8_codes(snapshot, asked, request.k):
+            self._int8.wait_for_codes(snapshot, self._settings.search_wait_seconds)
             snapshot = self.snapshot(request.generation_id, snapshot.version)
-            asked = select(snapshot.photos, request.photos, request.exclude)
-        question = Question(
+            asked = build_row_mask(snapshot.photos, request.photos, request.exclude)
+        question = SearchOptions(
             k=request.k,
             min_score=request.min_score,
             mode=request.mode,
             most_rows=request.most_rows,
             most_seconds=request.most_seconds,
         )
-        weighted = _weighted(query, request.word_weights)
+        weighted = _weight_query(query, request.word_weights)
         if weighted is None:
-            found = answer(snapshot, query, asked, question, self._glances)
+            found = execute_query(snapshot, query, asked, question, self._batcher)
         else:
-            found = weighted_answer(snapshot, query, weighted, asked, question, self._glances)
+            found = execute_weighted_query(
+                snapshot, query, weighted, asked, question, self._batcher
+            )
         return SearchResponse(
             hits=found.hits,
             # Better rows may lie in what is missing.
@@ -160,9 +176,9 @@ class SearchWorker:
         )
 
     @property
-    def together(self) -> Glances:
+    def query_batcher(self) -> QueryBatcher:
         """How often queries went through the codes, and how many together."""
-        return self._glances
+        return self._batcher
 
     def status(self) -> SearchStatus:
         snapshots = self._snapshots
@@ -177,7 +193,7 @@ class SearchWorker:
             versions=versions,
             incomplete=tuple(key for key, snapshot in snapshots.items() if snapshot.missing),
             missing=tuple(key for snapshot in snapshots.values() for key in snapshot.missing),
-            lags=self.lags.now(versions),
+            lags=self.replication_lag.current_lags(versions),
             devices=self._residency.status(snapshots.values()),
         )
 
@@ -189,9 +205,9 @@ class SearchWorker:
             snapshot = self._snapshots.get(generation_id)
             if snapshot is not None and snapshot.version >= min_version:
                 return snapshot
-            snapshot = self._advance(generation_id, min_version)
+            snapshot = self._sync_generation(generation_id, min_version)
             if snapshot is None:
-                raise expired(f"generation {generation_id}")
+                raise query_expired_error(f"generation {generation_id}")
             if snapshot.version >= min_version:
                 return snapshot
             if time.monotonic() > deadline:
@@ -200,31 +216,31 @@ class SearchWorker:
                     f"Search has not caught up with version {min_version} of the map. "
                     "Ask again in a moment.",
                 )
-            time.sleep(WAIT_STEP_SECONDS)
+            time.sleep(VERSION_POLL_SECONDS)
 
-    def _advance(
+    def _sync_generation(
         self, generation_id: UUID, version: int, damaged: Snapshot | None = None
     ) -> Snapshot | None:
         """The generation at this version or a later one; another snapshot than `damaged`."""
-        with self._swap:
-            loading = self._loading.setdefault(generation_id, threading.Lock())
+        with self._snapshots_lock:
+            loading = self._load_locks.setdefault(generation_id, threading.Lock())
         with loading:
             old = self._snapshots.get(generation_id)
             if old is not None and old.version >= version and old is not damaged:
                 return old  # another thread loaded it while this one waited
-            new = advance(
+            new = sync_snapshot(
                 self._catalog,
                 self._store,
                 self._folder,
-                self._memory,
+                self._memory_budget,
                 generation_id,
                 old,
                 self._unreadable,
                 self.shard,
             )
             if new is not None:
-                new = self._residency.carry(new, old)
-                with self._swap:
+                new = self._residency.carry_over(new, old)
+                with self._snapshots_lock:
                     self._snapshots = {**self._snapshots, generation_id: new}
             return new
 
@@ -238,45 +254,45 @@ class SearchWorker:
         self._files_due[snapshot.generation_id] = now + FILE_CHECK_SECONDS
         return any(chunk.was_changed() for chunk in snapshot.chunks)
 
-    def _fill_device(self, generation_id: UUID) -> None:
+    def _update_gpu(self, generation_id: UUID) -> None:
         """Put the generation on the device, if there is one, or take it from there after a failure.
         Queries go on meanwhile."""
         snapshot = self._snapshots.get(generation_id)
-        if snapshot is None or not self._residency.wants(snapshot):
+        if snapshot is None or not self._residency.needs_update(snapshot):
             return
-        filled = self._residency.fill(snapshot)
-        if filled.resident is None and snapshot.resident is None:
-            if self._residency.lacks_int8(snapshot):
-                self._int8.start(snapshot)
+        filled = self._residency.update(snapshot)
+        if filled.gpu_snapshot is None and snapshot.gpu_snapshot is None:
+            if self._residency.needs_int8_codes(snapshot):
+                self._int8.start_build(snapshot)
             return
-        with self._swap:
-            loading = self._loading.setdefault(generation_id, threading.Lock())
+        with self._snapshots_lock:
+            loading = self._load_locks.setdefault(generation_id, threading.Lock())
         with loading:
             now = self._snapshots.get(generation_id)
             if now is not None:
-                new = self._residency.carry(now, filled)
-                with self._swap:
+                new = self._residency.carry_over(now, filled)
+                with self._snapshots_lock:
                     self._snapshots = {**self._snapshots, generation_id: new}
 
     def _attach_int8(self, generation_id: UUID, made: dict[UUID, Int8Codes]) -> None:
         """Swap in the snapshot that is there now with its int8 codes."""
-        with self._swap:
-            loading = self._loading.setdefault(generation_id, threading.Lock())
+        with self._snapshots_lock:
+            loading = self._load_locks.setdefault(generation_id, threading.Lock())
         with loading:
             old = self._snapshots.get(generation_id)
             if old is None:
                 return  # it was forgotten meanwhile
-            new = bounded(self._store, self._folder, self._memory, old, made)
-            with self._swap:
+            new = with_int8_codes(self._store, self._folder, self._memory_budget, old, made)
+            with self._snapshots_lock:
                 self._snapshots = {**self._snapshots, generation_id: new}
 
 
-def _weighted(row: Row, weights: tuple[float, ...]) -> Row | None:
+def _weight_query(row: Row, weights: tuple[float, ...]) -> Row | None:
     """None without weights, and where no word of the query has any: the plain ranking is left."""
     if not weights:
         return None
     try:
-        weighted = weigh(row, weights)
+        weighted = apply_word_weights(row, weights)
     except ValueError as error:
         raise InvalidRequest("word_weights_unfit", f"{error}.") from None
     # As every row and every query is: the same question, whichever way it is searched.

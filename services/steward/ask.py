@@ -5,34 +5,34 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from uuid import UUID
 
-from services.steward.located import Located
-from shared.catalog.chunks import descriptor_of
+from services.steward.located import GeotaggedPhoto
+from shared.catalog.chunks import find_descriptor
 from shared.catalog.generations import Generation
 from shared.catalog.session import Catalog
 from shared.errors import Conflict, Gone, Unavailable
-from shared.estimate.places import Spot
-from shared.search_protocol import Hit, SearchPort, SearchRequest
-from shared.shards import names_a_shard
+from shared.estimate.places import PhotoLocation
+from shared.search_protocol import SearchBackend, SearchHit, SearchRequest
+from shared.shards import is_shard_name
 
-TRIES = 2
+MAX_READ_ATTEMPTS = 2
 
-UNKNOWN = Spot(None, None, None)
+UNKNOWN_LOCATION = PhotoLocation(None, None, None)
 
-Ranking = list[tuple[Hit, Spot]]
-Ask = Callable[[Located, int], Ranking | None]
+LocatedRanking = list[tuple[SearchHit, PhotoLocation]]
+RankPhoto = Callable[[GeotaggedPhoto, int], LocatedRanking | None]
 """`Asker.ask`, with the weights chosen."""
 
 
-class Asker:
+class EvaluationSearch:
     """Asks with stored photos; `photos` are those whose spots are known."""
 
     def __init__(
         self,
         catalog: Catalog,
-        search: SearchPort,
+        search: SearchBackend,
         generation: Generation,
         version: int,
-        photos: Mapping[UUID, Located],
+        photos: Mapping[UUID, GeotaggedPhoto],
     ) -> None:
         self._catalog = catalog
         self._search = search
@@ -40,19 +40,19 @@ class Asker:
         self._version = version
         self._photos = photos
 
-    def ask(
+    def rank_similar(
         self,
-        query: Located,
+        query: GeotaggedPhoto,
         k: int,
         weights: tuple[float, ...] = (),
-        without: tuple[UUID, ...] = (),
-    ) -> Ranking | None:
+        excluded_photos: tuple[UUID, ...] = (),
+    ) -> LocatedRanking | None:
         """The k most similar database photos and their spots, without the query itself and those
-        of `without`; None for a query that was deleted since. Conflict (`map_damaged`) when a part
+        of `excluded_photos`; None for a query that was deleted since. Conflict (`map_damaged`) when a part
         can't be searched."""
-        for attempt in range(1, TRIES + 1):
+        for attempt in range(1, MAX_READ_ATTEMPTS + 1):
             with self._catalog.read() as session:
-                found = descriptor_of(session, self._generation.id, query.photo_id)
+                found = find_descriptor(session, self._generation.id, query.photo_id)
             if found is None:
                 return None
             descriptor, chunk = found
@@ -63,36 +63,36 @@ class Asker:
                 row=descriptor.row,
                 min_version=self._version,
                 k=k,
-                exclude=(query.photo_id, *without),
+                exclude=(query.photo_id, *excluded_photos),
                 word_weights=weights,
             )
             try:
                 answer = self._search.search(request)
             except Gone:  # its chunk was merged into another between the two calls
-                if attempt == TRIES:
+                if attempt == MAX_READ_ATTEMPTS:
                     raise
                 continue
             except Unavailable as error:
                 if error.code == "chunk_unreadable":
-                    raise damaged([chunk.object_key]) from error
+                    raise map_damaged_error([chunk.object_key]) from error
                 raise
-            if any(names_a_shard(part) for part in answer.missing):
+            if any(is_shard_name(part) for part in answer.missing):
                 raise Unavailable(
                     "search_incomplete",
                     f"Without {', '.join(answer.missing)} the figures would be those of a part "
                     "of the map.",
                 )
             if answer.missing:
-                raise damaged(answer.missing)
-            return [(hit, self._spot(hit)) for hit in answer.hits]
+                raise map_damaged_error(answer.missing)
+            return [(hit, self._location(hit)) for hit in answer.hits]
         raise AssertionError("the last try returns or raises")
 
-    def _spot(self, hit: Hit) -> Spot:
+    def _location(self, hit: SearchHit) -> PhotoLocation:
         found = self._photos.get(hit.photo_id)
-        return found.spot if found else UNKNOWN
+        return found.spot if found else UNKNOWN_LOCATION
 
 
-def damaged(missing: Sequence[str]) -> Conflict:
+def map_damaged_error(missing: Sequence[str]) -> Conflict:
     """What figures of the rest would hide."""
     return Conflict(
         "map_damaged",

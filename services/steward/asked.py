@@ -5,15 +5,15 @@ from __future__ import annotations
 import threading
 import time
 
-from services.steward.take import Stopped
+from services.steward.take import JobInterrupted
 from shared.catalog.session import Catalog
 from shared.jobs import Job
-from shared.jobs.leases import held, token_of
+from shared.jobs.leases import get_lease_token, lock_leased_jobs
 
-REPORT_SECONDS = 0.5  # between two notes of the progress
+PROGRESS_INTERVAL_SECONDS = 0.5  # between two notes of the progress
 
 
-class Asked:
+class EvaluationProgress:
     """Counts the questions of one claimed job."""
 
     def __init__(self, catalog: Catalog, job: Job, stop: threading.Event) -> None:
@@ -23,24 +23,24 @@ class Asked:
         self._count = 0
         self._reported = time.monotonic()
 
-    def begin(self, total: int) -> None:
+    def set_total(self, total: int) -> None:
         """So many there will be, about."""
-        self._report(total)
+        self._write_progress(total)
 
-    def one(self) -> None:
+    def advance(self) -> None:
         """One more; Stopped when the job is no longer ours, or its steward is to end."""
         self._count += 1
         if self._stop.is_set():
-            raise Stopped
-        if time.monotonic() - self._reported > REPORT_SECONDS:
+            raise JobInterrupted
+        if time.monotonic() - self._reported > PROGRESS_INTERVAL_SECONDS:
             self._reported = time.monotonic()
-            self._report()
+            self._write_progress()
 
-    def _report(self, total: int | None = None) -> None:
+    def _write_progress(self, total: int | None = None) -> None:
         with self._catalog.write() as session:
-            mine = held(session, token_of(self._job), [self._job])
+            mine = lock_leased_jobs(session, get_lease_token(self._job), [self._job])
             for current in mine:
                 current.progress_total = max(1, total or current.progress_total)
                 current.progress_done = min(self._count, current.progress_total)
         if not mine:
-            raise Stopped
+            raise JobInterrupted

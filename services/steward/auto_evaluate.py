@@ -10,23 +10,23 @@ from uuid import UUID
 from sqlalchemy import exists, select
 from sqlalchemy.orm import Session
 
-from shared.catalog.evaluations import last_evaluation
-from shared.catalog.figures import figures_of
+from shared.catalog.evaluations import latest_evaluation
+from shared.catalog.figures import get_map_statistics
 from shared.catalog.generations import Generation, active_generation
 from shared.catalog.maps import list_maps, lock_map
 from shared.catalog.session import Catalog
-from shared.catalog.vocabularies import standing_of, why_no_word_weights
+from shared.catalog.vocabularies import vocabulary_standing, word_weights_unavailable_reason
 from shared.ids import new_id
 from shared.jobs import Job, JobKind, JobState, Priority
-from shared.jobs.table import QUERY_JOBS, UNFINISHED
-from shared.word_weights.record import stored_word_weights
+from shared.jobs.table import QUERY_JOBS, UNFINISHED_STATES
+from shared.word_weights.record import parse_word_weights
 
-SAMPLE_PHOTOS = 300  # enough for a threshold that one in twenty exceeds
-CHANGED_SHARE = 0.2  # of the photos: more, and what was measured is out of date
+AUTO_SAMPLE_PHOTOS = 300  # enough for a threshold that one in twenty exceeds
+REEVALUATE_SHARE = 0.2  # of the photos: more, and what was measured is out of date
 
 
 @dataclass(frozen=True, slots=True)
-class Due:
+class DueJob:
     """A job that a map should have now."""
 
     kind: JobKind
@@ -42,12 +42,12 @@ def evaluate_changed_maps(catalog: Catalog, least_photos: int, word_weights: boo
         due = [
             map_.id
             for map_ in list_maps(session)
-            if _due(session, map_.id, least_photos, word_weights)
+            if _due_job(session, map_.id, least_photos, word_weights)
         ]
     for map_id in due:
         with catalog.write() as session:
             lock_map(session, map_id)
-            wanted = _due(session, map_id, least_photos, word_weights)
+            wanted = _due_job(session, map_id, least_photos, word_weights)
             if wanted is None:
                 continue  # another steward was first
             session.add(
@@ -61,67 +61,69 @@ def evaluate_changed_maps(catalog: Catalog, least_photos: int, word_weights: boo
             )
 
 
-def _due(session: Session, map_id: UUID, least_photos: int, word_weights: bool) -> Due | None:
+def _due_job(
+    session: Session, map_id: UUID, least_photos: int, word_weights: bool
+) -> DueJob | None:
     """The job that the map should have now, if any."""
     generation = active_generation(session, map_id)
     if generation is None or _is_busy(session, map_id):
         return None
-    figures, _ = figures_of(session, map_id)
+    figures, _ = get_map_statistics(session, map_id)
     if figures.located < least_photos:
         return None
     searchable, queries = figures.searchable, figures.located_queries
     params = {
-        "sample": SAMPLE_PHOTOS,
+        "sample": AUTO_SAMPLE_PHOTOS,
         "seed": 0,
         "automatic": True,
         "generation_id": str(generation.id),
         "searchable": searchable,
         "labelled_queries": queries,
     }
-    seen = _evaluated(session, generation)
-    if seen is None or _differs(searchable, seen[0]) or _differs(queries, seen[1]):
-        return Due(JobKind.EVALUATE, params)
-    if not word_weights or not _has_words_of_its_own(session, generation):
+    seen = _last_evaluated_counts(session, generation)
+    if seen is None or _changed_enough(searchable, seen[0]) or _changed_enough(queries, seen[1]):
+        return DueJob(JobKind.EVALUATE, params)
+    if not word_weights or not _has_own_vocabulary(session, generation):
         return None
-    learnt = _learnt(session, generation)
-    if learnt is None or _differs(searchable, learnt):
-        return Due(JobKind.WORD_WEIGHTS, params)
+    learnt = _last_weighted_count(session, generation)
+    if learnt is None or _changed_enough(searchable, learnt):
+        return DueJob(JobKind.WORD_WEIGHTS, params)
     return None
 
 
 def _is_busy(session: Session, map_id: UUID) -> bool:
     """Photos are being described, or an evaluation is under way: what is found still changes."""
     unfinished = exists().where(
-        Job.map_id == map_id, Job.state.in_(UNFINISHED), Job.kind.not_in(QUERY_JOBS)
+        Job.map_id == map_id, Job.state.in_(UNFINISHED_STATES), Job.kind.not_in(QUERY_JOBS)
     )
     return bool(session.scalar(select(unfinished)))
 
 
-def _has_words_of_its_own(session: Session, generation: Generation) -> bool:
+def _has_own_vocabulary(session: Session, generation: Generation) -> bool:
     """Weights of a foreign vocabulary have never helped (benchmarks/RESULTS.md)."""
     return (
-        standing_of(session, generation) == "own"
-        and why_no_word_weights(session, generation) is None
+        vocabulary_standing(session, generation) == "own"
+        and word_weights_unavailable_reason(session, generation) is None
     )
 
 
-def _evaluated(session: Session, generation: Generation) -> tuple[int, int] | None:
+def _last_evaluated_counts(session: Session, generation: Generation) -> tuple[int, int] | None:
     """How many photos and labelled queries the last evaluation saw."""
-    if failed := _came_to_nothing(session, generation, JobKind.EVALUATE):
+    if failed := _failed_job_params(session, generation, JobKind.EVALUATE):
         return failed["searchable"], failed["labelled_queries"]
-    last = last_evaluation(session, generation.id)
+    last = latest_evaluation(session, generation.id)
     return None if last is None else (last.searchable, last.labelled_queries)
 
 
-def _learnt(session: Session, generation: Generation) -> int | None:
+def _last_weighted_count(session: Session, generation: Generation) -> int | None:
     """Of how many photos the generation's word weights were learnt."""
-    if failed := _came_to_nothing(session, generation, JobKind.WORD_WEIGHTS):
+    if failed := _failed_job_params(session, generation, JobKind.WORD_WEIGHTS):
         return int(failed["searchable"])
-    record = stored_word_weights(generation.word_weights)
+    record = parse_word_weights(generation.word_weights)
     return None if record is None else record.searchable
 
 
-def _came_to_nothing(
+def _failed_job_params(
     session: Session, generation: Generation, kind: JobKind
 ) -> dict[str, Any] | None:
     """The parameters of the map's last job of this kind, if it was queued here and came to nothing:
@@ -142,5 +144,5 @@ def _came_to_nothing(
     return None
 
 
-def _differs(now: int, then: int) -> bool:
-    return abs(now - then) > CHANGED_SHARE * then
+def _changed_enough(now: int, then: int) -> bool:
+    return abs(now - then) > REEVALUATE_SHARE * then

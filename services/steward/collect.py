@@ -21,10 +21,10 @@ from sqlalchemy.orm import Session
 from services.steward.journal import deletion_is_journaled, journal_deletions
 from shared.catalog.base import db_now, db_now_plus
 from shared.catalog.chunks import Chunk, Descriptor
-from shared.catalog.direct_uploads import DirectUpload
+from shared.catalog.direct_uploads import PresignedUpload
 from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.journaled import is_journaled
-from shared.catalog.maps import bump_version, lock_map
+from shared.catalog.maps import increment_map_version, lock_map
 from shared.catalog.models import Model
 from shared.catalog.photos import Photo
 from shared.catalog.session import Catalog
@@ -33,7 +33,14 @@ from shared.catalog.whitenings import StoredWhitening
 from shared.chunks import codes_key, delete_chunk, manifest_key
 from shared.errors import Conflict
 from shared.jobs.batches import BatchItem
-from shared.jobs.table import MODEL_CHANGES, QUERY_JOBS, UNFINISHED, Job, JobKind, JobState
+from shared.jobs.table import (
+    MODEL_CHANGE_JOBS,
+    QUERY_JOBS,
+    UNFINISHED_STATES,
+    Job,
+    JobKind,
+    JobState,
+)
 from shared.journal.lag import catalog_lag
 from shared.journal.outbox import accept_segments
 from shared.objects import ObjectStore, OwnedStore
@@ -52,9 +59,9 @@ from shared.objects.keys import (
     WORK,
     incoming_key,
     is_original_key,
-    keys_of_query,
     local_features_key,
     local_features_prefix,
+    query_object_keys,
     thumbnail_key,
 )
 from shared.objects.port import ObjectInfo
@@ -63,17 +70,19 @@ from shared.settings import Settings
 
 log = logging.getLogger(__name__)
 
-AT_ONCE = 500  # rows looked at in one transaction
+ROWS_PER_TRANSACTION = 500  # rows looked at in one transaction
 REMEMBERED = 10_000  # orphans that need no second walk over the store
 ALWAYS_COLLECTED = 100  # orphans: in a small store, a few are a large share
-COMPLETED_SECONDS = 86_400.0  # for which a completed direct upload is remembered
+COMPLETED_UPLOAD_SECONDS = 86_400.0  # for which a completed direct upload is remembered
 
 
 def collect_superseded_chunks(catalog: Catalog, store: ObjectStore, grace_seconds: float) -> None:
     """Chunks that were merged into others; the grace lets running queries finish with them."""
     with catalog.read() as session:
         chunks = session.scalars(
-            select(Chunk).where(Chunk.superseded_at < db_now_plus(-grace_seconds)).limit(AT_ONCE)
+            select(Chunk)
+            .where(Chunk.superseded_at < db_now_plus(-grace_seconds))
+            .limit(ROWS_PER_TRANSACTION)
         ).all()
     for chunk in chunks:
         delete_chunk(store, chunk.object_key)
@@ -96,7 +105,7 @@ def collect_ended_generations(catalog: Catalog, store: ObjectStore, grace_second
                 Generation.state.in_((GenerationState.RETIRED, GenerationState.ABANDONED)),
                 Generation.ended_at < db_now_plus(-grace_seconds),
             )
-            .limit(AT_ONCE)
+            .limit(ROWS_PER_TRANSACTION)
         ).all()
         given_up = session.scalars(
             select(Job.id)
@@ -106,7 +115,7 @@ def collect_ended_generations(catalog: Catalog, store: ObjectStore, grace_second
                 Generation.state == GenerationState.ABANDONED,
                 Generation.ended_at < db_now_plus(-grace_seconds),
             )
-            .limit(AT_ONCE)
+            .limit(ROWS_PER_TRANSACTION)
         ).all()
     if given_up:
         with catalog.write() as session:
@@ -130,7 +139,9 @@ def collect_whitenings(catalog: Catalog, store: ObjectStore, grace_seconds: floa
         or_(Generation.ended_at.is_(None), Generation.ended_at >= db_now_plus(-grace_seconds)),
     )
     with catalog.read() as session:
-        ended = session.scalars(select(StoredWhitening).where(~in_use).limit(AT_ONCE)).all()
+        ended = session.scalars(
+            select(StoredWhitening).where(~in_use).limit(ROWS_PER_TRANSACTION)
+        ).all()
     for whitening in ended:
         store.delete(whitening.object_key)
     if ended:
@@ -156,7 +167,7 @@ def collect_deleted_photos(catalog: Catalog, store: ObjectStore, grace_seconds: 
             .where(
                 Photo.deleted_at.is_not(None), Photo.object_key != "", deletion_is_journaled(Photo)
             )
-            .limit(AT_ONCE)
+            .limit(ROWS_PER_TRANSACTION)
         ).all()
         described_in = _generations_with_rows(session, {photo.map_id for photo in photos})
     for photo in photos:
@@ -173,7 +184,7 @@ def collect_deleted_photos(catalog: Catalog, store: ObjectStore, grace_seconds: 
                 # The revision is named, or this would count as a change for the journal.
                 .values(object_key="", revision=Photo.revision)
             )
-        _forget_photos(session, grace_seconds)
+        _delete_photo_rows(session, grace_seconds)
 
 
 def _generations_with_rows(session: Session, map_ids: set[UUID]) -> dict[UUID, list[UUID]]:
@@ -189,7 +200,7 @@ def _generations_with_rows(session: Session, map_ids: set[UUID]) -> dict[UUID, l
     return found
 
 
-def _forget_photos(session: Session, grace_seconds: float) -> None:
+def _delete_photo_rows(session: Session, grace_seconds: float) -> None:
     gone = session.execute(
         select(Photo.id, Photo.map_id)
         .where(
@@ -197,14 +208,16 @@ def _forget_photos(session: Session, grace_seconds: float) -> None:
             Photo.object_key == "",
             is_journaled(Photo),
         )
-        .limit(AT_ONCE)
+        .limit(ROWS_PER_TRANSACTION)
     ).all()
     photo_ids = [photo_id for photo_id, _ in gone]
     if not photo_ids:
         return
     for map_id in sorted({map_id for _, map_id in gone}):
         lock_map(session, map_id)
-        bump_version(session, map_id)  # workers that are far behind load their chunks again
+        increment_map_version(
+            session, map_id
+        )  # workers that are far behind load their chunks again
     session.execute(delete(Descriptor).where(Descriptor.photo_id.in_(photo_ids)))
     session.execute(delete(Job).where(Job.photo_id.in_(photo_ids)))
     session.execute(delete(Photo).where(Photo.id.in_(photo_ids)))
@@ -217,10 +230,10 @@ def collect_queries(catalog: Catalog, store: ObjectStore, ttl_seconds: float) ->
         job_ids = session.scalars(
             select(Job.id)
             .where(Job.kind.in_(QUERY_JOBS), Job.created_at < db_now_plus(-ttl_seconds))
-            .limit(AT_ONCE)
+            .limit(ROWS_PER_TRANSACTION)
         ).all()
     for job_id in job_ids:
-        for key in keys_of_query(job_id):
+        for key in query_object_keys(job_id):
             store.delete(key)
     if job_ids:
         with catalog.write() as session:
@@ -231,22 +244,24 @@ def collect_direct_uploads(catalog: Catalog, store: ObjectStore) -> None:
     """Direct uploads that were not completed in time, with what was sent for them; completed ones
     after a day more, in which completing them again gives the same answer."""
     gone = or_(
-        and_(DirectUpload.answer.is_(None), DirectUpload.expires_at < db_now()),
-        DirectUpload.expires_at < db_now_plus(-COMPLETED_SECONDS),
+        and_(PresignedUpload.answer.is_(None), PresignedUpload.expires_at < db_now()),
+        PresignedUpload.expires_at < db_now_plus(-COMPLETED_UPLOAD_SECONDS),
     )
     with catalog.read() as session:
-        upload_ids = session.scalars(select(DirectUpload.id).where(gone).limit(AT_ONCE)).all()
+        upload_ids = session.scalars(
+            select(PresignedUpload.id).where(gone).limit(ROWS_PER_TRANSACTION)
+        ).all()
     for upload_id in upload_ids:
         store.delete(incoming_key(upload_id))
     if upload_ids:
         with catalog.write() as session:
             session.execute(
                 # Looked at again: it may have been completed at the last moment.
-                delete(DirectUpload).where(DirectUpload.id.in_(upload_ids), gone)
+                delete(PresignedUpload).where(PresignedUpload.id.in_(upload_ids), gone)
             )
 
 
-def collect_work(catalog: Catalog, store: ObjectStore) -> None:
+def collect_model_change_files(catalog: Catalog, store: ObjectStore) -> None:
     """What model changes kept between their slices, once they have ended or need it no more."""
     keys = [info.key for info in store.list(WORK)]
     if not keys:
@@ -254,8 +269,8 @@ def collect_work(catalog: Catalog, store: ObjectStore) -> None:
     with catalog.read() as session:
         unfinished = session.scalars(
             select(Job.id).where(
-                Job.kind.in_(MODEL_CHANGES),
-                Job.state.in_(UNFINISHED),
+                Job.kind.in_(MODEL_CHANGE_JOBS),
+                Job.state.in_(UNFINISHED_STATES),
                 Job.generation_id.is_(None),
             )
         )
@@ -265,7 +280,7 @@ def collect_work(catalog: Catalog, store: ObjectStore) -> None:
             store.delete(key)
 
 
-def collect_brought(catalog: Catalog, store: ObjectStore, prefix: str, kind: JobKind) -> None:
+def collect_job_files(catalog: Catalog, store: ObjectStore, prefix: str, kind: JobKind) -> None:
     """Files that came for jobs of this kind, once these have ended. One that no job knows may just
     be coming in.
     """
@@ -274,7 +289,7 @@ def collect_brought(catalog: Catalog, store: ObjectStore, prefix: str, kind: Job
         return
     with catalog.read() as session:
         ended = session.scalars(
-            select(Job.params).where(Job.kind == kind, Job.state.not_in(UNFINISHED))
+            select(Job.params).where(Job.kind == kind, Job.state.not_in(UNFINISHED_STATES))
         )
         done = {params.get("object_key") for params in ended}
     for key in keys:
@@ -318,7 +333,7 @@ def collect_orphans(
     lies in the trash then, and the journal goes on.
     """
     count, first = StoreCount(), list[ObjectInfo]()
-    for info in orphans(catalog, store, age_seconds, count):
+    for info in find_orphans(catalog, store, age_seconds, count):
         if len(first) < REMEMBERED:
             first.append(info)
     found, before = count.orphans.total(), read_hold(store)
@@ -337,7 +352,7 @@ def collect_orphans(
             raise CollectionHeld(hold)
     moved = _move_orphans(catalog, store, first)
     if found > len(first):
-        moved += _move_orphans(catalog, store, orphans(catalog, store, age_seconds))
+        moved += _move_orphans(catalog, store, find_orphans(catalog, store, age_seconds))
     if confirmed:
         accept_segments(catalog, store)
     if before is not None and (confirmed or before.reason != HoldReason.ADOPTED):
@@ -351,10 +366,10 @@ def count_store(catalog: Catalog | None, store: ObjectStore) -> StoreCount:
     """All objects, and those of any age that no row knows; without a catalog: none is known."""
     count = StoreCount()
     if catalog is not None:
-        for _ in orphans(catalog, store, 0.0, count):
+        for _ in find_orphans(catalog, store, 0.0, count):
             pass
         return count
-    for prefix in REFERENCED:
+    for prefix in REFERENCED_BY_PREFIX:
         for info in _counted(store.list(prefix), count):
             if prefix != ORIGINALS or is_original_key(info.key):
                 count.orphans[prefix] += 1
@@ -362,7 +377,7 @@ def count_store(catalog: Catalog | None, store: ObjectStore) -> StoreCount:
     return count
 
 
-def orphans(
+def find_orphans(
     catalog: Catalog, store: ObjectStore, age_seconds: float, count: StoreCount | None = None
 ) -> Iterator[ObjectInfo]:
     """Objects older than `age_seconds` that no row knows: crashes between object and commit.
@@ -371,7 +386,7 @@ def orphans(
     """
     count = StoreCount() if count is None else count
     before = _now(catalog) - timedelta(seconds=age_seconds)
-    for prefix in REFERENCED:
+    for prefix in REFERENCED_BY_PREFIX:
         for some in _batches(_counted(store.list(prefix), count)):
             for info in _unknown(catalog, prefix, [i for i in some if i.modified_at < before]):
                 count.orphans[prefix] += 1
@@ -387,7 +402,7 @@ def _counted(found: Iterable[ObjectInfo], count: StoreCount) -> Iterator[ObjectI
 
 def _batches(found: Iterable[ObjectInfo]) -> Iterator[list[ObjectInfo]]:
     iterator = iter(found)
-    while some := list(islice(iterator, AT_ONCE)):
+    while some := list(islice(iterator, ROWS_PER_TRANSACTION)):
         yield some
 
 
@@ -396,7 +411,7 @@ def _unknown(catalog: Catalog, prefix: str, some: list[ObjectInfo]) -> list[Obje
     if not some:
         return []
     with catalog.read() as session:
-        known = set(REFERENCED[prefix](session, [info.key for info in some]))
+        known = set(REFERENCED_BY_PREFIX[prefix](session, [info.key for info in some]))
     return [info for info in some if info.key not in known]
 
 
@@ -423,20 +438,20 @@ def _now(catalog: Catalog) -> datetime:
         return session.execute(select(db_now())).scalar_one()
 
 
-def collect(catalog: Catalog, store: ObjectStore, settings: Settings) -> None:
+def collect_garbage(catalog: Catalog, store: ObjectStore, settings: Settings) -> None:
     """Everything above but the orphans, which need a walk over the whole store."""
     collect_superseded_chunks(catalog, store, settings.superseded_grace_seconds)
     collect_ended_generations(catalog, store, settings.retired_grace_seconds)
     collect_whitenings(catalog, store, settings.retired_grace_seconds)
     collect_deleted_photos(catalog, store, settings.retired_grace_seconds)
     collect_queries(catalog, store, settings.query_ttl_seconds)
-    collect_work(catalog, store)
+    collect_model_change_files(catalog, store)
     collect_direct_uploads(catalog, store)
-    collect_brought(catalog, store, ARCHIVES, JobKind.BATCH)
-    collect_brought(catalog, store, CHECKPOINTS, JobKind.ADD_MODEL)
+    collect_job_files(catalog, store, ARCHIVES, JobKind.BATCH)
+    collect_job_files(catalog, store, CHECKPOINTS, JobKind.ADD_MODEL)
 
 
-def _known_originals(session: Session, keys: list[str]) -> Iterable[str]:
+def _referenced_originals(session: Session, keys: list[str]) -> Iterable[str]:
     """Those of photos and of waiting items of batches; and whatever Placewise has not put there:
     that is not ours to remove."""
     stored = session.scalars(select(Photo.object_key).where(Photo.object_key.in_(keys)))
@@ -448,72 +463,72 @@ def _known_originals(session: Session, keys: list[str]) -> Iterable[str]:
     return [*stored, *filter(None, waiting), *(key for key in keys if not is_original_key(key))]
 
 
-def _waiting_for(kind: JobKind) -> Callable[[Session, list[str]], Iterable[str]]:
+def _referenced_by_unfinished_jobs(kind: JobKind) -> Callable[[Session, list[str]], Iterable[str]]:
     """Files that came for jobs of this kind which have not ended."""
 
     def known(session: Session, keys: list[str]) -> Iterable[str]:
         waiting = session.scalars(
-            select(Job.params).where(Job.kind == kind, Job.state.in_(UNFINISHED))
+            select(Job.params).where(Job.kind == kind, Job.state.in_(UNFINISHED_STATES))
         )
         return [params["object_key"] for params in waiting if "object_key" in params]
 
     return known
 
 
-def _known_incoming(session: Session, keys: list[str]) -> Iterable[str]:
+def _referenced_incoming(session: Session, keys: list[str]) -> Iterable[str]:
     """Those of uploads that are not completed; of others, a URL that was still good sent more."""
-    upload_ids = _ids(key.removeprefix(INCOMING) for key in keys)
+    upload_ids = _parse_uuids(key.removeprefix(INCOMING) for key in keys)
     waiting = session.scalars(
-        select(DirectUpload.id).where(
-            DirectUpload.id.in_(upload_ids), DirectUpload.answer.is_(None)
+        select(PresignedUpload.id).where(
+            PresignedUpload.id.in_(upload_ids), PresignedUpload.answer.is_(None)
         )
     )
     return [incoming_key(upload_id) for upload_id in waiting]
 
 
-def _known_thumbnails(session: Session, keys: list[str]) -> Iterable[str]:
-    photo_ids = _ids(key.removeprefix(THUMBNAILS).removesuffix(".jpg") for key in keys)
+def _referenced_thumbnails(session: Session, keys: list[str]) -> Iterable[str]:
+    photo_ids = _parse_uuids(key.removeprefix(THUMBNAILS).removesuffix(".jpg") for key in keys)
     live = session.scalars(
         select(Photo.id).where(Photo.id.in_(photo_ids), Photo.deleted_at.is_(None))
     )
     return [thumbnail_key(photo_id) for photo_id in live]
 
 
-def _known_chunks(session: Session, keys: list[str]) -> Iterable[str]:
+def _referenced_chunks(session: Session, keys: list[str]) -> Iterable[str]:
     arrays = {key.rpartition(".")[0] + ".npy" for key in keys}
     known = session.scalars(select(Chunk.object_key).where(Chunk.object_key.in_(arrays)))
     return [name for key in known for name in (key, manifest_key(key), codes_key(key))]
 
 
-def _known_vocabularies(session: Session, keys: list[str]) -> Iterable[str]:
+def _referenced_vocabularies(session: Session, keys: list[str]) -> Iterable[str]:
     stored = session.scalars(select(Vocabulary.object_key).where(Vocabulary.object_key.in_(keys)))
     waiting = session.scalars(
-        select(Job.params).where(Job.kind == JobKind.IMPORT, Job.state.in_(UNFINISHED))
+        select(Job.params).where(Job.kind == JobKind.IMPORT, Job.state.in_(UNFINISHED_STATES))
     )
     return [*stored, *(params["object_key"] for params in waiting)]
 
 
-def _known_whitenings(session: Session, keys: list[str]) -> Iterable[str]:
+def _referenced_whitenings(session: Session, keys: list[str]) -> Iterable[str]:
     return session.scalars(
         select(StoredWhitening.object_key).where(StoredWhitening.object_key.in_(keys))
     )
 
 
-def _known_models(session: Session, keys: list[str]) -> Iterable[str]:
+def _referenced_models(session: Session, keys: list[str]) -> Iterable[str]:
     return filter(None, session.scalars(select(Model.object_key).where(Model.object_key.in_(keys))))
 
 
-def _known_queries(session: Session, keys: list[str]) -> Iterable[str]:
-    job_ids = _ids(key.removeprefix(QUERIES).partition(".")[0] for key in keys)
+def _referenced_queries(session: Session, keys: list[str]) -> Iterable[str]:
+    job_ids = _parse_uuids(key.removeprefix(QUERIES).partition(".")[0] for key in keys)
     known = session.scalars(select(Job.id).where(Job.id.in_(job_ids)))
-    return [key for job_id in known for key in keys_of_query(job_id)]
+    return [key for job_id in known for key in query_object_keys(job_id)]
 
 
-def _known_local_features(session: Session, keys: list[str]) -> Iterable[str]:
+def _referenced_local_features(session: Session, keys: list[str]) -> Iterable[str]:
     """Those of live photos in generations that still have their descriptors."""
     named = {key: key.removeprefix(FEATURES).removesuffix(".npy").split("/") for key in keys}
-    generation_ids = _ids(names[0] for names in named.values())
-    photo_ids = _ids(names[-1] for names in named.values())
+    generation_ids = _parse_uuids(names[0] for names in named.values())
+    photo_ids = _parse_uuids(names[-1] for names in named.values())
     known = session.execute(
         select(Descriptor.generation_id, Descriptor.photo_id)
         .join(Photo, Photo.id == Descriptor.photo_id)
@@ -526,7 +541,7 @@ def _known_local_features(session: Session, keys: list[str]) -> Iterable[str]:
     return [local_features_key(generation_id, photo_id) for generation_id, photo_id in known]
 
 
-def _ids(names: Iterable[str]) -> set[UUID]:
+def _parse_uuids(names: Iterable[str]) -> set[UUID]:
     """Those of the names that are ids: what else lies in the store belongs to no row."""
     found = set()
     for name in names:
@@ -535,16 +550,16 @@ def _ids(names: Iterable[str]) -> set[UUID]:
     return found
 
 
-REFERENCED: dict[str, Callable[[Session, list[str]], Iterable[str]]] = {
-    INCOMING: _known_incoming,
-    ARCHIVES: _waiting_for(JobKind.BATCH),
-    CHECKPOINTS: _waiting_for(JobKind.ADD_MODEL),
-    MODELS: _known_models,
-    ORIGINALS: _known_originals,
-    THUMBNAILS: _known_thumbnails,
-    "chunks/": _known_chunks,
-    VOCABULARIES: _known_vocabularies,
-    WHITENINGS: _known_whitenings,
-    QUERIES: _known_queries,
-    FEATURES: _known_local_features,
+REFERENCED_BY_PREFIX: dict[str, Callable[[Session, list[str]], Iterable[str]]] = {
+    INCOMING: _referenced_incoming,
+    ARCHIVES: _referenced_by_unfinished_jobs(JobKind.BATCH),
+    CHECKPOINTS: _referenced_by_unfinished_jobs(JobKind.ADD_MODEL),
+    MODELS: _referenced_models,
+    ORIGINALS: _referenced_originals,
+    THUMBNAILS: _referenced_thumbnails,
+    "chunks/": _referenced_chunks,
+    VOCABULARIES: _referenced_vocabularies,
+    WHITENINGS: _referenced_whitenings,
+    QUERIES: _referenced_queries,
+    FEATURES: _referenced_local_features,
 }

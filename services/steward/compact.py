@@ -11,9 +11,9 @@ from sqlalchemy import delete, func, select, update
 from sqlalchemy.orm import Session
 
 from shared.catalog.base import db_now
-from shared.catalog.chunks import Chunk, Descriptor, live_rows
+from shared.catalog.chunks import Chunk, Descriptor, list_live_rows
 from shared.catalog.generations import Generation, GenerationState, lock_generation
-from shared.catalog.maps import Map, bump_version, lock_map
+from shared.catalog.maps import Map, increment_map_version, lock_map
 from shared.catalog.photos import Photo
 from shared.catalog.session import Catalog
 from shared.chunks import read_chunk, write_chunk
@@ -24,18 +24,18 @@ from shared.read_retries import ReadRetries
 
 log = logging.getLogger(__name__)
 
-SLOTS_AT_ONCE = 100  # of which dead rows are counted in one round: 100,000 rows, some 0.2 s
-DEAD_SHARE = 0.2  # of a chunk's rows: more, and rewriting it is worth the reading
+DEAD_ROW_SAMPLE_SLOTS = 100  # of which dead rows are counted in one round: 100,000 rows, some 0.2 s
+DEAD_ROW_SHARE = 0.2  # of a chunk's rows: more, and rewriting it is worth the reading
 
 
-def compact(
+def merge_small_chunks(
     catalog: Catalog, store: ObjectStore, compact_chunks: int, retries: ReadRetries | None = None
 ) -> int:
     """Merge every slot that is worth it; returns how many were merged. `retries` keeps the slots
     whose chunks can't be read from being read with every round."""
     retries = retries or ReadRetries()
     merged = 0
-    for generation_id, slot in _worth_merging(catalog, compact_chunks):
+    for generation_id, slot in _find_slots_to_merge(catalog, compact_chunks):
         name = f"slot {slot} of generation {generation_id}"
         if not retries.is_due(name):
             continue
@@ -51,8 +51,8 @@ def merge_slot(catalog: Catalog, store: ObjectStore, generation_id: UUID, slot: 
     """Write the slot's live rows into one new chunk; False when something changed meanwhile."""
     with catalog.read() as session:
         generation = session.get_one(Generation, generation_id)
-        old = _chunks(session, generation_id, slot)
-        kept = {chunk.id: live_rows(session, chunk.id) for chunk in old}
+        old = _slot_chunks(session, generation_id, slot)
+        kept = {chunk.id: list_live_rows(session, chunk.id) for chunk in old}
     rows = [read_chunk(store, chunk.object_key, chunk.sha256) for chunk in old]
     photo_ids = [photo_id for chunk in old for _, photo_id in kept[chunk.id]]
     written, chunk_id = None, new_id()
@@ -71,7 +71,7 @@ def merge_slot(catalog: Catalog, store: ObjectStore, generation_id: UUID, slot: 
     with catalog.write() as session:
         lock_map(session, generation.map_id)
         generation = lock_generation(session, generation_id)
-        now = {chunk.id for chunk in _chunks(session, generation_id, slot)}
+        now = {chunk.id for chunk in _slot_chunks(session, generation_id, slot)}
         if now != {chunk.id for chunk in old}:
             return False  # another steward, or a new chunk in the slot: the new file is an orphan
         old_ids = [chunk.id for chunk in old]
@@ -105,12 +105,12 @@ def merge_slot(catalog: Catalog, store: ObjectStore, generation_id: UUID, slot: 
                 if photo_id in present
             )
         session.execute(update(Chunk).where(Chunk.id.in_(old_ids)).values(superseded_at=db_now()))
-        bump_version(session, generation.map_id)
+        increment_map_version(session, generation.map_id)
     log.info("slot %d of %s: %d chunks are one", slot, generation_id, len(old))
     return True
 
 
-def _chunks(session: Session, generation_id: UUID, slot: int) -> list[Chunk]:
+def _slot_chunks(session: Session, generation_id: UUID, slot: int) -> list[Chunk]:
     return list(
         session.scalars(
             select(Chunk)
@@ -124,7 +124,7 @@ def _chunks(session: Session, generation_id: UUID, slot: int) -> list[Chunk]:
     )
 
 
-def _worth_merging(catalog: Catalog, compact_chunks: int) -> list[tuple[UUID, int]]:
+def _find_slots_to_merge(catalog: Catalog, compact_chunks: int) -> list[tuple[UUID, int]]:
     """Slots that are full but in pieces, open slots in many pieces, and slots with dead rows.
 
     Dead rows are counted in SLOTS_AT_ONCE slots only, drawn anew each time: counting all of a
@@ -148,11 +148,11 @@ def _worth_merging(catalog: Catalog, compact_chunks: int) -> list[tuple[UUID, in
             )
             .group_by(Chunk.generation_id, Chunk.slot, Generation.open_slot)
         ).all()
-        drawn = random.sample(slots, min(SLOTS_AT_ONCE, len(slots)))
+        drawn = random.sample(slots, min(DEAD_ROW_SAMPLE_SLOTS, len(slots)))
         dead = {
             (generation_id, slot)
             for generation_id, slot, _, _, rows in drawn
-            if rows - _alive(session, generation_id, slot) > DEAD_SHARE * rows
+            if rows - _count_live_rows(session, generation_id, slot) > DEAD_ROW_SHARE * rows
         }
     return [
         (generation_id, slot)
@@ -163,7 +163,7 @@ def _worth_merging(catalog: Catalog, compact_chunks: int) -> list[tuple[UUID, in
     ]
 
 
-def _alive(session: Session, generation_id: UUID, slot: int) -> int:
+def _count_live_rows(session: Session, generation_id: UUID, slot: int) -> int:
     """The rows of the slot that belong to live photos."""
     counted = (
         select(func.count())

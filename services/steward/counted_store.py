@@ -10,7 +10,7 @@ from shared.objects import ObjectStore
 from shared.objects.port import ObjectInfo, ObjectWriter
 
 
-class CountedStore:
+class DeletionCountingStore:
     """`store`, and `on_delete` after each deletion."""
 
     def __init__(self, store: ObjectStore, on_delete: Callable[[], object]) -> None:

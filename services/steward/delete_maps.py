@@ -14,11 +14,11 @@ from uuid import UUID
 from sqlalchemy import delete, select
 
 from services.steward.journal import deletion_is_journaled, journal_deletions
-from shared.catalog.base import rowcount
+from shared.catalog.base import affected_rows
 from shared.catalog.chunks import Chunk, Descriptor
-from shared.catalog.direct_uploads import DirectUpload
+from shared.catalog.direct_uploads import PresignedUpload
 from shared.catalog.evaluations import Evaluation
-from shared.catalog.figures import MapFigures
+from shared.catalog.figures import CachedMapStatistics
 from shared.catalog.generations import Generation
 from shared.catalog.journaled import is_journaled
 from shared.catalog.maps import Map
@@ -29,24 +29,24 @@ from shared.catalog.vocabularies import Vocabulary
 from shared.catalog.whitenings import StoredWhitening
 from shared.chunks import delete_chunk
 from shared.jobs.batches import BatchItem
-from shared.jobs.finish import cancel_all
+from shared.jobs.finish import cancel_jobs
 from shared.jobs.table import QUERY_JOBS, Job, JobKind
 from shared.objects import ObjectStore
 from shared.objects.keys import (
     ORIGINALS,
     incoming_key,
-    keys_of_query,
     local_features_prefix,
+    query_object_keys,
     thumbnail_key,
 )
 
 log = logging.getLogger(__name__)
 
-AT_ONCE = 500  # rows removed in one transaction
+ROWS_PER_TRANSACTION = 500  # rows removed in one transaction
 SLICE_SECONDS = 2.0  # then the steward's other duties have their turn
 
 
-def delete_maps(catalog: Catalog, store: ObjectStore) -> None:
+def purge_deleted_maps(catalog: Catalog, store: ObjectStore) -> None:
     """Go on removing every deleted map, for a few seconds."""
     journal_deletions(catalog, store, Map)
     with catalog.read() as session:
@@ -55,28 +55,28 @@ def delete_maps(catalog: Catalog, store: ObjectStore) -> None:
         ).all()
     until = time.monotonic() + SLICE_SECONDS
     for map_id in gone:
-        while not _step(catalog, store, map_id):
+        while not _purge_next(catalog, store, map_id):
             if time.monotonic() > until:
                 return
 
 
-def _step(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
+def _purge_next(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
     """Remove the next rows of the map with their objects; True when nothing more can be removed."""
     with catalog.write() as session:
-        cancel_all(session, Job.map_id == map_id)
+        cancel_jobs(session, Job.map_id == map_id)
     for some_were_left in (
-        _chunks,
-        _queries,
-        _batches,
-        _photos,
-        _direct_uploads,
-        _local_features,  # last: it asks the store, whatever is there
+        _purge_chunks,
+        _purge_queries,
+        _purge_batches,
+        _purge_photos,
+        _purge_presigned_uploads,
+        _purge_local_features,  # last: it asks the store, whatever is there
     ):
         if some_were_left(catalog, store, map_id):
             return False
-    _vocabularies(catalog, store, map_id)
+    _purge_vocabulary_objects(catalog, store, map_id)
     with catalog.write() as session:
-        session.execute(delete(MapFigures).where(MapFigures.map_id == map_id))
+        session.execute(delete(CachedMapStatistics).where(CachedMapStatistics.map_id == map_id))
         session.execute(delete(Evaluation).where(Evaluation.map_id == map_id))
         session.execute(delete(Search).where(Search.map_id == map_id))
         session.execute(delete(Job).where(Job.map_id == map_id))
@@ -85,18 +85,18 @@ def _step(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
         session.execute(delete(StoredWhitening).where(StoredWhitening.map_id == map_id))
         # Without a word in the journal the map would come back when the catalog is rebuilt.
         gone = session.execute(delete(Map).where(Map.id == map_id, is_journaled(Map)))
-    if rowcount(gone):
+    if affected_rows(gone):
         log.info("the deleted map %s is gone", map_id)
     return True
 
 
-def _chunks(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
+def _purge_chunks(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
     with catalog.read() as session:
         chunks = session.scalars(
             select(Chunk)
             .join(Generation, Generation.id == Chunk.generation_id)
             .where(Generation.map_id == map_id)
-            .limit(AT_ONCE // 10)
+            .limit(ROWS_PER_TRANSACTION // 10)
         ).all()
     for chunk in chunks:
         delete_chunk(store, chunk.object_key)
@@ -108,13 +108,15 @@ def _chunks(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
     return bool(ids)
 
 
-def _queries(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
+def _purge_queries(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
     with catalog.read() as session:
         ids = session.scalars(
-            select(Job.id).where(Job.map_id == map_id, Job.kind.in_(QUERY_JOBS)).limit(AT_ONCE)
+            select(Job.id)
+            .where(Job.map_id == map_id, Job.kind.in_(QUERY_JOBS))
+            .limit(ROWS_PER_TRANSACTION)
         ).all()
     for job_id in ids:
-        for key in keys_of_query(job_id):
+        for key in query_object_keys(job_id):
             store.delete(key)
     if ids:
         with catalog.write() as session:
@@ -122,7 +124,7 @@ def _queries(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
     return bool(ids)
 
 
-def _batches(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
+def _purge_batches(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
     """Their archives, their items, and uploaded files that have not become photos."""
     with catalog.read() as session:
         params = session.scalars(
@@ -132,7 +134,7 @@ def _batches(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
             select(BatchItem)
             .join(Job, Job.id == BatchItem.job_id)
             .where(Job.map_id == map_id)
-            .limit(AT_ONCE)
+            .limit(ROWS_PER_TRANSACTION)
         ).all()
     for archive in params:
         if "object_key" in archive:
@@ -152,9 +154,11 @@ def _batches(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
     return bool(items)
 
 
-def _photos(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
+def _purge_photos(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
     with catalog.read() as session:
-        photos = session.scalars(select(Photo).where(Photo.map_id == map_id).limit(AT_ONCE)).all()
+        photos = session.scalars(
+            select(Photo).where(Photo.map_id == map_id).limit(ROWS_PER_TRANSACTION)
+        ).all()
     for photo in photos:
         if photo.object_key:  # empty: its bytes went when it was deleted
             store.delete(photo.object_key)
@@ -168,30 +172,32 @@ def _photos(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
     return bool(ids)
 
 
-def _direct_uploads(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
+def _purge_presigned_uploads(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
     with catalog.read() as session:
         ids = session.scalars(
-            select(DirectUpload.id).where(DirectUpload.map_id == map_id).limit(AT_ONCE)
+            select(PresignedUpload.id)
+            .where(PresignedUpload.map_id == map_id)
+            .limit(ROWS_PER_TRANSACTION)
         ).all()
     for upload_id in ids:
         store.delete(incoming_key(upload_id))
     if ids:
         with catalog.write() as session:
-            session.execute(delete(DirectUpload).where(DirectUpload.id.in_(ids)))
+            session.execute(delete(PresignedUpload).where(PresignedUpload.id.in_(ids)))
     return bool(ids)
 
 
-def _local_features(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
+def _purge_local_features(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
     with catalog.read() as session:
         ids = session.scalars(select(Generation.id).where(Generation.map_id == map_id)).all()
     kept = chain.from_iterable(store.list(local_features_prefix(id_)) for id_ in ids)
-    keys = [info.key for info in islice(kept, AT_ONCE)]
+    keys = [info.key for info in islice(kept, ROWS_PER_TRANSACTION)]
     for key in keys:
         store.delete(key)
     return bool(keys)
 
 
-def _vocabularies(catalog: Catalog, store: ObjectStore, map_id: UUID) -> None:
+def _purge_vocabulary_objects(catalog: Catalog, store: ObjectStore, map_id: UUID) -> None:
     """Only the objects, also those of imports that never came to a row, those of whitenings, and
     checkpoints that were sent under the map's name: the rows are few.
     """

@@ -14,24 +14,24 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from shared.catalog.chunks import Descriptor
-from shared.catalog.photos import Photo, PhotoRole, has_place
-from shared.estimate.places import Spot
-from shared.geodesy import distances_m, latitude_band
+from shared.catalog.photos import Photo, PhotoRole, is_geotagged
+from shared.estimate.places import PhotoLocation
+from shared.geodesy import distances_m, latitude_bounds
 
 
 @dataclass(frozen=True, slots=True)
-class Located:
+class GeotaggedPhoto:
     """A described photo whose place is known."""
 
     photo_id: UUID
-    spot: Spot
+    spot: PhotoLocation
     captured_at: datetime | None
 
 
-class LocatedPhotos:
+class GeotaggedPhotos:
     """Database photos by place: how many of them show one."""
 
-    def __init__(self, photos: Sequence[Located]) -> None:
+    def __init__(self, photos: Sequence[GeotaggedPhoto]) -> None:
         self.photos = photos
         self._labels = Counter(p.spot.place for p in photos if p.spot.place is not None)
         on_earth = sorted(
@@ -42,20 +42,20 @@ class LocatedPhotos:
             [(p.spot.latitude, p.spot.longitude) for p in on_earth], dtype=np.float64
         ).reshape(-1, 2)
 
-    def showing(self, spot: Spot, radius_m: float) -> int:
+    def count_at_place(self, spot: PhotoLocation, radius_m: float) -> int:
         """How many photos lie within `radius_m` of the spot, or bear its label: the larger count,
         so that one that does both counts once."""
         labelled = self._labels[spot.place] if spot.place is not None else 0
         return max(labelled, len(self._within(spot, radius_m)))
 
-    def within(self, spot: Spot, radius_m: float) -> list[UUID]:
+    def find_within(self, spot: PhotoLocation, radius_m: float) -> list[UUID]:
         """The photos that lie within `radius_m` of the spot; none where it has no coordinates."""
         return [self._ids[number] for number in self._within(spot, radius_m).tolist()]
 
-    def _within(self, spot: Spot, radius_m: float) -> NDArray[np.int64]:
+    def _within(self, spot: PhotoLocation, radius_m: float) -> NDArray[np.int64]:
         if spot.latitude is None or spot.longitude is None:
             return np.empty(0, np.int64)
-        south, north = latitude_band(spot.latitude, radius_m)
+        south, north = latitude_bounds(spot.latitude, radius_m)
         first, last = np.searchsorted(self._spots[:, 0], [south, north])
         near = self._spots[first : last + 1]
         away = distances_m(spot.latitude, spot.longitude, near[:, 0], near[:, 1])
@@ -63,9 +63,9 @@ class LocatedPhotos:
         return found
 
 
-def read_located(
+def read_geotagged_photos(
     session: Session, map_id: UUID, generation_id: UUID, role: PhotoRole
-) -> list[Located]:
+) -> list[GeotaggedPhoto]:
     """The live photos of a role that have a descriptor in the generation and a place, by id."""
     found = session.execute(
         select(Photo.id, Photo.latitude, Photo.longitude, Photo.place, Photo.captured_at)
@@ -75,8 +75,8 @@ def read_located(
             Descriptor.generation_id == generation_id,
             Photo.deleted_at.is_(None),
             Photo.role == role,
-            has_place(),
+            is_geotagged(),
         )
         .order_by(Photo.id)
     )
-    return [Located(row[0], Spot(*row[1:4]), row[4]) for row in found]
+    return [GeotaggedPhoto(row[0], PhotoLocation(*row[1:4]), row[4]) for row in found]

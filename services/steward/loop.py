@@ -15,137 +15,147 @@ from services.steward.auto_evaluate import evaluate_changed_maps
 from services.steward.batches.worker import resume_batches
 from services.steward.collect import (
     CollectionHeld,
-    collect,
+    collect_garbage,
     collect_orphans,
     empty_expired_trash,
 )
-from services.steward.compact import compact
-from services.steward.count_maps import count_large_maps
-from services.steward.counted_store import CountedStore
-from services.steward.delete_maps import delete_maps
+from services.steward.compact import merge_small_chunks
+from services.steward.count_maps import update_statistics_of_large_maps
+from services.steward.counted_store import DeletionCountingStore
+from services.steward.delete_maps import purge_deleted_maps
 from services.steward.journal import JournalDuty
 from services.steward.mend_generations import mend_generations
 from services.steward.metrics import StewardMetrics
-from services.steward.model_changes import advance_model_changes, fit_maps_that_wait
-from services.steward.queue import free_leases, resend_hints
+from services.steward.model_changes import advance_model_changes, auto_fit_vocabularies
+from services.steward.queue import release_expired_leases, resend_hints
 from services.steward.retention import (
-    forget_old_deliveries,
-    forget_old_jobs,
-    forget_old_keys,
-    forget_old_searches,
+    delete_expired_idempotency_keys,
+    delete_old_deliveries,
+    delete_old_jobs,
+    delete_old_searches,
 )
-from services.steward.search_workers import remove_dead_workers
-from shared.catalog.away import Outage
+from services.steward.search_workers import remove_dead_search_workers
+from shared.catalog.away import OutageLog
 from shared.catalog.session import Catalog
 from shared.catalog.unusable import sqlite_file
 from shared.disk_reserve import DiskReserve
 from shared.heartbeat import Heartbeat
-from shared.jobs import Hints
+from shared.jobs import Wakeups
 from shared.objects import OwnedStore
 from shared.read_retries import ReadRetries
 from shared.settings import Settings
 
 log = logging.getLogger(__name__)
 
-TICK_SECONDS = 0.25
+SCHEDULER_TICK_SECONDS = 0.25
 # The trash is emptied before the gateway refuses uploads (MIN_FREE_BYTES).
 FREE_TRASH_FACTOR = 2
 
 
 @dataclass(slots=True)
-class Duty:
+class PeriodicTask:
     name: str
-    every_seconds: float
-    do: Callable[[], object]
-    due: float = field(default=0.0)
+    interval_seconds: float
+    run: Callable[[], object]
+    next_run: float = field(default=0.0)
 
 
-class Steward:
+class Scheduler:
     """Does each duty when it is due. A duty that fails is logged and tried again next time."""
 
     def __init__(
         self,
         catalog: Catalog,
         store: OwnedStore,
-        hints: Hints,
+        hints: Wakeups,
         settings: Settings,
         metrics: StewardMetrics | None = None,
     ) -> None:
         self._metrics = metrics = metrics or StewardMetrics(CollectorRegistry())
-        self._outage = Outage("steward")
+        self._outage = OutageLog("steward")
         self._heartbeat = Heartbeat(settings.heartbeat_file)
         merge_retries = ReadRetries()
 
-        def counted(duty: str) -> CountedStore:
-            return CountedStore(store, metrics.objects_deleted.labels(duty).inc)
+        def counted(duty: str) -> DeletionCountingStore:
+            return DeletionCountingStore(store, metrics.objects_deleted.labels(duty).inc)
 
         # Of the catalog's own disk, where it is a file.
         catalog_file = sqlite_file(catalog)
         reserve = catalog_file and DiskReserve(catalog_file.parent, settings.min_free_bytes)
-        self._journal = Duty("write journal", 2.0, JournalDuty(catalog, store, metrics))
-        self.duties = [
-            *([Duty("keep disk reserve", 5.0, reserve.keep)] if reserve else []),
-            Duty(
+        self._journal = PeriodicTask("write journal", 2.0, JournalDuty(catalog, store, metrics))
+        self.tasks = [
+            *([PeriodicTask("keep disk reserve", 5.0, reserve.keep)] if reserve else []),
+            PeriodicTask(
                 "free leases",
                 1.0,
-                lambda: metrics.leases_expired.inc(free_leases(catalog, settings.max_attempts)),
+                lambda: metrics.leases_expired.inc(
+                    release_expired_leases(catalog, settings.max_attempts)
+                ),
             ),
-            Duty(
+            PeriodicTask(
                 "resend hints", 2.0, lambda: metrics.hints_resent.inc(resend_hints(catalog, hints))
             ),
-            Duty(
+            PeriodicTask(
                 "advance model changes",
                 0.5,
                 lambda: advance_model_changes(catalog, hints),
             ),
-            Duty("mend generations", 5.0, lambda: mend_generations(catalog, store)),
-            Duty("resume batches", 5.0, lambda: resume_batches(catalog, settings)),
-            Duty("remove dead search workers", 2.0, lambda: remove_dead_workers(catalog)),
-            Duty(
+            PeriodicTask("mend generations", 5.0, lambda: mend_generations(catalog, store)),
+            PeriodicTask("resume batches", 5.0, lambda: resume_batches(catalog, settings)),
+            PeriodicTask(
+                "remove dead search workers", 2.0, lambda: remove_dead_search_workers(catalog)
+            ),
+            PeriodicTask(
                 "fit maps that wait",
                 2.0,
-                lambda: fit_maps_that_wait(catalog, hints, settings.auto_fit_photos),
+                lambda: auto_fit_vocabularies(catalog, hints, settings.auto_fit_photos),
             ),
-            Duty("count large maps", 10.0, lambda: count_large_maps(catalog)),
-            Duty(
+            PeriodicTask(
+                "count large maps", 10.0, lambda: update_statistics_of_large_maps(catalog)
+            ),
+            PeriodicTask(
                 "compact",
                 5.0,
                 lambda: metrics.slots_merged.inc(
-                    compact(catalog, store, settings.compact_chunks, merge_retries)
+                    merge_small_chunks(catalog, store, settings.compact_chunks, merge_retries)
                 ),
             ),
             self._journal,
-            Duty("delete maps", 1.0, lambda: delete_maps(catalog, counted("delete_maps"))),
-            Duty("collect", 10.0, lambda: collect(catalog, counted("collect"), settings)),
-            Duty(
+            PeriodicTask(
+                "delete maps", 1.0, lambda: purge_deleted_maps(catalog, counted("delete_maps"))
+            ),
+            PeriodicTask(
+                "collect", 10.0, lambda: collect_garbage(catalog, counted("collect"), settings)
+            ),
+            PeriodicTask(
                 "forget old jobs",
                 10.0,
-                lambda: forget_old_jobs(catalog, settings.job_retention_days),
+                lambda: delete_old_jobs(catalog, settings.job_retention_days),
             ),
-            Duty(
+            PeriodicTask(
                 "forget old searches",
                 10.0,
-                lambda: forget_old_searches(catalog, settings.search_history_days),
+                lambda: delete_old_searches(catalog, settings.search_history_days),
             ),
-            Duty(
+            PeriodicTask(
                 "forget old deliveries",
                 10.0,
-                lambda: forget_old_deliveries(catalog, settings.job_retention_days),
+                lambda: delete_old_deliveries(catalog, settings.job_retention_days),
             ),
-            Duty("forget old keys", 10.0, lambda: forget_old_keys(catalog)),
-            Duty(
+            PeriodicTask("forget old keys", 10.0, lambda: delete_expired_idempotency_keys(catalog)),
+            PeriodicTask(
                 "evaluate changed maps",
                 2.0,
                 lambda: evaluate_changed_maps(
                     catalog, settings.auto_evaluate_photos, settings.word_weights
                 ),
             ),
-            Duty(
+            PeriodicTask(
                 "collect orphans",
                 3600.0,
                 lambda: _collect_orphans(catalog, store, settings, metrics),
             ),
-            Duty(
+            PeriodicTask(
                 "free trash",
                 10.0,
                 lambda: _free_trash(store, FREE_TRASH_FACTOR * settings.min_free_bytes, metrics),
@@ -155,30 +165,30 @@ class Steward:
     def run(self, stop: threading.Event) -> None:
         """Do what is due until `stop` is set; then write what the journal does not have yet."""
         while not stop.is_set():
-            for duty in self.duties:
-                if time.monotonic() >= duty.due and not stop.is_set():
-                    self._do(duty)
+            for duty in self.tasks:
+                if time.monotonic() >= duty.next_run and not stop.is_set():
+                    self._run_task(duty)
                     self._heartbeat.beat()
-            stop.wait(TICK_SECONDS)
-        self._do(self._journal)
+            stop.wait(SCHEDULER_TICK_SECONDS)
+        self._run_task(self._journal)
 
-    def _do(self, duty: Duty) -> None:
+    def _run_task(self, duty: PeriodicTask) -> None:
         started, outcome = time.monotonic(), "done"
         try:
-            duty.do()
-            self._outage.over()
+            duty.run()
+            self._outage.record_success()
         except SQLAlchemyError as error:
             outcome = "catalog_away"
-            self._outage.met(error)
+            self._outage.record_error(error)
         except Exception:  # one duty's trouble must not end the others
             outcome = "failed"
             log.exception(
                 "the steward could not %s; next try in %g s",
                 duty.name,
-                duty.every_seconds,
+                duty.interval_seconds,
             )
-        self._metrics.duty(duty.name, outcome, time.monotonic() - started)
-        duty.due = time.monotonic() + duty.every_seconds
+        self._metrics.observe_task(duty.name, outcome, time.monotonic() - started)
+        duty.next_run = time.monotonic() + duty.interval_seconds
 
 
 def _collect_orphans(

@@ -18,52 +18,58 @@ from typing import Any
 
 import numpy as np
 
-from services.steward.ask import UNKNOWN, Ask, Asker, Ranking
-from services.steward.labelled import Labelled, Outcome, Recall
-from services.steward.located import Located, LocatedPhotos, read_located
+from services.steward.ask import UNKNOWN_LOCATION, EvaluationSearch, LocatedRanking, RankPhoto
+from services.steward.labelled import LabelledQueryMetrics, QueryOutcome, RecallCounter
+from services.steward.located import GeotaggedPhoto, GeotaggedPhotos, read_geotagged_photos
 from shared.catalog.generations import Generation
 from shared.catalog.maps import Map
 from shared.catalog.photos import PhotoRole
 from shared.catalog.session import Catalog
-from shared.estimate.calibration import Calibration, learn_confidence, learn_threshold
-from shared.estimate.evidence import DEPTH, Evidence, Ranked, locate, weigh
-from shared.estimate.places import elsewhere, metres_between, same_place
-from shared.search_protocol import Hit, SearchPort
+from shared.estimate.calibration import Calibration, fit_confidence, fit_threshold
+from shared.estimate.evidence import (
+    EVIDENCE_DEPTH,
+    PlaceEvidence,
+    RankedPhoto,
+    compute_evidence,
+    estimate_location,
+)
+from shared.estimate.places import distance_between_m, is_different_place, is_same_place
+from shared.search_protocol import SearchBackend, SearchHit
 
-MOST_RANKS = 800  # looked at to find what is elsewhere, where hundreds show the same place
+MAX_RANKS = 800  # looked at to find what is elsewhere, where hundreds show the same place
 
 # A match taken less than this before or after the query is of the same session.
-SESSION = timedelta(hours=12)
+SAME_SESSION_PERIOD = timedelta(hours=12)
 
 
 @dataclass(frozen=True, slots=True)
-class Measured:
+class MapEvaluationResult:
     figures: dict[str, Any]
     calibration: Calibration
 
 
-class Measure:
+class MapEvaluation:
     """Measures one generation. `on_asked` is called after every query; what it raises ends it."""
 
     def __init__(
         self,
         catalog: Catalog,
-        search: SearchPort,
+        search: SearchBackend,
         generation: Generation,
         radius_m: float,
-        on_asked: Callable[[], None],
+        on_query: Callable[[], None],
     ) -> None:
         self.radius_m = radius_m
-        self.on_asked = on_asked
+        self.on_query = on_query
         with catalog.read() as session:
             of = (session, generation.map_id, generation.id)
-            self.database = LocatedPhotos(read_located(*of, PhotoRole.DATABASE))
-            self.queries = read_located(*of, PhotoRole.QUERY)
+            self.database = GeotaggedPhotos(read_geotagged_photos(*of, PhotoRole.DATABASE))
+            self.queries = read_geotagged_photos(*of, PhotoRole.QUERY)
             version = session.get_one(Map, generation.map_id).version
         self._by_id = {photo.photo_id: photo for photo in self.database.photos}
-        self.asker = Asker(catalog, search, generation, version, self._by_id)
+        self.search = EvaluationSearch(catalog, search, generation, version, self._by_id)
 
-    def sample(self, size: int, seed: int) -> list[Located]:
+    def draw_sample(self, size: int, seed: int) -> list[GeotaggedPhoto]:
         """The photos to leave out, one after the other: at most `size`, drawn from the seed."""
         photos = self.database.photos
         chosen = np.random.default_rng(seed).choice(
@@ -71,12 +77,14 @@ class Measure:
         )
         return [photos[index] for index in sorted(chosen.tolist())]
 
-    def run(self, sample: Sequence[Located], weights: tuple[float, ...] = ()) -> Measured:
+    def evaluate(
+        self, sample: Sequence[GeotaggedPhoto], weights: tuple[float, ...] = ()
+    ) -> MapEvaluationResult:
         """Ask with every photo of the sample and with every labelled query, ranked by the word
         weights where there are any."""
-        ask = partial(self.asker.ask, weights=weights)
+        ask = partial(self.search.rank_similar, weights=weights)
         recall, impostors, alone = self._leave_one_out(sample, ask)
-        threshold = learn_threshold(impostors)
+        threshold = fit_threshold(impostors)
         provisional = Calibration(
             radius_m=self.radius_m,
             support_threshold=threshold,
@@ -84,10 +92,10 @@ class Measure:
             labelled_queries=0,
             confidence=None,
         )
-        labelled = self._ask_labelled(provisional, ask)
-        judged = labelled.judged()
+        labelled = self._evaluate_labelled_queries(provisional, ask)
+        judged = labelled.confidence_samples()
         calibration = provisional.model_copy(
-            update={"labelled_queries": len(judged), "confidence": learn_confidence(judged)}
+            update={"labelled_queries": len(judged), "confidence": fit_confidence(judged)}
         )
         figures = {
             "radius_m": self.radius_m,
@@ -99,69 +107,79 @@ class Measure:
                 "calibration": calibration.state,
             },
         }
-        return Measured(figures, calibration)
+        return MapEvaluationResult(figures, calibration)
 
     def _leave_one_out(
-        self, sample: Sequence[Located], ask: Ask
-    ) -> tuple[Recall, list[Evidence], int]:
+        self, sample: Sequence[GeotaggedPhoto], rank_photo: RankPhoto
+    ) -> tuple[RecallCounter, list[PlaceEvidence], int]:
         """Recall, the evidence of impostors, and how many photos are alone at their place."""
-        recall, impostors, alone = Recall(), [], 0
+        recall, impostors, alone = RecallCounter(), [], 0
         for query in sample:
-            ranking = ask(query, DEPTH)
-            self.on_asked()
+            ranking = rank_photo(query, EVIDENCE_DEPTH)
+            self.on_query()
             if ranking is None:
                 continue
-            if self.database.showing(query.spot, self.radius_m) > 1:  # itself is one of them
-                recall.add([same_place(query.spot, spot, self.radius_m) for _, spot in ranking])
+            if self.database.count_at_place(query.spot, self.radius_m) > 1:  # itself is one of them
+                recall.add([is_same_place(query.spot, spot, self.radius_m) for _, spot in ranking])
             else:
                 alone += 1
-            evidence = weigh(self._strangers(query, ranking, ask), self.radius_m)
+            evidence = compute_evidence(
+                self._other_places(query, ranking, rank_photo), self.radius_m
+            )
             if evidence is not None:
                 impostors.append(evidence)
         return recall, impostors, alone
 
-    def _strangers(self, query: Located, ranking: Ranking, ask: Ask) -> list[Ranked]:
+    def _other_places(
+        self, query: GeotaggedPhoto, ranking: LocatedRanking, ask: RankPhoto
+    ) -> list[RankedPhoto]:
         """The ranking as it would be if the query's place were not in the map."""
-        depth = DEPTH
+        depth = EVIDENCE_DEPTH
         while True:
-            strangers = [r for r in _ranked(ranking) if elsewhere(query.spot, r.spot)]
-            if len(strangers) >= DEPTH // 2 or len(ranking) < depth or depth >= MOST_RANKS:
-                return strangers[:DEPTH]
+            strangers = [r for r in _to_ranked(ranking) if is_different_place(query.spot, r.spot)]
+            if len(strangers) >= EVIDENCE_DEPTH // 2 or len(ranking) < depth or depth >= MAX_RANKS:
+                return strangers[:EVIDENCE_DEPTH]
             depth *= 2
             ranking = ask(query, depth) or []
 
-    def _ask_labelled(self, calibration: Calibration, ask: Ask) -> Labelled:
-        labelled = Labelled()
+    def _evaluate_labelled_queries(
+        self, calibration: Calibration, ask: RankPhoto
+    ) -> LabelledQueryMetrics:
+        labelled = LabelledQueryMetrics()
         for query in self.queries:
-            ranking = ask(query, DEPTH)
-            self.on_asked()
+            ranking = ask(query, EVIDENCE_DEPTH)
+            self.on_query()
             if ranking is None:
                 continue
-            in_map = self.database.showing(query.spot, self.radius_m) > 0
+            in_map = self.database.count_at_place(query.spot, self.radius_m) > 0
             if in_map:
                 labelled.recall.add(
-                    [same_place(query.spot, spot, self.radius_m) for _, spot in ranking]
+                    [is_same_place(query.spot, spot, self.radius_m) for _, spot in ranking]
                 )
-            evidence = weigh(_ranked(ranking), self.radius_m)
-            found = locate(_ranked(ranking), self.radius_m) if evidence else UNKNOWN
+            evidence = compute_evidence(_to_ranked(ranking), self.radius_m)
+            found = (
+                estimate_location(_to_ranked(ranking), self.radius_m)
+                if evidence
+                else UNKNOWN_LOCATION
+            )
             labelled.outcomes.append(
-                Outcome(
+                QueryOutcome(
                     in_map=in_map,
                     evidence=evidence,
-                    right=same_place(query.spot, found, self.radius_m),
-                    error_m=metres_between(query.spot, found),
+                    is_correct=is_same_place(query.spot, found, self.radius_m),
+                    error_m=distance_between_m(query.spot, found),
                     same_session=bool(ranking) and self._same_session(query, ranking[0][0]),
                     accepted=calibration.accepts(evidence) if evidence else None,
                 )
             )
         return labelled
 
-    def _same_session(self, query: Located, best: Hit) -> bool:
+    def _same_session(self, query: GeotaggedPhoto, best: SearchHit) -> bool:
         match = self._by_id.get(best.photo_id)
         if match is None or match.captured_at is None or query.captured_at is None:
             return False
-        return abs(match.captured_at - query.captured_at) < SESSION
+        return abs(match.captured_at - query.captured_at) < SAME_SESSION_PERIOD
 
 
-def _ranked(ranking: Ranking) -> list[Ranked]:
-    return [Ranked(hit.ranked_by, spot) for hit, spot in ranking]
+def _to_ranked(ranking: LocatedRanking) -> list[RankedPhoto]:
+    return [RankedPhoto(hit.ranked_by, spot) for hit, spot in ranking]

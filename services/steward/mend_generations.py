@@ -24,9 +24,9 @@ from shared.chunks import CORRUPT, read_chunk
 from shared.errors import NotFound, PlacewiseError, Unavailable
 from shared.integrity.repair import give_up_chunk
 from shared.jobs import Job
-from shared.jobs.finish import fail
+from shared.jobs.finish import fail_job
 from shared.jobs.model_changes import abandon_generation
-from shared.jobs.table import MODEL_CHANGES, UNFINISHED
+from shared.jobs.table import MODEL_CHANGE_JOBS, UNFINISHED_STATES
 from shared.objects import ObjectStore
 
 log = logging.getLogger(__name__)
@@ -48,7 +48,7 @@ def mend_generations(catalog: Catalog, store: ObjectStore) -> None:
                 Chunk.object_key.in_(unreadable_keys(session)),
                 Chunk.superseded_at.is_(None),
                 Generation.state == GenerationState.BUILDING,
-                Generation.complete_at < db_now_plus(-search_workers.SLOW_SECONDS),
+                Generation.complete_at < db_now_plus(-search_workers.SLOW_LOAD_SECONDS),
             )
         ).all()
     for chunk in reported:
@@ -76,8 +76,8 @@ def _mend(session: Session, chunk_id: UUID, error: PlacewiseError) -> None:
         select(Job)
         .where(
             Job.generation_id == generation.id,
-            Job.kind.in_(MODEL_CHANGES),
-            Job.state.in_(UNFINISHED),
+            Job.kind.in_(MODEL_CHANGE_JOBS),
+            Job.state.in_(UNFINISHED_STATES),
         )
         .with_for_update()
     )
@@ -85,7 +85,7 @@ def _mend(session: Session, chunk_id: UUID, error: PlacewiseError) -> None:
         return
     mended = int(job.params.get(MENDED, 0)) + 1
     if mended > MAX_MENDED_CHUNKS:
-        fail(job, error.as_problem())
+        fail_job(job, error.as_problem())
         abandon_generation(session, job)
         log.error("the model change %s fails: %s", job.id, error)
         return

@@ -10,9 +10,9 @@ from prometheus_client.core import GaugeMetricFamily
 from prometheus_client.metrics_core import Metric
 from prometheus_client.registry import Collector
 
-PREFIX = "placewise_steward"
+METRIC_PREFIX = "placewise_steward"
 # From a look that finds nothing to a walk over a whole bucket.
-SECONDS = (0.005, 0.01, 0.05, 0.1, 0.5, 1.0, 5.0, 10.0, 60.0, 300.0, 900.0)
+TASK_BUCKETS_SECONDS = (0.005, 0.01, 0.05, 0.1, 0.5, 1.0, 5.0, 10.0, 60.0, 300.0, 900.0)
 
 
 class StewardMetrics:
@@ -20,93 +20,93 @@ class StewardMetrics:
 
     def __init__(self, registry: CollectorRegistry) -> None:
         self._duties = Counter(
-            f"{PREFIX}_duties",
+            f"{METRIC_PREFIX}_duties",
             "Rounds of each duty by what became of them: done, failed, or catalog_away.",
             ["duty", "outcome"],
             registry=registry,
         )
         self._duty_seconds = Histogram(
-            f"{PREFIX}_duty_seconds",
+            f"{METRIC_PREFIX}_duty_seconds",
             "Seconds that a round of a duty took.",
             ["duty"],
-            buckets=SECONDS,
+            buckets=TASK_BUCKETS_SECONDS,
             registry=registry,
         )
         self.leases_expired = Counter(
-            f"{PREFIX}_leases_expired",
+            f"{METRIC_PREFIX}_leases_expired",
             "Jobs that were taken back from workers that fell silent.",
             registry=registry,
         )
         self.hints_resent = Counter(
-            f"{PREFIX}_hints_resent",
+            f"{METRIC_PREFIX}_hints_resent",
             "Hints for work that was found waiting.",
             registry=registry,
         )
         self.slots_merged = Counter(
-            f"{PREFIX}_slots_merged", "Slots whose chunks became one.", registry=registry
+            f"{METRIC_PREFIX}_slots_merged", "Slots whose chunks became one.", registry=registry
         )
         self.journal_lines = Counter(
-            f"{PREFIX}_journal_lines",
+            f"{METRIC_PREFIX}_journal_lines",
             "Rows of the catalog that were written to the journal.",
             registry=registry,
         )
         self.catalog_lag_segments = Gauge(
-            f"{PREFIX}_catalog_lag_segments",
+            f"{METRIC_PREFIX}_catalog_lag_segments",
             "Journal segments of the object store that the catalog does not know: 0, unless an "
             "older catalog was restored.",
             registry=registry,
         )
         self.objects_deleted = Counter(
-            f"{PREFIX}_objects_deleted",
+            f"{METRIC_PREFIX}_objects_deleted",
             "Objects that nothing refers to any more.",
             ["duty"],
             registry=registry,
         )
         self.objects_trashed = Counter(
-            f"{PREFIX}_objects_trashed",
+            f"{METRIC_PREFIX}_objects_trashed",
             "Orphaned objects that were moved to the trash.",
             registry=registry,
         )
         self.collection_held = Gauge(
-            f"{PREFIX}_collection_held",
+            f"{METRIC_PREFIX}_collection_held",
             "1 while orphans are not collected before `placewise storage collect --confirm`.",
             registry=registry,
         )
         self.trash_bytes = Gauge(
-            f"{PREFIX}_trash_bytes",
+            f"{METRIC_PREFIX}_trash_bytes",
             "Bytes in the trash after the last collection.",
             registry=registry,
         )
         self._jobs = Counter(
-            f"{PREFIX}_jobs",
+            f"{METRIC_PREFIX}_jobs",
             "The steward's own jobs, slice by slice, by what became of each: done, stopped, "
             "paused, failed, crashed.",
             ["kind", "outcome"],
             registry=registry,
         )
-        self._done_at: dict[str, float] = {}
-        registry.register(_Lag(self._done_at))
+        self._last_success: dict[str, float] = {}
+        registry.register(_TaskLagCollector(self._last_success))
 
-    def duty(self, name: str, outcome: str, seconds: float) -> None:
+    def observe_task(self, name: str, outcome: str, seconds: float) -> None:
         """A round of the duty has ended."""
         duty = name.replace(" ", "_")
         self._duties.labels(duty, outcome).inc()
         self._duty_seconds.labels(duty).observe(seconds)
         if outcome == "done":
-            self._done_at[duty] = time.monotonic()
+            self._last_success[duty] = time.monotonic()
 
-    def job(self, kind: str, outcome: str) -> None:
+    def count_job(self, kind: str, outcome: str) -> None:
         """A slice of one of its jobs has ended."""
         self._jobs.labels(kind, outcome).inc()
 
 
-class _Lag(Collector):
+class _TaskLagCollector(Collector):
     def __init__(self, done_at: Mapping[str, float]) -> None:
         self._done_at = done_at
 
     def collect(self) -> Iterable[Metric]:
         lag = GaugeMetricFamily(
-            f"{PREFIX}_duty_lag_seconds",
+            f"{METRIC_PREFIX}_duty_lag_seconds",
             "Seconds since a round of the duty was last done.",
             labels=["duty"],
         )

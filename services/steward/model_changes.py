@@ -14,71 +14,71 @@ from uuid import UUID
 from sqlalchemy import delete, exists, func, insert, select, update
 from sqlalchemy.orm import Session, aliased
 
-from services.steward.search_workers import search_has_loaded
+from services.steward.search_workers import search_workers_have_loaded
 from shared.catalog.base import Condition, db_now
-from shared.catalog.chunks import Descriptor, about_described
+from shared.catalog.chunks import Descriptor, estimate_described
 from shared.catalog.generations import (
     Generation,
     GenerationState,
     active_generation,
     lock_generation,
 )
-from shared.catalog.maps import Map, bump_version, list_maps, lock_map
+from shared.catalog.maps import Map, increment_map_version, list_maps, lock_map
 from shared.catalog.photos import Photo, PhotoRole
 from shared.catalog.session import Catalog
-from shared.catalog.webhooks import EventKind, announce
+from shared.catalog.webhooks import EventKind, enqueue_event
 from shared.catalog.whitenings import StoredWhitening
 from shared.errors import Conflict
 from shared.ids import new_id
-from shared.jobs import Hints, Job, JobKind, JobState, Priority
-from shared.jobs.finish import succeed
+from shared.jobs import Job, JobKind, JobState, Priority, Wakeups
+from shared.jobs.finish import succeed_job
 from shared.jobs.model_changes import start_model_change
-from shared.jobs.table import MODEL_CHANGES, UNFINISHED, WaitingFor
+from shared.jobs.table import MODEL_CHANGE_JOBS, UNFINISHED_STATES, WaitingFor
 
 log = logging.getLogger(__name__)
 
-WAITING = (WaitingFor.DESCRIPTORS, WaitingFor.SEARCH)
+ADVANCED_WAITS = (WaitingFor.DESCRIPTORS, WaitingFor.SEARCH)
 
-FILL_JOBS = 2000  # reindex jobs queued in one transaction
+REINDEX_JOBS_PER_TRANSACTION = 2000  # reindex jobs queued in one transaction
 
 # What `POST /vocabularies` with {} asks for; no `clusters` means the extractor's own number.
-DEFAULT_FIT = {"clusters": None, "sample": 1000, "seed": 0}
+DEFAULT_FIT_PARAMS = {"clusters": None, "sample": 1000, "seed": 0}
 
 
-def advance_model_changes(catalog: Catalog, hints: Hints) -> None:
+def advance_model_changes(catalog: Catalog, hints: Wakeups) -> None:
     """One step for every model change that waits for descriptors, or for search to load them."""
     with catalog.read() as session:
         waiting = session.scalars(
-            select(Job).where(Job.kind.in_(MODEL_CHANGES), Job.waiting_for.in_(WAITING))
+            select(Job).where(Job.kind.in_(MODEL_CHANGE_JOBS), Job.waiting_for.in_(ADVANCED_WAITS))
         ).all()
     for job in waiting:
         with catalog.write() as session:
             lock_map(session, job.map_id)
             current = session.get_one(Job, job.id, with_for_update=True)
-            if current.waiting_for in WAITING and current.generation_id:
-                queued = _advance(session, current, current.generation_id)
+            if current.waiting_for in ADVANCED_WAITS and current.generation_id:
+                queued = _advance_generation(session, current, current.generation_id)
                 if queued:
                     hints.send()
 
 
-def fit_maps_that_wait(catalog: Catalog, hints: Hints, auto_fit_photos: int) -> None:
+def auto_fit_vocabularies(catalog: Catalog, hints: Wakeups, auto_fit_photos: int) -> None:
     """A map whose photos wait for a vocabulary gets one fitted once it has enough of them."""
     with catalog.read() as session:
         maps = [map_.id for map_ in list_maps(session)]
-        ready = [id_ for id_ in maps if _waiting_photos(session, id_, auto_fit_photos)]
+        ready = [id_ for id_ in maps if _has_enough_waiting_photos(session, id_, auto_fit_photos)]
     for map_id in ready:
         with catalog.write() as session:
             if _last_change_failed(session, map_id):
                 continue  # the reason is in the job; a person has to act
             try:
-                job = start_model_change(session, map_id, JobKind.FIT, dict(DEFAULT_FIT))
+                job = start_model_change(session, map_id, JobKind.FIT, dict(DEFAULT_FIT_PARAMS))
             except Conflict:
                 continue  # one is under way
         log.info("map %s has enough photos: fitting a vocabulary (job %s)", map_id, job.id)
         hints.send()
 
 
-def _waiting_photos(session: Session, map_id: UUID, least: int) -> bool:
+def _has_enough_waiting_photos(session: Session, map_id: UUID, least: int) -> bool:
     """Whether `least` database photos of the map wait for a vocabulary."""
     waiting = (
         select(Job.id)
@@ -94,11 +94,11 @@ def _waiting_photos(session: Session, map_id: UUID, least: int) -> bool:
     return session.scalar(select(func.count()).select_from(waiting.subquery())) == least
 
 
-def _advance(session: Session, job: Job, generation_id: UUID) -> int:
+def _advance_generation(session: Session, job: Job, generation_id: UUID) -> int:
     """Queue what is missing, note the progress, or finish; returns how many jobs were queued."""
     generation = lock_generation(session, generation_id)
     if generation.state == GenerationState.BUILDING:
-        queued = _queue_missing(session, generation)
+        queued = _queue_missing_photos(session, generation)
         open_jobs = (Job.kind == JobKind.REINDEX) & (Job.generation_id == generation_id)
     else:  # the map's first generation: photos are described into it by their own jobs
         queued = 0
@@ -107,25 +107,27 @@ def _advance(session: Session, job: Job, generation_id: UUID) -> int:
             & (Job.map_id == job.map_id)
             & (Job.created_at <= generation.created_at)
         )
-    if queued or session.scalar(select(exists().where(open_jobs, Job.state.in_(UNFINISHED)))):
+    if queued or session.scalar(
+        select(exists().where(open_jobs, Job.state.in_(UNFINISHED_STATES)))
+    ):
         before = int(job.params.get("done_before", 0))
-        done = about_described(session, generation_id)
+        done = estimate_described(session, generation_id)
         # Also when it was complete before: photos have come since.
         job.waiting_for, job.stage, job.awaited = WaitingFor.DESCRIPTORS, "describe", None
         job.progress_done = max(0, min(before + done, job.progress_total - 1))
         return queued
-    failed = _count(session, open_jobs & (Job.state == JobState.FAILED))
+    failed = _count_jobs(session, open_jobs & (Job.state == JobState.FAILED))
     if generation.state == GenerationState.BUILDING:
-        if not search_has_loaded(session, job, generation):
+        if not search_workers_have_loaded(session, job, generation):
             return 0
-        _switch(session, generation)
+        _activate_generation(session, generation)
     job.progress_failed = failed
     job.progress_total = max(job.progress_total, failed)
-    photos = about_described(session, generation_id)
+    photos = estimate_described(session, generation_id)
     whitening = None
     if generation.whitening_id is not None:
-        whitening = session.get_one(StoredWhitening, generation.whitening_id).in_short()
-    succeed(
+        whitening = session.get_one(StoredWhitening, generation.whitening_id).summary()
+    succeed_job(
         job,
         {
             "generation_id": str(generation_id),
@@ -141,7 +143,7 @@ def _advance(session: Session, job: Job, generation_id: UUID) -> int:
     return 0
 
 
-def _queue_missing(session: Session, generation: Generation) -> int:
+def _queue_missing_photos(session: Session, generation: Generation) -> int:
     """A reindex job for each photo that still needs one; up to FILL_JOBS of them."""
     active = active_generation(session, generation.map_id)
     assert active is not None, "a generation is built only beside an active one"
@@ -165,7 +167,7 @@ def _queue_missing(session: Session, generation: Generation) -> int:
             ),
         )
         .order_by(Photo.id)
-        .limit(FILL_JOBS)
+        .limit(REINDEX_JOBS_PER_TRANSACTION)
     )
     rows = [
         {
@@ -183,7 +185,7 @@ def _queue_missing(session: Session, generation: Generation) -> int:
     return len(rows)
 
 
-def _switch(session: Session, generation: Generation) -> None:
+def _activate_generation(session: Session, generation: Generation) -> None:
     """The new generation answers from this commit on."""
     active = active_generation(session, generation.map_id)
     assert active is not None, "a generation is built only beside an active one"
@@ -194,7 +196,7 @@ def _switch(session: Session, generation: Generation) -> None:
     generation.activated_at = db_now()
     map_ = session.get_one(Map, generation.map_id)
     map_.extractor = generation.extractor
-    announce(
+    enqueue_event(
         session,
         EventKind.GENERATION_SWITCHED,
         {
@@ -210,18 +212,18 @@ def _switch(session: Session, generation: Generation) -> None:
     for photo_id, job_id in session.execute(failed).all():
         session.execute(update(Photo).where(Photo.id == photo_id).values(job_id=job_id))
     session.execute(delete(Job).where(reindex, Job.state != JobState.FAILED))
-    bump_version(session, generation.map_id)
+    increment_map_version(session, generation.map_id)
 
 
 def _last_change_failed(session: Session, map_id: UUID) -> bool:
     last = session.scalar(
         select(Job.state)
-        .where(Job.map_id == map_id, Job.kind.in_(MODEL_CHANGES))
+        .where(Job.map_id == map_id, Job.kind.in_(MODEL_CHANGE_JOBS))
         .order_by(Job.id.desc())
         .limit(1)
     )
     return last in (JobState.FAILED, JobState.CANCELLED)
 
 
-def _count(session: Session, condition: Condition) -> int:
+def _count_jobs(session: Session, condition: Condition) -> int:
     return session.scalar(select(func.count()).select_from(Job).where(condition)) or 0

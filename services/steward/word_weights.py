@@ -12,31 +12,33 @@ from __future__ import annotations
 from collections.abc import Sequence
 from uuid import UUID
 
-from services.steward.labelled import Recall
-from services.steward.located import Located
-from services.steward.measure import Measure
-from services.steward.teach import rows_at_once, teach
+from services.steward.labelled import RecallCounter
+from services.steward.located import GeotaggedPhoto
+from services.steward.measure import MapEvaluation
+from services.steward.teach import accumulate_pair_statistics, photos_per_lesson
 from shared.catalog.generations import Generation
 from shared.catalog.session import Catalog
-from shared.estimate.places import same_place
+from shared.estimate.places import is_same_place
 from shared.objects import ObjectStore
-from shared.word_weights.compare import is_a_rise, rises_by_chance
-from shared.word_weights.learn import Taught
+from shared.word_weights.compare import is_significant_improvement, sign_test_p_value
+from shared.word_weights.learn import PairStatistics
 from shared.word_weights.pairs import (
-    LEAST_PAIRS,
+    MIN_PAIRS,
     NEAREST_M,
-    Curriculum,
-    TaughtBy,
-    choose_pairs,
+    PairSource,
+    PairSplit,
+    sample_pairs,
 )
 from shared.word_weights.record import HeldOut, Outcome, WordWeights
 
-DIGITS = 6  # of a weight, as it is stored
-RANKS = 10  # looked at for R@10
-MOST_BURST = 200  # photos that are left out with one: more are a fixed camera's, and not asked with
+WEIGHT_DECIMALS = 6  # of a weight, as it is stored
+TRIAL_RANKS = 10  # looked at for R@10
+MAX_BURST_PHOTOS = (
+    200  # photos that are left out with one: more are a fixed camera's, and not asked with
+)
 
 
-class LearnWords:
+class WordWeightsFit:
     """Learns the weights of one generation with `words` words in its vocabulary."""
 
     def __init__(
@@ -45,79 +47,84 @@ class LearnWords:
         store: ObjectStore,
         generation: Generation,
         words: int,
-        measure: Measure,
+        measure: MapEvaluation,
     ) -> None:
         self._catalog = catalog
         self._store = store
         self._generation = generation
         self._words = words
-        self._measure = measure
+        self._evaluation = measure
 
-    def run(self, sample: Sequence[Located], seed: int, searchable: int) -> WordWeights:
+    def fit(self, sample: Sequence[GeotaggedPhoto], seed: int, searchable: int) -> WordWeights:
         """What there is to keep, whatever came of it. `sample` are the photos to try weights on.
 
-        Raises what `Measure` and `teach` raise.
+        Raises what `MapEvaluation` and `teach` raise.
         """
-        photos = self._measure.database.photos
-        chosen = choose_pairs(
-            [photo.spot for photo in photos], seed, rows_at_once(self._generation.dimension)
+        photos = self._evaluation.database.photos
+        chosen = sample_pairs(
+            [photo.spot for photo in photos], seed, photos_per_lesson(self._generation.dimension)
         )
-        halves = self._teach(chosen)
+        halves = self._fit_halves(chosen)
         record = WordWeights(
             outcome=Outcome.NOT_ENOUGH_PAIRS,
-            reason=_too_few(chosen.by, halves),
+            reason=_not_enough_pairs_reason(chosen.by, halves),
             taught_by=chosen.by,
             near_pairs=sum(half.near.pairs for half in halves),
             far_pairs=sum(half.far.pairs for half in halves),
             seed=seed,
             searchable=searchable,
         )
-        if min(min(half.near.pairs, half.far.pairs) for half in halves) < LEAST_PAIRS:
+        if min(min(half.near.pairs, half.far.pairs) for half in halves) < MIN_PAIRS:
             return record
-        together = _as_stored(halves[0] + halves[1])
-        of_other_half = (_as_stored(halves[1]), _as_stored(halves[0]))
+        together = _rounded_weights(halves[0] + halves[1])
+        of_other_half = (_rounded_weights(halves[1]), _rounded_weights(halves[0]))
         half_of = {photo.photo_id: half for photo, half in zip(photos, chosen.halves, strict=True)}
         tried = [(query, of_other_half[half_of[query.photo_id]]) for query in sample]
-        held_out = self._try(tried, chosen.by)
-        kept = is_a_rise(held_out.better, held_out.worse)
+        held_out = self._cross_validate(tried, chosen.by)
+        kept = is_significant_improvement(held_out.better, held_out.worse)
         record = record.model_copy(
             update={
                 "outcome": Outcome.KEPT if kept else Outcome.NOT_KEPT,
-                "reason": _what_came_of_it(held_out),
+                "reason": _held_out_reason(held_out),
                 "weights": together,
                 "held_out": held_out,
             }
         )
         if kept:
-            measured = self._measure.run(sample, together)
+            measured = self._evaluation.evaluate(sample, together)
             record = record.model_copy(update={"calibration": measured.calibration})
         return record
 
-    def _teach(self, chosen: Curriculum) -> tuple[Taught, Taught]:
-        ids = [photo.photo_id for photo in self._measure.database.photos]
+    def _fit_halves(self, chosen: PairSplit) -> tuple[PairStatistics, PairStatistics]:
+        ids = [photo.photo_id for photo in self._evaluation.database.photos]
 
-        def half(lessons: int) -> Taught:
-            return teach(
+        def half(lessons: int) -> PairStatistics:
+            return accumulate_pair_statistics(
                 self._catalog,
                 self._store,
                 self._generation.id,
                 ids,
-                chosen.lessons[lessons],
+                chosen.batches[lessons],
                 self._words,
-                self._measure.on_asked,
+                self._evaluation.on_query,
             )
 
         return half(0), half(1)
 
-    def _try(self, sample: Sequence[tuple[Located, tuple[float, ...]]], by: TaughtBy) -> HeldOut:
+    def _cross_validate(
+        self, sample: Sequence[tuple[GeotaggedPhoto, tuple[float, ...]]], by: PairSource
+    ) -> HeldOut:
         """Each photo that is not alone at its place, asked without weights and with these."""
-        without, weighted, better, worse = Recall(), Recall(), 0, 0
+        without, weighted, better, worse = RecallCounter(), RecallCounter(), 0, 0
         for query, weights in sample:
-            self._measure.on_asked()
-            burst = self._burst(query, by)
+            self._evaluation.on_query()
+            burst = self._photos_to_exclude(query, by)
             if burst is None:
                 continue
-            plain, found = self._right(query, (), burst), self._right(query, weights, burst)
+            plain, found = (
+                self._correct_ranks(query, (), burst),
+                self._correct_ranks(query, weights, burst),
+            )
             if plain is None or found is None:
                 continue
             without.add(plain)
@@ -129,43 +136,45 @@ class LearnWords:
             weighted=weighted.figures(),
             better=better,
             worse=worse,
-            chance=rises_by_chance(better, worse),
+            chance=sign_test_p_value(better, worse),
         )
 
-    def _burst(self, query: Located, by: TaughtBy) -> tuple[UUID, ...] | None:
+    def _photos_to_exclude(self, query: GeotaggedPhoto, by: PairSource) -> tuple[UUID, ...] | None:
         """What is left out with the photo; None where nothing of its place would be left."""
-        database, radius_m = self._measure.database, self._measure.radius_m
-        if by == TaughtBy.PLACES:
-            return () if database.showing(query.spot, radius_m) > 1 else None  # itself is one
-        burst = database.within(query.spot, NEAREST_M)  # itself among them
-        alone = len(database.within(query.spot, radius_m)) == len(burst)
-        return None if alone or len(burst) > MOST_BURST else tuple(burst)
+        database, radius_m = self._evaluation.database, self._evaluation.radius_m
+        if by == PairSource.PLACES:
+            return (
+                () if database.count_at_place(query.spot, radius_m) > 1 else None
+            )  # itself is one
+        burst = database.find_within(query.spot, NEAREST_M)  # itself among them
+        alone = len(database.find_within(query.spot, radius_m)) == len(burst)
+        return None if alone or len(burst) > MAX_BURST_PHOTOS else tuple(burst)
 
-    def _right(
-        self, query: Located, weights: tuple[float, ...], without: tuple[UUID, ...]
+    def _correct_ranks(
+        self, query: GeotaggedPhoto, weights: tuple[float, ...], without: tuple[UUID, ...]
     ) -> list[bool] | None:
         """Which photos of the ranking show the query's place; None for a deleted query."""
-        ranking = self._measure.asker.ask(query, RANKS, weights, without)
+        ranking = self._evaluation.search.rank_similar(query, TRIAL_RANKS, weights, without)
         if ranking is None:
             return None
-        return [same_place(query.spot, spot, self._measure.radius_m) for _, spot in ranking]
+        return [is_same_place(query.spot, spot, self._evaluation.radius_m) for _, spot in ranking]
 
 
-def _as_stored(taught: Taught) -> tuple[float, ...]:
-    return tuple(round(weight, DIGITS) for weight in taught.weights().tolist())
+def _rounded_weights(taught: PairStatistics) -> tuple[float, ...]:
+    return tuple(round(weight, WEIGHT_DECIMALS) for weight in taught.weights().tolist())
 
 
-def _too_few(by: TaughtBy, halves: tuple[Taught, Taught]) -> str:
+def _not_enough_pairs_reason(by: PairSource, halves: tuple[PairStatistics, PairStatistics]) -> str:
     near, far = ([half.near.pairs for half in halves], [half.far.pairs for half in halves])
-    what = "5 to 25 m apart" if by == TaughtBy.COORDINATES else "under one label"
+    what = "5 to 25 m apart" if by == PairSource.COORDINATES else "under one label"
     return (
         f"By {by} the two halves of the map have {near[0]} and {near[1]} pairs of photos of one "
-        f"place ({what}) and {far[0]} and {far[1]} of two places; {LEAST_PAIRS} of either kind are "
+        f"place ({what}) and {far[0]} and {far[1]} of two places; {MIN_PAIRS} of either kind are "
         "needed in each half."
     )
 
 
-def _what_came_of_it(held_out: HeldOut) -> str:
+def _held_out_reason(held_out: HeldOut) -> str:
     return (
         f"Of {held_out.without['queries']} photos, each asked with what the other half of the map "
         f"has taught, {held_out.better} find their place first with weights alone and "

@@ -12,11 +12,11 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, field_validator
 
 from services.trainer.read_value import (
-    read_flag,
-    read_height_width,
-    read_names,
-    read_number_or_word,
-    read_structure,
+    parse_bool,
+    parse_image_size,
+    parse_literal,
+    parse_names,
+    parse_number_or_text,
 )
 
 # fmt: off
@@ -26,21 +26,21 @@ CITIES = (
     "WashingtonDC", "Brussels", "London", "Melbourne", "Osaka", "PRS",
 )
 # fmt: on
-SMALLEST_IMAGE = 32
+MIN_IMAGE_PIXELS = 32
 """pixels of a side: below, a residual network's last map is smaller than one position"""
 
-Flag = Annotated[bool, BeforeValidator(read_flag)]
-Names = Annotated[tuple[str, ...], BeforeValidator(read_names)]
-Numbers = Annotated[tuple[int, ...], BeforeValidator(read_structure)]
-HeightWidth = Annotated[tuple[int, int], BeforeValidator(read_height_width)]
+Bool = Annotated[bool, BeforeValidator(parse_bool)]
+NameList = Annotated[tuple[str, ...], BeforeValidator(parse_names)]
+IntList = Annotated[tuple[int, ...], BeforeValidator(parse_literal)]
+HeightWidth = Annotated[tuple[int, int], BeforeValidator(parse_image_size)]
 
 
-def _said(group: str, default: Any, help_text: str, **limits: Any) -> Any:
+def _argument(group: str, default: Any, help_text: str, **limits: Any) -> Any:
     return Field(default, description=help_text, json_schema_extra={"group": group}, **limits)
 
 
-DATA, MODEL, LEARNING, LOSS = "Data", "Model", "Optimisation", "Loss and miner"
-EVALUATION, KEEPING, MACHINE, RUN = "Evaluation", "Checkpoints", "Machine", "Run"
+DATA, MODEL, OPTIMISATION, LOSS = "Data", "Model", "Optimisation", "Loss and miner"
+EVALUATION, CHECKPOINTS, MACHINE, RUN = "Evaluation", "Checkpoints", "Machine", "Run"
 
 
 class TrainingArguments(BaseModel):
@@ -48,144 +48,151 @@ class TrainingArguments(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, protected_namespaces=())
 
-    data_root: Path | None = _said(
+    data_root: Path | None = _argument(
         DATA, None, "Folder of the training set, as `placewise datasets check` recognises it."
     )
-    eval_roots: Annotated[tuple[Path, ...], BeforeValidator(read_structure)] = _said(
+    eval_roots: Annotated[tuple[Path, ...], BeforeValidator(parse_literal)] = _argument(
         DATA, (), "JSON list of folders with the evaluation sets; empty: data_root."
     )
-    cities: Names = _said(
+    cities: NameList = _argument(
         DATA, CITIES, "The cities to learn from, in that order; left out: all in the folder."
     )
-    batch_size: int = _said(DATA, 64, "Places in a batch.", ge=1)
-    img_per_place: int = _said(DATA, 2, "Photos of each place in a batch.", ge=1)
-    min_img_per_place: int = _said(DATA, 2, "Places with fewer photos are left out.", ge=1)
-    shuffle_all: Flag = _said(
+    batch_size: int = _argument(DATA, 64, "Places in a batch.", ge=1)
+    img_per_place: int = _argument(DATA, 2, "Photos of each place in a batch.", ge=1)
+    min_img_per_place: int = _argument(DATA, 2, "Places with fewer photos are left out.", ge=1)
+    shuffle_all: Bool = _argument(
         DATA, False, "Mix the places of all cities; else batches go city by city."
     )
-    random_sample_from_each_place: Flag = _said(
+    random_sample_from_each_place: Bool = _argument(
         DATA, True, "Draw a place's photos at random; else its first ones."
     )
-    image_size: HeightWidth = _said(DATA, (320, 320), "Height and width of a photo, pixels.")
-    num_workers: int = _said(DATA, 8, "Processes that read photos; 0: none of their own.", ge=0)
-    show_data_stats: Flag = _said(DATA, True, "Print what the data sets hold before training.")
-    augmentation: Literal["randaugment", "none"] = _said(
+    image_size: HeightWidth = _argument(DATA, (320, 320), "Height and width of a photo, pixels.")
+    num_workers: int = _argument(DATA, 8, "Processes that read photos; 0: none of their own.", ge=0)
+    show_data_stats: Bool = _argument(DATA, True, "Print what the data sets hold before training.")
+    augmentation: Literal["randaugment", "none"] = _argument(
         DATA, "randaugment", "What photos go through before the network learns from them."
     )
-    on_bad_image: Literal["skip", "error"] = _said(
+    on_bad_image: Literal["skip", "error"] = _argument(
         DATA, "skip", "A photo that does not decode: left out, named and counted; or an error."
     )
 
-    backbone_arch: str = _said(MODEL, "resnet18", "Name of the backbone.")
-    pretrained: Flag = _said(MODEL, True, "Begin with ImageNet weights.")
-    weights: Path | None = _said(
+    backbone_arch: str = _argument(MODEL, "resnet18", "Name of the backbone.")
+    pretrained: Bool = _argument(MODEL, True, "Begin with ImageNet weights.")
+    weights: Path | None = _argument(
         MODEL, None, "File with the backbone's weights; else the hub's cache."
     )
-    layers_to_freeze: int = _said(MODEL, 2, "Freeze up to and with this layer; -1: none.", ge=-1)
-    layers_to_crop: Numbers = _said(MODEL, (), "JSON list: 4 drops layer4, 3 also layer3.")
-    agg_arch: str = _said(MODEL, "AVG", "Name of the aggregator.")
-    agg_config: Annotated[dict[str, Any], BeforeValidator(read_structure)] = _said(
+    layers_to_freeze: int = _argument(
+        MODEL, 2, "Freeze up to and with this layer; -1: none.", ge=-1
+    )
+    layers_to_crop: IntList = _argument(MODEL, (), "JSON list: 4 drops layer4, 3 also layer3.")
+    agg_arch: str = _argument(MODEL, "AVG", "Name of the aggregator.")
+    agg_config: Annotated[dict[str, Any], BeforeValidator(parse_literal)] = _argument(
         MODEL, {}, "JSON dict: the aggregator's own arguments; channels and map are inferred."
     )
 
-    lr: float = _said(LEARNING, 2e-4, "Learning rate.", gt=0)
-    optimizer: Literal["adam", "adamw", "sgd"] = _said(LEARNING, "adam", "Which optimiser.")
-    weight_decay: float = _said(LEARNING, 0.0, "Weight decay.", ge=0)
-    momentum: float = _said(LEARNING, 0.9, "Of sgd.", ge=0, lt=1)
-    warmpup_steps: int = _said(
-        LEARNING, 600, "Steps in which the learning rate rises linearly; also --warmup_steps.", ge=0
+    lr: float = _argument(OPTIMISATION, 2e-4, "Learning rate.", gt=0)
+    optimizer: Literal["adam", "adamw", "sgd"] = _argument(OPTIMISATION, "adam", "Which optimiser.")
+    weight_decay: float = _argument(OPTIMISATION, 0.0, "Weight decay.", ge=0)
+    momentum: float = _argument(OPTIMISATION, 0.9, "Of sgd.", ge=0, lt=1)
+    warmpup_steps: int = _argument(
+        OPTIMISATION,
+        600,
+        "Steps in which the learning rate rises linearly; also --warmup_steps.",
+        ge=0,
     )
-    milestones: Numbers = _said(
-        LEARNING, (5, 10, 15, 25), "JSON list of epochs at which lr is multiplied by lr_mult."
+    milestones: IntList = _argument(
+        OPTIMISATION, (5, 10, 15, 25), "JSON list of epochs at which lr is multiplied by lr_mult."
     )
-    lr_mult: float = _said(LEARNING, 0.3, "The factor of each milestone.", gt=0)
-    max_epochs: int = _said(LEARNING, 1, "Epochs to learn.", ge=1)
-    max_steps: int | None = _said(
-        LEARNING, None, "End after so many steps, also within an epoch.", ge=1
+    lr_mult: float = _argument(OPTIMISATION, 0.3, "The factor of each milestone.", gt=0)
+    max_epochs: int = _argument(OPTIMISATION, 1, "Epochs to learn.", ge=1)
+    max_steps: int | None = _argument(
+        OPTIMISATION, None, "End after so many steps, also within an epoch.", ge=1
     )
-    seed: int = _said(LEARNING, 1, "Of weights, sampling and augmentation.", ge=0)
+    seed: int = _argument(OPTIMISATION, 1, "Of weights, sampling and augmentation.", ge=0)
 
-    loss_name: str = _said(LOSS, "MultiSimilarityLoss", "Name of the loss.")
-    miner_name: str = _said(LOSS, "MultiSimilarityMiner", "Name of the miner, or none.")
-    miner_margin: float = _said(
+    loss_name: str = _argument(LOSS, "MultiSimilarityLoss", "Name of the loss.")
+    miner_name: str = _argument(LOSS, "MultiSimilarityMiner", "Name of the miner, or none.")
+    miner_margin: float = _argument(
         LOSS, 0.1, "Margin of TripletMarginMiner, epsilon of MultiSimilarityMiner."
     )
 
-    val_set_names: Names = _said(
+    val_set_names: NameList = _argument(
         EVALUATION, ("sfxs_val",), "Sets measured while learning; left out: the folder's own."
     )
-    test_set_names: Names = _said(
+    test_set_names: NameList = _argument(
         EVALUATION,
         ("sfxs_test", "tokyoxs_test"),
         "Sets measured by the phases test and all; left out: the folder's own.",
     )
     test_image_size: Annotated[
-        Literal["same", "native"] | HeightWidth, BeforeValidator(read_height_width)
+        Literal["same", "native"] | HeightWidth, BeforeValidator(parse_image_size)
     ] = Field(
         "same",
         description="same as image_size, native (one photo at a time), or H W in pixels.",
         json_schema_extra={"group": EVALUATION},
     )
-    faiss_gpu: Flag = _said(EVALUATION, True, "Search by faiss on the GPU.")
-    check_val_every_n_epoch: int = _said(EVALUATION, 1, "Epochs between validations.", ge=1)
-    num_sanity_val_steps: int = _said(
+    faiss_gpu: Bool = _argument(EVALUATION, True, "Search by faiss on the GPU.")
+    check_val_every_n_epoch: int = _argument(EVALUATION, 1, "Epochs between validations.", ge=1)
+    num_sanity_val_steps: int = _argument(
         EVALUATION, 0, "Validation batches tried before training; -1: all.", ge=-1
     )
 
-    experiment_phase: Literal["train", "test", "all"] = _said(
+    experiment_phase: Literal["train", "test", "all"] = _argument(
         RUN, "train", "train, test (a checkpoint), or all: train, then test the best."
     )
-    model_path: Path | None = _said(
+    model_path: Path | None = _argument(
         RUN, None, "Checkpoint that the phase test measures, and that training begins with."
     )
-    default_root_dir: str = _said(RUN, "./LOGS/", "Folder of the runs.")
-    run_name: str | None = _said(RUN, None, "Folder of this run below it; left out: by time.")
-    logger: Names = _said(
+    default_root_dir: str = _argument(RUN, "./LOGS/", "Folder of the runs.")
+    run_name: str | None = _argument(RUN, None, "Folder of this run below it; left out: by time.")
+    logger: NameList = _argument(
         RUN, ("tensorboard", "csv"), "csv, tensorboard, wandb, mlflow (a list), or none."
     )
-    log_every_n_steps: int = _said(RUN, 20, "Steps between two lines of the logs.", ge=1)
-    fast_dev_run: Flag = _said(RUN, False, "Try one batch of everything; keep nothing.")
+    log_every_n_steps: int = _argument(RUN, 20, "Steps between two lines of the logs.", ge=1)
+    fast_dev_run: Bool = _argument(RUN, False, "Try one batch of everything; keep nothing.")
 
-    monitor: str = _said(
-        KEEPING, "sfxs_val/R1", "The metric that decides which checkpoints are best."
+    monitor: str = _argument(
+        CHECKPOINTS, "sfxs_val/R1", "The metric that decides which checkpoints are best."
     )
-    mode: Literal["min", "max"] = _said(KEEPING, "max", "Whether more of it is better.")
-    save_top_k: int = _said(KEEPING, 3, "How many best checkpoints stay; -1: all, 0: none.", ge=-1)
-    save_weights_only: Flag = _said(
-        KEEPING, True, "Best checkpoints without the optimiser; last.ckpt always has all."
+    mode: Literal["min", "max"] = _argument(CHECKPOINTS, "max", "Whether more of it is better.")
+    save_top_k: int = _argument(
+        CHECKPOINTS, 3, "How many best checkpoints stay; -1: all, 0: none.", ge=-1
     )
-    filename: str = _said(
-        KEEPING,
+    save_weights_only: Bool = _argument(
+        CHECKPOINTS, True, "Best checkpoints without the optimiser; last.ckpt always has all."
+    )
+    filename: str = _argument(
+        CHECKPOINTS,
         "{backbone_arch}_epoch({epoch:02d})_step({step:04d})_R1[{R1:.4f}]_R5[{R5:.4f}]",
         "Name of a best checkpoint; R1 is the monitored set's, others by SET/R1.",
     )
-    auto_insert_metric_name: Flag = _said(
-        KEEPING, False, "Write a metric's name before its figure."
+    auto_insert_metric_name: Bool = _argument(
+        CHECKPOINTS, False, "Write a metric's name before its figure."
     )
 
-    accelerator: Literal["gpu", "cuda", "mps", "cpu", "auto"] = _said(
+    accelerator: Literal["gpu", "cuda", "mps", "cpu", "auto"] = _argument(
         MACHINE, "gpu", "What computes."
     )
-    devices: Annotated[int | str | tuple[int, ...], BeforeValidator(read_number_or_word)] = Field(
+    devices: Annotated[int | str | tuple[int, ...], BeforeValidator(parse_number_or_text)] = Field(
         (0,), description="Which one: [0], or 1 for any.", json_schema_extra={"group": MACHINE}
     )
-    precision: Annotated[int | str, BeforeValidator(read_number_or_word)] = Field(
+    precision: Annotated[int | str, BeforeValidator(parse_number_or_text)] = Field(
         32, description="32, 16-mixed or bf16-mixed.", json_schema_extra={"group": MACHINE}
     )
-    reload_dataloaders_every_n_epochs: int = _said(
+    reload_dataloaders_every_n_epochs: int = _argument(
         DATA, 1, "Epochs between two shufflings of the places; 0: shuffled once.", ge=0
     )
 
     @field_validator("image_size")
     @classmethod
-    def _large_enough(cls, size: tuple[int, int]) -> tuple[int, int]:
-        if min(size) < SMALLEST_IMAGE:
-            raise ValueError(f"each side must be {SMALLEST_IMAGE} pixels or more")
+    def _check_image_size(cls, size: tuple[int, int]) -> tuple[int, int]:
+        if min(size) < MIN_IMAGE_PIXELS:
+            raise ValueError(f"each side must be {MIN_IMAGE_PIXELS} pixels or more")
         return size
 
     @field_validator("filename", "default_root_dir")
     @classmethod
-    def _shell_escapes_away(cls, text: str) -> str:
+    def _unescape_underscores(cls, text: str) -> str:
         # The predecessor's command writes `\_` inside double quotes, where a shell keeps both.
         return text.replace("\\_", "_")
 
@@ -196,7 +203,7 @@ class TrainingArguments(BaseModel):
 
     @field_validator("logger")
     @classmethod
-    def _known_loggers(cls, names: tuple[str, ...]) -> tuple[str, ...]:
+    def _check_loggers(cls, names: tuple[str, ...]) -> tuple[str, ...]:
         known = ("csv", "tensorboard", "wandb", "mlflow", "none")
         for name in names:
             if name not in known:
@@ -206,13 +213,13 @@ class TrainingArguments(BaseModel):
         return tuple(name for name in names if name != "none")
 
 
-def group_of(name: str) -> str:
+def argument_group(name: str) -> str:
     """The heading of the help under which an argument stands."""
     extra = TrainingArguments.model_fields[name].json_schema_extra
     assert isinstance(extra, dict)
     return str(extra["group"])
 
 
-def is_flag(name: str) -> bool:
+def is_boolean(name: str) -> bool:
     """Whether the argument is true or false."""
     return TrainingArguments.model_fields[name].annotation is bool

@@ -11,21 +11,21 @@ from torchvision import transforms as tv
 RANDAUGMENT_OPERATIONS = 3
 RANDAUGMENT_MAGNITUDE = 9
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
-IMAGENET_DEVIATION = (0.229, 0.224, 0.225)
+IMAGENET_STD = (0.229, 0.224, 0.225)
 
-_augment = tv.RandAugment(
+_randaugment = tv.RandAugment(
     num_ops=RANDAUGMENT_OPERATIONS,
     magnitude=RANDAUGMENT_MAGNITUDE,
     interpolation=tv.InterpolationMode.BILINEAR,
 )
 
 
-def augmented(image: Image.Image, seed: int) -> Image.Image:
+def apply_randaugment(image: Image.Image, seed: int) -> Image.Image:
     """Three operations of RandAugment (Cubuk et al. 2020), the same for the same seed."""
     # RandAugment draws from the global generator, which is the training's own elsewhere.
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        changed: Image.Image = _augment(image)
+        changed: Image.Image = _randaugment(image)
     return changed
 
 
@@ -33,5 +33,5 @@ def to_tensor(image: Image.Image) -> Tensor:
     """RGB -> (3, H, W) float32, normalised by ImageNet's means and deviations."""
     pixels = torch.from_numpy(np.array(image, np.uint8)).permute(2, 0, 1)
     mean = torch.tensor(IMAGENET_MEAN)[:, None, None]
-    deviation = torch.tensor(IMAGENET_DEVIATION)[:, None, None]
+    deviation = torch.tensor(IMAGENET_STD)[:, None, None]
     return (pixels.float() / 255 - mean) / deviation

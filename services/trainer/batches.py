@@ -12,10 +12,10 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
-from services.trainer.augment import augmented, to_tensor
-from services.trainer.sampling import BatchPlan, Draw
+from services.trainer.augment import apply_randaugment, to_tensor
+from services.trainer.sampling import PlaceBatchSampler, PlaceSample
 from shared.errors import Unprocessable
-from shared.vision.decode_small import decode_small
+from shared.vision.decode_small import decode_resized
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,22 +24,22 @@ class Batch:
     """(n, 3, H, W) float32; n is P x K without the photos that do not decode"""
     labels: Tensor
     """(n,) int64 place ids"""
-    bad: tuple[tuple[str, str], ...] = ()
+    undecodable: tuple[tuple[str, str], ...] = ()
     """path and reason of each photo left out"""
 
     def to(self, device: torch.device, non_blocking: bool = False) -> Batch:
         return Batch(
             self.photos.to(device, non_blocking=non_blocking),
             self.labels.to(device, non_blocking=non_blocking),
-            self.bad,
+            self.undecodable,
         )
 
     def pin_memory(self) -> Batch:
-        return Batch(self.photos.pin_memory(), self.labels.pin_memory(), self.bad)
+        return Batch(self.photos.pin_memory(), self.labels.pin_memory(), self.undecodable)
 
 
-class PlacePhotos(Dataset[Batch]):
-    """The photos of one `Draw`, decoded, augmented, normalised.
+class PlaceDataset(Dataset[Batch]):
+    """The photos of one `PlaceSample`, decoded, augmented, normalised.
 
     A photo that does not decode is left out and named in `bad`, or is Unprocessable
     (`undecodable_photo`) with `bad_is_error`.
@@ -47,32 +47,32 @@ class PlacePhotos(Dataset[Batch]):
 
     def __init__(
         self,
-        plan: BatchPlan,
+        plan: PlaceBatchSampler,
         image_size: tuple[int, int],
         *,
         augment: bool = True,
-        bad_is_error: bool,
+        fail_on_undecodable: bool,
     ) -> None:
         self._places = plan.places
         self._image_size = image_size
         self._augment = augment
-        self._bad_is_error = bad_is_error
+        self._fail_on_undecodable = fail_on_undecodable
 
-    def __getitem__(self, draw: Draw) -> Batch:
+    def __getitem__(self, draw: PlaceSample) -> Batch:
         place = self._places[draw.place]
         photos: list[Tensor] = []
         bad: list[tuple[str, str]] = []
         for position, number in enumerate(draw.photos):
             path = place.photos[number]
             try:
-                image = decode_small(path, self._image_size)
+                image = decode_resized(path, self._image_size)
             except Unprocessable as error:
-                if self._bad_is_error:
-                    raise undecodable(str(path), error.detail) from error
+                if self._fail_on_undecodable:
+                    raise undecodable_photo_error(str(path), error.detail) from error
                 bad.append((str(path), error.detail))
                 continue
             if self._augment:
-                image = augmented(image, draw.seed + position)
+                image = apply_randaugment(image, draw.seed + position)
             photos.append(to_tensor(image))
         empty = torch.empty((0, 3, *self._image_size))
         return Batch(
@@ -82,7 +82,7 @@ class PlacePhotos(Dataset[Batch]):
         )
 
 
-def undecodable(path: str, reason: str) -> Unprocessable:
+def undecodable_photo_error(path: str, reason: str) -> Unprocessable:
     return Unprocessable(
         "undecodable_photo",
         f"{path} does not decode: {reason}. Mend or remove it, or leave such photos out: "
@@ -90,16 +90,16 @@ def undecodable(path: str, reason: str) -> Unprocessable:
     )
 
 
-def joined(parts: list[Batch]) -> Batch:
+def collate_batches(parts: list[Batch]) -> Batch:
     """Places one after the other."""
     return Batch(
         torch.cat([part.photos for part in parts]),
         torch.cat([part.labels for part in parts]),
-        tuple(each for part in parts for each in part.bad),
+        tuple(each for part in parts for each in part.undecodable),
     )
 
 
-class TrainingBatches:
+class ResumableDataLoader:
     """All batches of one epoch after the other; Lightning takes it for a data loader.
 
     Its state is the number of batches that were handed out, so that training goes on behind them.
@@ -107,7 +107,7 @@ class TrainingBatches:
     """
 
     def __init__(
-        self, plan: BatchPlan, photos: PlacePhotos, *, num_workers: int, pin_memory: bool
+        self, plan: PlaceBatchSampler, photos: PlaceDataset, *, num_workers: int, pin_memory: bool
     ) -> None:
         self.plan = plan
         self.sampler = self  # where Lightning tells the epoch: set_epoch
@@ -116,32 +116,32 @@ class TrainingBatches:
         self._num_workers = num_workers
         self._pin_memory = pin_memory
         self._epoch = 0
-        self._given = 0
+        self._batches_yielded = 0
 
     def __len__(self) -> int:
         return len(self.plan)
 
     def set_epoch(self, epoch: int) -> None:
         if epoch != self._epoch:
-            self._epoch, self._given = epoch, 0
+            self._epoch, self._batches_yielded = epoch, 0
 
     def state_dict(self) -> dict[str, Any]:
-        return {"epoch": self._epoch, "given": self._given}
+        return {"epoch": self._epoch, "given": self._batches_yielded}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        self._epoch, self._given = state["epoch"], state["given"]
+        self._epoch, self._batches_yielded = state["epoch"], state["given"]
 
     def __iter__(self) -> Iterator[Batch]:
         # A generator: nothing is read before the first batch is taken, when the epoch is known.
-        if self._given >= len(self.plan):
-            self._given = 0
+        if self._batches_yielded >= len(self.plan):
+            self._batches_yielded = 0
         loader: DataLoader[Batch] = DataLoader(
             self._photos,
-            batch_sampler=_Drawn(self.plan, self._epoch, self._given),
+            batch_sampler=_RemainingBatches(self.plan, self._epoch, self._batches_yielded),
             num_workers=self._num_workers,
-            collate_fn=joined,
+            collate_fn=collate_batches,
             pin_memory=self._pin_memory,
-            worker_init_fn=_begin_worker if self._num_workers else None,
+            worker_init_fn=_init_worker if self._num_workers else None,
             generator=torch.Generator(),  # else it draws from that of the steps
         )
         batches = iter(loader)
@@ -151,24 +151,24 @@ class TrainingBatches:
             self.seconds_waited += time.perf_counter() - began
             if batch is None:
                 return
-            self._given += 1
+            self._batches_yielded += 1
             yield batch
 
 
-class _Drawn:
+class _RemainingBatches:
     """The rest of an epoch as torch's loader asks for it: lists of what to read."""
 
-    def __init__(self, plan: BatchPlan, epoch: int, start: int) -> None:
+    def __init__(self, plan: PlaceBatchSampler, epoch: int, start: int) -> None:
         self._plan, self._epoch, self._start = plan, epoch, start
 
     def __len__(self) -> int:
         return len(self._plan) - self._start
 
-    def __iter__(self) -> Iterator[list[Draw]]:
+    def __iter__(self) -> Iterator[list[PlaceSample]]:
         return self._plan.batches(self._epoch, self._start)
 
 
-def _begin_worker(number: int) -> None:
+def _init_worker(number: int) -> None:
     # Ctrl-C is for the parent, which ends its workers after it has kept the run.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     torch.set_num_threads(1)

@@ -16,13 +16,13 @@ from shared.errors import InvalidRequest
 
 FIELD = r"\{(?P<name>[^{}:]+)(?P<format>:[^{}]*)?\}"
 # With what belongs to it: `_R1[...]`, `-loss=...`.
-LABELLED = re.compile(
+LABELLED_FIELD = re.compile(
     rf"(?P<before>[_\-. ]?(?:[A-Za-z][A-Za-z0-9]*)?[\[(=]?)?{FIELD}(?P<after>[\])])?"
 )
-SYNONYMS = {"encoder_arch": "backbone_arch"}
+FIELD_ALIASES = {"encoder_arch": "backbone_arch"}
 
 
-class NameTemplate:
+class CheckpointNameTemplate:
     """A template whose fields are known to be those that a run has.
 
     `dropped` are the fields that no run of these sets logs: they drop out, with the label and the
@@ -35,69 +35,71 @@ class NameTemplate:
         fixed: Mapping[str, Any],
         metrics: Iterable[str],
         *,
-        monitored: str = "",
+        monitored_set: str = "",
         insert_names: bool = False,
     ) -> None:
         known = {"epoch", "step", *metrics}
-        self.dropped: list[str] = []
+        self.dropped_fields: list[str] = []
         self._insert_names = insert_names
 
         def settle(match: re.Match[str]) -> str:
-            name = _plain(match["name"])
-            if f"{monitored}/{name}" in known:
-                name = f"{monitored}/{name}"
+            name = _strip_owner(match["name"])
+            if f"{monitored_set}/{name}" in known:
+                name = f"{monitored_set}/{name}"
             before, after = match["before"] or "", match["after"] or ""
             if name in known:
                 return f"{before}{{{name}{match['format'] or ''}}}{after}"
             if name in fixed:
-                return f"{before}{safe(_formatted(fixed[name], match['format']))}{after}"
-            self.dropped.append(match["name"])
+                return (
+                    f"{before}{safe_filename(_format_value(fixed[name], match['format']))}{after}"
+                )
+            self.dropped_fields.append(match["name"])
             return ""
 
-        self._template = LABELLED.sub(settle, template)
+        self._template = LABELLED_FIELD.sub(settle, template)
         if not self._template.strip("_-. "):
             raise InvalidRequest(
                 "bad_argument",
-                f"--filename: nothing is left of {template!r}; known: {_list(known)}",
+                f"--filename: nothing is left of {template!r}; known: {_join_names(known)}",
             )
 
-    def filled(self, figures: Mapping[str, Any]) -> str:
+    def format_name(self, figures: Mapping[str, Any]) -> str:
         """The name with these figures; `/` becomes `-`: a name is no path."""
 
         def fill(match: re.Match[str]) -> str:
-            figure = _formatted(figures[match["name"]], match["format"])
+            figure = _format_value(figures[match["name"]], match["format"])
             return f"{match['name']}={figure}" if self._insert_names else figure
 
-        return safe(re.sub(FIELD, fill, self._template))
+        return safe_filename(re.sub(FIELD, fill, self._template))
 
 
-def folder_from(template: str, fixed: Mapping[str, Any]) -> str:
+def format_folder(template: str, fixed: Mapping[str, Any]) -> str:
     """A folder's path with arguments in it; InvalidRequest (`bad_argument`) for other fields."""
 
     def fill(match: re.Match[str]) -> str:
-        name = _plain(match["name"])
+        name = _strip_owner(match["name"])
         if name not in fixed:
             raise InvalidRequest(
                 "bad_argument", f"--default_root_dir: {name!r} is no argument of a run."
             )
-        return safe(_formatted(fixed[name], match["format"]))
+        return safe_filename(_format_value(fixed[name], match["format"]))
 
     return re.sub(FIELD, fill, template)
 
 
-def safe(text: str) -> str:
+def safe_filename(text: str) -> str:
     """The text as a part of a file's name on every system."""
     return re.sub(r'[/\\:*?"<>|\x00-\x1f]', "-", text)
 
 
-def _plain(name: str) -> str:
+def _strip_owner(name: str) -> str:
     name = name.strip()
     for owner in ("self.", "model."):
         name = name.removeprefix(owner)
-    return SYNONYMS.get(name, name)
+    return FIELD_ALIASES.get(name, name)
 
 
-def _formatted(value: Any, form: str | None) -> str:
+def _format_value(value: Any, form: str | None) -> str:
     try:
         return format(value, (form or ":")[1:])
     except (ValueError, TypeError) as error:
@@ -106,5 +108,5 @@ def _formatted(value: Any, form: str | None) -> str:
         ) from error
 
 
-def _list(names: Iterable[str]) -> str:
+def _join_names(names: Iterable[str]) -> str:
     return ", ".join(sorted(names))

@@ -17,21 +17,21 @@ from shared.errors import InvalidRequest, NotFound
 
 ALIASES = {"warmup_steps": "warmpup_steps"}
 """how one would spell it: how the predecessor does"""
-NAMES = tuple(TrainingArguments.model_fields)
+ARGUMENT_NAMES = tuple(TrainingArguments.model_fields)
 
 
-def known_name(name: str) -> str:
+def resolve_name(name: str) -> str:
     """`batch-size`, `batch_size` -> `batch_size`; InvalidRequest (`unknown_argument`) otherwise."""
     wanted = name.replace("-", "_")
     wanted = ALIASES.get(wanted, wanted)
-    if wanted in NAMES:
+    if wanted in ARGUMENT_NAMES:
         return wanted
     raise InvalidRequest(
-        "unknown_argument", f"There is no argument {name!r}.{nearest(wanted, NAMES)}"
+        "unknown_argument", f"There is no argument {name!r}.{suggest_name(wanted, ARGUMENT_NAMES)}"
     )
 
 
-def nearest(name: str, known: Iterable[str]) -> str:
+def suggest_name(name: str, known: Iterable[str]) -> str:
     """` Did you mean ...?` where something is near, else the list of what is known."""
     names = list(known)
     by_lower = {each.lower(): each for each in names}
@@ -41,18 +41,18 @@ def nearest(name: str, known: Iterable[str]) -> str:
     return f" Known: {', '.join(names)}."
 
 
-def read_yaml(path: Path) -> dict[str, Any]:
+def load_yaml(path: Path) -> dict[str, Any]:
     """A YAML file's mapping of arguments.
 
     Raises NotFound (`config_not_found`), InvalidRequest (`bad_config` for what is no mapping,
     `unknown_argument` for a key).
     """
-    values = read_mapping(path)
-    return known_keys(values, str(path))
+    values = load_mapping(path)
+    return resolve_keys(values, str(path))
 
 
-def read_mapping(path: Path) -> dict[str, Any]:
-    """A YAML file's mapping, whatever its keys; the errors of `read_yaml` but the last."""
+def load_mapping(path: Path) -> dict[str, Any]:
+    """A YAML file's mapping, whatever its keys; the errors of `load_yaml` but the last."""
     import yaml  # of the extra `trainer`; the help is shown without it
 
     try:
@@ -68,18 +68,18 @@ def read_mapping(path: Path) -> dict[str, Any]:
     return loaded
 
 
-def known_keys(values: Mapping[str, Any], where: str) -> dict[str, Any]:
+def resolve_keys(values: Mapping[str, Any], source: str) -> dict[str, Any]:
     """The values under their arguments' names; InvalidRequest names the place for one unknown."""
     found: dict[str, Any] = {}
     for key, value in values.items():
         try:
-            found[known_name(key)] = value
+            found[resolve_name(key)] = value
         except InvalidRequest as error:
-            raise InvalidRequest(error.code, f"{where}: {error.detail}") from error
+            raise InvalidRequest(error.code, f"{source}: {error.detail}") from error
     return found
 
 
-def make_arguments(*layers: Mapping[str, Any]) -> TrainingArguments:
+def build_arguments(*layers: Mapping[str, Any]) -> TrainingArguments:
     """Checked arguments; a later layer overrides an earlier one.
 
     Raises InvalidRequest (`bad_argument`) that names each argument that can't be so.
@@ -98,15 +98,15 @@ def make_arguments(*layers: Mapping[str, Any]) -> TrainingArguments:
         raise InvalidRequest("bad_argument", "; ".join(dict.fromkeys(faults))) from error
 
 
-def as_plain(arguments: TrainingArguments) -> dict[str, Any]:
+def to_plain_dict(arguments: TrainingArguments) -> dict[str, Any]:
     """Every argument as text, numbers, lists and dicts: what YAML and JSON hold."""
     plain: dict[str, Any] = arguments.model_dump(mode="json")
     return plain
 
 
-def write_yaml(arguments: TrainingArguments, path: Path) -> None:
+def save_yaml(arguments: TrainingArguments, path: Path) -> None:
     """The file from which the same run can be made."""
     import yaml
 
-    text = yaml.safe_dump(as_plain(arguments), sort_keys=False, allow_unicode=True)
+    text = yaml.safe_dump(to_plain_dict(arguments), sort_keys=False, allow_unicode=True)
     path.write_text("# Every argument of this run: placewise train --config THIS\n" + text)

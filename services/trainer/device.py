@@ -10,7 +10,7 @@ import torch
 from services.trainer.arguments import TrainingArguments
 from shared.errors import InvalidRequest, Misconfigured
 
-PRECISIONS = {
+PRECISION_ALIASES = {
     "32": "32-true",
     "32-true": "32-true",
     "16": "16-mixed",
@@ -30,19 +30,19 @@ class Device:
     torch_device: torch.device
 
 
-def choose_device(arguments: TrainingArguments) -> Device:
+def resolve_device(arguments: TrainingArguments) -> Device:
     """The one device that the arguments mean.
 
     Raises Misconfigured (`no_gpu`), InvalidRequest (`several_devices`, `unknown_precision`,
     `precision_unfit`).
     """
-    accelerator = _accelerator(arguments.accelerator)
-    index = _index(arguments.devices)
-    precision = PRECISIONS.get(str(arguments.precision))
+    accelerator = _resolve_accelerator(arguments.accelerator)
+    index = _device_index(arguments.devices)
+    precision = PRECISION_ALIASES.get(str(arguments.precision))
     if precision is None:
         raise InvalidRequest(
             "unknown_precision",
-            f"--precision {arguments.precision} is unknown; known: {', '.join(PRECISIONS)}.",
+            f"--precision {arguments.precision} is unknown; known: {', '.join(PRECISION_ALIASES)}.",
         )
     if precision == "16-mixed" and accelerator != "gpu":
         raise InvalidRequest(
@@ -59,12 +59,12 @@ def choose_device(arguments: TrainingArguments) -> Device:
     return Device("gpu", [index], precision, torch.device("cuda", index))
 
 
-def _accelerator(asked: str) -> str:
-    if asked == "auto":
+def _resolve_accelerator(requested: str) -> str:
+    if requested == "auto":
         if torch.cuda.is_available():
             return "gpu"
         return "mps" if torch.backends.mps.is_available() else "cpu"
-    if asked in ("gpu", "cuda"):
+    if requested in ("gpu", "cuda"):
         if not torch.cuda.is_available():
             raise Misconfigured(
                 "no_gpu",
@@ -73,12 +73,12 @@ def _accelerator(asked: str) -> str:
                 "CUDA build of PyTorch.",
             )
         return "gpu"
-    if asked == "mps" and not torch.backends.mps.is_available():
+    if requested == "mps" and not torch.backends.mps.is_available():
         raise Misconfigured("no_gpu", "PyTorch finds no MPS device here: say --accelerator cpu.")
-    return asked
+    return requested
 
 
-def _index(devices: int | str | tuple[int, ...]) -> int:
+def _device_index(devices: int | str | tuple[int, ...]) -> int:
     if devices in (1, "1", "auto"):
         return 0
     if isinstance(devices, tuple) and len(devices) == 1 and devices[0] >= 0:

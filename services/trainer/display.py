@@ -6,7 +6,7 @@ from typing import Protocol
 
 
 class Display(Protocol):
-    def say(self, text: str) -> None:
+    def info(self, text: str) -> None:
         """A line for the record."""
 
     def warn(self, text: str) -> None:
@@ -16,13 +16,13 @@ class Display(Protocol):
         """How far `what` is; it begins when first heard of and ends at `most`."""
 
 
-class Quiet:
+class NullDisplay:
     """Shows nothing; what was said stays, for whoever asks."""
 
     def __init__(self) -> None:
         self.said: list[str] = []
 
-    def say(self, text: str) -> None:
+    def info(self, text: str) -> None:
         self.said.append(text)
 
     def warn(self, text: str) -> None:

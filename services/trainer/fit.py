@@ -12,16 +12,16 @@ import lightning
 from lightning.pytorch.loggers import Logger
 
 from services.trainer.arguments import TrainingArguments
-from services.trainer.batches import TrainingBatches
+from services.trainer.batches import ResumableDataLoader
 from services.trainer.device import Device
-from services.trainer.learner import Learner
-from services.trainer.watch import Watch
+from services.trainer.learner import MetricLearningModule
+from services.trainer.watch import TrainingCallback
 
 
 def fit(
-    learner: Learner,
-    batches: TrainingBatches,
-    watch: Watch,
+    module: MetricLearningModule,
+    batches: ResumableDataLoader,
+    callback: TrainingCallback,
     arguments: TrainingArguments,
     device: Device,
     folder: Path,
@@ -44,7 +44,7 @@ def fit(
             max_epochs=arguments.max_epochs,
             log_every_n_steps=arguments.log_every_n_steps,
             logger=list(loggers) or False,
-            callbacks=[watch],
+            callbacks=[callback],
             default_root_dir=folder,
             enable_checkpointing=False,
             enable_progress_bar=False,
@@ -53,9 +53,9 @@ def fit(
             num_sanity_val_steps=0,
             use_distributed_sampler=False,
         )
-        learner.train()
+        module.train()
         trainer.fit(
-            learner,
+            module,
             batches,
             ckpt_path=resume_from,
             weights_only=True if resume_from is not None else None,

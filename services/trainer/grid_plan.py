@@ -20,21 +20,21 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from services.trainer.checkpoint_names import safe
+from services.trainer.checkpoint_names import safe_filename
 from services.trainer.configuration import (
-    known_keys,
-    known_name,
-    make_arguments,
-    nearest,
-    read_mapping,
+    build_arguments,
+    load_mapping,
+    resolve_keys,
+    resolve_name,
+    suggest_name,
 )
 from services.trainer.losses import make_loss
-from services.trainer.make_model import model_config
+from services.trainer.make_model import build_model_config
 from services.trainer.miners import make_miner
 from shared.errors import InvalidRequest, PlacewiseError
 
-KEYS = ("base", "grid", "runs", "fingerprints")
-NOT_OF_A_RUN = ("default_root_dir", "run_name")
+GRID_KEYS = ("base", "grid", "runs", "fingerprints")
+RESERVED_ARGUMENTS = ("default_root_dir", "run_name")
 """which the grid gives to each run itself"""
 
 
@@ -53,41 +53,43 @@ class GridPlan:
     """of the sets on which the published figures were made; empty: not known"""
 
 
-def read_plan(path: Path, overrides: Mapping[str, Any]) -> GridPlan:
+def load_grid_plan(path: Path, overrides: Mapping[str, Any]) -> GridPlan:
     """The plan in a YAML file, with arguments that override every run's.
 
     Every run's arguments and names are checked before the first begins. Raises NotFound
     (`config_not_found`), InvalidRequest (`bad_grid`, `unknown_argument`, `bad_argument`), and what
     an unknown backbone, aggregator, loss or miner is.
     """
-    stored = read_mapping(path)
+    stored = load_mapping(path)
     for key in stored:
-        if key not in KEYS:
-            raise _bad(path, f"there is no key {key!r}.{nearest(key, KEYS)}")
-    base = known_keys(_mapping(path, "base", stored.get("base")), f"{path}, base")
+        if key not in GRID_KEYS:
+            raise _grid_error(path, f"there is no key {key!r}.{suggest_name(key, GRID_KEYS)}")
+    base = resolve_keys(_require_mapping(path, "base", stored.get("base")), f"{path}, base")
     runs = [
-        _planned(path, name, {**base, **arguments, **overrides}, published)
+        _plan_run(path, name, {**base, **arguments, **overrides}, published)
         for name, arguments, published in (
-            *_combined(path, _mapping(path, "grid", stored.get("grid"))),
-            *_listed(path, stored.get("runs") or []),
+            *_expand_grid(path, _require_mapping(path, "grid", stored.get("grid"))),
+            *_listed_runs(path, stored.get("runs") or []),
         )
     ]
     if not runs:
-        raise _bad(path, "it has neither `grid` nor `runs`: there is nothing to train")
+        raise _grid_error(path, "it has neither `grid` nor `runs`: there is nothing to train")
     names = [run.name for run in runs]
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
-        raise _bad(path, f"several runs are called {', '.join(twice)}: give each a name of its own")
-    fingerprints = _mapping(path, "fingerprints", stored.get("fingerprints"))
+        raise _grid_error(
+            path, f"several runs are called {', '.join(twice)}: give each a name of its own"
+        )
+    fingerprints = _require_mapping(path, "fingerprints", stored.get("fingerprints"))
     return GridPlan(tuple(runs), {name: str(value) for name, value in fingerprints.items()})
 
 
-def _combined(path: Path, axes: dict[str, Any]) -> list[tuple[str, dict[str, Any], Any]]:
+def _expand_grid(path: Path, axes: dict[str, Any]) -> list[tuple[str, dict[str, Any], Any]]:
     options: list[list[tuple[str, dict[str, Any]]]] = []
     for axis, values in axes.items():
         if not isinstance(values, list) or not values:
-            raise _bad(path, f"grid, {axis}: a list of values is needed")
-        options.append([_option(path, axis, value) for value in values])
+            raise _grid_error(path, f"grid, {axis}: a list of values is needed")
+        options.append([_axis_option(path, axis, value) for value in values])
     found: list[tuple[str, dict[str, Any], Any]] = []
     for chosen in itertools.product(*options) if options else ():
         arguments: dict[str, Any] = {}
@@ -97,50 +99,52 @@ def _combined(path: Path, axes: dict[str, Any]) -> list[tuple[str, dict[str, Any
     return found
 
 
-def _option(path: Path, axis: str, value: Any) -> tuple[str, dict[str, Any]]:
+def _axis_option(path: Path, axis: str, value: Any) -> tuple[str, dict[str, Any]]:
     if isinstance(value, dict):
-        arguments = known_keys(value, f"{path}, grid, {axis}")
+        arguments = resolve_keys(value, f"{path}, grid, {axis}")
         label = "-".join(
             str(each) for each in arguments.values() if not isinstance(each, (dict, list))
         )
         return label or axis, arguments
-    return str(value), {known_name(axis): value}
+    return str(value), {resolve_name(axis): value}
 
 
-def _listed(path: Path, runs: Any) -> list[tuple[str, dict[str, Any], Any]]:
+def _listed_runs(path: Path, runs: Any) -> list[tuple[str, dict[str, Any], Any]]:
     found = []
     for number, entry in enumerate(runs if isinstance(runs, list) else [runs], start=1):
-        values = dict(_mapping(path, f"runs, {number}", entry))
+        values = dict(_require_mapping(path, f"runs, {number}", entry))
         name = str(values.pop("name", f"{number:02d}"))
-        published = _mapping(path, f"{name}, published", values.pop("published", None))
-        found.append((name, known_keys(values, f"{path}, runs, {name}"), published))
+        published = _require_mapping(path, f"{name}, published", values.pop("published", None))
+        found.append((name, resolve_keys(values, f"{path}, runs, {name}"), published))
     return found
 
 
-def _planned(path: Path, name: str, values: dict[str, Any], published: Any) -> PlannedRun:
-    given = [key for key in NOT_OF_A_RUN if key in values]
+def _plan_run(path: Path, name: str, values: dict[str, Any], published: Any) -> PlannedRun:
+    given = [key for key in RESERVED_ARGUMENTS if key in values]
     if given:
-        raise _bad(path, f"{', '.join(given)} can't be given: each run has its folder in --out")
+        raise _grid_error(
+            path, f"{', '.join(given)} can't be given: each run has its folder in --out"
+        )
     try:
-        arguments = make_arguments(values)
-        model_config(arguments)
+        arguments = build_arguments(values)
+        build_model_config(arguments)
         make_loss(arguments.loss_name)
         make_miner(arguments.miner_name, arguments.miner_margin)
         figures = {str(key): float(value) for key, value in published.items()}
     except PlacewiseError as error:
         raise type(error)(error.code, f"{path}, {name}: {error.detail}") from error
     except (TypeError, ValueError) as error:
-        raise _bad(path, f"{name}, published: numbers are needed") from error
-    return PlannedRun(safe(name), values, figures)
+        raise _grid_error(path, f"{name}, published: numbers are needed") from error
+    return PlannedRun(safe_filename(name), values, figures)
 
 
-def _mapping(path: Path, where: str, value: Any) -> dict[str, Any]:
+def _require_mapping(path: Path, location: str, value: Any) -> dict[str, Any]:
     if value is None:
         return {}
     if not isinstance(value, dict):
-        raise _bad(path, f"{where}: names with values are needed")
+        raise _grid_error(path, f"{location}: names with values are needed")
     return value
 
 
-def _bad(path: Path, detail: str) -> InvalidRequest:
+def _grid_error(path: Path, detail: str) -> InvalidRequest:
     return InvalidRequest("bad_grid", f"{path}: {detail}.")

@@ -9,11 +9,11 @@ from typing import Any
 
 from shared.errors import Unprocessable
 
-FILE = "history.json"
+HISTORY_FILE = "history.json"
 
 
 @dataclass
-class Epoch:
+class EpochRecord:
     number: int
     """from 0"""
     step: int
@@ -25,11 +25,11 @@ class Epoch:
 
 
 @dataclass
-class History:
+class TrainingHistory:
     """Grows with the run; saved when a checkpoint is."""
 
     training_set: dict[str, Any]
-    epochs: list[Epoch] = field(default_factory=list)
+    epochs: list[EpochRecord] = field(default_factory=list)
     """those that were measured"""
     best: list[tuple[float, str]] = field(default_factory=list)
     """score and file name of the best checkpoints, the best first"""
@@ -43,20 +43,21 @@ class History:
     """of them, for photos to be read"""
 
     def save(self, folder: Path) -> None:
-        path = folder / FILE
-        partial = path.with_name(f"{FILE}.partial")
+        path = folder / HISTORY_FILE
+        partial = path.with_name(f"{HISTORY_FILE}.partial")
         partial.write_text(json.dumps(asdict(self), indent=1) + "\n")
         partial.replace(path)
 
     @classmethod
-    def load(cls, folder: Path) -> History:
+    def load(cls, folder: Path) -> TrainingHistory:
         """Unprocessable (`run_unreadable`) where the folder's file can't be read."""
         try:
-            stored = json.loads((folder / FILE).read_text())
-            stored["epochs"] = [Epoch(**epoch) for epoch in stored["epochs"]]
+            stored = json.loads((folder / HISTORY_FILE).read_text())
+            stored["epochs"] = [EpochRecord(**epoch) for epoch in stored["epochs"]]
             stored["best"] = [(score, name) for score, name in stored["best"]]
             return cls(**stored)
         except (OSError, ValueError, TypeError, KeyError) as error:
             raise Unprocessable(
-                "run_unreadable", f"{folder / FILE} can't be read: {error}. Begin a new run."
+                "run_unreadable",
+                f"{folder / HISTORY_FILE} can't be read: {error}. Begin a new run.",
             ) from error

@@ -10,22 +10,22 @@ from pathlib import Path
 
 import torch
 
-from services.trainer.checkpoint_names import NameTemplate
+from services.trainer.checkpoint_names import CheckpointNameTemplate
 
-LAST = "last.ckpt"
-OF_TRAINING = ("optimizer_states", "lr_schedulers", "loops", "callbacks", "MixedPrecision")
+LAST_CHECKPOINT = "last.ckpt"
+TRAINING_STATE_KEYS = ("optimizer_states", "lr_schedulers", "loops", "callbacks", "MixedPrecision")
 """what a checkpoint of weights alone does not hold"""
 
-Save = Callable[[Path, bool], None]
+SaveCheckpoint = Callable[[Path, bool], None]
 """Writes the present state to a path; True: the weights alone"""
 
 
 @dataclass
-class KeptCheckpoints:
+class TopKCheckpoints:
     """Which checkpoints stay in `folder`. Files appear whole, or not at all."""
 
     folder: Path
-    name: NameTemplate
+    name: CheckpointNameTemplate
     monitor: str
     mode: str
     top_k: int
@@ -33,22 +33,24 @@ class KeptCheckpoints:
     best: list[tuple[float, str]] = field(default_factory=list)
     """Score and file name, the best first; of equal ones the earlier"""
 
-    def keep_last(self, save: Save) -> Path:
+    def save_last(self, save: SaveCheckpoint) -> Path:
         """Write the full state from which training goes on."""
-        return self._write(save, LAST, weights_only=False)
+        return self._write(save, LAST_CHECKPOINT, weights_only=False)
 
-    def consider(self, save: Save, figures: dict[str, float], epoch: int, step: int) -> bool:
+    def save_if_best(
+        self, save: SaveCheckpoint, metrics: dict[str, float], epoch: int, step: int
+    ) -> bool:
         """Keep the present weights if they are among the best; whether they are.
 
         A score that is not a number is never among them.
         """
-        score = figures.get(self.monitor, math.nan)
-        ranked = [kept for kept in self.best if not self._better(score, kept[0])]
+        score = metrics.get(self.monitor, math.nan)
+        ranked = [kept for kept in self.best if not self._is_better(score, kept[0])]
         place = len(ranked)
         if math.isnan(score) or self.top_k == 0 or 0 < self.top_k <= place:
             return False
-        filled = self.name.filled({**figures, "epoch": epoch, "step": step})
-        name = self._free(f"{filled}.ckpt")
+        filled = self.name.format_name({**metrics, "epoch": epoch, "step": step})
+        name = self._unique_name(f"{filled}.ckpt")
         self._write(save, name, weights_only=self.weights_only)
         self.best.insert(place, (score, name))
         while 0 < self.top_k < len(self.best):
@@ -61,21 +63,21 @@ class KeptCheckpoints:
 
     @property
     def last_path(self) -> Path:
-        return self.folder / LAST
+        return self.folder / LAST_CHECKPOINT
 
-    def _better(self, score: float, than: float) -> bool:
+    def _is_better(self, score: float, than: float) -> bool:
         return score > than if self.mode == "max" else score < than
 
-    def _free(self, name: str) -> str:
+    def _unique_name(self, name: str) -> str:
         """The name, numbered where an earlier checkpoint already has it."""
-        taken = {file for _, file in self.best} | {LAST}
+        taken = {file for _, file in self.best} | {LAST_CHECKPOINT}
         free, number = name, 1
         while free in taken:
             number += 1
             free = f"{name.removesuffix('.ckpt')}-v{number}.ckpt"
         return free
 
-    def _write(self, save: Save, name: str, *, weights_only: bool) -> Path:
+    def _write(self, save: SaveCheckpoint, name: str, *, weights_only: bool) -> Path:
         self.folder.mkdir(parents=True, exist_ok=True)
         path = self.folder / name
         partial = path.with_name(f"{name}.partial")
@@ -90,5 +92,5 @@ def copy_checkpoint(source: Path, path: Path, weights_only: bool) -> None:
     """The checkpoint at another path; True: without what only training needs."""
     stored = torch.load(source, map_location="cpu", weights_only=True)
     if weights_only:
-        stored = {key: value for key, value in stored.items() if key not in OF_TRAINING}
+        stored = {key: value for key, value in stored.items() if key not in TRAINING_STATE_KEYS}
     torch.save(stored, path)

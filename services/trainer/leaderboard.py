@@ -11,19 +11,19 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from services.trainer.grid import Outcome, State
+from services.trainer.grid import RunOutcome, RunState
 from services.trainer.grid_plan import GridPlan
 
-SETTINGS = ("agg_arch", "loss_name", "miner_name")
+SETTING_COLUMNS = ("agg_arch", "loss_name", "miner_name")
 SHOWN_KS = (1, 5)
 
 Row = dict[str, str]
 
 
-def leaderboard(plan: GridPlan, outcomes: Sequence[Outcome]) -> list[Row]:
+def leaderboard(plan: GridPlan, outcomes: Sequence[RunOutcome]) -> list[Row]:
     """One row for each run, the best first by its own metric; those without figures come last."""
     ranked = sorted(outcomes, key=lambda outcome: -_score(outcome))
-    comparable = _comparable(plan, outcomes)
+    comparable = _comparable_sets(plan, outcomes)
     rows = [_row(outcome, comparable) for outcome in ranked]
     columns = dict.fromkeys(column for row in rows for column in row)
     return [{column: row.get(column, "") for column in columns} for row in rows]
@@ -41,16 +41,16 @@ def write_leaderboard(rows: Sequence[Row], out: Path) -> None:
     (out / "leaderboard.md").write_text(f"{text}\n", encoding="utf-8")
 
 
-def _row(outcome: Outcome, comparable: set[str]) -> Row:
+def _row(outcome: RunOutcome, comparable: set[str]) -> Row:
     row: Row = {"run": outcome.run.name}
     if outcome.report is None:
-        row |= {name: str(outcome.run.arguments.get(name, "")) for name in SETTINGS}
+        row |= {name: str(outcome.run.arguments.get(name, "")) for name in SETTING_COLUMNS}
         why = f": {outcome.error['code']}" if outcome.error else ""
         return {**row, "state": f"{outcome.state}{why}"}
     report = outcome.report
-    row |= {name: str(report["arguments"][name]) for name in SETTINGS}
+    row |= {name: str(report["arguments"][name]) for name in SETTING_COLUMNS}
     row["state"] = str(outcome.state)
-    figures = {**_best_epoch(report)["figures"], **_tested(report)}
+    figures = {**_best_epoch(report)["figures"], **_test_metrics(report)}
     for metric, share in figures.items():
         set_name, _, at = metric.rpartition("/")
         if int(at.removeprefix("R")) not in SHOWN_KS:
@@ -65,7 +65,7 @@ def _row(outcome: Outcome, comparable: set[str]) -> Row:
     return row
 
 
-def _comparable(plan: GridPlan, outcomes: Sequence[Outcome]) -> set[str]:
+def _comparable_sets(plan: GridPlan, outcomes: Sequence[RunOutcome]) -> set[str]:
     found = set()
     for outcome in outcomes:
         for name, about in (outcome.report or {}).get("sets", {}).items():
@@ -82,7 +82,7 @@ def _best_epoch(report: dict[str, Any]) -> dict[str, Any]:
     )
 
 
-def _tested(report: dict[str, Any]) -> dict[str, float]:
+def _test_metrics(report: dict[str, Any]) -> dict[str, float]:
     """A test's figures; they stand above a validation's of the same set."""
     return {
         f"{name}/R{k}": share
@@ -92,8 +92,8 @@ def _tested(report: dict[str, Any]) -> dict[str, float]:
     }
 
 
-def _score(outcome: Outcome) -> float:
-    if outcome.state is not State.FINISHED or outcome.report is None:
+def _score(outcome: RunOutcome) -> float:
+    if outcome.state is not RunState.FINISHED or outcome.report is None:
         return float("-inf")
     figure = _best_epoch(outcome.report)["figures"].get(outcome.report["monitor"])
     if figure is None:

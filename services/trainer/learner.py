@@ -14,17 +14,17 @@ from services.trainer.losses import make_loss
 from services.trainer.miners import batch_accuracy, make_miner
 from services.trainer.optimise import learning_rate, make_optimizer
 from shared.errors import Unprocessable
-from shared.vision.place_models.model import PlaceModel
+from shared.vision.place_models.model import VprModel
 
 
-class Learner(lightning.LightningModule):
+class MetricLearningModule(lightning.LightningModule):
     """One step: photos -> descriptors -> the miner's pairs or triplets -> the loss.
 
     `about` are plain values that its checkpoints carry beside the model's configuration.
     """
 
     def __init__(
-        self, model: PlaceModel, arguments: TrainingArguments, about: dict[str, Any]
+        self, model: VprModel, arguments: TrainingArguments, metadata: dict[str, Any]
     ) -> None:
         super().__init__()
         self.model = model
@@ -33,7 +33,7 @@ class Learner(lightning.LightningModule):
         self.last_loss = float("nan")
         self.last_accuracy: float | None = None
         self._arguments = arguments
-        self._about = about
+        self._about = metadata
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         return make_optimizer(self.model.parameters(), self._arguments)
@@ -55,7 +55,8 @@ class Learner(lightning.LightningModule):
         if not len(batch.photos):
             raise Unprocessable(
                 "no_photo_decodes",
-                "No photo of a whole batch decodes: " + "; ".join(p for p, _ in batch.bad[:3]),
+                "No photo of a whole batch decodes: "
+                + "; ".join(p for p, _ in batch.undecodable[:3]),
             )
         rows = self.model(batch.photos)
         # Exponents of similarities overflow in half precision.

@@ -16,7 +16,7 @@ from lightning.pytorch.loggers import (
 
 from shared.errors import Misconfigured
 
-PACKAGES = {"tensorboard": ("tensorboard",), "wandb": ("wandb",), "mlflow": ("mlflow",)}
+LOGGER_PACKAGES = {"tensorboard": ("tensorboard",), "wandb": ("wandb",), "mlflow": ("mlflow",)}
 
 
 def make_loggers(names: tuple[str, ...], folder: Path, arguments: dict[str, Any]) -> list[Logger]:
@@ -44,7 +44,7 @@ def make_loggers(names: tuple[str, ...], folder: Path, arguments: dict[str, Any]
 def check_loggers(names: tuple[str, ...]) -> None:
     """As `make_loggers` raises, before anything else is done."""
     for name in names:
-        for package in PACKAGES.get(name, ()):
+        for package in LOGGER_PACKAGES.get(name, ()):
             if importlib.util.find_spec(package) is None:
                 raise Misconfigured(
                     "logger_missing",

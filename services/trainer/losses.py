@@ -17,7 +17,7 @@ from pytorch_metric_learning.utils import loss_and_miner_utils
 from torch import nn
 from torch.nn.functional import softplus
 
-from services.trainer.names import choose
+from services.trainer.names import match_name
 
 
 class AngularLoss(losses.AngularLoss):  # type: ignore[misc]
@@ -92,4 +92,4 @@ def make_loss(name: str) -> nn.Module:
     `name`: a key of LOSSES, in capitals or not, with or without `Loss`. Unprocessable:
     `unknown_loss`.
     """
-    return LOSSES[choose(name, tuple(LOSSES), suffix="Loss", argument="loss_name")]()
+    return LOSSES[match_name(name, tuple(LOSSES), suffix="Loss", argument="loss_name")]()

@@ -6,32 +6,34 @@ from services.trainer.arguments import TrainingArguments
 from services.trainer.display import Display
 from shared.errors import Conflict
 from shared.vision.place_models.checkpoint import load_checkpoint
-from shared.vision.place_models.config import ModelConfig
-from shared.vision.place_models.model import PlaceModel, build_model
+from shared.vision.place_models.config import VprModelConfig
+from shared.vision.place_models.model import VprModel, build_vpr_model
 
 
-def model_config(arguments: TrainingArguments) -> ModelConfig:
+def build_model_config(arguments: TrainingArguments) -> VprModelConfig:
     """The model that the arguments describe; raises what `ModelConfig.read` does."""
-    return ModelConfig.read({name: getattr(arguments, name) for name in ModelConfig.model_fields})
+    return VprModelConfig.parse(
+        {name: getattr(arguments, name) for name in VprModelConfig.model_fields}
+    )
 
 
-def make_model(arguments: TrainingArguments, display: Display, *, resuming: bool) -> PlaceModel:
+def make_model(arguments: TrainingArguments, display: Display, *, resuming: bool) -> VprModel:
     """With pretrained weights, with those of `model_path`, or random by the seed.
 
-    One that resumes gets its weights later. Raises what `build_model` and `load_checkpoint` do, and
+    One that resumes gets its weights later. Raises what `build_vpr_model` and `load_checkpoint` do, and
     Conflict (`run_differs`) for a checkpoint of another network.
     """
-    config = model_config(arguments)
+    config = build_model_config(arguments)
     elsewhere = resuming or arguments.model_path is not None
     if elsewhere:
-        model = build_model(config.model_copy(update={"pretrained": False}))
+        model = build_vpr_model(config.model_copy(update={"pretrained": False}))
         model.config = model.config.model_copy(update={"pretrained": config.pretrained})
     else:
-        model = build_model(config, weights=arguments.weights)
+        model = build_vpr_model(config, weights=arguments.weights)
     if arguments.model_path is not None and not resuming:
         begun = load_checkpoint(arguments.model_path).model
-        if begun.config.model_dump(exclude=_NOT_OF_THE_NETWORK) != model.config.model_dump(
-            exclude=_NOT_OF_THE_NETWORK
+        if begun.config.model_dump(exclude=_TRAINING_ONLY_FIELDS) != model.config.model_dump(
+            exclude=_TRAINING_ONLY_FIELDS
         ):
             raise Conflict(
                 "run_differs",
@@ -47,4 +49,4 @@ def make_model(arguments: TrainingArguments, display: Display, *, resuming: bool
     return model
 
 
-_NOT_OF_THE_NETWORK = {"pretrained", "layers_to_freeze"}
+_TRAINING_ONLY_FIELDS = {"pretrained", "layers_to_freeze"}

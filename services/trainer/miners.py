@@ -17,10 +17,10 @@ from pytorch_metric_learning.losses import FastAPLoss
 from pytorch_metric_learning.utils import loss_and_miner_utils
 from torch import nn
 
-from services.trainer.names import choose
+from services.trainer.names import match_name
 
 NO_MINER = "none"
-NUMBERS_AT_ONCE = 1 << 22  # 16 MB of float32
+MAX_BLOCK_VALUES = 1 << 22  # 16 MB of float32
 
 
 class AngularMiner(nn.Module):
@@ -31,18 +31,18 @@ class AngularMiner(nn.Module):
     of them; here the distances to the centre of each pair are taken, some pairs at a time.
     """
 
-    def __init__(self, angle: float, numbers_at_once: int = NUMBERS_AT_ONCE) -> None:
-        """`angle` in degrees; no intermediate result has more than `numbers_at_once` numbers,
+    def __init__(self, angle: float, max_block_values: int = MAX_BLOCK_VALUES) -> None:
+        """`angle` in degrees; no intermediate result has more than `max_block_values` numbers,
         unless one pair's has."""
         super().__init__()
         self.tangent = math.tan(math.radians(angle))
-        self.numbers_at_once = numbers_at_once
+        self.max_block_values = max_block_values
 
     @torch.no_grad()
     def forward(self, rows: torch.Tensor, labels: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """(B, D) unit rows, (B,) labels -> indices of anchors, positives and negatives."""
         a, p, _, _ = loss_and_miner_utils.get_all_pairs_indices(labels)
-        at_once = max(1, self.numbers_at_once // max(rows.shape))
+        at_once = max(1, self.max_block_values // max(rows.shape))
         found = []
         for anchors, positives in zip(a.split(at_once), p.split(at_once), strict=True):
             sides = (rows[anchors] - rows[positives]).norm(dim=1, keepdim=True)
@@ -87,7 +87,7 @@ def make_miner(name: str | None, margin: float = 0.1) -> nn.Module | None:
     if name is None or name.strip().lower() == NO_MINER:
         return None
     known = (*MINERS, NO_MINER)
-    return MINERS[choose(name, known, suffix="Miner", argument="miner_name")](margin)
+    return MINERS[match_name(name, known, suffix="Miner", argument="miner_name")](margin)
 
 
 def batch_accuracy(

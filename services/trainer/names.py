@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from shared.errors import Unprocessable
 
 
-def choose(name: str, known: Sequence[str], *, suffix: str, argument: str) -> str:
+def match_name(name: str, known: Sequence[str], *, suffix: str, argument: str) -> str:
     """The one of `known` that `name` means, in capitals or not, with or without the suffix.
 
     Unprocessable: `unknown_loss` or `unknown_miner`, by the suffix; it lists the known ones.

@@ -8,14 +8,14 @@ from pathlib import Path
 from typing import Any
 
 from services.trainer.arguments import TrainingArguments
-from services.trainer.configuration import nearest
+from services.trainer.configuration import suggest_name
 from shared.datasets.sets import evaluation_set_names, open_evaluation_set, open_training_set
 from shared.datasets.shots import EvaluationSet, TrainingSet
 from shared.errors import InvalidRequest, NotFound
 
 
 @dataclass(frozen=True, slots=True)
-class Sets:
+class EvaluationSets:
     """Evaluation sets of a run; a test set that the phase does not need is not opened."""
 
     validation: tuple[EvaluationSet, ...]
@@ -26,20 +26,20 @@ class Sets:
     """what val_set_names and test_set_names mean in this folder"""
 
 
-def open_places(arguments: TrainingArguments) -> TrainingSet:
+def select_training_set(arguments: TrainingArguments) -> TrainingSet:
     """The places to learn from; cities that were not named are all that the folder has.
 
     Raises InvalidRequest (`data_root_missing`), and what `open_training_set` raises.
     """
     named = "cities" in arguments.model_fields_set
     return open_training_set(
-        _data_root(arguments),
+        _require_data_root(arguments),
         arguments.cities if named else None,
         min_photos=arguments.min_img_per_place,
     )
 
 
-def open_sets(arguments: TrainingArguments) -> Sets:
+def select_evaluation_sets(arguments: TrainingArguments) -> EvaluationSets:
     """The sets to validate and to test on, as far as the phase needs them.
 
     A set that was named must be there. Where none was, those of the default names are taken, or
@@ -49,14 +49,14 @@ def open_sets(arguments: TrainingArguments) -> Sets:
     Raises NotFound (`set_missing`, which lists the known ones), InvalidRequest
     (`data_root_missing`).
     """
-    roots = arguments.eval_roots or (_data_root(arguments),)
+    roots = arguments.eval_roots or (_require_data_root(arguments),)
     there: dict[str, Path] = {}
     for root in roots:
         for name in evaluation_set_names(root):
             there.setdefault(name, root)
     names = {
-        "val_set_names": _names(arguments, "val_set_names", "val", there),
-        "test_set_names": _names(arguments, "test_set_names", "test", there),
+        "val_set_names": _resolve_set_names(arguments, "val_set_names", "val", there),
+        "test_set_names": _resolve_set_names(arguments, "test_set_names", "test", there),
     }
     opened: dict[str, EvaluationSet] = {}
 
@@ -67,58 +67,58 @@ def open_sets(arguments: TrainingArguments) -> Sets:
                     "set_missing",
                     f"--{argument}: there is no set {name!r} in "
                     f"{', '.join(str(root) for root in roots)}."
-                    + (nearest(name, there) if there else " No set was recognised there."),
+                    + (suggest_name(name, there) if there else " No set was recognised there."),
                 )
             if name not in opened:
                 opened[name] = open_evaluation_set(there[name], name)
         return tuple(opened[name] for name in names[argument])
 
     phase = arguments.experiment_phase
-    return Sets(
+    return EvaluationSets(
         validation=chosen("val_set_names") if phase != "test" else (),
         test=chosen("test_set_names") if phase != "train" else (),
         names=names,
     )
 
 
-def _names(
-    arguments: TrainingArguments, argument: str, word: str, there: Iterable[str]
+def _resolve_set_names(
+    arguments: TrainingArguments, argument: str, keyword: str, available: Iterable[str]
 ) -> tuple[str, ...]:
     names: tuple[str, ...] = getattr(arguments, argument)
     if argument in arguments.model_fields_set:
         return names
     return (
-        tuple(name for name in names if name in there)
-        or tuple(name for name in there if word in name)
-        or tuple(there)
+        tuple(name for name in names if name in available)
+        or tuple(name for name in available if keyword in name)
+        or tuple(available)
     )
 
 
-def describe_training_set(found: TrainingSet) -> dict[str, Any]:
+def summarise_training_set(training_set: TrainingSet) -> dict[str, Any]:
     """What reports say of it, and what a resumed run compares."""
     return {
-        "name": found.name,
-        "layout": found.layout,
-        "cities": list(found.cities),
-        "places": len(found.places),
-        "photos": found.photo_count,
-        "fingerprint": found.fingerprint,
+        "name": training_set.name,
+        "layout": training_set.layout,
+        "cities": list(training_set.cities),
+        "places": len(training_set.places),
+        "photos": training_set.photo_count,
+        "fingerprint": training_set.fingerprint,
     }
 
 
-def describe_set(found: EvaluationSet) -> dict[str, Any]:
+def summarise_evaluation_set(evaluation_set: EvaluationSet) -> dict[str, Any]:
     """What stands beside every figure of the set."""
     return {
-        "database": len(found.database),
-        "queries": len(found.queries),
-        "without_positive": len(found.without_positives),
-        "rule": found.rule,
-        "protocol": found.protocol,
-        "fingerprint": found.fingerprint,
+        "database": len(evaluation_set.database),
+        "queries": len(evaluation_set.queries),
+        "without_positive": len(evaluation_set.without_positives),
+        "rule": evaluation_set.rule,
+        "protocol": evaluation_set.protocol,
+        "fingerprint": evaluation_set.fingerprint,
     }
 
 
-def _data_root(arguments: TrainingArguments) -> Path:
+def _require_data_root(arguments: TrainingArguments) -> Path:
     if arguments.data_root is None:
         raise InvalidRequest(
             "data_root_missing",

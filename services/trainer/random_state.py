@@ -16,7 +16,7 @@ def seed_everything(seed: int) -> None:
     torch.manual_seed(seed)
 
 
-def random_state() -> dict[str, Any]:
+def rng_state() -> dict[str, Any]:
     """Of every generator that a step may draw from, in plain types and tensors."""
     name, keys, position, has_gauss, gauss = np.random.get_state(legacy=True)
     version, words, gauss_next = random.getstate()
@@ -29,8 +29,8 @@ def random_state() -> dict[str, Any]:
     }  # fmt: skip
 
 
-def set_random_state(state: dict[str, Any]) -> None:
-    """The inverse of `random_state`; GPUs that are not there any more are left out."""
+def restore_rng_state(state: dict[str, Any]) -> None:
+    """The inverse of `rng_state`; GPUs that are not there any more are left out."""
     torch.set_rng_state(state["torch"].cpu())
     if torch.cuda.is_available() and len(state["cuda"]) == torch.cuda.device_count():
         torch.cuda.set_rng_state_all([each.cpu() for each in state["cuda"]])

@@ -11,11 +11,11 @@ import json
 import re
 from typing import Any
 
-TRUE = frozenset(("true", "yes", "on", "1"))
-FALSE = frozenset(("false", "no", "off", "0"))
+TRUE_WORDS = frozenset(("true", "yes", "on", "1"))
+FALSE_WORDS = frozenset(("false", "no", "off", "0"))
 
 
-def read_flag(value: Any) -> Any:
+def parse_bool(value: Any) -> Any:
     """`True`, `false`, `yes`, `0` ... -> bool; what is no text stays for pydantic to judge.
 
     Raises ValueError for any other text: a non-empty text is not simply true.
@@ -23,14 +23,14 @@ def read_flag(value: Any) -> Any:
     if not isinstance(value, str):
         return value
     word = value.strip().lower()
-    if word in TRUE:
+    if word in TRUE_WORDS:
         return True
-    if word in FALSE:
+    if word in FALSE_WORDS:
         return False
     raise ValueError(f"{value!r} is neither true nor false")
 
 
-def read_structure(value: Any) -> Any:
+def parse_literal(value: Any) -> Any:
     """JSON or Python notation -> list, tuple, dict or number; ValueError for what is neither."""
     if not isinstance(value, str):
         return value
@@ -43,30 +43,30 @@ def read_structure(value: Any) -> Any:
     raise ValueError(f"{value!r} is neither JSON nor Python notation")
 
 
-def read_names(value: Any) -> Any:
-    """As `read_structure`; a bare word, or several with commas between, is a list of names."""
+def parse_names(value: Any) -> Any:
+    """As `parse_literal`; a bare word, or several with commas between, is a list of names."""
     if isinstance(value, str) and re.fullmatch(r"[\w.\- ]+(,[\w.\- ]+)*", value.strip()):
         return [name.strip() for name in value.split(",")]
-    return read_structure(value)
+    return parse_literal(value)
 
 
-def read_height_width(value: Any) -> Any:
+def parse_image_size(value: Any) -> Any:
     """`(320, 320)`, `[320, 320]`, `320 320`, `320x320` (H W) and `320` (both) -> (H, W)."""
     if isinstance(value, str):
         numbers = re.fullmatch(r"\s*(\d+)(?:\s*[x, ]\s*(\d+))?\s*", value)
         if numbers:
             return (int(numbers[1]), int(numbers[2] or numbers[1]))
-        value = read_structure(value) if value.strip()[:1] in ("(", "[") else value.strip()
+        value = parse_literal(value) if value.strip()[:1] in ("(", "[") else value.strip()
     if isinstance(value, int):
         return (value, value)
     return value
 
 
-def read_number_or_word(value: Any) -> Any:
+def parse_number_or_text(value: Any) -> Any:
     """`32` -> 32, `[0]` -> [0], `16-mixed` -> "16-mixed"."""
     if not isinstance(value, str):
         return value
     try:
-        return read_structure(value)
+        return parse_literal(value)
     except ValueError:
         return value.strip()

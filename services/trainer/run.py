@@ -11,51 +11,61 @@ from typing import Any
 import torch
 
 from services.trainer.arguments import TrainingArguments
-from services.trainer.batches import PlacePhotos, TrainingBatches
-from services.trainer.configuration import as_plain, write_yaml
+from services.trainer.batches import PlaceDataset, ResumableDataLoader
+from services.trainer.configuration import save_yaml, to_plain_dict
 from services.trainer.device import Device
 from services.trainer.display import Display
 from services.trainer.fit import fit
-from services.trainer.history import Epoch, History
-from services.trainer.keep import KeptCheckpoints, copy_checkpoint
-from services.trainer.learner import Learner
+from services.trainer.history import EpochRecord, TrainingHistory
+from services.trainer.keep import TopKCheckpoints, copy_checkpoint
+from services.trainer.learner import MetricLearningModule
 from services.trainer.loggers import make_loggers
 from services.trainer.make_model import make_model
-from services.trainer.open_data import Sets, describe_training_set, open_places, open_sets
+from services.trainer.open_data import (
+    EvaluationSets,
+    select_evaluation_sets,
+    select_training_set,
+    summarise_training_set,
+)
 from services.trainer.random_state import seed_everything
 from services.trainer.run_folder import (
-    CONFIG,
-    METRICS,
+    CONFIG_FILE,
+    METRICS_FILE,
+    create_run_folder,
     find_run,
-    new_run_folder,
-    resumed_arguments,
+    load_resumed_arguments,
 )
-from services.trainer.sampling import BatchPlan
-from services.trainer.settle import as_meant, as_values, check_machine, kept_checkpoints
+from services.trainer.sampling import PlaceBatchSampler
+from services.trainer.settle import (
+    check_environment,
+    make_checkpoints,
+    portable_arguments,
+    resolve_arguments,
+)
 from services.trainer.stop import RunStopped, StopRequest
-from services.trainer.summary import show_data, summarise
-from services.trainer.validation import Validation, figures_of
-from services.trainer.watch import Watch, is_measured_after, note_epoch
+from services.trainer.summary import build_summary, print_data_sets
+from services.trainer.validation import Validator, flatten_recalls
+from services.trainer.watch import TrainingCallback, is_validation_epoch, record_epoch
 from shared.datasets.shots import TrainingSet
 from shared.errors import Conflict, InvalidRequest
 from shared.vision.place_models.checkpoint import load_checkpoint
-from shared.vision.place_models.model import PlaceModel
+from shared.vision.place_models.model import VprModel
 
 Json = dict[str, Any]
 
 
 @dataclass
-class _Ready:
+class _PreparedRun:
     """A run before its first step."""
 
     arguments: TrainingArguments
     device: Device
     places: TrainingSet
-    sets: Sets
-    model: PlaceModel
+    sets: EvaluationSets
+    model: VprModel
     folder: Path
-    history: History
-    kept: KeptCheckpoints
+    history: TrainingHistory
+    kept: TopKCheckpoints
     resume_from: Path | None
 
 
@@ -64,23 +74,23 @@ def run(arguments: TrainingArguments, display: Display, stop: StopRequest) -> Js
 
     Raises RunStopped, and every error that a run's arguments or data can have.
     """
-    device = check_machine(arguments)
+    device = check_environment(arguments)
     if arguments.experiment_phase == "test":
-        return _test_only(arguments, device, display, stop)
-    places, sets = open_places(arguments), open_sets(arguments)
-    arguments = as_meant(arguments, places, sets)
+        return _run_test_phase(arguments, device, display, stop)
+    places, sets = select_training_set(arguments), select_evaluation_sets(arguments)
+    arguments = resolve_arguments(arguments, places, sets)
     if arguments.show_data_stats:
-        show_data(places, sets, display)
+        print_data_sets(places, sets, display)
     seed_everything(arguments.seed)
     model = make_model(arguments, display, resuming=False)
-    folder = Path() if arguments.fast_dev_run else new_run_folder(arguments)
+    folder = Path() if arguments.fast_dev_run else create_run_folder(arguments)
     arguments = arguments.model_copy(update={"run_name": folder.name})
-    kept = kept_checkpoints(arguments, folder, sets, display)
-    history = History(describe_training_set(places))
+    kept = make_checkpoints(arguments, folder, sets, display)
+    history = TrainingHistory(summarise_training_set(places))
     if not arguments.fast_dev_run:
-        write_yaml(arguments, folder / CONFIG)
-    ready = _Ready(arguments, device, places, sets, model, folder, history, kept, None)
-    return _kept_when_stopped(ready, display, stop)
+        save_yaml(arguments, folder / CONFIG_FILE)
+    ready = _PreparedRun(arguments, device, places, sets, model, folder, history, kept, None)
+    return _run_until_stopped(ready, display, stop)
 
 
 def resume(path: Path, changes: Json, display: Display, stop: StopRequest) -> Json:
@@ -89,27 +99,27 @@ def resume(path: Path, changes: Json, display: Display, stop: StopRequest) -> Js
     Raises also NotFound (`run_not_found`), Conflict (`run_differs`).
     """
     folder, checkpoint = find_run(path)
-    arguments = resumed_arguments(folder, changes)
-    device = check_machine(arguments)
-    places, history = open_places(arguments), History.load(folder)
+    arguments = load_resumed_arguments(folder, changes)
+    device = check_environment(arguments)
+    places, history = select_training_set(arguments), TrainingHistory.load(folder)
     if history.training_set["fingerprint"] != places.fingerprint:
         raise Conflict(
             "run_differs",
             f"The photos below {arguments.data_root} are not those that the run in {folder} began "
             "with. Bring them back, or begin a new run (--model_path takes this one's weights).",
         )
-    sets = open_sets(arguments)
-    kept = kept_checkpoints(arguments, folder, sets, display)
+    sets = select_evaluation_sets(arguments)
+    kept = make_checkpoints(arguments, folder, sets, display)
     kept.best = [each for each in history.best if (kept.folder / each[1]).is_file()]
     model = make_model(arguments, display, resuming=True)
-    write_yaml(arguments, folder / CONFIG)
-    ready = _Ready(arguments, device, places, sets, model, folder, history, kept, checkpoint)
-    return _kept_when_stopped(ready, display, stop)
+    save_yaml(arguments, folder / CONFIG_FILE)
+    ready = _PreparedRun(arguments, device, places, sets, model, folder, history, kept, checkpoint)
+    return _run_until_stopped(ready, display, stop)
 
 
-def _kept_when_stopped(ready: _Ready, display: Display, stop: StopRequest) -> Json:
+def _run_until_stopped(ready: _PreparedRun, display: Display, stop: StopRequest) -> Json:
     try:
-        return _learn(ready, display, stop)
+        return _train(ready, display, stop)
     except RunStopped:
         if not ready.kept.last_path.is_file():
             raise RunStopped(
@@ -121,11 +131,13 @@ def _kept_when_stopped(ready: _Ready, display: Display, stop: StopRequest) -> Js
         ) from None
 
 
-def _learn(ready: _Ready, display: Display, stop: StopRequest) -> Json:
+def _train(ready: _PreparedRun, display: Display, stop: StopRequest) -> Json:
     arguments, device = ready.arguments, ready.device
-    learner = Learner(ready.model, arguments, about={"training": as_values(arguments)})
-    validation = Validation(arguments, device.torch_device, display.progress, stop)
-    plan = BatchPlan(
+    learner = MetricLearningModule(
+        ready.model, arguments, metadata={"training": portable_arguments(arguments)}
+    )
+    validation = Validator(arguments, device.torch_device, display.progress, stop)
+    plan = PlaceBatchSampler(
         ready.places.places,
         arguments.batch_size,
         arguments.img_per_place,
@@ -134,19 +146,19 @@ def _learn(ready: _Ready, display: Display, stop: StopRequest) -> Json:
         arguments.reload_dataloaders_every_n_epochs,
         arguments.seed,
     )
-    photos = PlacePhotos(
+    photos = PlaceDataset(
         plan,
         arguments.image_size,
         augment=arguments.augmentation == "randaugment",
-        bad_is_error=arguments.on_bad_image == "error",
+        fail_on_undecodable=arguments.on_bad_image == "error",
     )
-    batches = TrainingBatches(
+    batches = ResumableDataLoader(
         plan,
         photos,
         num_workers=arguments.num_workers,
         pin_memory=device.torch_device.type == "cuda",
     )
-    watch = Watch(
+    watch = TrainingCallback(
         arguments,
         ready.folder,
         batches,
@@ -158,10 +170,10 @@ def _learn(ready: _Ready, display: Display, stop: StopRequest) -> Json:
         display,
     )
     loggers = [] if arguments.fast_dev_run else make_loggers(
-        arguments.logger, ready.folder, as_plain(arguments)
+        arguments.logger, ready.folder, to_plain_dict(arguments)
     )  # fmt: skip
     if ready.resume_from is None:
-        validation.try_out(
+        validation.sanity_check(
             learner.model.to(device.torch_device),
             ready.sets.validation,
             arguments.num_sanity_val_steps,
@@ -169,12 +181,12 @@ def _learn(ready: _Ready, display: Display, stop: StopRequest) -> Json:
         seed_everything(arguments.seed)
         is_over = False
     else:
-        is_over = _measure_what_is_due(ready, learner, validation, display)
+        is_over = _finish_interrupted_validation(ready, learner, validation, display)
     if not is_over:
         fit(learner, batches, watch, arguments, device, ready.folder, loggers, ready.resume_from)
     if arguments.fast_dev_run:
-        validation.try_out(learner.model.to(device.torch_device), ready.sets.validation, 1)
-        display.say("One batch of everything went through; nothing was kept.")
+        validation.sanity_check(learner.model.to(device.torch_device), ready.sets.validation, 1)
+        display.info("One batch of everything went through; nothing was kept.")
         return {"fast_dev_run": True}
     ready.history.save(ready.folder)
     tested = {}
@@ -182,13 +194,13 @@ def _learn(ready: _Ready, display: Display, stop: StopRequest) -> Json:
         chosen = ready.kept.best_path or ready.kept.last_path
         best = load_checkpoint(chosen).model.to(device.torch_device)
         tested = validation.measure(best, ready.sets.test, for_tests=True)
-    report = summarise(arguments, ready.folder, ready.history, ready.kept, ready.sets, tested)
-    (ready.folder / METRICS).write_text(json.dumps(report, indent=2) + "\n")
+    report = build_summary(arguments, ready.folder, ready.history, ready.kept, ready.sets, tested)
+    (ready.folder / METRICS_FILE).write_text(json.dumps(report, indent=2) + "\n")
     return report
 
 
-def _measure_what_is_due(
-    ready: _Ready, learner: Learner, validation: Validation, display: Display
+def _finish_interrupted_validation(
+    ready: _PreparedRun, learner: MetricLearningModule, validation: Validator, display: Display
 ) -> bool:
     """Take the figures of an epoch that was interrupted while it was measured; whether the run
     has all its steps."""
@@ -200,15 +212,15 @@ def _measure_what_is_due(
         epoch_done and epoch + 1 >= arguments.max_epochs
     )
     history.epochs = [each for each in history.epochs if each.step <= step]
-    is_due = is_over or (epoch_done and is_measured_after(epoch, arguments))
+    is_due = is_over or (epoch_done and is_validation_epoch(epoch, arguments))
     if not is_due or any(each.step == step for each in history.epochs):
         return is_over
     learner.load_state_dict(stored["state_dict"])
     learner.model.to(ready.device.torch_device)
-    found = figures_of(validation.measure(learner.model, ready.sets.validation))
+    found = flatten_recalls(validation.measure(learner.model, ready.sets.validation))
     source = ready.resume_from
-    note_epoch(
-        Epoch(epoch, step, stored["last_loss"], found),
+    record_epoch(
+        EpochRecord(epoch, step, stored["last_loss"], found),
         history,
         ready.kept,
         lambda path, weights_only: copy_checkpoint(source, path, weights_only),
@@ -218,7 +230,7 @@ def _measure_what_is_due(
     return is_over
 
 
-def _test_only(
+def _run_test_phase(
     arguments: TrainingArguments, device: Device, display: Display, stop: StopRequest
 ) -> Json:
     if arguments.model_path is None:
@@ -229,14 +241,14 @@ def _test_only(
     checkpoint = load_checkpoint(arguments.model_path)
     if "image_size" not in arguments.model_fields_set:
         arguments = arguments.model_copy(update={"image_size": checkpoint.config.image_size})
-    sets = open_sets(arguments)
+    sets = select_evaluation_sets(arguments)
     if arguments.show_data_stats:
-        show_data(None, sets, display)
-    validation = Validation(arguments, device.torch_device, display.progress, stop)
+        print_data_sets(None, sets, display)
+    validation = Validator(arguments, device.torch_device, display.progress, stop)
     model = checkpoint.model.to(device.torch_device)
     tested = validation.measure(model, sets.test, for_tests=True)
-    folder = new_run_folder(arguments)
-    write_yaml(arguments, folder / CONFIG)
-    report = summarise(arguments, folder, None, None, sets, tested)
-    (folder / METRICS).write_text(json.dumps(report, indent=2) + "\n")
+    folder = create_run_folder(arguments)
+    save_yaml(arguments, folder / CONFIG_FILE)
+    report = build_summary(arguments, folder, None, None, sets, tested)
+    (folder / METRICS_FILE).write_text(json.dumps(report, indent=2) + "\n")
     return report

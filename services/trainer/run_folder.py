@@ -15,16 +15,16 @@ from pathlib import Path
 from typing import Any
 
 from services.trainer.arguments import TrainingArguments
-from services.trainer.checkpoint_names import folder_from, safe
-from services.trainer.configuration import as_plain, make_arguments, read_yaml
+from services.trainer.checkpoint_names import format_folder, safe_filename
+from services.trainer.configuration import build_arguments, load_yaml, to_plain_dict
 from shared.errors import Conflict, Misconfigured, NotFound
 
-CHECKPOINTS = "checkpoints"
-CONFIG = "config.yaml"
-METRICS = "metrics.json"
+CHECKPOINTS_FOLDER = "checkpoints"
+CONFIG_FILE = "config.yaml"
+METRICS_FILE = "metrics.json"
 
 # A run that went on with another of these would be another run.
-FIXED = (
+IMMUTABLE_ARGUMENTS = (
     "batch_size", "img_per_place", "min_img_per_place", "shuffle_all",
     "random_sample_from_each_place", "image_size", "reload_dataloaders_every_n_epochs", "cities",
     "backbone_arch", "layers_to_freeze", "layers_to_crop", "agg_arch", "agg_config", "optimizer",
@@ -32,29 +32,31 @@ FIXED = (
 )  # fmt: skip
 
 
-def new_run_folder(arguments: TrainingArguments) -> Path:
+def create_run_folder(arguments: TrainingArguments) -> Path:
     """An empty folder for a run that begins.
 
     Raises Conflict (`run_exists`) for a name that is taken, Misconfigured (`out_unwritable`).
     """
-    root = Path(folder_from(arguments.default_root_dir, as_plain(arguments)))
+    root = Path(format_folder(arguments.default_root_dir, to_plain_dict(arguments)))
     if arguments.run_name is not None:
-        folder = root / safe(arguments.run_name)
+        folder = root / safe_filename(arguments.run_name)
         if folder.is_dir() and any(folder.iterdir()):
             raise Conflict(
                 "run_exists",
                 f"{folder} holds a run already. Go on with it by --resume {folder}, or give "
                 "another --run_name.",
             )
-        return _made(folder, exist_ok=True)
+        return _make_folder(folder, exist_ok=True)
     # Local time: the name is for whoever looks into the folder.
     began = datetime.now().astimezone().strftime("%Y%m%d-%H%M%S")
-    stem = safe(f"{began}-{arguments.backbone_arch}-{arguments.agg_arch}-{arguments.loss_name}")
+    stem = safe_filename(
+        f"{began}-{arguments.backbone_arch}-{arguments.agg_arch}-{arguments.loss_name}"
+    )
     number = 1
     while True:
         name = stem if number == 1 else f"{stem}-{number}"
         try:
-            return _made(root / name, exist_ok=False)
+            return _make_folder(root / name, exist_ok=False)
         except FileExistsError:
             number += 1
 
@@ -65,26 +67,28 @@ def find_run(resume: Path) -> tuple[Path, Path]:
     Raises NotFound (`run_not_found`).
     """
     if resume.is_dir():
-        folder, checkpoint = resume, resume / CHECKPOINTS / "last.ckpt"
+        folder, checkpoint = resume, resume / CHECKPOINTS_FOLDER / "last.ckpt"
     else:
         folder, checkpoint = resume.parent.parent, resume
-    for needed in (folder / CONFIG, checkpoint):
+    for needed in (folder / CONFIG_FILE, checkpoint):
         if not needed.is_file():
             raise NotFound(
                 "run_not_found",
                 f"--resume {resume}: there is no {needed}. Name the folder of a run, in which "
-                f"{CONFIG} and {CHECKPOINTS}/last.ckpt lie; a run that ended before its first "
+                f"{CONFIG_FILE} and {CHECKPOINTS_FOLDER}/last.ckpt lie; a run that ended before its first "
                 "step has none.",
             )
     return folder, checkpoint
 
 
-def resumed_arguments(folder: Path, changes: dict[str, Any]) -> TrainingArguments:
+def load_resumed_arguments(folder: Path, changes: dict[str, Any]) -> TrainingArguments:
     """What the run was told, with changes. Conflict (`run_differs`) for a change that would make
     it another run."""
-    stored = read_yaml(folder / CONFIG)
-    before, after = make_arguments(stored), make_arguments(stored, changes)
-    differing = [name for name in FIXED if getattr(before, name) != getattr(after, name)]
+    stored = load_yaml(folder / CONFIG_FILE)
+    before, after = build_arguments(stored), build_arguments(stored, changes)
+    differing = [
+        name for name in IMMUTABLE_ARGUMENTS if getattr(before, name) != getattr(after, name)
+    ]
     if differing:
         raise Conflict(
             "run_differs",
@@ -94,7 +98,7 @@ def resumed_arguments(folder: Path, changes: dict[str, Any]) -> TrainingArgument
     return after
 
 
-def _made(folder: Path, *, exist_ok: bool) -> Path:
+def _make_folder(folder: Path, *, exist_ok: bool) -> Path:
     try:
         folder.mkdir(parents=True, exist_ok=exist_ok)
     except FileExistsError:

@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 
 from shared.datasets.sets import TrainingPlace
 
-ORDER, PHOTOS, AUGMENT = 1, 2, 3  # what a stream of random numbers is for
+ORDER_STREAM, PHOTO_STREAM, AUGMENT_STREAM = 1, 2, 3  # what a stream of random numbers is for
 
 
 @dataclass(frozen=True, slots=True)
-class Draw:
+class PlaceSample:
     """One place in a batch."""
 
     place: int
@@ -30,7 +30,7 @@ class Draw:
 
 
 @dataclass(frozen=True)
-class BatchPlan:
+class PlaceBatchSampler:
     """Batches of places, as the predecessor samples them.
 
     `shuffle_all` False keeps the cities' order and shuffles the places inside each: a batch then
@@ -50,27 +50,27 @@ class BatchPlan:
     def __len__(self) -> int:
         return -(-len(self.places) // self.places_per_batch)
 
-    def batches(self, epoch: int, start: int = 0) -> Iterator[list[Draw]]:
+    def batches(self, epoch: int, start: int = 0) -> Iterator[list[PlaceSample]]:
         """The epoch's batches from number `start` on."""
         order = self.order(epoch)
         for number in range(start, len(self)):
             first = number * self.places_per_batch
-            rng = np.random.default_rng((self.seed, PHOTOS, epoch, number))
-            seeds = np.random.default_rng((self.seed, AUGMENT, epoch, number))
+            rng = np.random.default_rng((self.seed, PHOTO_STREAM, epoch, number))
+            seeds = np.random.default_rng((self.seed, AUGMENT_STREAM, epoch, number))
             yield [
-                Draw(int(place), self._photos(int(place), rng), int(seeds.integers(2**63)))
+                PlaceSample(int(place), self._photos(int(place), rng), int(seeds.integers(2**63)))
                 for place in order[first : first + self.places_per_batch]
             ]
 
     def order(self, epoch: int) -> NDArray[np.int64]:
         """The indices of all places as the epoch goes through them."""
         every = self.reshuffle_every_epochs
-        rng = np.random.default_rng((self.seed, ORDER, epoch // every if every else 0))
+        rng = np.random.default_rng((self.seed, ORDER_STREAM, epoch // every if every else 0))
         if self.shuffle_all:
             return rng.permutation(len(self.places))
-        return np.concatenate([rng.permutation(indices) for indices in self._by_city()])
+        return np.concatenate([rng.permutation(indices) for indices in self._indices_by_city()])
 
-    def _by_city(self) -> list[NDArray[np.int64]]:
+    def _indices_by_city(self) -> list[NDArray[np.int64]]:
         by_city: dict[str, list[int]] = {}
         for index, place in enumerate(self.places):
             by_city.setdefault(place.city, []).append(index)

@@ -8,36 +8,38 @@ from typing import Any
 import numpy as np
 
 from services.trainer.arguments import TrainingArguments
-from services.trainer.checkpoint_names import NameTemplate
-from services.trainer.configuration import as_plain
-from services.trainer.device import Device, choose_device
+from services.trainer.checkpoint_names import CheckpointNameTemplate
+from services.trainer.configuration import to_plain_dict
+from services.trainer.device import Device, resolve_device
 from services.trainer.display import Display
-from services.trainer.evaluation.nearest import nearest
-from services.trainer.evaluation.recalls import KS
-from services.trainer.keep import KeptCheckpoints
+from services.trainer.evaluation.nearest import exact_knn
+from services.trainer.evaluation.recalls import DEFAULT_KS
+from services.trainer.keep import TopKCheckpoints
 from services.trainer.loggers import check_loggers
-from services.trainer.open_data import Sets
-from services.trainer.run_folder import CHECKPOINTS
+from services.trainer.open_data import EvaluationSets
+from services.trainer.run_folder import CHECKPOINTS_FOLDER
 from shared.datasets.shots import TrainingSet
 from shared.errors import InvalidRequest
 
 Json = dict[str, Any]
 
 
-def check_machine(arguments: TrainingArguments) -> Device:
+def check_environment(arguments: TrainingArguments) -> Device:
     """The device, when all that the arguments need of this machine is there.
 
     Raises Misconfigured (`no_gpu`, `faiss_gpu_missing`, `logger_missing`), InvalidRequest.
     """
-    device = choose_device(arguments)
+    device = resolve_device(arguments)
     check_loggers(arguments.logger)
     if arguments.faiss_gpu:
         one = np.ones((1, 1), np.float32)
-        nearest(one, one, 1, faiss_gpu=True)
+        exact_knn(one, one, 1, faiss_gpu=True)
     return device
 
 
-def as_meant(arguments: TrainingArguments, places: TrainingSet, sets: Sets) -> TrainingArguments:
+def resolve_arguments(
+    arguments: TrainingArguments, places: TrainingSet, sets: EvaluationSets
+) -> TrainingArguments:
     """The arguments with what was left to the data set filled in."""
     if arguments.img_per_place > arguments.min_img_per_place:
         raise InvalidRequest(
@@ -57,11 +59,11 @@ def as_meant(arguments: TrainingArguments, places: TrainingSet, sets: Sets) -> T
     return TrainingArguments(**{**arguments.model_dump(), **changes})
 
 
-def kept_checkpoints(
-    arguments: TrainingArguments, folder: Path, sets: Sets, display: Display
-) -> KeptCheckpoints:
+def make_checkpoints(
+    arguments: TrainingArguments, folder: Path, sets: EvaluationSets, display: Display
+) -> TopKCheckpoints:
     """The run's checkpoints, none kept yet; InvalidRequest (`unknown_metric`, `bad_argument`)."""
-    metrics = [f"{each.name}/R{k}" for each in sets.validation for k in KS]
+    metrics = [f"{each.name}/R{k}" for each in sets.validation for k in DEFAULT_KS]
     if not metrics:
         display.warn("There is no set to validate on: only last.ckpt is kept.")
     elif arguments.monitor not in metrics:
@@ -70,17 +72,17 @@ def kept_checkpoints(
             f"--monitor {arguments.monitor} is not measured in this run; known: "
             f"{', '.join(metrics)}.",
         )
-    name = NameTemplate(
+    name = CheckpointNameTemplate(
         arguments.filename,
-        as_plain(arguments),
+        to_plain_dict(arguments),
         metrics,
-        monitored=arguments.monitor.rpartition("/")[0],
+        monitored_set=arguments.monitor.rpartition("/")[0],
         insert_names=arguments.auto_insert_metric_name,
     )
-    for dropped in name.dropped if metrics else ():
+    for dropped in name.dropped_fields if metrics else ():
         display.warn(f"--filename: no run on these sets logs {dropped}; it drops out of the names.")
-    return KeptCheckpoints(
-        folder / CHECKPOINTS,
+    return TopKCheckpoints(
+        folder / CHECKPOINTS_FOLDER,
         name,
         arguments.monitor,
         arguments.mode,
@@ -89,9 +91,9 @@ def kept_checkpoints(
     )
 
 
-def as_values(arguments: TrainingArguments) -> Json:
+def portable_arguments(arguments: TrainingArguments) -> Json:
     """What a checkpoint says of its training; no paths of this machine."""
-    plain = as_plain(arguments)
+    plain = to_plain_dict(arguments)
     for name in ("data_root", "eval_roots", "weights", "model_path", "default_root_dir"):
         plain.pop(name)
     return plain

@@ -22,11 +22,11 @@ class StopRequest:
         self._is_listening = False
 
     @contextmanager
-    def listening(self) -> Iterator[StopRequest]:
+    def handle_signals(self) -> Iterator[StopRequest]:
         """Take the signals for as long as the block lasts; only in the main thread."""
         before = {number: signal.getsignal(number) for number in SIGNALS}
         self._is_listening = True
-        self.take_signals()
+        self.install_handlers()
         try:
             yield self
         finally:
@@ -34,7 +34,7 @@ class StopRequest:
             for number, handler in before.items():
                 signal.signal(number, handler)
 
-    def take_signals(self) -> None:
+    def install_handlers(self) -> None:
         """Take them back from Lightning, which puts a handler of its own before that of SIGTERM and
         would end the run with nothing kept."""
         if self._is_listening:

@@ -13,48 +13,50 @@ import pytorch_metric_learning
 import torch
 
 from services.trainer.arguments import TrainingArguments
-from services.trainer.configuration import as_plain
+from services.trainer.configuration import to_plain_dict
 from services.trainer.display import Display
 from services.trainer.evaluation.recalls import Recalls
-from services.trainer.history import History
-from services.trainer.keep import KeptCheckpoints
-from services.trainer.open_data import Sets, describe_set
-from services.trainer.run_folder import CONFIG
+from services.trainer.history import TrainingHistory
+from services.trainer.keep import TopKCheckpoints
+from services.trainer.open_data import EvaluationSets, summarise_evaluation_set
+from services.trainer.run_folder import CONFIG_FILE
 from shared.datasets.shots import TrainingSet
 from shared.vision.place_models.checkpoint import load_checkpoint
 
 Json = dict[str, Any]
 
 
-def show_data(places: TrainingSet | None, sets: Sets, display: Display) -> None:
+def print_data_sets(places: TrainingSet | None, sets: EvaluationSets, display: Display) -> None:
     """What there is to learn from and to be measured on."""
     if places is not None:
-        display.say(
+        display.info(
             f"To learn from: {len(places.places)} places, {places.photo_count} photos, "
             f"{len(places.cities)} cities ({places.layout} in {places.root})"
         )
     for each in {one.name: one for one in (*sets.validation, *sets.test)}.values():
-        display.say(
+        display.info(
             f"{each.name}: {len(each.database)} database photos, {len(each.queries)} queries, "
             f"{len(each.without_positives)} of them without a positive ({each.rule}, "
             f"protocol {each.protocol}, {each.fingerprint[:12]})"
         )
 
 
-def summarise(
+def build_summary(
     arguments: TrainingArguments,
     folder: Path,
-    history: History | None,
-    kept: KeptCheckpoints | None,
-    sets: Sets,
+    history: TrainingHistory | None,
+    kept: TopKCheckpoints | None,
+    sets: EvaluationSets,
     tested: dict[str, Recalls],
 ) -> Json:
     """The content of `metrics.json`; shares are from 0 to 1."""
     report: Json = {
         "run": str(folder),
-        "config": str(folder / CONFIG),
-        "arguments": as_plain(arguments),
-        "sets": {each.name: describe_set(each) for each in (*sets.validation, *sets.test)},
+        "config": str(folder / CONFIG_FILE),
+        "arguments": to_plain_dict(arguments),
+        "sets": {
+            each.name: summarise_evaluation_set(each) for each in (*sets.validation, *sets.test)
+        },
         "test": {name: one.as_json() for name, one in tested.items()},
         "versions": {
             "python": platform.python_version(),
@@ -64,24 +66,26 @@ def summarise(
         },
     }
     if history is not None and kept is not None:
-        report |= _of_training(arguments, history, kept)
+        report |= _training_summary(arguments, history, kept)
     else:
-        report["best"] = _described(Path(str(arguments.model_path)), None)
-    report["next"] = _next(arguments, report)
+        report["best"] = _checkpoint_details(Path(str(arguments.model_path)), None)
+    report["next"] = _next_commands(arguments, report)
     return report
 
 
-def _of_training(arguments: TrainingArguments, history: History, kept: KeptCheckpoints) -> Json:
+def _training_summary(
+    arguments: TrainingArguments, history: TrainingHistory, kept: TopKCheckpoints
+) -> Json:
     best = (
-        _described(kept.best_path, kept.best[0][0]) if kept.best_path is not None
-        else _described(kept.last_path, None)
+        _checkpoint_details(kept.best_path, kept.best[0][0]) if kept.best_path is not None
+        else _checkpoint_details(kept.last_path, None)
     )  # fmt: skip
     return {
         "training_set": history.training_set,
         "epochs": [asdict(epoch) for epoch in history.epochs],
         "monitor": arguments.monitor,
         "best": best,
-        "checkpoints": [_listed(kept.folder / name, score) for score, name in kept.best],
+        "checkpoints": [_checkpoint_entry(kept.folder / name, score) for score, name in kept.best],
         "last": str(kept.last_path),
         "bad_photos": history.bad_photos,
         "images": history.images,
@@ -93,20 +97,20 @@ def _of_training(arguments: TrainingArguments, history: History, kept: KeptCheck
     }
 
 
-def _listed(path: Path, score: float | None) -> Json:
+def _checkpoint_entry(path: Path, score: float | None) -> Json:
     return {"path": str(path), "score": score}
 
 
-def _described(path: Path, score: float | None) -> Json:
+def _checkpoint_details(path: Path, score: float | None) -> Json:
     loaded = load_checkpoint(path)
     return {
-        **_listed(path, score),
+        **_checkpoint_entry(path, score),
         "fingerprint": loaded.fingerprint,
         "dimension": loaded.model.dimension,
     }
 
 
-def _next(arguments: TrainingArguments, report: Json) -> list[str]:
+def _next_commands(arguments: TrainingArguments, report: Json) -> list[str]:
     """Commands that one would type now."""
     best = shlex.quote(report["best"]["path"])
     root = shlex.quote(str((arguments.eval_roots or (arguments.data_root,))[0]))

@@ -8,17 +8,17 @@ from dataclasses import replace
 import torch
 
 from services.trainer.arguments import TrainingArguments
-from services.trainer.evaluation.describe_model import DescribeModel
-from services.trainer.evaluation.recalls import Recalls, recalls
+from services.trainer.evaluation.describe_model import ModelDescriber
+from services.trainer.evaluation.recalls import Recalls, evaluate_recall
 from services.trainer.stop import StopRequest
 from shared.datasets.shots import EvaluationSet
 
-PHOTOS_AT_ONCE = 32
+BATCH_PHOTOS = 32
 
-Told = Callable[[str, int, int], None]
+ProgressCallback = Callable[[str, int, int], None]
 
 
-class Validation:
+class Validator:
     """Measures a network on sets, one after the other.
 
     Validation photos have the size that the training's have; `for_tests` uses `test_image_size`.
@@ -28,12 +28,12 @@ class Validation:
         self,
         arguments: TrainingArguments,
         device: torch.device,
-        told: Told,
+        on_progress: ProgressCallback,
         stop: StopRequest,
     ) -> None:
         self._arguments = arguments
         self._device = device
-        self._told = told
+        self._told = on_progress
         self._stop = stop
 
     def measure(
@@ -41,8 +41,8 @@ class Validation:
     ) -> dict[str, Recalls]:
         """By the sets' names. Raises RunStopped, and what describing and searching raise."""
         size = self._test_size() if for_tests else self._arguments.image_size
-        describe = DescribeModel(
-            model, self._device, size, batch_photos=1 if size is None else PHOTOS_AT_ONCE
+        describe = ModelDescriber(
+            model, self._device, size, batch_photos=1 if size is None else BATCH_PHOTOS
         )
         found = {}
         for each in sets:
@@ -51,13 +51,17 @@ class Validation:
                 self._stop.check()
                 self._told(f"{name}: {what}", done, most)
 
-            asked = recalls(describe, each, faiss_gpu=self._arguments.faiss_gpu, told=told)
+            asked = evaluate_recall(
+                describe, each, faiss_gpu=self._arguments.faiss_gpu, on_progress=told
+            )
             found[each.name] = asked.recalls
         return found
 
-    def try_out(self, model: torch.nn.Module, sets: Sequence[EvaluationSet], batches: int) -> None:
+    def sanity_check(
+        self, model: torch.nn.Module, sets: Sequence[EvaluationSet], batches: int
+    ) -> None:
         """Measure the first batches of each set, -1: all, so that a fault in them shows early."""
-        most = batches * PHOTOS_AT_ONCE if batches >= 0 else None
+        most = batches * BATCH_PHOTOS if batches >= 0 else None
         begun = [
             replace(
                 each,
@@ -80,6 +84,10 @@ class Validation:
         return None if size == "native" else size
 
 
-def figures_of(found: dict[str, Recalls]) -> dict[str, float]:
+def flatten_recalls(recalls_by_set: dict[str, Recalls]) -> dict[str, float]:
     """`SET/R1`, `SET/R5` ... -> shares from 0 to 1; a query without a positive counts as missed."""
-    return {f"{name}/R{k}": share for name, one in found.items() for k, share in one.of_all.items()}
+    return {
+        f"{name}/R{k}": share
+        for name, one in recalls_by_set.items()
+        for k, share in one.recall_all.items()
+    }

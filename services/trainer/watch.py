@@ -14,31 +14,31 @@ from typing import Any
 import lightning
 
 from services.trainer.arguments import TrainingArguments
-from services.trainer.batches import Batch, TrainingBatches
+from services.trainer.batches import Batch, ResumableDataLoader
 from services.trainer.display import Display
-from services.trainer.history import Epoch, History
-from services.trainer.keep import KeptCheckpoints, Save
-from services.trainer.learner import Learner
-from services.trainer.random_state import random_state, set_random_state
+from services.trainer.history import EpochRecord, TrainingHistory
+from services.trainer.keep import SaveCheckpoint, TopKCheckpoints
+from services.trainer.learner import MetricLearningModule
+from services.trainer.random_state import restore_rng_state, rng_state
 from services.trainer.stop import StopRequest
-from services.trainer.validation import Validation, figures_of
+from services.trainer.validation import Validator, flatten_recalls
 from shared.datasets.shots import EvaluationSet
 
-SHOWN_BAD_PHOTOS = 10
+MAX_BAD_PHOTO_WARNINGS = 10
 
 
-class Watch(lightning.Callback):
+class TrainingCallback(lightning.Callback):
     """Drives `kept`, `validation` and `history` of one run. Raises RunStopped out of `fit`."""
 
     def __init__(
         self,
         arguments: TrainingArguments,
         folder: Path,
-        batches: TrainingBatches,
+        batches: ResumableDataLoader,
         sets: Sequence[EvaluationSet],
-        validation: Validation,
-        kept: KeptCheckpoints,
-        history: History,
+        validation: Validator,
+        kept: TopKCheckpoints,
+        history: TrainingHistory,
         stop: StopRequest,
         display: Display,
     ) -> None:
@@ -53,10 +53,10 @@ class Watch(lightning.Callback):
         self._display = display
         self._random_state: dict[str, Any] | None = None
         self._began = 0.0
-        self._step_of_last = -1
+        self._last_saved_step = -1
 
     def state_dict(self) -> dict[str, Any]:
-        return random_state()
+        return rng_state()
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         self._random_state = state_dict
@@ -64,10 +64,10 @@ class Watch(lightning.Callback):
     def on_train_start(
         self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
     ) -> None:
-        self._stop.take_signals()
+        self._stop.install_handlers()
         if self._random_state is not None:
-            set_random_state(self._random_state)
-        self._continue_clock()
+            restore_rng_state(self._random_state)
+        self._start_timer()
 
     def on_train_batch_end(
         self,
@@ -77,17 +77,17 @@ class Watch(lightning.Callback):
         batch: Batch,
         batch_idx: int,
     ) -> None:
-        assert isinstance(pl_module, Learner)
-        self._note_bad(batch)
+        assert isinstance(pl_module, MetricLearningModule)
+        self._record_undecodable(batch)
         self._history.images += len(batch.photos)
         epoch = trainer.current_epoch
         most = self._arguments.max_steps
         ends = self._arguments.fast_dev_run or (most is not None and trainer.global_step >= most)
         self._show(pl_module, epoch, batch_idx + 1)
         if trainer.is_last_batch or ends:
-            self._stop_clock()
+            self._stop_timer()
             self._end_epoch(trainer, pl_module, ends)
-            self._continue_clock()
+            self._start_timer()
         if ends:
             trainer.should_stop = True
         elif self._stop.asked:
@@ -100,21 +100,23 @@ class Watch(lightning.Callback):
         pl_module: lightning.LightningModule,
         exception: BaseException,
     ) -> None:
-        self._stop_clock()
+        self._stop_timer()
 
-    def _end_epoch(self, trainer: lightning.Trainer, learner: Learner, ends: bool) -> None:
+    def _end_epoch(
+        self, trainer: lightning.Trainer, learner: MetricLearningModule, ends: bool
+    ) -> None:
         if self._arguments.fast_dev_run:
             return
         epoch = trainer.current_epoch
         # Before the sets are measured, which may take long and be interrupted.
         self._keep(trainer)
-        if not is_measured_after(epoch, self._arguments) and not ends:
+        if not is_validation_epoch(epoch, self._arguments) and not ends:
             return
-        found = figures_of(self._validation.measure(learner.model, self._sets))
+        found = flatten_recalls(self._validation.measure(learner.model, self._sets))
         for logger in trainer.loggers:
             logger.log_metrics({**found, "epoch": epoch}, trainer.global_step)
-        note_epoch(
-            Epoch(epoch, trainer.global_step, learner.last_loss, found),
+        record_epoch(
+            EpochRecord(epoch, trainer.global_step, learner.last_loss, found),
             self._history,
             self._kept,
             trainer.save_checkpoint,
@@ -123,26 +125,26 @@ class Watch(lightning.Callback):
         self._history.save(self._folder)
 
     def _keep(self, trainer: lightning.Trainer) -> None:
-        if self._step_of_last == trainer.global_step:
+        if self._last_saved_step == trainer.global_step:
             return
-        self._stop_clock()
+        self._stop_timer()
         self._history.save(self._folder)
-        self._kept.keep_last(trainer.save_checkpoint)
-        self._step_of_last = trainer.global_step
-        self._continue_clock()
+        self._kept.save_last(trainer.save_checkpoint)
+        self._last_saved_step = trainer.global_step
+        self._start_timer()
 
-    def _note_bad(self, batch: Batch) -> None:
-        for path, reason in batch.bad:
+    def _record_undecodable(self, batch: Batch) -> None:
+        for path, reason in batch.undecodable:
             if path in self._history.bad_photos:
                 continue
             self._history.bad_photos[path] = reason
             count = len(self._history.bad_photos)
-            if count <= SHOWN_BAD_PHOTOS:
+            if count <= MAX_BAD_PHOTO_WARNINGS:
                 self._display.warn(f"{path} is left out, it does not decode: {reason}")
-            elif count == SHOWN_BAD_PHOTOS + 1:
+            elif count == MAX_BAD_PHOTO_WARNINGS + 1:
                 self._display.warn("More photos do not decode; metrics.json names them all.")
 
-    def _show(self, learner: Learner, epoch: int, done: int) -> None:
+    def _show(self, learner: MetricLearningModule, epoch: int, done: int) -> None:
         accuracy = "" if learner.last_accuracy is None else f"  b_acc {learner.last_accuracy:.2f}"
         self._display.progress(
             f"epoch {epoch + 1}/{self._arguments.max_epochs}",
@@ -151,40 +153,40 @@ class Watch(lightning.Callback):
             f"loss {learner.last_loss:.4f}{accuracy}",
         )
 
-    def _continue_clock(self) -> None:
+    def _start_timer(self) -> None:
         self._began = time.perf_counter()
         self._batches.seconds_waited = 0.0
 
-    def _stop_clock(self) -> None:
+    def _stop_timer(self) -> None:
         if self._began:
             self._history.seconds += time.perf_counter() - self._began
             self._history.seconds_waited += self._batches.seconds_waited
         self._began = 0.0
 
 
-def is_measured_after(epoch: int, arguments: TrainingArguments) -> bool:
+def is_validation_epoch(epoch: int, arguments: TrainingArguments) -> bool:
     """Every so many epochs, and after the last."""
     done = epoch + 1
     return done % arguments.check_val_every_n_epoch == 0 or done >= arguments.max_epochs
 
 
-def note_epoch(
-    epoch: Epoch,
-    history: History,
-    kept: KeptCheckpoints,
-    save: Save,
+def record_epoch(
+    epoch: EpochRecord,
+    history: TrainingHistory,
+    kept: TopKCheckpoints,
+    save: SaveCheckpoint,
     display: Display,
 ) -> None:
     """An epoch's figures: into the history, on the display, and its checkpoint among the best."""
     history.epochs.append(epoch)
-    is_best = kept.consider(save, epoch.figures, epoch.number, epoch.step)
+    is_best = kept.save_if_best(save, epoch.figures, epoch.number, epoch.step)
     history.best = list(kept.best)
     figures = "  ".join(
-        f"{name} {share:.1%}" for name, share in epoch.figures.items() if _is_short(name)
+        f"{name} {share:.1%}" for name, share in epoch.figures.items() if _is_headline_metric(name)
     )
     place = " (kept)" if is_best else ""
-    display.say(f"epoch {epoch.number + 1}: loss {epoch.loss:.4f}  {figures}{place}")
+    display.info(f"epoch {epoch.number + 1}: loss {epoch.loss:.4f}  {figures}{place}")
 
 
-def _is_short(name: str) -> bool:
+def _is_headline_metric(name: str) -> bool:
     return name.endswith(("/R1", "/R5"))

@@ -25,12 +25,12 @@ from shared.errors import Conflict, Misconfigured
 from shared.objects.folder import FolderStore
 from shared.private_files import FILE_MODE, make_private_folder, write_private
 
-FORMAT = 1
-LOCK = ".backup.lock"
+BACKUP_FORMAT = 1
+LOCK_FILE = ".backup.lock"
 
 
 @dataclass(frozen=True, slots=True)
-class Kept:
+class BackedUpObject:
     """An object in the backup. `modified` is when the original was written, ISO 8601."""
 
     key: str
@@ -40,7 +40,7 @@ class Kept:
 
 
 @dataclass(frozen=True, slots=True)
-class About:
+class BackupManifest:
     """What `backup.json` says."""
 
     installation_id: str
@@ -61,7 +61,7 @@ class About:
     """Objects whose bytes are not those that the catalog knows."""
     journal_sequence: int = 0
     """Of the last journal segment that the catalog had written."""
-    format: int = FORMAT
+    format: int = BACKUP_FORMAT
 
 
 class BackupFolder:
@@ -69,7 +69,7 @@ class BackupFolder:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.index: dict[str, Kept] = {}
+        self.index: dict[str, BackedUpObject] = {}
         self._index_file = path / "objects.jsonl"
 
     @functools.cached_property
@@ -77,7 +77,7 @@ class BackupFolder:
         """May lie on a medium that can only be read."""
         return FolderStore(self.path / "objects", alone=False)
 
-    def about(self) -> About | None:
+    def about(self) -> BackupManifest | None:
         """None for a folder in which no backup was ever finished."""
         try:
             said: dict[str, Any] = json.loads((self.path / "backup.json").read_text())
@@ -85,18 +85,18 @@ class BackupFolder:
             return None
         except ValueError as error:
             raise _unreadable(self.path, "backup.json") from error
-        if said.get("format") != FORMAT:
+        if said.get("format") != BACKUP_FORMAT:
             raise Misconfigured(
                 "backup_of_another_release",
                 f"{self.path} has the format {said.get('format')!r}, and this release reads "
-                f"{FORMAT}. Use the release that made it: {said.get('release')}.",
+                f"{BACKUP_FORMAT}. Use the release that made it: {said.get('release')}.",
             )
-        return About(**said)
+        return BackupManifest(**said)
 
     @contextlib.contextmanager
-    def locked(self) -> Iterator[None]:
+    def exclusive_lock(self) -> Iterator[None]:
         """For this process alone; Conflict (`backup_in_use`) while another one has it."""
-        lock = FileLock(self.path / LOCK, timeout=0, mode=FILE_MODE)
+        lock = FileLock(self.path / LOCK_FILE, timeout=0, mode=FILE_MODE)
         try:
             lock.acquire()
         except Timeout:
@@ -112,7 +112,7 @@ class BackupFolder:
         """Make the folder, or go on with what is there. Misconfigured (`not_a_backup`) for one that
         holds something else."""
         make_private_folder(self.path)
-        there = {entry.name for entry in self.path.iterdir()} - {LOCK}
+        there = {entry.name for entry in self.path.iterdir()} - {LOCK_FILE}
         if there and not there & {"objects.jsonl", "backup.json"}:
             raise Misconfigured(
                 "not_a_backup",
@@ -128,17 +128,17 @@ class BackupFolder:
         with contextlib.suppress(FileNotFoundError):
             for line in self._index_file.read_text().splitlines():
                 with contextlib.suppress(ValueError, TypeError):
-                    kept = Kept(**json.loads(line))
+                    kept = BackedUpObject(**json.loads(line))
                     self.index[kept.key] = kept
 
-    def note(self, kept: Kept) -> None:
+    def note(self, kept: BackedUpObject) -> None:
         """The object is there, whole."""
         self.index[kept.key] = kept
         with self._index_file.open("a") as lines:
             # Begins a line: what a kill has cut off before ends here.
             lines.write("\n" + json.dumps(asdict(kept)))
 
-    def finish(self, about: About, keep: set[str]) -> None:
+    def finish(self, about: BackupManifest, keep: set[str]) -> None:
         """From here on the folder is this backup. Objects that are not in `keep`, and the rows of
         the backup before, go."""
         write_private(self.path / "backup.json", json.dumps(asdict(about), indent=2) + "\n")
@@ -153,7 +153,7 @@ class BackupFolder:
                 shutil.rmtree(old)
 
 
-def open_backup(path: Path) -> tuple[BackupFolder, About]:
+def open_backup(path: Path) -> tuple[BackupFolder, BackupManifest]:
     """A finished backup, to be read. Misconfigured: `no_backup`, `backup_of_another_release`,
     `backup_unreadable`."""
     folder = BackupFolder(path)

@@ -10,29 +10,29 @@ from uuid import UUID
 from sqlalchemy import select, text
 from sqlalchemy.orm import Session
 
-from shared.backup.copy_objects import has, objects_to_keep, take
-from shared.backup.folder import About, BackupFolder
-from shared.backup.rows import Progress, dump_rows
+from shared.backup.copy_objects import back_up_object, is_backed_up, list_backup_objects
+from shared.backup.folder import BackupFolder, BackupManifest
+from shared.backup.rows import BackupProgress, dump_rows
 from shared.catalog.base import db_now
-from shared.catalog.connections import UNLIMITED
+from shared.catalog.connections import NO_TIMEOUTS
 from shared.catalog.installation import Installation
 from shared.catalog.session import Catalog
 from shared.errors import Misconfigured, NotFound, Unavailable
-from shared.integrity.named_objects import named_objects
+from shared.integrity.named_objects import list_referenced_objects
 from shared.objects import ObjectStore
 from shared.objects.keys import JOURNAL
 
-ROUNDS = 5  # of reading the catalog anew because something it named went away meanwhile
+MAX_COPY_PASSES = 5  # of reading the catalog anew because something it named went away meanwhile
 
 
-def make_backup(
+def create_backup(
     catalog: Catalog,
     store: ObjectStore,
     installation_id: UUID,
     path: Path,
     import_prefix: str,
-    progress: Progress = lambda what, done, total: None,
-) -> About:
+    progress: BackupProgress = lambda what, done, total: None,
+) -> BackupManifest:
     """Bring the folder `path` to what the service is now; what is there already is not copied
     again, whether it is of an earlier backup or of one that was interrupted.
 
@@ -43,7 +43,7 @@ def make_backup(
     """
     folder = BackupFolder(path)
     folder.open_for_writing()
-    with folder.locked():
+    with folder.exclusive_lock():
         before = folder.about()
         if before is not None and before.installation_id != str(installation_id):
             raise Misconfigured(
@@ -51,20 +51,20 @@ def make_backup(
                 f"{path} holds a backup of another Placewise. Give each a folder of its own.",
             )
         seen = _copy_all(store, folder, import_prefix, progress)
-        unlimited = catalog.limited(UNLIMITED)
-        for _ in range(ROUNDS):
+        unlimited = catalog.with_timeouts(NO_TIMEOUTS)
+        for _ in range(MAX_COPY_PASSES):
             with unlimited.read() as session:
                 # The first statement fixes what is seen.
                 now = session.execute(select(db_now())).scalar_one()
                 name = f"catalog-{now:%Y%m%dT%H%M%S%f}"
                 counts = dump_rows(session, path / name, progress)
                 schema = _revision(session)
-                named = {found.key: found for found in named_objects(session)}
+                named = {found.key: found for found in list_referenced_objects(session)}
                 sequence = session.scalar(select(Installation.journal_sequence)) or 0
             # Read after the catalog: it holds all that the catalog's rows are marked as journaled.
             journal = {info.key for info in store.list(JOURNAL)}
-            gone = _copy_rest(store, folder, [*named, *journal], progress)
-            missing = _still_named(unlimited, gone)
+            gone = _copy_missing(store, folder, [*named, *journal], progress)
+            missing = _still_referenced(unlimited, gone)
             if missing == gone:
                 break
         else:
@@ -81,7 +81,7 @@ def make_backup(
             and folder.index[key].sha256 != found.sha256
         )
         keep = (seen | named.keys() | journal) & folder.index.keys()
-        about = About(
+        about = BackupManifest(
             installation_id=str(installation_id),
             schema=schema,
             release=version("placewise"),
@@ -99,20 +99,20 @@ def make_backup(
 
 
 def _copy_all(
-    store: ObjectStore, folder: BackupFolder, import_prefix: str, progress: Progress
+    store: ObjectStore, folder: BackupFolder, import_prefix: str, progress: BackupProgress
 ) -> set[str]:
     """Every object as it is now; the keys."""
-    there = list(objects_to_keep(store, import_prefix))
+    there = list(list_backup_objects(store, import_prefix))
     for done, info in enumerate(there, start=1):
-        if not has(folder, info):
+        if not is_backed_up(folder, info):
             with contextlib.suppress(NotFound):  # deleted since it was listed
-                take(store, folder, info)
+                back_up_object(store, folder, info)
         progress("objects", done, len(there))
     return {info.key for info in there}
 
 
-def _copy_rest(
-    store: ObjectStore, folder: BackupFolder, named: list[str], progress: Progress
+def _copy_missing(
+    store: ObjectStore, folder: BackupFolder, named: list[str], progress: BackupProgress
 ) -> set[str]:
     """What is named and not there yet; the keys of those that the store does not have."""
     rest = [key for key in named if key not in folder.index]
@@ -123,19 +123,19 @@ def _copy_rest(
             if info is None:
                 gone.add(key)
             else:
-                take(store, folder, info)
+                back_up_object(store, folder, info)
         except NotFound:
             gone.add(key)
         progress("objects that came meanwhile", done, len(rest))
     return gone
 
 
-def _still_named(catalog: Catalog, gone: set[str]) -> set[str]:
+def _still_referenced(catalog: Catalog, gone: set[str]) -> set[str]:
     """Those that are named even now: they are lost, not overtaken."""
     if not gone:
         return set()
     with catalog.read() as session:
-        return {found.key for found in named_objects(session) if found.key in gone}
+        return {found.key for found in list_referenced_objects(session) if found.key in gone}
 
 
 def _revision(session: Session) -> str:

@@ -19,12 +19,12 @@ from shared.catalog.maps import Map
 from shared.catalog.models import Model
 from shared.errors import Conflict, Misconfigured, NotFound
 from shared.ids import new_id
-from shared.model_names import PREFIX
-from shared.recipes import Recipe
+from shared.model_names import TRAINED_MODEL_PREFIX
+from shared.recipes import ExtractorConfig
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class NewModel:
+class ModelRegistration:
     """What is known of a checkpoint that was checked and stored."""
 
     name: str
@@ -41,58 +41,65 @@ class NewModel:
     card: dict[str, Any]
 
 
-def add_model(session: Session, new: NewModel) -> tuple[Model, bool]:
+def register_model(session: Session, registration: ModelRegistration) -> tuple[Model, bool]:
     """The model's row, and whether it was not there before.
 
     The same weights under the same name replace the file that is there, or come back after they
     were removed; with them come the licence and the note, where they are given. Conflict
     (`model_name_taken`) where the name means, or has meant, other weights.
     """
-    found = _row(session, new.name, lock=True)
+    found = _find_model(session, registration.name, lock=True)
     if found is None:
         row = Model(
             id=new_id(),
-            name=f"{PREFIX}{new.name}",
-            fingerprint=new.fingerprint,
-            licence=new.licence or "not said",
-            card=new.card,
-            added_name=new.name,
+            name=f"{TRAINED_MODEL_PREFIX}{registration.name}",
+            fingerprint=registration.fingerprint,
+            licence=registration.licence or "not said",
+            card=registration.card,
+            added_name=registration.name,
             added_at=db_now(),
-            object_key=new.object_key,
-            sha256=new.sha256,
-            size_bytes=new.size_bytes,
-            dimension=new.dimension,
-            config=new.config,
-            note=new.note,
+            object_key=registration.object_key,
+            sha256=registration.sha256,
+            size_bytes=registration.size_bytes,
+            dimension=registration.dimension,
+            config=registration.config,
+            note=registration.note,
         )
         try:
             with session.begin_nested():
                 session.add(row)
                 session.flush()
         except IntegrityError:  # another worker was first
-            found = _row(session, new.name, lock=True)
+            found = _find_model(session, registration.name, lock=True)
             assert found is not None
         else:
             return row, True
-    if found.fingerprint != new.fingerprint:
+    if found.fingerprint != registration.fingerprint:
         gone = "" if found.object_key else ", which were removed, and names are not used again"
         raise Conflict(
             "model_name_taken",
-            f"The name {new.name!r} belongs to other weights (fingerprint "
-            f"{found.fingerprint[:12]}, these have {new.fingerprint[:12]}){gone}. Take another "
+            f"The name {registration.name!r} belongs to other weights (fingerprint "
+            f"{found.fingerprint[:12]}, these have {registration.fingerprint[:12]}){gone}. Take another "
             "name.",
-            model=new.name,
+            model=registration.name,
         )
     came_back = found.object_key is None
-    found.object_key, found.sha256, found.size_bytes = new.object_key, new.sha256, new.size_bytes
-    found.licence, found.note = new.licence or found.licence, new.note or found.note
+    found.object_key, found.sha256, found.size_bytes = (
+        registration.object_key,
+        registration.sha256,
+        registration.size_bytes,
+    )
+    found.licence, found.note = (
+        registration.licence or found.licence,
+        registration.note or found.note,
+    )
     if came_back:
         found.added_at = db_now()
     session.flush()
     return found, came_back
 
 
-def list_models(session: Session) -> list[Model]:
+def list_registered_models(session: Session) -> list[Model]:
     """Every model that was added and not removed, by name."""
     return list(
         session.scalars(
@@ -103,28 +110,28 @@ def list_models(session: Session) -> list[Model]:
     )
 
 
-def get_model(session: Session, name: str) -> Model:
+def get_registered_model(session: Session, name: str) -> Model:
     """The added model of that name; NotFound (`model_missing`)."""
-    found = _row(session, name)
+    found = _find_model(session, name)
     if found is None or found.object_key is None:
-        raise NotFound("model_missing", _missing(name), model=name)
+        raise NotFound("model_missing", _model_missing_detail(name), model=name)
     return found
 
 
-def check_model(session: Session, recipe: Recipe) -> None:
+def check_model_registered(session: Session, recipe: ExtractorConfig) -> None:
     """NotFound (`model_missing`) where the recipe names a model that was not added."""
     if recipe.trained is not None and recipe.trained.registered is not None:
-        get_model(session, recipe.trained.registered)
+        get_registered_model(session, recipe.trained.registered)
 
 
-def model_to_load(session: Session, name: str, *, lock: bool = False) -> Model:
-    """`get_model` for who describes photos: Misconfigured, as weights that are missing are.
+def get_model_for_loading(session: Session, name: str, *, lock: bool = False) -> Model:
+    """`get_registered_model` for who describes photos: Misconfigured, as weights that are missing are.
 
     With `lock` it can't be removed before the transaction ends.
     """
-    found = _row(session, name, lock=lock)
+    found = _find_model(session, name, lock=lock)
     if found is None or found.object_key is None:
-        raise Misconfigured("model_missing", _missing(name), model=name)
+        raise Misconfigured("model_missing", _model_missing_detail(name), model=name)
     return found
 
 
@@ -134,14 +141,14 @@ def remove_model(session: Session, name: str, new_map_extractor: str) -> Model:
     NotFound (`model_missing`); Conflict (`model_in_use`) while a map is described with it, is
     about to be, or new maps are (`new_map_extractor`).
     """
-    row = _row(session, name, lock=True)
+    row = _find_model(session, name, lock=True)
     if row is None or row.object_key is None:
-        raise NotFound("model_missing", _missing(name), model=name)
-    maps = maps_using(session, row)
+        raise NotFound("model_missing", _model_missing_detail(name), model=name)
+    maps = list_maps_using_model(session, row)
     if maps:
         raise Conflict(
             "model_in_use",
-            f"The model {name!r} describes the photos of {_listed(maps)}. Switch them to another "
+            f"The model {name!r} describes the photos of {_join_names(maps)}. Switch them to another "
             "extractor first (POST /api/v1/generations), or delete them.",
             model=name,
             maps=maps,
@@ -158,7 +165,7 @@ def remove_model(session: Session, name: str, new_map_extractor: str) -> Model:
     return row
 
 
-def maps_using(session: Session, model: Model) -> list[str]:
+def list_maps_using_model(session: Session, model: Model) -> list[str]:
     """Names of the live maps whose photos it describes, or will: by a generation that answers or
     is being built, or by the extractor of a map that has none yet."""
     of_generations = (
@@ -174,21 +181,21 @@ def maps_using(session: Session, model: Model) -> list[str]:
     return sorted({*session.scalars(of_generations), *session.scalars(of_maps)})
 
 
-def _row(session: Session, name: str, *, lock: bool = False) -> Model | None:
+def _find_model(session: Session, name: str, *, lock: bool = False) -> Model | None:
     wanted = select(Model).where(Model.added_name == name)
     if lock:
         wanted = wanted.with_for_update().execution_options(populate_existing=True)
     return session.scalar(wanted)
 
 
-def _missing(name: str) -> str:
+def _model_missing_detail(name: str) -> str:
     return (
         f"There is no model named {name!r} here. Add it: `placewise models add CHECKPOINT --name "
         f"{name}`, or POST /api/v1/models. GET /api/v1/models lists those that are there."
     )
 
 
-def _listed(maps: list[str]) -> str:
+def _join_names(maps: list[str]) -> str:
     shown = ", ".join(repr(name) for name in maps[:5])
     return (
         ("the map " if len(maps) == 1 else "the maps ")

@@ -14,9 +14,9 @@ from shared.errors import StorageFull, Unavailable
 
 log = logging.getLogger(__name__)
 
-SACRIFICED = {"40001": "serialization failure", "40P01": "deadlock"}
-TOO_SLOW = {"57014": "the statement took too long", "55P03": "a lock was not to be had"}
-READ_ONLY = "25006"  # the old primary, after a failover
+ROLLBACK_SQLSTATES = {"40001": "serialization failure", "40P01": "deadlock"}
+TIMEOUT_SQLSTATES = {"57014": "the statement took too long", "55P03": "a lock was not to be had"}
+READ_ONLY_SQLSTATE = "25006"  # the old primary, after a failover
 POSTGRES_FULL = "53100"
 POSTGRES_DAMAGED = ("XX001", "XX002")
 DAMAGED = ("SQLITE_CORRUPT", "SQLITE_NOTADB")
@@ -24,19 +24,19 @@ DAMAGED = ("SQLITE_CORRUPT", "SQLITE_NOTADB")
 FULL_RETRY_SECONDS = 60
 
 
-def sqlstate(error: BaseException) -> str | None:
+def get_sqlstate(error: BaseException) -> str | None:
     """PostgreSQL's five characters; None for what came from elsewhere."""
     return getattr(getattr(error, "orig", None), "sqlstate", None)
 
 
-def as_unavailable(error: BaseException) -> Unavailable | None:
+def to_unavailable(error: BaseException) -> Unavailable | None:
     """What to tell whoever asked when the catalog can't be used right now; None for what is no
     such error (a violated constraint, say)."""
     if isinstance(error, PoolTimeout):
-        return _busy("every connection is in use")
+        return _catalog_busy_error("every connection is in use")
     if not isinstance(error, DBAPIError):
         return None
-    state = sqlstate(error)
+    state = get_sqlstate(error)
     sqlite = str(getattr(error.orig, "sqlite_errorname", ""))
     if sqlite == "SQLITE_FULL" or state == POSTGRES_FULL:
         return StorageFull(
@@ -57,19 +57,19 @@ def as_unavailable(error: BaseException) -> Unavailable | None:
             f"The catalog's disk has failed ({reason_of(error)}): nothing was changed. Look at the "
             "disk's free space and at the system's log (dmesg), and take a backup.",
         )
-    if state in TOO_SLOW:
-        return _busy(TOO_SLOW[state])
-    if state in SACRIFICED:
-        return _busy(SACRIFICED[state])
+    if state in TIMEOUT_SQLSTATES:
+        return _catalog_busy_error(TIMEOUT_SQLSTATES[state])
+    if state in ROLLBACK_SQLSTATES:
+        return _catalog_busy_error(ROLLBACK_SQLSTATES[state])
     away = isinstance(error, OperationalError | InterfaceError) or error.connection_invalidated
-    if away or (isinstance(error, InternalError) and state == READ_ONLY):
+    if away or (isinstance(error, InternalError) and state == READ_ONLY_SQLSTATE):
         return Unavailable(
             "catalog_unavailable", "The catalog can't be reached right now. Try again in a moment."
         )
     return None
 
 
-def _busy(why: str) -> Unavailable:
+def _catalog_busy_error(why: str) -> Unavailable:
     return Unavailable(
         "catalog_busy",
         f"The catalog is too busy right now ({why}). Try again in a moment, and ask for less at "
@@ -77,23 +77,23 @@ def _busy(why: str) -> Unavailable:
     )
 
 
-class Outage:
+class OutageLog:
     """Says once that the catalog is away, and once that it is back: one for each loop."""
 
     def __init__(self, who: str) -> None:
         self._who = who
         self._away = False
 
-    def met(self, error: Exception) -> None:
+    def record_error(self, error: Exception) -> None:
         """`error` ended a round of the loop. What is no outage is logged in full each time."""
-        unavailable = as_unavailable(error)
+        unavailable = to_unavailable(error)
         if unavailable is None:
             log.error("the %s met an error in the catalog", self._who, exc_info=error)
         elif not self._away:
             self._away = True
             log.warning("the %s waits for the catalog: %s", self._who, reason_of(error))
 
-    def over(self) -> None:
+    def record_success(self) -> None:
         """A round went well."""
         if self._away:
             self._away = False

@@ -17,9 +17,9 @@ from sqlalchemy.sql.elements import ColumnElement
 from sqlalchemy.sql.functions import FunctionElement
 from sqlalchemy.types import Boolean, Float, Text, TypeDecorator
 
-from shared.geodesy import EARTH_RADIUS_M, without_dust
+from shared.geodesy import EARTH_RADIUS_M, flush_to_zero
 
-SQLITE_DISTANCE = "placewise_distance_m"
+SQLITE_DISTANCE_FUNCTION = "placewise_distance_m"
 
 Condition = ColumnElement[bool]
 
@@ -44,14 +44,14 @@ class UtcDateTime(TypeDecorator[datetime]):
         return value.replace(tzinfo=UTC) if value.tzinfo is None else value.astimezone(UTC)
 
 
-class Degrees(TypeDecorator[float]):
+class CoordinateColumn(TypeDecorator[float]):
     """A latitude or longitude, without what is too small to compute with."""
 
     impl = Float
     cache_ok = True
 
     def process_bind_param(self, value: float | None, dialect: Dialect) -> float | None:
-        return None if value is None else without_dust(value)
+        return None if value is None else flush_to_zero(value)
 
 
 JsonValue = JSON(none_as_null=True).with_variant(JSONB(none_as_null=True), "postgresql")
@@ -174,9 +174,9 @@ def _distance_postgresql(element: db_distance_m, compiler: Any, **kw: Any) -> st
 @compiles(db_distance_m, "sqlite")
 def _distance_sqlite(element: db_distance_m, compiler: Any, **kw: Any) -> str:
     # SQLite may be built without trigonometry: `session` brings the function to each connection.
-    return f"{SQLITE_DISTANCE}({compiler.process(element.clauses, **kw)})"
+    return f"{SQLITE_DISTANCE_FUNCTION}({compiler.process(element.clauses, **kw)})"
 
 
-def rowcount(result: Any) -> int:
+def affected_rows(result: Any) -> int:
     """How many rows an UPDATE or DELETE touched."""
     return int(result.rowcount)

@@ -27,13 +27,13 @@ from sqlalchemy.orm import Mapped, Session, mapped_column
 
 from shared.catalog.base import Base, UtcDateTime, db_now
 from shared.catalog.generations import Generation
-from shared.catalog.photos import Photo, PhotoFacts, PhotoRole, has_place
+from shared.catalog.photos import Photo, PhotoFilterValues, PhotoRole, is_geotagged
 from shared.ids import new_id
 
 # Rows that are counted whenever someone asks: some 10 ms.
-COUNTED_NOW = 10_000
+MAX_EXACT_COUNT = 10_000
 
-ASKED_AT_ONCE = 1000  # photos named in one statement
+IDS_PER_QUERY = 1000  # photos named in one statement
 
 
 class Chunk(Base):
@@ -87,7 +87,7 @@ class Descriptor(Base):
     )
 
 
-def descriptor_of(
+def find_descriptor(
     session: Session, generation_id: UUID, photo_id: UUID
 ) -> tuple[Descriptor, Chunk] | None:
     """The photo's descriptor in the generation and the chunk that holds it."""
@@ -99,19 +99,19 @@ def descriptor_of(
     return None if found is None else (found[0], found[1])
 
 
-def rows_of(
+def find_descriptor_rows(
     session: Session, generation_id: UUID, photo_ids: Sequence[UUID]
 ) -> dict[str, list[tuple[int, UUID]]]:
     """Where the photos' descriptors in the generation lie: (row, photo) by row, of each chunk's
     object; photos without one are left out."""
     found: dict[str, list[tuple[int, UUID]]] = {}
-    for begin in range(0, len(photo_ids), ASKED_AT_ONCE):
+    for begin in range(0, len(photo_ids), IDS_PER_QUERY):
         located = session.execute(
             select(Chunk.object_key, Descriptor.row, Descriptor.photo_id)
             .join(Chunk, Chunk.id == Descriptor.chunk_id)
             .where(
                 Descriptor.generation_id == generation_id,
-                Descriptor.photo_id.in_(photo_ids[begin : begin + ASKED_AT_ONCE]),
+                Descriptor.photo_id.in_(photo_ids[begin : begin + IDS_PER_QUERY]),
             )
         )
         for object_key, row, photo_id in located:
@@ -121,7 +121,7 @@ def rows_of(
     return found
 
 
-def live_chunks(session: Session, generation_id: UUID) -> list[Chunk]:
+def list_live_chunks(session: Session, generation_id: UUID) -> list[Chunk]:
     """The chunks that make up the generation now, in slot order."""
     return list(
         session.scalars(
@@ -132,20 +132,22 @@ def live_chunks(session: Session, generation_id: UUID) -> list[Chunk]:
     )
 
 
-def live_rows(session: Session, chunk_id: UUID) -> list[tuple[int, UUID]]:
+def list_live_rows(session: Session, chunk_id: UUID) -> list[tuple[int, UUID]]:
     """(row, photo) of the chunk's rows that belong to live photos, by row."""
-    return [(row, facts.photo_id) for row, facts in live_facts(session, chunk_id)]
+    return [(row, facts.photo_id) for row, facts in list_live_filter_values(session, chunk_id)]
 
 
-def live_facts(session: Session, chunk_id: UUID) -> list[tuple[int, PhotoFacts]]:
+def list_live_filter_values(
+    session: Session, chunk_id: UUID
+) -> list[tuple[int, PhotoFilterValues]]:
     """(row, what search knows of its photo) of the chunk's live rows, by row."""
     found = session.execute(
-        select(Descriptor.row, *PhotoFacts.COLUMNS)
+        select(Descriptor.row, *PhotoFilterValues.COLUMNS)
         .join(Photo, Photo.id == Descriptor.photo_id)
         .where(Descriptor.chunk_id == chunk_id, Photo.deleted_at.is_(None))
         .order_by(Descriptor.row)
     )
-    return [(row[0], PhotoFacts(*row[1:])) for row in found]
+    return [(row[0], PhotoFilterValues(*row[1:])) for row in found]
 
 
 def count_described(session: Session, generation_id: UUID, role: PhotoRole | None = None) -> int:
@@ -161,7 +163,7 @@ def count_described(session: Session, generation_id: UUID, role: PhotoRole | Non
     return session.scalar(counted) or 0
 
 
-def about_described(session: Session, generation_id: UUID) -> int:
+def estimate_described(session: Session, generation_id: UUID) -> int:
     """As `count_described`, for progress: beyond COUNTED_NOW the chunks' rows are added up, which
     may hold some of photos that were deleted since they were merged last."""
     rows = session.scalar(
@@ -169,7 +171,7 @@ def about_described(session: Session, generation_id: UUID) -> int:
             Chunk.generation_id == generation_id, Chunk.superseded_at.is_(None)
         )
     )
-    return int(rows) if rows and rows > COUNTED_NOW else count_described(session, generation_id)
+    return int(rows) if rows and rows > MAX_EXACT_COUNT else count_described(session, generation_id)
 
 
 def count_searchable(session: Session, generation_id: UUID) -> int:
@@ -177,18 +179,18 @@ def count_searchable(session: Session, generation_id: UUID) -> int:
     return count_described(session, generation_id, PhotoRole.DATABASE)
 
 
-def count_located(session: Session, generation_id: UUID, role: PhotoRole) -> int:
+def count_geotagged(session: Session, generation_id: UUID, role: PhotoRole) -> int:
     """How many live photos of a role have a descriptor in the generation and a known place."""
-    located = _located(generation_id, role).subquery()
+    located = _select_geotagged(generation_id, role).subquery()
     return session.scalar(select(func.count()).select_from(located)) or 0
 
 
-def has_located(session: Session, generation_id: UUID, role: PhotoRole) -> bool:
-    """Whether there is one of those that `count_located` counts."""
-    return session.scalar(_located(generation_id, role).limit(1)) is not None
+def has_geotagged(session: Session, generation_id: UUID, role: PhotoRole) -> bool:
+    """Whether there is one of those that `count_geotagged` counts."""
+    return session.scalar(_select_geotagged(generation_id, role).limit(1)) is not None
 
 
-def _located(generation_id: UUID, role: PhotoRole) -> Select[UUID]:
+def _select_geotagged(generation_id: UUID, role: PhotoRole) -> Select[UUID]:
     return (
         select(Descriptor.photo_id)
         .join(Photo, Photo.id == Descriptor.photo_id)
@@ -196,12 +198,12 @@ def _located(generation_id: UUID, role: PhotoRole) -> Select[UUID]:
             Descriptor.generation_id == generation_id,
             Photo.deleted_at.is_(None),
             Photo.role == role,
-            has_place(),
+            is_geotagged(),
         )
     )
 
 
-def take_slot(generation: Generation, rows: int, slot_rows: int) -> int:
+def allocate_slot(generation: Generation, rows: int, slot_rows: int) -> int:
     """The slot that a new chunk of `rows` goes into, holding at most `slot_rows` in the end.
 
     The caller holds the generation's lock.

@@ -21,13 +21,13 @@ from shared.settings import Settings
 
 # A transaction waits for its own process only between two statements: that takes no time, unless
 # the process hangs. Its locks are then taken from it.
-IDLE_SECONDS = 60.0
+PING_AFTER_IDLE_SECONDS = 60.0
 # What the server's own limit may take to reach us; after that the server itself is silent.
-SILENCE_SECONDS = 2.0
-PING_SECONDS = 2.0
+ANSWER_MARGIN_SECONDS = 2.0
+PING_TIMEOUT_SECONDS = 2.0
 
 # A peer that vanished without a word (a cut network, a lost machine) is found out by these.
-KEEPALIVES = {
+TCP_KEEPALIVE_OPTIONS = {
     "keepalives": 1,
     "keepalives_idle": 10,  # seconds
     "keepalives_interval": 3,  # seconds
@@ -37,7 +37,7 @@ KEEPALIVES = {
 
 
 @dataclass(frozen=True, slots=True)
-class Limits:
+class TransactionTimeouts:
     """How long PostgreSQL may take inside a transaction; SQLite knows no such limits."""
 
     statement_seconds: float = 60.0
@@ -46,12 +46,12 @@ class Limits:
     """Waiting for one lock, then the statement is ended (SQLSTATE 55P03)."""
 
     @classmethod
-    def of_requests(cls, settings: Settings) -> Self:
+    def for_requests(cls, settings: Settings) -> Self:
         """Someone waits for the answer."""
         return cls(settings.database_statement_seconds, settings.database_lock_seconds)
 
     @classmethod
-    def of_work(cls, settings: Settings) -> Self:
+    def for_background(cls, settings: Settings) -> Self:
         """In the background, where giving up costs more than waiting."""
         return cls(settings.database_work_seconds, settings.database_work_seconds)
 
@@ -59,16 +59,16 @@ class Limits:
         return (
             f"SET LOCAL statement_timeout = {self.statement_seconds * 1000:.0f};"
             f"SET LOCAL lock_timeout = {self.lock_seconds * 1000:.0f};"
-            f"SET LOCAL idle_in_transaction_session_timeout = {IDLE_SECONDS * 1000:.0f}"
+            f"SET LOCAL idle_in_transaction_session_timeout = {PING_AFTER_IDLE_SECONDS * 1000:.0f}"
         )
 
 
 # Of a walk over everything.
-UNLIMITED = Limits(statement_seconds=0)
+NO_TIMEOUTS = TransactionTimeouts(statement_seconds=0)
 
 
 @dataclass(frozen=True, slots=True)
-class Pool:
+class PoolConfig:
     """A process's connections to PostgreSQL. Durations in seconds."""
 
     name: str = "placewise"
@@ -81,7 +81,7 @@ class Pool:
     connect_seconds: float = 3.0
 
     @classmethod
-    def of(cls, settings: Settings, service: str) -> Self:
+    def from_settings(cls, settings: Settings, service: str) -> Self:
         return cls(
             name=f"placewise-{service}",
             size=settings.database_pool_size,
@@ -91,14 +91,14 @@ class Pool:
         )
 
 
-class BoundedConnection(psycopg.Connection[Any]):
+class TimeoutConnection(psycopg.Connection[Any]):
     """Gives the server up when it is silent for `answer_seconds`.
 
     The server's own limits need a server that works: a frozen one, or one whose disk hangs, keeps
     its connections open and says nothing.
     """
 
-    answer_seconds: float | None = PING_SECONDS
+    answer_seconds: float | None = PING_TIMEOUT_SECONDS
     """None: for as long as it takes."""
 
     def wait(self, gen: PQGen[RV], interval: float = 0.1, timeout: float | None = None) -> RV:
@@ -110,7 +110,7 @@ class BoundedConnection(psycopg.Connection[Any]):
             raise
 
 
-def make_postgres_engine(url: URL, pool: Pool) -> Engine:
+def make_postgres_engine(url: URL, pool: PoolConfig) -> Engine:
     """The engine; transactions run under `Limits` when the execution option `placewise_limits`
     says so."""
     engine = create_engine(
@@ -121,40 +121,40 @@ def make_postgres_engine(url: URL, pool: Pool) -> Engine:
         pool_pre_ping=True,
         creator=_connector(url, pool),
     )
-    event.listen(engine, "begin", _set_limits)
-    event.listen(engine, "checkin", _expect_a_ping)
+    event.listen(engine, "begin", _set_timeouts)
+    event.listen(engine, "checkin", _limit_ping)
     return engine
 
 
-def _connector(url: URL, pool: Pool) -> Callable[[], BoundedConnection]:
+def _connector(url: URL, pool: PoolConfig) -> Callable[[], TimeoutConnection]:
     arguments: dict[str, Any] = {
         "application_name": pool.name,
         # psycopg takes whole seconds, and no less than 2.
         "connect_timeout": max(2, round(pool.connect_seconds)),
-        **KEEPALIVES,
+        **TCP_KEEPALIVE_OPTIONS,
         **url.translate_connect_args(username="user", database="dbname"),
         **url.query,  # what the operator says comes last
     }
 
-    def connect() -> BoundedConnection:
-        return BoundedConnection.connect(prepare_threshold=None, **arguments)
+    def connect() -> TimeoutConnection:
+        return TimeoutConnection.connect(prepare_threshold=None, **arguments)
 
     return connect
 
 
-def _set_limits(connection: Connection) -> None:
-    limits: Limits | None = connection.get_execution_options().get("placewise_limits")
+def _set_timeouts(connection: Connection) -> None:
+    limits: TransactionTimeouts | None = connection.get_execution_options().get("placewise_limits")
     driver = connection.connection.driver_connection
-    assert isinstance(driver, BoundedConnection)
+    assert isinstance(driver, TimeoutConnection)
     driver.answer_seconds = None
     if limits is None:
         return
     if limits.statement_seconds:
-        driver.answer_seconds = limits.statement_seconds + SILENCE_SECONDS
+        driver.answer_seconds = limits.statement_seconds + ANSWER_MARGIN_SECONDS
     if not driver.autocommit:  # where there is no transaction to be limited
         connection.exec_driver_sql(limits.sql())
 
 
-def _expect_a_ping(connection: BoundedConnection | None, _record: object) -> None:
+def _limit_ping(connection: TimeoutConnection | None, _record: object) -> None:
     if connection is not None:  # None: it was found broken
-        connection.answer_seconds = PING_SECONDS
+        connection.answer_seconds = PING_TIMEOUT_SECONDS

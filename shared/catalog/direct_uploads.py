@@ -18,7 +18,7 @@ from shared.errors import Gone, NotFound
 from shared.ids import new_id
 
 
-class DirectUpload(Base):
+class PresignedUpload(Base):
     """A photo that was announced. `status` and `answer` are what completing it was answered."""
 
     __tablename__ = "direct_uploads"
@@ -40,16 +40,16 @@ class DirectUpload(Base):
     )
 
 
-def get_direct_upload(
+def get_presigned_upload(
     session: Session, map_id: UUID, upload_id: UUID, *, lock: bool = False
-) -> DirectUpload:
+) -> PresignedUpload:
     """An upload of the map that is completed, or can be still.
 
     Raises NotFound (`upload_not_found`) and Gone (`upload_expired`).
     """
     wanted = (
-        select(DirectUpload, (DirectUpload.expires_at <= db_now()).label("expired"))
-        .where(DirectUpload.id == upload_id, DirectUpload.map_id == map_id)
+        select(PresignedUpload, (PresignedUpload.expires_at <= db_now()).label("expired"))
+        .where(PresignedUpload.id == upload_id, PresignedUpload.map_id == map_id)
         .execution_options(populate_existing=True)
     )
     found = session.execute(wanted.with_for_update() if lock else wanted).one_or_none()
@@ -58,7 +58,7 @@ def get_direct_upload(
             "upload_not_found",
             f"There is no upload {upload_id} in this map. Begin one: POST /api/v1/uploads/presign.",
         )
-    upload: DirectUpload = found[0]
+    upload: PresignedUpload = found[0]
     if found.expired and upload.answer is None:
         raise Gone(
             "upload_expired",

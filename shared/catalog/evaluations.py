@@ -43,7 +43,7 @@ def list_evaluations(
     return list(session.scalars(wanted.order_by(Evaluation.id.desc()).limit(limit)))
 
 
-def last_evaluation(session: Session, generation_id: UUID) -> Evaluation | None:
+def latest_evaluation(session: Session, generation_id: UUID) -> Evaluation | None:
     """The generation's newest one."""
     return session.scalar(
         select(Evaluation)

@@ -17,20 +17,20 @@ from sqlalchemy import Float, ForeignKey, Select, Uuid, func, literal, select
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
 from shared.catalog.base import Base, JsonValue, UtcDateTime, db_now, db_now_plus
-from shared.catalog.chunks import COUNTED_NOW, count_located, count_searchable
+from shared.catalog.chunks import MAX_EXACT_COUNT, count_geotagged, count_searchable
 from shared.catalog.generations import active_generation
-from shared.catalog.photos import Photo, PhotoRole, count_live
+from shared.catalog.photos import Photo, PhotoRole, count_live_photos
 from shared.catalog.searches import Search
 from shared.jobs.table import Job
 
-LEAST_AGE_SECONDS = 30.0
+MIN_STATISTICS_AGE_SECONDS = 30.0
 # A large map's figures are counted in 1/50 of the time at most.
-REST = 50.0
+RECOUNT_REST_FACTOR = 50.0
 DAY_SECONDS = 86_400.0
 
 
-class MapFigures(Base):
-    """The last count of a large map: `Figures` as JSON, and how long it took."""
+class CachedMapStatistics(Base):
+    """The last count of a large map: `MapStatistics` as JSON, and how long it took."""
 
     __tablename__ = "map_figures"
 
@@ -41,7 +41,7 @@ class MapFigures(Base):
 
 
 @dataclass(frozen=True, slots=True)
-class Figures:
+class MapStatistics:
     """Counts of live rows; those of descriptors are of the generation that answers."""
 
     photos: int
@@ -61,30 +61,30 @@ class Figures:
     """By state."""
 
 
-def figures_of(session: Session, map_id: UUID) -> tuple[Figures, datetime]:
+def get_map_statistics(session: Session, map_id: UUID) -> tuple[MapStatistics, datetime]:
     """The map's figures, and the time for which they hold."""
-    if is_large(session, map_id):
-        kept = session.get(MapFigures, map_id)
+    if is_large_map(session, map_id):
+        kept = session.get(CachedMapStatistics, map_id)
         if kept is not None:
-            return Figures(**kept.figures), kept.counted_at
-    return count_figures(session, map_id), session.execute(select(db_now())).scalar_one()
+            return MapStatistics(**kept.figures), kept.counted_at
+    return compute_map_statistics(session, map_id), session.execute(select(db_now())).scalar_one()
 
 
-def is_large(session: Session, map_id: UUID) -> bool:
+def is_large_map(session: Session, map_id: UUID) -> bool:
     """Whether the map has too much to be counted for every caller."""
     of_map: tuple[Select[Any], ...] = (
         select(literal(1)).select_from(Photo).where(Photo.map_id == map_id),
         select(literal(1)).select_from(Job).where(Job.map_id == map_id),
         select(literal(1)).select_from(Search).where(Search.map_id == map_id),
     )
-    most = COUNTED_NOW + 1
+    most = MAX_EXACT_COUNT + 1
     return any(
         session.scalar(select(func.count()).select_from(rows.limit(most).subquery())) == most
         for rows in of_map
     )
 
 
-def count_figures(session: Session, map_id: UUID) -> Figures:
+def compute_map_statistics(session: Session, map_id: UUID) -> MapStatistics:
     """Count everything; on a map with a million photos this takes seconds."""
     generation = active_generation(session, map_id)
     live = (Photo.map_id == map_id) & Photo.deleted_at.is_(None)
@@ -98,13 +98,13 @@ def count_figures(session: Session, map_id: UUID) -> Figures:
     jobs = select(Job.state, func.count()).where(Job.map_id == map_id).group_by(Job.state)
     recent = select(func.count()).select_from(Photo).where(live, Photo.uploaded_at > day)
     located = (
-        [count_located(session, generation.id, role) for role in PhotoRole]
+        [count_geotagged(session, generation.id, role) for role in PhotoRole]
         if generation
         else [0, 0]
     )
-    return Figures(
-        photos=count_live(session, map_id, PhotoRole.DATABASE),
-        labelled_queries=count_live(session, map_id, PhotoRole.QUERY),
+    return MapStatistics(
+        photos=count_live_photos(session, map_id, PhotoRole.DATABASE),
+        labelled_queries=count_live_photos(session, map_id, PhotoRole.QUERY),
         photo_bytes=int(session.scalar(select(func.sum(Photo.size_bytes)).where(live)) or 0),
         uploads_24h=session.scalar(recent) or 0,
         searchable=count_searchable(session, generation.id) if generation else 0,
@@ -118,19 +118,21 @@ def count_figures(session: Session, map_id: UUID) -> Figures:
     )
 
 
-def is_due(session: Session, map_id: UUID) -> bool:
+def are_statistics_stale(session: Session, map_id: UUID) -> bool:
     """Whether a large map's figures have become old."""
-    kept = session.get(MapFigures, map_id)
+    kept = session.get(CachedMapStatistics, map_id)
     if kept is None:
         return True
-    age = max(LEAST_AGE_SECONDS, REST * kept.took_seconds)
+    age = max(MIN_STATISTICS_AGE_SECONDS, RECOUNT_REST_FACTOR * kept.took_seconds)
     return bool(session.scalar(select(literal(kept.counted_at, UtcDateTime()) < db_now_plus(-age))))
 
 
-def keep_figures(session: Session, map_id: UUID) -> None:
+def cache_map_statistics(session: Session, map_id: UUID) -> None:
     """Count, and keep the figures."""
     started = time.perf_counter()
     now = session.execute(select(db_now())).scalar_one()
-    figures = asdict(count_figures(session, map_id))
+    figures = asdict(compute_map_statistics(session, map_id))
     took = time.perf_counter() - started
-    session.merge(MapFigures(map_id=map_id, figures=figures, counted_at=now, took_seconds=took))
+    session.merge(
+        CachedMapStatistics(map_id=map_id, figures=figures, counted_at=now, took_seconds=took)
+    )

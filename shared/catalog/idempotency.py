@@ -22,14 +22,14 @@ from sqlalchemy import Index, Integer, String, Text, UniqueConstraint, Uuid, del
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
-from shared.catalog.base import Base, JsonValue, UtcDateTime, db_now, db_now_plus, rowcount
+from shared.catalog.base import Base, JsonValue, UtcDateTime, affected_rows, db_now, db_now_plus
 from shared.errors import Conflict, Unprocessable
 from shared.ids import new_id
 
 IN_USE_RETRY_SECONDS = 1
 
 
-class KeyedCall(Base):
+class IdempotencyRecord(Base):
     """One call under a key. `scope` is whose key it is: two callers may choose the same one."""
 
     __tablename__ = "idempotency_keys"
@@ -54,7 +54,7 @@ class KeyedCall(Base):
 
 
 @dataclass(frozen=True, slots=True)
-class CallMade:
+class RequestIdentity:
     """What tells a repeated call from another one under the same key."""
 
     scope: str
@@ -65,32 +65,32 @@ class CallMade:
 
 
 @dataclass(frozen=True, slots=True)
-class KeptAnswer:
+class StoredResponse:
     status: int
     headers: dict[str, str]
     body: str
     """JSON, as it was sent."""
 
 
-def claim_key(
-    session: Session, made: CallMade, *, lease_seconds: float, life_seconds: float
-) -> UUID | KeptAnswer:
+def claim_idempotency_key(
+    session: Session, request: RequestIdentity, *, lease_seconds: float, life_seconds: float
+) -> UUID | StoredResponse:
     """A token under which the call may be done, or the answer that it was given already.
 
     Raises Unprocessable (`idempotency_key_reused`) when another call was made under the key, and
     Conflict (`idempotency_key_in_use`) while the same call is under way.
     """
     while True:
-        token = _insert(session, made, lease_seconds, life_seconds)
+        token = _insert(session, request, lease_seconds, life_seconds)
         if token is not None:
             return token
         found = session.execute(
             select(
-                KeyedCall,
-                (KeyedCall.expires_at <= db_now()).label("expired"),
-                (KeyedCall.lease_until > db_now()).label("held"),
+                IdempotencyRecord,
+                (IdempotencyRecord.expires_at <= db_now()).label("expired"),
+                (IdempotencyRecord.lease_until > db_now()).label("held"),
             )
-            .where(KeyedCall.scope == made.scope, KeyedCall.key == made.key)
+            .where(IdempotencyRecord.scope == request.scope, IdempotencyRecord.key == request.key)
             .with_for_update()
             .execution_options(populate_existing=True)
         ).one_or_none()
@@ -98,17 +98,17 @@ def claim_key(
             continue  # given back since the insert met it
         row, expired, held = found
         if not expired:
-            if (row.call, row.fingerprint) != (made.call, made.fingerprint):
+            if (row.call, row.fingerprint) != (request.call, request.fingerprint):
                 raise Unprocessable(
                     "idempotency_key_reused",
                     "Another call was made with this Idempotency-Key. Take a new key for each "
                     "call, and the same one only to repeat it.",
                 )
             if row.status is not None:
-                return KeptAnswer(row.status, row.headers or {}, row.body or "")
+                return StoredResponse(row.status, row.headers or {}, row.body or "")
             if held:
-                raise in_use()
-        row.call, row.fingerprint = made.call, made.fingerprint
+                raise key_in_use_error()
+        row.call, row.fingerprint = request.call, request.fingerprint
         row.token = new_id()
         row.lease_until = db_now_plus(lease_seconds)
         row.expires_at = db_now_plus(life_seconds)
@@ -117,25 +117,29 @@ def claim_key(
         return row.token
 
 
-def keep_answer(session: Session, token: UUID, answer: KeptAnswer) -> None:
+def store_response(session: Session, token: UUID, response: StoredResponse) -> None:
     """The call's answer from now on. Conflict (`idempotency_key_in_use`), which must undo the
     caller's transaction, when the lease has expired and someone else does the call."""
     kept = session.execute(
-        update(KeyedCall)
-        .where(KeyedCall.token == token)
-        .values(status=answer.status, headers=answer.headers, body=answer.body)
+        update(IdempotencyRecord)
+        .where(IdempotencyRecord.token == token)
+        .values(status=response.status, headers=response.headers, body=response.body)
         .execution_options(synchronize_session=False)
     )
-    if not rowcount(kept):
-        raise in_use()
+    if not affected_rows(kept):
+        raise key_in_use_error()
 
 
-def release_key(session: Session, token: UUID) -> None:
+def release_idempotency_key(session: Session, token: UUID) -> None:
     """The call has had no effect: it may be made again at once."""
-    session.execute(delete(KeyedCall).where(KeyedCall.token == token, KeyedCall.status.is_(None)))
+    session.execute(
+        delete(IdempotencyRecord).where(
+            IdempotencyRecord.token == token, IdempotencyRecord.status.is_(None)
+        )
+    )
 
 
-def in_use() -> Conflict:
+def key_in_use_error() -> Conflict:
     return Conflict(
         "idempotency_key_in_use",
         "The same call is under way with this Idempotency-Key. Repeat it a little later.",
@@ -144,14 +148,14 @@ def in_use() -> Conflict:
 
 
 def _insert(
-    session: Session, made: CallMade, lease_seconds: float, life_seconds: float
+    session: Session, made: RequestIdentity, lease_seconds: float, life_seconds: float
 ) -> UUID | None:
     """The new row's token; None when the key has a row."""
     token = new_id()
     try:
         with session.begin_nested():
             session.add(
-                KeyedCall(
+                IdempotencyRecord(
                     scope=made.scope,
                     key=made.key,
                     call=made.call,

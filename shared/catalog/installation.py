@@ -24,7 +24,7 @@ from shared.catalog.vocabularies import Vocabulary
 from shared.catalog.whitenings import StoredWhitening
 from shared.ids import new_id
 from shared.objects import OwnedStore
-from shared.objects.folder import MARK
+from shared.objects.folder import OWNER_MARK
 from shared.objects.open_store import open_store
 from shared.objects.store_owner import Place, check_free, claim_store, place_of
 from shared.settings import Settings
@@ -50,7 +50,7 @@ class Installation(Base):
     __table_args__ = (CheckConstraint("number = 1", name="there_is_one"),)
 
 
-def ensure_installation(session: Session) -> Installation:
+def get_or_create_installation(session: Session) -> Installation:
     """The catalog's row, made on first use."""
     found: Installation | None = session.scalar(select(Installation))
     if found is not None:
@@ -65,15 +65,15 @@ def ensure_installation(session: Session) -> Installation:
     return made
 
 
-def open_own_store(catalog: Catalog, settings: Settings, *, alone: bool) -> OwnedStore:
+def open_installation_store(catalog: Catalog, settings: Settings, *, exclusive: bool) -> OwnedStore:
     """The object store of the settings, once it is sure to be this catalog's own.
 
     Raises Misconfigured as `open_store` and `claim_store` do, and Unavailable for a bucket that
     can't be used now.
     """
-    store = open_store(settings, alone=alone)
+    store = open_store(settings, exclusive=exclusive)
     with catalog.write() as session:
-        installation = ensure_installation(session)
+        installation = get_or_create_installation(session)
     place = claim_store(
         store,
         installation.id,
@@ -84,23 +84,23 @@ def open_own_store(catalog: Catalog, settings: Settings, *, alone: bool) -> Owne
     )
     if place != installation.bucket:
         with catalog.write() as session:
-            ensure_installation(session).bucket = place
+            get_or_create_installation(session).bucket = place
     return store
 
 
 def check_before_new_catalog(catalog: Catalog, settings: Settings) -> None:
     """Refuse to create an SQLite catalog beside objects of another one, before its file exists: a
-    restored file would otherwise meet the new one. Misconfigured as `open_own_store`."""
+    restored file would otherwise meet the new one. Misconfigured as `open_installation_store`."""
     file = Path(catalog.url.database or "") if catalog.is_sqlite else None
     if file is not None and (not file.exists() or file.stat().st_size == 0):
-        check_free(open_store(settings, alone=False), settings.import_prefix)
+        check_free(open_store(settings, exclusive=False), settings.import_prefix)
 
 
 def adopt_store(catalog: Catalog, store: OwnedStore) -> None:
     """Make this catalog the owner of the store, whoever owned it."""
     with catalog.write() as session:
-        installation = ensure_installation(session)
-        store.write_note(MARK, str(installation.id).encode())
+        installation = get_or_create_installation(session)
+        store.write_note(OWNER_MARK, str(installation.id).encode())
         installation.bucket = place_of(store)
 
 

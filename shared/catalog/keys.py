@@ -13,13 +13,13 @@ from uuid import UUID
 from sqlalchemy import BigInteger, Integer, String, Text, Uuid, func, or_, select, update
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
-from shared.api_keys import Scope, hash_key, new_key, shown_prefix
+from shared.api_keys import Scope, api_key_prefix, generate_api_key, hash_api_key
 from shared.catalog.base import Base, JsonValue, UtcDateTime, db_now, db_now_plus
 from shared.catalog.photos import Photo
 from shared.errors import NotFound, Unauthorized
 from shared.ids import new_id
 
-USE_NOTED_SECONDS = 60.0  # `last_used_at` is no finer
+LAST_USED_RESOLUTION_SECONDS = 60.0  # `last_used_at` is no finer
 
 
 class ApiKey(Base):
@@ -50,7 +50,7 @@ class KeyLimits:
     max_photos: int | None = None
 
 
-def make_key(
+def create_api_key(
     session: Session,
     name: str,
     scopes: Collection[Scope],
@@ -59,11 +59,11 @@ def make_key(
     limits: KeyLimits = KeyLimits(),
 ) -> tuple[ApiKey, str]:
     """A new key's row, and the key itself: to be shown now or never."""
-    key = new_key()
+    key = generate_api_key()
     row = ApiKey(
         name=name,
-        prefix=shown_prefix(key),
-        sha256=hash_key(key),
+        prefix=api_key_prefix(key),
+        sha256=hash_api_key(key),
         scopes=sorted(scopes),
         expires_at=None if life_seconds is None else db_now_plus(life_seconds),
         requests_per_minute=limits.requests_per_minute,
@@ -76,7 +76,7 @@ def make_key(
     return row, key
 
 
-def find_key(session: Session, sha256: str) -> ApiKey:
+def authenticate_api_key(session: Session, sha256: str) -> ApiKey:
     """The key that may be used now. Unauthorized (`key_unknown`, `key_revoked`, `key_expired`)."""
     found = session.execute(
         select(ApiKey, (ApiKey.expires_at <= db_now()).label("expired")).where(
@@ -97,12 +97,12 @@ def find_key(session: Session, sha256: str) -> ApiKey:
     return key
 
 
-def list_keys(session: Session) -> list[ApiKey]:
+def list_api_keys(session: Session) -> list[ApiKey]:
     """Every key that was ever made, newest first."""
     return list(session.scalars(select(ApiKey).order_by(ApiKey.id.desc())))
 
 
-def revoke_key(session: Session, key_id: UUID) -> ApiKey:
+def revoke_api_key(session: Session, key_id: UUID) -> ApiKey:
     """From this commit on the key opens nothing. NotFound (`key_not_found`)."""
     found = session.get(ApiKey, key_id, with_for_update=True)
     if found is None:
@@ -123,7 +123,7 @@ def has_admin_key(session: Session) -> bool:
     return any(Scope.ADMIN in scopes for scopes in session.scalars(usable))
 
 
-def note_use(session: Session, key_id: UUID) -> None:
+def record_key_use(session: Session, key_id: UUID) -> None:
     """The key was used now; written only where that was not noted within the last minute."""
     session.execute(
         update(ApiKey)
@@ -131,7 +131,7 @@ def note_use(session: Session, key_id: UUID) -> None:
             ApiKey.id == key_id,
             or_(
                 ApiKey.last_used_at.is_(None),
-                ApiKey.last_used_at < db_now_plus(-USE_NOTED_SECONDS),
+                ApiKey.last_used_at < db_now_plus(-LAST_USED_RESOLUTION_SECONDS),
             ),
         )
         .values(last_used_at=db_now())
@@ -139,7 +139,7 @@ def note_use(session: Session, key_id: UUID) -> None:
     )
 
 
-def count_photos_of(session: Session, key_id: UUID, most: int) -> int:
-    """Live photos that came in with the key, counted up to `most`."""
-    some = select(Photo.id).where(Photo.key_id == key_id, Photo.deleted_at.is_(None)).limit(most)
+def count_photos_of_key(session: Session, key_id: UUID, limit: int) -> int:
+    """Live photos that came in with the key, counted up to `limit`."""
+    some = select(Photo.id).where(Photo.key_id == key_id, Photo.deleted_at.is_(None)).limit(limit)
     return session.scalar(select(func.count()).select_from(some.subquery())) or 0

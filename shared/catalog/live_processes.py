@@ -21,19 +21,19 @@ from sqlalchemy import String, Uuid, delete, select, update
 from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
-from shared.catalog.away import Outage
+from shared.catalog.away import OutageLog
 from shared.catalog.base import Base, UtcDateTime, db_now, db_now_plus
 from shared.catalog.session import Catalog
 from shared.ids import new_id
 
 log = logging.getLogger(__name__)
 
-EVERY_SECONDS = 10.0
-DEAD_SECONDS = 35.0  # three of them, and a little
-FORGOTTEN_SECONDS = 86_400.0
+PROCESS_HEARTBEAT_SECONDS = 10.0
+PROCESS_TIMEOUT_SECONDS = 35.0  # three of them, and a little
+PROCESS_RETENTION_SECONDS = 86_400.0
 
 
-class LiveProcess(Base):
+class RegisteredProcess(Base):
     """One process; `role` is the name of its command."""
 
     __tablename__ = "live_processes"
@@ -47,30 +47,30 @@ class LiveProcess(Base):
 
 
 @dataclass(frozen=True, slots=True)
-class Living:
+class ProcessStatus:
     role: str
     name: str
     release: str
-    silent_seconds: float
+    seconds_since_heartbeat: float
 
 
 @contextlib.contextmanager
-def signs_of_life(catalog: Catalog, role: str) -> Iterator[None]:
+def process_heartbeat(catalog: Catalog, role: str) -> Iterator[None]:
     """While the block runs, a thread says every EVERY_SECONDS that this process lives. While the
     catalog is away it says nothing, and is the first to notice that nobody listens."""
     process_id, stop = new_id(), threading.Event()
     name = f"{socket.gethostname()}-{os.getpid()}"
-    outage = Outage(f"{role}'s sign of life")
+    outage = OutageLog(f"{role}'s sign of life")
 
     def tell() -> None:
         while True:
             try:
                 with catalog.write() as session:
-                    _tell(session, process_id, role, name)
-                outage.over()
+                    _upsert_process(session, process_id, role, name)
+                outage.record_success()
             except SQLAlchemyError as error:
-                outage.met(error)
-            if stop.wait(EVERY_SECONDS):
+                outage.record_error(error)
+            if stop.wait(PROCESS_HEARTBEAT_SECONDS):
                 return
 
     teller = threading.Thread(target=tell, name="signs-of-life", daemon=True)
@@ -82,32 +82,36 @@ def signs_of_life(catalog: Catalog, role: str) -> Iterator[None]:
         teller.join()
         try:
             with catalog.write() as session:
-                session.execute(delete(LiveProcess).where(LiveProcess.id == process_id))
+                session.execute(delete(RegisteredProcess).where(RegisteredProcess.id == process_id))
         except SQLAlchemyError as error:
             log.info("this process could not sign off: %s", error)
 
 
-def _tell(session: Session, process_id: UUID, role: str, name: str) -> None:
+def _upsert_process(session: Session, process_id: UUID, role: str, name: str) -> None:
     touched = session.execute(
-        update(LiveProcess)
-        .where(LiveProcess.id == process_id)
+        update(RegisteredProcess)
+        .where(RegisteredProcess.id == process_id)
         .values(seen_at=db_now())
-        .returning(LiveProcess.id)
+        .returning(RegisteredProcess.id)
     )
     if touched.first() is None:
         session.execute(
-            delete(LiveProcess).where(LiveProcess.seen_at < db_now_plus(-FORGOTTEN_SECONDS))
+            delete(RegisteredProcess).where(
+                RegisteredProcess.seen_at < db_now_plus(-PROCESS_RETENTION_SECONDS)
+            )
         )
-        session.add(LiveProcess(id=process_id, role=role, name=name, release=version("placewise")))
+        session.add(
+            RegisteredProcess(id=process_id, role=role, name=name, release=version("placewise"))
+        )
 
 
-def living(session: Session) -> list[Living]:
+def list_processes(session: Session) -> list[ProcessStatus]:
     """Every process that was heard of in the last day; who is silent for DEAD_SECONDS is dead, or
     was killed."""
     found = session.execute(
-        select(LiveProcess, db_now()).order_by(LiveProcess.role, LiveProcess.name)
+        select(RegisteredProcess, db_now()).order_by(RegisteredProcess.role, RegisteredProcess.name)
     )
     return [
-        Living(one.role, one.name, one.release, (now - one.seen_at).total_seconds())
+        ProcessStatus(one.role, one.name, one.release, (now - one.seen_at).total_seconds())
         for one, now in found
     ]

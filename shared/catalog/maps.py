@@ -19,8 +19,8 @@ from shared.errors import Conflict, NotFound
 from shared.ids import new_id
 
 DEFAULT_MAP = "default"
-MAP_NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$"
-DELETED = "deleted/"  # no name that people can give holds a slash
+MAP_NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$"
+DELETED_NAME_PREFIX = "deleted/"  # no name that people can give holds a slash
 
 
 class Map(Journaled, Base):
@@ -58,12 +58,12 @@ def mark_map_deleted(session: Session, map_: Map) -> None:
 
     What belongs to it goes later: `services.steward.delete_maps`.
     """
-    map_.name = f"{DELETED}{map_.id}"
+    map_.name = f"{DELETED_NAME_PREFIX}{map_.id}"
     map_.deleted_at = db_now()
     session.flush()
 
 
-def ensure_default_map(session: Session, extractor: str) -> Map:
+def get_or_create_default_map(session: Session, extractor: str) -> Map:
     """The map named `default`, made on first use."""
     found = session.scalar(select(Map).where(Map.name == DEFAULT_MAP))
     if found is not None:
@@ -101,7 +101,7 @@ def lock_map(session: Session, map_id: UUID) -> Map:
     ).one()
 
 
-def bump_version(session: Session, map_id: UUID) -> int:
+def increment_map_version(session: Session, map_id: UUID) -> int:
     """One more: search workers following the map will look again. Returns the new version.
 
     The row stays locked until commit, so versions become visible in the order of their numbers.

@@ -22,12 +22,12 @@ from shared.catalog.base import (
     json_array_has,
 )
 from shared.catalog.photos import Photo, PhotoRole
-from shared.geodesy import latitude_band, longitude_reach
-from shared.photo_filter import EVERYTHING, Box, Circle, PhotoFilter
+from shared.geodesy import latitude_bounds, longitude_half_width
+from shared.photo_filter import NO_FILTER, Box, Circle, PhotoFilter
 
 # Further than that nobody counts, nor turns pages: a count costs as much as it counts.
-COUNTED_AT_MOST = 10_000
-TRIGRAM = 3
+MAX_COUNTED_MATCHES = 10_000
+TRIGRAM_CHARACTERS = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +40,7 @@ class MetadataFilter:
     upload_before: datetime | None = None
     min_file_size: int | None = None
     max_file_size: int | None = None
-    photos: PhotoFilter = EVERYTHING
+    photos: PhotoFilter = NO_FILTER
     """Where, when and what the photo shows."""
     role: PhotoRole | None = None
 
@@ -49,7 +49,7 @@ class MetadataFilter:
         found: list[Condition] = []
         if self.filename is not None:
             found.append(photo.filename.icontains(self.filename, autoescape=True))
-            if trigrams and len(self.filename) >= TRIGRAM:
+            if trigrams and len(self.filename) >= TRIGRAM_CHARACTERS:
                 part = filename_trigrams(literal(self.filename))
                 found.append(filename_trigrams(photo.filename).bool_op("@>")(part))
         if self.upload_after is not None:
@@ -65,29 +65,29 @@ class MetadataFilter:
         return found + filter_conditions(self.photos, photo)
 
 
-def filter_conditions(wanted: PhotoFilter, photo: type[Photo] = Photo) -> list[Condition]:
+def filter_conditions(photo_filter: PhotoFilter, photo: type[Photo] = Photo) -> list[Condition]:
     """The filter in SQL."""
     found: list[Condition] = []
-    if wanted.near is not None:
-        found += _within(wanted.near, photo)
-    if wanted.box is not None:
-        found += _inside(wanted.box, photo)
-    if wanted.captured_after is not None:
-        found.append(photo.captured_at >= wanted.captured_after)
-    if wanted.captured_before is not None:
-        found.append(photo.captured_at <= wanted.captured_before)
-    if wanted.place is not None:
-        found.append(photo.place == wanted.place)
-    if wanted.ids is not None:
-        found.append(photo.id.in_(wanted.ids))
-    found.extend(json_array_has(photo.tags, tag) for tag in wanted.tags)
+    if photo_filter.near is not None:
+        found += _circle_conditions(photo_filter.near, photo)
+    if photo_filter.box is not None:
+        found += _box_conditions(photo_filter.box, photo)
+    if photo_filter.captured_after is not None:
+        found.append(photo.captured_at >= photo_filter.captured_after)
+    if photo_filter.captured_before is not None:
+        found.append(photo.captured_at <= photo_filter.captured_before)
+    if photo_filter.place is not None:
+        found.append(photo.place == photo_filter.place)
+    if photo_filter.ids is not None:
+        found.append(photo.id.in_(photo_filter.ids))
+    found.extend(json_array_has(photo.tags, tag) for tag in photo_filter.tags)
     return found
 
 
-def search_metadata(
+def search_photos(
     session: Session,
     map_id: UUID,
-    wanted: MetadataFilter,
+    metadata_filter: MetadataFilter,
     limit: int,
     after: tuple[datetime, UUID] | None,
 ) -> tuple[list[Photo], int]:
@@ -95,14 +95,14 @@ def search_metadata(
     up to COUNTED_AT_MOST."""
     on_postgres = session.get_bind().dialect.name == "postgresql"
     live = [Photo.map_id == map_id, Photo.deleted_at.is_(None)]
-    conditions = [*live, *wanted.conditions(trigrams=on_postgres)]
-    counted = select(literal(1)).select_from(Photo).where(*conditions).limit(COUNTED_AT_MOST)
+    conditions = [*live, *metadata_filter.conditions(trigrams=on_postgres)]
+    counted = select(literal(1)).select_from(Photo).where(*conditions).limit(MAX_COUNTED_MATCHES)
     total = session.scalar(select(func.count()).select_from(counted.subquery())) or 0
     newest = (Photo.uploaded_at.desc(), Photo.id.desc())
     if after is not None:
-        live.append(tuple_(Photo.uploaded_at, Photo.id) < tuple_(*_bound(after)))
+        live.append(tuple_(Photo.uploaded_at, Photo.id) < tuple_(*_cursor_bound(after)))
     page: Select[Photo]
-    if total < COUNTED_AT_MOST:
+    if total < MAX_COUNTED_MATCHES:
         rare = select(Photo.id).where(*conditions).cte("rare")
         page = select(Photo).join(rare.prefix_with("MATERIALIZED"), rare.c.id == Photo.id)
         page = page.where(*live).order_by(*newest)
@@ -111,18 +111,18 @@ def search_metadata(
         # index of theirs and sort hundreds of thousands.
         walked = select(Photo).where(*live).order_by(*newest).offset(0).subquery()
         seen = aliased(Photo, walked)
-        page = select(seen).where(*wanted.conditions(seen, trigrams=False))
+        page = select(seen).where(*metadata_filter.conditions(seen, trigrams=False))
         page = page.order_by(seen.uploaded_at.desc(), seen.id.desc())
     return list(session.scalars(page.limit(limit))), total
 
 
-def _within(circle: Circle, photo: type[Photo]) -> list[Condition]:
-    south, north = latitude_band(circle.latitude, circle.radius_m)
+def _circle_conditions(circle: Circle, photo: type[Photo]) -> list[Condition]:
+    south, north = latitude_bounds(circle.latitude, circle.radius_m)
     away = db_distance_m(
         literal(circle.latitude), literal(circle.longitude), photo.latitude, photo.longitude
     )
     found = [photo.latitude.between(south, north), away <= circle.radius_m]
-    reach = longitude_reach(circle.latitude, circle.radius_m)
+    reach = longitude_half_width(circle.latitude, circle.radius_m)
     if reach is None or reach >= 180:
         return found
     # What the index can sort out by itself; the distance decides.
@@ -133,21 +133,21 @@ def _within(circle: Circle, photo: type[Photo]) -> list[Condition]:
         north=north,
         east=east - 360 if east > 180 else east,
     )
-    found.append(or_(*_longitudes(around, photo)))
+    found.append(or_(*_longitude_conditions(around, photo)))
     return found
 
 
-def _inside(box: Box, photo: type[Photo]) -> list[Condition]:
+def _box_conditions(box: Box, photo: type[Photo]) -> list[Condition]:
     at_a_pole = [func.abs(photo.latitude) == 90.0] if box.north == 90 or box.south == -90 else []
     return [
         photo.latitude.between(box.south, box.north),
-        or_(*at_a_pole, *_longitudes(box, photo)),
+        or_(*at_a_pole, *_longitude_conditions(box, photo)),
     ]
 
 
-def _longitudes(box: Box, photo: type[Photo]) -> list[Condition]:
+def _longitude_conditions(box: Box, photo: type[Photo]) -> list[Condition]:
     return [photo.longitude.between(west, east) for west, east in box.longitude_ranges()]
 
 
-def _bound(after: tuple[datetime, UUID]) -> tuple[object, object]:
+def _cursor_bound(after: tuple[datetime, UUID]) -> tuple[object, object]:
     return literal(after[0], UtcDateTime()), literal(after[1], Uuid())

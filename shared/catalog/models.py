@@ -48,7 +48,7 @@ class Model(Journaled, Base):
     )
 
 
-def ensure_model(
+def get_or_create_model(
     session: Session, name: str, fingerprint: str, licence: str, card: dict[str, Any]
 ) -> Model:
     """The row of these weights, made on first use."""

@@ -31,7 +31,7 @@ from sqlalchemy.orm import Mapped, Session, mapped_column
 from shared.catalog.base import (
     Base,
     Condition,
-    Degrees,
+    CoordinateColumn,
     JsonValue,
     UtcDateTime,
     db_now,
@@ -70,8 +70,8 @@ class Photo(Journaled, Base):
     size_bytes: Mapped[int] = mapped_column(BigInteger)
     width: Mapped[int] = mapped_column(Integer)
     height: Mapped[int] = mapped_column(Integer)
-    latitude: Mapped[float | None] = mapped_column(Degrees)
-    longitude: Mapped[float | None] = mapped_column(Degrees)
+    latitude: Mapped[float | None] = mapped_column(CoordinateColumn)
+    longitude: Mapped[float | None] = mapped_column(CoordinateColumn)
     heading: Mapped[float | None] = mapped_column(Float)
     captured_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
     place: Mapped[str | None] = mapped_column(Text)
@@ -147,7 +147,7 @@ class Photo(Journaled, Base):
 
 
 @dataclass(frozen=True, slots=True)
-class PhotoFacts:
+class PhotoFilterValues:
     """What search keeps of a photo, to filter by."""
 
     COLUMNS: ClassVar = (
@@ -192,7 +192,7 @@ def get_photo(session: Session, map_id: UUID, photo_id: UUID) -> Photo:
     return photo
 
 
-def find_live_by_sha256(session: Session, map_id: UUID, sha256: str) -> Photo | None:
+def find_photo_by_sha256(session: Session, map_id: UUID, sha256: str) -> Photo | None:
     """The live photo with these bytes, if the map has it."""
     return session.scalar(
         select(Photo).where(
@@ -201,7 +201,7 @@ def find_live_by_sha256(session: Session, map_id: UUID, sha256: str) -> Photo | 
     )
 
 
-def live_photos(session: Session, photo_ids: Iterable[UUID]) -> dict[UUID, Photo]:
+def get_live_photos(session: Session, photo_ids: Iterable[UUID]) -> dict[UUID, Photo]:
     """Those of the photos that are live, by id."""
     found = session.scalars(
         select(Photo).where(Photo.id.in_(list(photo_ids)), Photo.deleted_at.is_(None))
@@ -209,15 +209,19 @@ def live_photos(session: Session, photo_ids: Iterable[UUID]) -> dict[UUID, Photo
     return {photo.id: photo for photo in found}
 
 
-def changed_since(session: Session, map_id: UUID, version: int) -> list[PhotoFacts]:
+def list_photos_changed_since(
+    session: Session, map_id: UUID, version: int
+) -> list[PhotoFilterValues]:
     """Photos of the map that were changed or deleted after `version`, as they are now."""
     found = session.execute(
-        select(*PhotoFacts.COLUMNS).where(Photo.map_id == map_id, Photo.changed_version > version)
+        select(*PhotoFilterValues.COLUMNS).where(
+            Photo.map_id == map_id, Photo.changed_version > version
+        )
     )
-    return [PhotoFacts(*facts) for facts in found]
+    return [PhotoFilterValues(*facts) for facts in found]
 
 
-def count_live(session: Session, map_id: UUID, role: PhotoRole | None = None) -> int:
+def count_live_photos(session: Session, map_id: UUID, role: PhotoRole | None = None) -> int:
     """How many live photos the map has, of one role or of any."""
     counted = (
         select(func.count())
@@ -229,7 +233,7 @@ def count_live(session: Session, map_id: UUID, role: PhotoRole | None = None) ->
     return session.scalar(counted) or 0
 
 
-def has_live(session: Session, map_id: UUID, role: PhotoRole) -> bool:
+def has_live_photo(session: Session, map_id: UUID, role: PhotoRole) -> bool:
     """Whether the map has a live photo of the role."""
     wanted = select(Photo.id).where(
         Photo.map_id == map_id, Photo.deleted_at.is_(None), Photo.role == role
@@ -237,12 +241,12 @@ def has_live(session: Session, map_id: UUID, role: PhotoRole) -> bool:
     return session.scalar(wanted.limit(1)) is not None
 
 
-def has_place() -> Condition:
+def is_geotagged() -> Condition:
     """True for photos with coordinates or a place label."""
     return or_(Photo.latitude.is_not(None), Photo.place.is_not(None))
 
 
-def mark_deleted(session: Session, photo: Photo, version: int) -> None:
+def mark_photo_deleted(session: Session, photo: Photo, version: int) -> None:
     """The photo is gone from every answer from this commit on; its bytes go later."""
     session.execute(
         update(Photo)

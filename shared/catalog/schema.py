@@ -19,8 +19,8 @@ from alembic.script import ScriptDirectory
 from sqlalchemy import inspect, text
 from sqlalchemy.exc import DBAPIError, SQLAlchemyError
 
-from shared.catalog.away import as_unavailable, sqlstate
-from shared.catalog.connections import Limits
+from shared.catalog.away import get_sqlstate, to_unavailable
+from shared.catalog.connections import TransactionTimeouts
 from shared.catalog.session import Catalog
 from shared.catalog.unusable import check_pages, opening
 from shared.errors import Misconfigured, PlacewiseError, Unavailable
@@ -29,24 +29,24 @@ from shared.private_files import FILE_MODE, make_private_folder
 log = logging.getLogger(__name__)
 
 MIGRATIONS = Path(__file__).parent / "migrations"
-ADVISORY_LOCK = 1886151011  # "plac" in ASCII
+ADVISORY_LOCK_ID = 1886151011  # "plac" in ASCII
 
 # Whoever asks for a table's strongest lock makes everyone behind him wait as long as he does: less
 # than a request waits for a lock. A statement that has its lock may take any time.
-MIGRATION_LIMITS = Limits(statement_seconds=0, lock_seconds=1.0)
+MIGRATION_TIMEOUTS = TransactionTimeouts(statement_seconds=0, lock_seconds=1.0)
 LOCK_NOT_AVAILABLE = "55P03"
 DEADLOCK = "40P01"
-PATIENCE_SECONDS = 300.0
-PAUSE_SECONDS = 1.0
-LOOK_SECONDS = 0.5
+MIGRATION_TIMEOUT_SECONDS = 300.0
+LOCK_RETRY_SECONDS = 1.0
+SCHEMA_POLL_SECONDS = 0.5
 
 
-def migrate(catalog: Catalog, patience_seconds: float = PATIENCE_SECONDS) -> None:
+def migrate(catalog: Catalog, timeout_seconds: float = MIGRATION_TIMEOUT_SECONDS) -> None:
     """Bring the schema to this release's; safe from several processes at once, beside a fleet.
 
     On PostgreSQL each migration is a transaction of its own, which gives up after a second when it
     can't have a lock and is tried again: traffic goes on meanwhile. Raises Unavailable
-    (`catalog_unavailable`; `catalog_busy` when a lock was not to be had for `patience_seconds`)
+    (`catalog_unavailable`; `catalog_busy` when a lock was not to be had for `timeout_seconds`)
     and Misconfigured (`schema_too_new`, and for a file that can't be used as `opening` does).
     """
     try:
@@ -55,9 +55,9 @@ def migrate(catalog: Catalog, patience_seconds: float = PATIENCE_SECONDS) -> Non
                 check_pages(catalog)
                 _migrate_sqlite(catalog)
         else:
-            _migrate_postgres(catalog, time.monotonic() + patience_seconds)
+            _migrate_postgres(catalog, time.monotonic() + timeout_seconds)
     except SQLAlchemyError as error:
-        unavailable = as_unavailable(error)
+        unavailable = to_unavailable(error)
         if unavailable is None:
             raise
         raise unavailable from error
@@ -72,7 +72,7 @@ def check_schema(catalog: Catalog) -> None:
     scripts = ScriptDirectory.from_config(_config())
     known = {script.revision for script in scripts.walk_revisions()}
     head = scripts.get_current_head()
-    present, understood_from = _stored(catalog)
+    present, understood_from = _read_schema_revision(catalog)
     if present == head:
         return
     if present is None or present in known:
@@ -110,7 +110,7 @@ def wait_for_schema(catalog: Catalog, seconds: float) -> None:
             check_schema(catalog)
             return
         except (Misconfigured, SQLAlchemyError) as error:
-            reason = as_unavailable(error) or error
+            reason = to_unavailable(error) or error
             hopeless = isinstance(reason, Misconfigured) and reason.code == "schema_too_new"
             if not isinstance(reason, PlacewiseError):
                 raise
@@ -119,10 +119,10 @@ def wait_for_schema(catalog: Catalog, seconds: float) -> None:
             if not told:
                 told = True
                 log.warning("waiting up to %g s: %s", seconds, reason.detail)
-        time.sleep(LOOK_SECONDS)
+        time.sleep(SCHEMA_POLL_SECONDS)
 
 
-def _stored(catalog: Catalog) -> tuple[str | None, str | None]:
+def _read_schema_revision(catalog: Catalog) -> tuple[str | None, str | None]:
     """The schema's revision, and the oldest one whose release understands it."""
     with catalog.read() as session:
         tables = set(inspect(session.connection()).get_table_names())
@@ -147,8 +147,8 @@ def _migrate_sqlite(catalog: Catalog) -> None:
 
 
 def _migrate_postgres(catalog: Catalog, deadline: float) -> None:
-    engine = catalog.engine.execution_options(placewise_limits=MIGRATION_LIMITS)
-    with _alone(catalog, deadline):
+    engine = catalog.engine.execution_options(placewise_limits=MIGRATION_TIMEOUTS)
+    with _migration_lock(catalog, deadline):
         while True:
             try:
                 with engine.connect() as connection:
@@ -157,21 +157,23 @@ def _migrate_postgres(catalog: Catalog, deadline: float) -> None:
                     command.upgrade(config, "head")
                 return
             except DBAPIError as error:
-                in_the_way = sqlstate(error) in (LOCK_NOT_AVAILABLE, DEADLOCK)
+                in_the_way = get_sqlstate(error) in (LOCK_NOT_AVAILABLE, DEADLOCK)
                 if not in_the_way or time.monotonic() > deadline:
                     raise
                 log.info("traffic holds a lock that a migration needs: trying again")
-            time.sleep(PAUSE_SECONDS * random.uniform(0.5, 1.5))  # noqa: S311
+            time.sleep(LOCK_RETRY_SECONDS * random.uniform(0.5, 1.5))  # noqa: S311
 
 
 @contextlib.contextmanager
-def _alone(catalog: Catalog, deadline: float) -> Iterator[None]:
+def _migration_lock(catalog: Catalog, deadline: float) -> Iterator[None]:
     """One migration at a time. The lock is tried, not waited for: a waiting statement holds a
     snapshot, and `CREATE INDEX CONCURRENTLY` waits for every snapshot to end."""
     while True:
         with catalog.engine.connect() as connection:
             # Without a parameter: a portal with one keeps its snapshot until the next statement.
-            tried = connection.exec_driver_sql(f"SELECT pg_try_advisory_xact_lock({ADVISORY_LOCK})")
+            tried = connection.exec_driver_sql(
+                f"SELECT pg_try_advisory_xact_lock({ADVISORY_LOCK_ID})"
+            )
             if tried.scalar():
                 yield
                 return
@@ -179,7 +181,7 @@ def _alone(catalog: Catalog, deadline: float) -> Iterator[None]:
             raise Unavailable(
                 "catalog_busy", "Another migration is running. Wait for it, then run this again."
             )
-        time.sleep(LOOK_SECONDS)
+        time.sleep(SCHEMA_POLL_SECONDS)
 
 
 def _config() -> Config:

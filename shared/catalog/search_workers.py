@@ -14,7 +14,7 @@ from uuid import UUID
 from sqlalchemy import Integer, String, Text, Uuid, delete, select, update
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
-from shared.catalog.base import Base, JsonValue, UtcDateTime, db_now, db_now_plus, rowcount
+from shared.catalog.base import Base, JsonValue, UtcDateTime, affected_rows, db_now, db_now_plus
 from shared.catalog.chunks import Chunk
 from shared.ids import new_id
 from shared.shards import Shard
@@ -23,10 +23,10 @@ UNREADABLE = "unreadable"
 """In `loaded`, beside the generations: the keys of the chunks that the worker can't read."""
 
 # Several heartbeats: a worker that was silent for longer holds up nothing any more.
-DEAD_SECONDS = 10.0
+SEARCH_WORKER_TIMEOUT_SECONDS = 10.0
 
 
-class RegisteredWorker(Base):
+class RegisteredSearchWorker(Base):
     """One process that answers searches. `loaded`: generation id -> version without a gap, and
     `UNREADABLE`."""
 
@@ -46,7 +46,7 @@ class RegisteredWorker(Base):
         return int(self.loaded.get(str(generation_id), -1)) >= version
 
 
-def tell_of_worker(
+def upsert_search_worker(
     session: Session,
     worker_id: UUID,
     name: str,
@@ -60,14 +60,14 @@ def tell_of_worker(
     if unreadable:
         versions[UNREADABLE] = list(unreadable)
     known = session.execute(
-        update(RegisteredWorker)
-        .where(RegisteredWorker.id == worker_id)
+        update(RegisteredSearchWorker)
+        .where(RegisteredSearchWorker.id == worker_id)
         .values(loaded=versions, seen_at=db_now())
         .execution_options(synchronize_session=False)
     )
-    if not rowcount(known):  # new, or removed while it could not reach the catalog
+    if not affected_rows(known):  # new, or removed while it could not reach the catalog
         session.add(
-            RegisteredWorker(
+            RegisteredSearchWorker(
                 id=worker_id,
                 name=name,
                 url=url,
@@ -78,30 +78,34 @@ def tell_of_worker(
         )
 
 
-def forget_worker(session: Session, worker_id: UUID) -> None:
+def delete_search_worker(session: Session, worker_id: UUID) -> None:
     """The worker has ended."""
-    session.execute(delete(RegisteredWorker).where(RegisteredWorker.id == worker_id))
+    session.execute(delete(RegisteredSearchWorker).where(RegisteredSearchWorker.id == worker_id))
 
 
-def forget_dead_workers(session: Session, *, everyone: bool = False) -> int:
-    """Remove the workers that are dead; `everyone`, where none can live."""
-    dead = delete(RegisteredWorker)
-    if not everyone:
-        dead = dead.where(RegisteredWorker.seen_at < db_now_plus(-DEAD_SECONDS))
-    return rowcount(session.execute(dead))
+def delete_dead_search_workers(session: Session, *, all_workers: bool = False) -> int:
+    """Remove the workers that are dead; `all_workers`, where none can live."""
+    dead = delete(RegisteredSearchWorker)
+    if not all_workers:
+        dead = dead.where(
+            RegisteredSearchWorker.seen_at < db_now_plus(-SEARCH_WORKER_TIMEOUT_SECONDS)
+        )
+    return affected_rows(session.execute(dead))
 
 
 def unreadable_keys(session: Session) -> set[str]:
     """The chunks that a live worker reports as unreadable."""
     live = session.scalars(
-        select(RegisteredWorker.loaded).where(
-            RegisteredWorker.seen_at >= db_now_plus(-DEAD_SECONDS)
+        select(RegisteredSearchWorker.loaded).where(
+            RegisteredSearchWorker.seen_at >= db_now_plus(-SEARCH_WORKER_TIMEOUT_SECONDS)
         )
     )
     return {key for loaded in live for key in loaded.get(UNREADABLE, ())}
 
 
-def workers_without(session: Session, generation_id: UUID, version: int) -> list[RegisteredWorker]:
+def list_lagging_workers(
+    session: Session, generation_id: UUID, version: int
+) -> list[RegisteredSearchWorker]:
     """The live workers that hold a part of the generation and have not loaded it at `version`
     yet, by name. A worker whose shard has no row of it has nothing to load."""
     slots = session.scalars(
@@ -110,9 +114,9 @@ def workers_without(session: Session, generation_id: UUID, version: int) -> list
         .distinct()
     ).all()
     live = session.scalars(
-        select(RegisteredWorker)
-        .where(RegisteredWorker.seen_at >= db_now_plus(-DEAD_SECONDS))
-        .order_by(RegisteredWorker.name, RegisteredWorker.id)
+        select(RegisteredSearchWorker)
+        .where(RegisteredSearchWorker.seen_at >= db_now_plus(-SEARCH_WORKER_TIMEOUT_SECONDS))
+        .order_by(RegisteredSearchWorker.name, RegisteredSearchWorker.id)
     )
     return [
         worker

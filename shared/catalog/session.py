@@ -16,9 +16,9 @@ from sqlalchemy.engine import make_url
 from sqlalchemy.exc import DBAPIError
 from sqlalchemy.orm import Session, sessionmaker
 
-from shared.catalog.away import SACRIFICED, sqlstate
-from shared.catalog.base import SQLITE_DISTANCE
-from shared.catalog.connections import Limits, Pool, make_postgres_engine
+from shared.catalog.away import ROLLBACK_SQLSTATES, get_sqlstate
+from shared.catalog.base import SQLITE_DISTANCE_FUNCTION
+from shared.catalog.connections import PoolConfig, TransactionTimeouts, make_postgres_engine
 from shared.geodesy import distance_m
 
 log = logging.getLogger(__name__)
@@ -26,8 +26,8 @@ log = logging.getLogger(__name__)
 # A writer that waits this long for SQLite's single write lock has met a bug, not a queue.
 SQLITE_BUSY_SECONDS = 60
 
-TRIES = 5  # of a unit that PostgreSQL sacrifices to others
-FIRST_PAUSE_SECONDS = 0.05  # doubled each time
+MAX_TRANSACTION_ATTEMPTS = 5  # of a unit that PostgreSQL sacrifices to others
+RETRY_BASE_SECONDS = 0.05  # doubled each time
 
 T = TypeVar("T")
 
@@ -41,7 +41,12 @@ class Catalog:
     `shared.catalog.away` says what of it is an outage.
     """
 
-    def __init__(self, url: str, pool: Pool = Pool(), limits: Limits = Limits()) -> None:
+    def __init__(
+        self,
+        url: str,
+        pool: PoolConfig = PoolConfig(),
+        limits: TransactionTimeouts = TransactionTimeouts(),
+    ) -> None:
         self.url = make_url(url)
         self.limits = limits
         self.is_sqlite = self.url.get_backend_name() == "sqlite"
@@ -61,7 +66,7 @@ class Catalog:
         # SQLite has one writer: queueing here is fair and does not spin as its busy handler does.
         self._sqlite_writer = threading.Lock()
 
-    def limited(self, limits: Limits) -> Catalog:
+    def with_timeouts(self, limits: TransactionTimeouts) -> Catalog:
         """The same connections, for transactions with other limits."""
         other = copy.copy(self)
         other.limits = limits
@@ -94,17 +99,17 @@ class Catalog:
         begins from nothing each time: `unit` may change nothing but the session. Every other
         error is raised at once.
         """
-        for attempt in range(TRIES - 1):
+        for attempt in range(MAX_TRANSACTION_ATTEMPTS - 1):
             try:
                 with self.write() as session:
                     return unit(session)
             except DBAPIError as error:
-                reason = SACRIFICED.get(sqlstate(error) or "")
+                reason = ROLLBACK_SQLSTATES.get(get_sqlstate(error) or "")
                 if reason is None:
                     raise
                 log.info("%s: %s is run again", reason, unit.__qualname__)
             # Apart, or they meet again.
-            time.sleep(random.uniform(0.5, 1.0) * FIRST_PAUSE_SECONDS * 2**attempt)  # noqa: S311
+            time.sleep(random.uniform(0.5, 1.0) * RETRY_BASE_SECONDS * 2**attempt)  # noqa: S311
         with self.write() as session:
             return unit(session)
 
@@ -128,7 +133,7 @@ def _prepare_sqlite(connection: Any, _record: Any) -> None:
     cursor.execute("PRAGMA synchronous = FULL")
     cursor.execute("PRAGMA foreign_keys = ON")
     cursor.close()
-    connection.create_function(SQLITE_DISTANCE, 4, _distance_or_null, deterministic=True)
+    connection.create_function(SQLITE_DISTANCE_FUNCTION, 4, _distance_or_null, deterministic=True)
 
 
 def _distance_or_null(*degrees: float | None) -> float | None:

@@ -11,7 +11,7 @@ from pathlib import Path
 from sqlalchemy import text
 from sqlalchemy.exc import SQLAlchemyError
 
-from shared.catalog.away import DAMAGED, as_unavailable, reason_of
+from shared.catalog.away import DAMAGED, reason_of, to_unavailable
 from shared.catalog.session import Catalog
 from shared.disk_reserve import RELEASE_BELOW_BYTES
 from shared.errors import Misconfigured
@@ -90,7 +90,7 @@ def _explained(path: Path, error: SQLAlchemyError) -> Misconfigured | None:
     if name.startswith(("SQLITE_CANTOPEN", "SQLITE_READONLY", "SQLITE_PERM", "SQLITE_AUTH")):
         return _unreadable(path)
     if name.startswith("SQLITE_IOERR"):
-        unavailable = as_unavailable(error)
+        unavailable = to_unavailable(error)
         assert unavailable is not None
         return Misconfigured(unavailable.code, f"{path}: {unavailable.detail}")
     return None

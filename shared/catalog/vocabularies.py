@@ -15,7 +15,7 @@ from shared.catalog.generations import Generation
 from shared.catalog.journaled import Journaled
 from shared.errors import NotFound
 from shared.ids import new_id
-from shared.recipes import PARITY_PREPROCESSINGS
+from shared.recipes import ANYLOC_PREPROCESSING_NAMES
 
 
 class VocabularyOrigin(StrEnum):
@@ -48,14 +48,14 @@ class Vocabulary(Journaled, Base):
         return "own" if self.origin == VocabularyOrigin.FITTED else "foreign"
 
 
-def standing_of(session: Session, generation: Generation) -> str:
+def vocabulary_standing(session: Session, generation: Generation) -> str:
     """The standing of the generation's vocabulary; `none` for an extractor without one."""
     if generation.vocabulary_id is None:
         return "none"
     return session.get_one(Vocabulary, generation.vocabulary_id).standing
 
 
-def why_no_word_weights(session: Session, generation: Generation) -> str | None:
+def word_weights_unavailable_reason(session: Session, generation: Generation) -> str | None:
     """Why its words can't be weighed, as a clause; None where they can.
 
     A weight belongs to one block of the descriptor, as long as a local feature. PCA mixes the
@@ -64,7 +64,7 @@ def why_no_word_weights(session: Session, generation: Generation) -> str | None:
     if generation.vocabulary_id is None:
         return "its extractor uses no vocabulary"
     preprocessing = generation.spec["preprocessing"]["name"]
-    if preprocessing in PARITY_PREPROCESSINGS:
+    if preprocessing in ANYLOC_PREPROCESSING_NAMES:
         return f"with {preprocessing} it is to rank as its authors' code does"
     vocabulary = session.get_one(Vocabulary, generation.vocabulary_id)
     if "pca" in generation.spec or (

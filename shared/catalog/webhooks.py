@@ -82,7 +82,7 @@ class Delivery(Base):
     )
 
 
-def make_webhook(session: Session, url: str, events: list[EventKind]) -> Webhook:
+def create_webhook(session: Session, url: str, events: list[EventKind]) -> Webhook:
     """A webhook with a new secret; `shared.webhook_address` says which `url` may be one."""
     secret = SECRET_PREFIX + base64.b64encode(secrets.token_bytes(SECRET_BYTES)).decode()
     made = Webhook(url=url, events=sorted(set(events)), secret=secret)
@@ -117,13 +117,13 @@ def list_deliveries(
     session: Session, webhook_id: UUID, limit: int, before: UUID | None
 ) -> list[Delivery]:
     """What was and will be sent, newest first, up to `limit`, older than `before`."""
-    wanted = select(Delivery).where(Delivery.webhook_id == webhook_id)
+    subscribed_webhook_ids = select(Delivery).where(Delivery.webhook_id == webhook_id)
     if before is not None:
-        wanted = wanted.where(Delivery.id < before)
-    return list(session.scalars(wanted.order_by(Delivery.id.desc()).limit(limit)))
+        subscribed_webhook_ids = subscribed_webhook_ids.where(Delivery.id < before)
+    return list(session.scalars(subscribed_webhook_ids.order_by(Delivery.id.desc()).limit(limit)))
 
 
-def wanted(session: Session, event: EventKind) -> list[UUID]:
+def subscribed_webhook_ids(session: Session, event: EventKind) -> list[UUID]:
     """The webhooks that want the event; they are looked up once in a transaction."""
     webhooks = session.info.get("webhooks")
     if webhooks is None:
@@ -134,9 +134,9 @@ def wanted(session: Session, event: EventKind) -> list[UUID]:
     return [webhook_id for webhook_id, events in webhooks if event in events]
 
 
-def announce(session: Session, event: EventKind, data: dict[str, Any]) -> None:
+def enqueue_event(session: Session, event: EventKind, data: dict[str, Any]) -> None:
     """Let every webhook that wants it hear of the event once this transaction is committed."""
-    webhooks = wanted(session, event)
+    webhooks = subscribed_webhook_ids(session, event)
     if not webhooks:
         return
     event_id = new_id()

@@ -35,7 +35,7 @@ class StoredWhitening(Journaled, Base):
     sha256: Mapped[str] = mapped_column(String(64))
     created_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())
 
-    def in_short(self) -> dict[str, Any]:
+    def summary(self) -> dict[str, Any]:
         """What an answer says of it."""
         return {
             "from_dimension": self.dimension,
@@ -45,7 +45,7 @@ class StoredWhitening(Journaled, Base):
         }
 
 
-def generation_to_whiten(session: Session, map_id: UUID) -> Generation:
+def get_pca_source_generation(session: Session, map_id: UUID) -> Generation:
     """The active generation, whose rows a PCA can be fitted on.
 
     Conflict: `nothing_described` in a map without one; `already_reduced` where PCA has shortened

@@ -12,23 +12,23 @@ from typing import Any, BinaryIO
 from urllib.parse import quote
 from uuid import UUID
 
-from shared.client.async_wire import AsyncWire
+from shared.client.async_wire import AsyncTransport
 from shared.client.sending import (
     API,
     FINISHED,
     POLL_SECONDS,
     Json,
-    Watched,
-    as_lines,
-    given,
-    hashed,
-    name_of,
-    opened,
-    unreadable,
+    ReadProgressFile,
+    drop_none,
+    open_file,
+    printable_name,
+    size_and_sha256,
+    to_jsonl,
+    unreadable_file_error,
 )
 
 
-class AsyncClient(AsyncWire):
+class AsyncClient(AsyncTransport):
     """Every call of one server and one map, answered with the API's JSON."""
 
     async def upload(self, photo: Path, filename: str | None = None, **fields: Any) -> Json:
@@ -44,14 +44,16 @@ class AsyncClient(AsyncWire):
 
         Raises Conflict (`no_direct_uploads`) where the server keeps photos in a folder.
         """
-        with opened(photo) as file:
-            size, sha256 = hashed(file)
+        with open_file(photo) as file:
+            size, sha256 = size_and_sha256(file)
             about = {
-                "filename": filename or name_of(photo),
+                "filename": filename or printable_name(photo),
                 "file_size": size,
                 "sha256": sha256,
             }
-            begun = await self._call("POST", "/uploads/presign", json={**about, **given(**fields)})
+            begun = await self._call(
+                "POST", "/uploads/presign", json={**about, **drop_none(**fields)}
+            )
             await self._put(begun, file)
         return await self._call("POST", begun["complete_url"].removeprefix(API))
 
@@ -60,31 +62,31 @@ class AsyncClient(AsyncWire):
     ) -> Json:
         """Start a batch with the photos of a zip or tar; `on_sent` sees the bytes sent so far."""
         try:
-            with Watched(archive.open("rb"), on_sent) as opened:
-                files = {"archive": (name_of(archive), opened)}
-                return await self._call("POST", "/upload/batch", opened, files=files)
+            with ReadProgressFile(archive.open("rb"), on_sent) as open_file:
+                files = {"archive": (printable_name(archive), open_file)}
+                return await self._call("POST", "/upload/batch", open_file, files=files)
         except OSError as error:
-            raise unreadable(archive, error) from error
+            raise unreadable_file_error(archive, error) from error
 
     async def upload_files(self, photos: Sequence[Path], manifest: Sequence[Json] = ()) -> Json:
         """Start a batch with these photos; each line of the manifest has a `filename` and the
         form's fields."""
-        with contextlib.ExitStack() as opened:
+        with contextlib.ExitStack() as open_file:
             files: list[tuple[str, Any]] = []
             for photo in photos:
                 try:
-                    file = opened.enter_context(photo.open("rb"))
+                    file = open_file.enter_context(photo.open("rb"))
                 except OSError as error:
-                    raise unreadable(photo, error) from error
+                    raise unreadable_file_error(photo, error) from error
                 files.append(("file", (photo.name, file)))
             if manifest:
-                files.append(("manifest", ("manifest.jsonl", as_lines(manifest))))
+                files.append(("manifest", ("manifest.jsonl", to_jsonl(manifest))))
             return await self._call("POST", "/upload/batch", files=files)
 
     async def import_objects(self, manifest: Sequence[Json]) -> Json:
         """Start a batch with objects of the server's store; each line has a `key` and the form's
         fields."""
-        return await self.import_manifest(as_lines(manifest))
+        return await self.import_manifest(to_jsonl(manifest))
 
     async def import_manifest(self, lines: bytes) -> Json:
         """`import_objects` with the lines as JSONL."""
@@ -117,7 +119,7 @@ class AsyncClient(AsyncWire):
         **filters: Any,
     ) -> Json:
         """The photos most similar to one that is not stored; the rest as in `similar_to`."""
-        params = given(
+        params = drop_none(
             top_k=top_k,
             min_score=min_score,
             rerank=rerank,
@@ -146,7 +148,7 @@ class AsyncClient(AsyncWire):
         `tags` and `ids` (separated by commas); `word_weights=False` ranks by the plain cosine.
         The first `rerank` of them are compared patch by patch; `explain` says of each what makes
         it similar."""
-        params = given(
+        params = drop_none(
             top_k=top_k,
             min_score=min_score,
             rerank=rerank,
@@ -195,7 +197,7 @@ class AsyncClient(AsyncWire):
 
     async def search(self, **filters: Any) -> Json:
         """Photos by what is known of them; see `GET /search`."""
-        return await self._call("GET", "/search", params=given(**filters))
+        return await self._call("GET", "/search", params=drop_none(**filters))
 
     async def fit_vocabulary(self, **wanted: int) -> Json:
         """Start fitting; `clusters`, `sample` and `seed` may be given."""
@@ -206,7 +208,7 @@ class AsyncClient(AsyncWire):
         return await self._send_file("/vocabularies/import", file)
 
     async def vocabulary_file(self, vocabulary_id: UUID | str) -> bytes:
-        """A vocabulary as a file that `import_vocabulary` takes: `.npz` (it begins with `PK`), or
+        """A vocabulary as a file that `start_vocabulary_import` takes: `.npz` (it begins with `PK`), or
         `.npy` where no one knows what it was learnt with."""
         return await self._get_bytes(f"/vocabularies/{vocabulary_id}/file")
 
@@ -223,7 +225,7 @@ class AsyncClient(AsyncWire):
     ) -> Json:
         """Start switching to a vocabulary that the map has, to descriptors of `pca` dimensions, or
         to another extractor; with none, to whole ones of an extractor without vocabulary."""
-        wanted = given(
+        wanted = drop_none(
             vocabulary_id=vocabulary_id and str(vocabulary_id), pca=pca, extractor=extractor
         )
         return await self._call("POST", "/generations", json=wanted)
@@ -272,7 +274,7 @@ class AsyncClient(AsyncWire):
         return list(found)
 
     async def create_map(self, name: str, extractor: str | None = None) -> Json:
-        return await self._call("POST", "/maps", json=given(name=name, extractor=extractor))
+        return await self._call("POST", "/maps", json=drop_none(name=name, extractor=extractor))
 
     async def delete_map(self, name: str) -> Json:
         """Delete a map with all its photos."""
@@ -288,9 +290,9 @@ class AsyncClient(AsyncWire):
         on_sent: Callable[[int], object] = lambda sent_bytes: None,
     ) -> Json:
         """Start adding a checkpoint as the model `name`; `on_sent` sees the bytes sent so far."""
-        said = given(name=name, licence=licence, note=note)
-        with opened(checkpoint) as file:
-            files = {"file": (name_of(checkpoint), Watched(file, on_sent))}
+        said = drop_none(name=name, licence=licence, note=note)
+        with open_file(checkpoint) as file:
+            files = {"file": (printable_name(checkpoint), ReadProgressFile(file, on_sent))}
             return await self._call("POST", "/models", file, files=files, data=said)
 
     async def models(self) -> list[Json]:
@@ -308,7 +310,7 @@ class AsyncClient(AsyncWire):
 
     async def create_key(self, name: str, scopes: Sequence[str], **limits: Any) -> Json:
         """A new key: `key` of the answer is shown this once. `limits` are those of POST /keys."""
-        wanted = {"name": name, "scopes": list(scopes), **given(**limits)}
+        wanted = {"name": name, "scopes": list(scopes), **drop_none(**limits)}
         return await self._call("POST", "/keys", json=wanted)
 
     async def revoke_key(self, key_id: str) -> Json:

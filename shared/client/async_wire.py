@@ -17,28 +17,28 @@ import httpx2
 
 from shared.client.sending import (
     API,
+    CHUNK_BYTES,
     IDEMPOTENCY_KEY,
-    READ_BYTES,
     TIMEOUT_SECONDS,
     Json,
     OnWait,
-    Patience,
+    RetryPolicy,
     Seekable,
-    checked_address,
-    given,
-    name_of,
-    opened,
-    refused,
+    drop_none,
+    open_file,
+    printable_name,
+    response_error,
+    validate_url,
 )
 from shared.errors import Conflict, TooManyRequests, Unavailable
 from shared.ids import new_id
 
-PAGE = 1000  # records asked for at once: the most that a server grants
+PAGE_SIZE = 1000  # records asked for at once: the most that a server grants
 
 Answer = TypeVar("Answer")
 
 
-class AsyncWire:
+class AsyncTransport:
     """One server and one map; close it, or use it as a context manager."""
 
     def __init__(
@@ -60,8 +60,8 @@ class AsyncWire:
 
         Raises InvalidRequest: `bad_key` for a key that no header can carry, `bad_address`.
         """
-        self.url = checked_address(url, key)
-        self._patience = Patience(patience_seconds, on_wait)
+        self.url = validate_url(url, key)
+        self._patience = RetryPolicy(patience_seconds, on_wait)
         self._timeout_seconds = timeout_seconds
         self._http = httpx2.AsyncClient(
             base_url=self.url,
@@ -87,14 +87,14 @@ class AsyncWire:
     def patient(self, patience_seconds: float, on_wait: OnWait) -> Self:
         """The same client with more patience, over the same connections."""
         other = copy.copy(self)
-        other._patience = Patience(patience_seconds, on_wait)
+        other._patience = RetryPolicy(patience_seconds, on_wait)
         return other
 
     async def _send_file(
         self, path: str, file: Path, called: str | None = None, **options: Any
     ) -> Json:
-        with opened(file) as stream:
-            files = {"file": (called or name_of(file), stream)}
+        with open_file(file) as stream:
+            files = {"file": (called or printable_name(file), stream)}
             return await self._call("POST", path, stream, files=files, **options)
 
     async def _call(
@@ -124,7 +124,7 @@ class AsyncWire:
         """Every record of a list that comes in pages, each fetched when it is reached."""
         cursor: str | None = None
         while True:
-            asked = given(**params, limit=PAGE, cursor=cursor)
+            asked = drop_none(**params, limit=PAGE_SIZE, cursor=cursor)
             page = await self._call("GET", path, params=asked)
             for one in page[field]:
                 yield one
@@ -143,8 +143,8 @@ class AsyncWire:
                 async with self._http.stream("GET", f"{API}{path}") as answer:
                     if not answer.is_success:
                         await answer.aread()
-                        raise refused(answer)
-                    async for piece in answer.aiter_bytes(READ_BYTES):
+                        raise response_error(answer)
+                    async for piece in answer.aiter_bytes(CHUNK_BYTES):
                         file.write(piece)
                         received += len(piece)
                         on_received(received)
@@ -163,7 +163,7 @@ class AsyncWire:
                     http,
                     begun["method"],
                     begun["url"],
-                    content=_pieces(file),
+                    content=_iter_chunks(file),
                     headers=begun["headers"],
                 )
 
@@ -179,7 +179,7 @@ class AsyncWire:
             raise self._unreachable(url, error) from error
         if answer.is_success:
             return answer
-        raise refused(answer)
+        raise response_error(answer)
 
     def _unreachable(self, url: str, error: httpx2.TransportError) -> Unavailable:
         host = self.url if url.startswith("/") else httpx2.URL(url).host
@@ -200,6 +200,6 @@ class AsyncWire:
                 times += 1
 
 
-async def _pieces(file: BinaryIO) -> AsyncIterator[bytes]:
-    while piece := file.read(READ_BYTES):
+async def _iter_chunks(file: BinaryIO) -> AsyncIterator[bytes]:
+    while piece := file.read(CHUNK_BYTES):
         yield piece

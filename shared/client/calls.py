@@ -17,18 +17,18 @@ from shared.client.sending import (
     FINISHED,
     POLL_SECONDS,
     Json,
-    Watched,
-    as_lines,
-    given,
-    hashed,
-    name_of,
-    opened,
-    unreadable,
+    ReadProgressFile,
+    drop_none,
+    open_file,
+    printable_name,
+    size_and_sha256,
+    to_jsonl,
+    unreadable_file_error,
 )
-from shared.client.wire import Wire
+from shared.client.wire import Transport
 
 
-class Client(Wire):
+class Client(Transport):
     """Every call of one server and one map, answered with the API's JSON."""
 
     def upload(self, photo: Path, filename: str | None = None, **fields: Any) -> Json:
@@ -44,14 +44,14 @@ class Client(Wire):
 
         Raises Conflict (`no_direct_uploads`) where the server keeps photos in a folder.
         """
-        with opened(photo) as file:
-            size, sha256 = hashed(file)
+        with open_file(photo) as file:
+            size, sha256 = size_and_sha256(file)
             about = {
-                "filename": filename or name_of(photo),
+                "filename": filename or printable_name(photo),
                 "file_size": size,
                 "sha256": sha256,
             }
-            begun = self._call("POST", "/uploads/presign", json={**about, **given(**fields)})
+            begun = self._call("POST", "/uploads/presign", json={**about, **drop_none(**fields)})
             self._put(begun, file)
         return self._call("POST", begun["complete_url"].removeprefix(API))
 
@@ -60,31 +60,31 @@ class Client(Wire):
     ) -> Json:
         """Start a batch with the photos of a zip or tar; `on_sent` sees the bytes sent so far."""
         try:
-            with Watched(archive.open("rb"), on_sent) as opened:
-                files = {"archive": (name_of(archive), opened)}
-                return self._call("POST", "/upload/batch", opened, files=files)
+            with ReadProgressFile(archive.open("rb"), on_sent) as open_file:
+                files = {"archive": (printable_name(archive), open_file)}
+                return self._call("POST", "/upload/batch", open_file, files=files)
         except OSError as error:
-            raise unreadable(archive, error) from error
+            raise unreadable_file_error(archive, error) from error
 
     def upload_files(self, photos: Sequence[Path], manifest: Sequence[Json] = ()) -> Json:
         """Start a batch with these photos; each line of the manifest has a `filename` and the
         form's fields."""
-        with contextlib.ExitStack() as opened:
+        with contextlib.ExitStack() as open_file:
             files: list[tuple[str, Any]] = []
             for photo in photos:
                 try:
-                    file = opened.enter_context(photo.open("rb"))
+                    file = open_file.enter_context(photo.open("rb"))
                 except OSError as error:
-                    raise unreadable(photo, error) from error
+                    raise unreadable_file_error(photo, error) from error
                 files.append(("file", (photo.name, file)))
             if manifest:
-                files.append(("manifest", ("manifest.jsonl", as_lines(manifest))))
+                files.append(("manifest", ("manifest.jsonl", to_jsonl(manifest))))
             return self._call("POST", "/upload/batch", files=files)
 
     def import_objects(self, manifest: Sequence[Json]) -> Json:
         """Start a batch with objects of the server's store; each line has a `key` and the form's
         fields."""
-        return self.import_manifest(as_lines(manifest))
+        return self.import_manifest(to_jsonl(manifest))
 
     def import_manifest(self, lines: bytes) -> Json:
         """`import_objects` with the lines as JSONL."""
@@ -117,7 +117,7 @@ class Client(Wire):
         **filters: Any,
     ) -> Json:
         """The photos most similar to one that is not stored; the rest as in `similar_to`."""
-        params = given(
+        params = drop_none(
             top_k=top_k,
             min_score=min_score,
             rerank=rerank,
@@ -146,7 +146,7 @@ class Client(Wire):
         `tags` and `ids` (separated by commas); `word_weights=False` ranks by the plain cosine.
         The first `rerank` of them are compared patch by patch; `explain` says of each what makes
         it similar."""
-        params = given(
+        params = drop_none(
             top_k=top_k,
             min_score=min_score,
             rerank=rerank,
@@ -193,7 +193,7 @@ class Client(Wire):
 
     def search(self, **filters: Any) -> Json:
         """Photos by what is known of them; see `GET /search`."""
-        return self._call("GET", "/search", params=given(**filters))
+        return self._call("GET", "/search", params=drop_none(**filters))
 
     def fit_vocabulary(self, **wanted: int) -> Json:
         """Start fitting; `clusters`, `sample` and `seed` may be given."""
@@ -204,7 +204,7 @@ class Client(Wire):
         return self._send_file("/vocabularies/import", file)
 
     def vocabulary_file(self, vocabulary_id: UUID | str) -> bytes:
-        """A vocabulary as a file that `import_vocabulary` takes: `.npz` (it begins with `PK`), or
+        """A vocabulary as a file that `start_vocabulary_import` takes: `.npz` (it begins with `PK`), or
         `.npy` where no one knows what it was learnt with."""
         return self._get_bytes(f"/vocabularies/{vocabulary_id}/file")
 
@@ -221,7 +221,7 @@ class Client(Wire):
     ) -> Json:
         """Start switching to a vocabulary that the map has, to descriptors of `pca` dimensions, or
         to another extractor; with none, to whole ones of an extractor without vocabulary."""
-        wanted = given(
+        wanted = drop_none(
             vocabulary_id=vocabulary_id and str(vocabulary_id), pca=pca, extractor=extractor
         )
         return self._call("POST", "/generations", json=wanted)
@@ -270,7 +270,7 @@ class Client(Wire):
         return list(found)
 
     def create_map(self, name: str, extractor: str | None = None) -> Json:
-        return self._call("POST", "/maps", json=given(name=name, extractor=extractor))
+        return self._call("POST", "/maps", json=drop_none(name=name, extractor=extractor))
 
     def delete_map(self, name: str) -> Json:
         """Delete a map with all its photos."""
@@ -286,9 +286,9 @@ class Client(Wire):
         on_sent: Callable[[int], object] = lambda sent_bytes: None,
     ) -> Json:
         """Start adding a checkpoint as the model `name`; `on_sent` sees the bytes sent so far."""
-        said = given(name=name, licence=licence, note=note)
-        with opened(checkpoint) as file:
-            files = {"file": (name_of(checkpoint), Watched(file, on_sent))}
+        said = drop_none(name=name, licence=licence, note=note)
+        with open_file(checkpoint) as file:
+            files = {"file": (printable_name(checkpoint), ReadProgressFile(file, on_sent))}
             return self._call("POST", "/models", file, files=files, data=said)
 
     def models(self) -> list[Json]:
@@ -306,7 +306,7 @@ class Client(Wire):
 
     def create_key(self, name: str, scopes: Sequence[str], **limits: Any) -> Json:
         """A new key: `key` of the answer is shown this once. `limits` are those of POST /keys."""
-        wanted = {"name": name, "scopes": list(scopes), **given(**limits)}
+        wanted = {"name": name, "scopes": list(scopes), **drop_none(**limits)}
         return self._call("POST", "/keys", json=wanted)
 
     def revoke_key(self, key_id: str) -> Json:

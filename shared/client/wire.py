@@ -16,28 +16,28 @@ import httpx2
 
 from shared.client.sending import (
     API,
+    CHUNK_BYTES,
     IDEMPOTENCY_KEY,
-    READ_BYTES,
     TIMEOUT_SECONDS,
     Json,
     OnWait,
-    Patience,
+    RetryPolicy,
     Seekable,
-    checked_address,
-    given,
-    name_of,
-    opened,
-    refused,
+    drop_none,
+    open_file,
+    printable_name,
+    response_error,
+    validate_url,
 )
 from shared.errors import Conflict, TooManyRequests, Unavailable
 from shared.ids import new_id
 
-PAGE = 1000  # records asked for at once: the most that a server grants
+PAGE_SIZE = 1000  # records asked for at once: the most that a server grants
 
 Answer = TypeVar("Answer")
 
 
-class Wire:
+class Transport:
     """One server and one map; close it, or use it as a context manager."""
 
     def __init__(
@@ -59,8 +59,8 @@ class Wire:
 
         Raises InvalidRequest: `bad_key` for a key that no header can carry, `bad_address`.
         """
-        self.url = checked_address(url, key)
-        self._patience = Patience(patience_seconds, on_wait)
+        self.url = validate_url(url, key)
+        self._patience = RetryPolicy(patience_seconds, on_wait)
         self._timeout_seconds = timeout_seconds
         self._http = httpx2.Client(
             base_url=self.url,
@@ -86,12 +86,12 @@ class Wire:
     def patient(self, patience_seconds: float, on_wait: OnWait) -> Self:
         """The same client with more patience, over the same connections."""
         other = copy.copy(self)
-        other._patience = Patience(patience_seconds, on_wait)
+        other._patience = RetryPolicy(patience_seconds, on_wait)
         return other
 
     def _send_file(self, path: str, file: Path, called: str | None = None, **options: Any) -> Json:
-        with opened(file) as stream:
-            files = {"file": (called or name_of(file), stream)}
+        with open_file(file) as stream:
+            files = {"file": (called or printable_name(file), stream)}
             return self._call("POST", path, stream, files=files, **options)
 
     def _call(self, method: str, path: str, body: Seekable | None = None, **options: Any) -> Json:
@@ -119,7 +119,7 @@ class Wire:
         """Every record of a list that comes in pages, each fetched when it is reached."""
         cursor: str | None = None
         while True:
-            asked = given(**params, limit=PAGE, cursor=cursor)
+            asked = drop_none(**params, limit=PAGE_SIZE, cursor=cursor)
             page = self._call("GET", path, params=asked)
             yield from page[field]
             cursor = page["next_cursor"]
@@ -137,8 +137,8 @@ class Wire:
                 with self._http.stream("GET", f"{API}{path}") as answer:
                     if not answer.is_success:
                         answer.read()
-                        raise refused(answer)
-                    for piece in answer.iter_bytes(READ_BYTES):
+                        raise response_error(answer)
+                    for piece in answer.iter_bytes(CHUNK_BYTES):
                         file.write(piece)
                         received += len(piece)
                         on_received(received)
@@ -157,7 +157,7 @@ class Wire:
                     http,
                     begun["method"],
                     begun["url"],
-                    content=_pieces(file),
+                    content=_iter_chunks(file),
                     headers=begun["headers"],
                 )
 
@@ -171,7 +171,7 @@ class Wire:
             raise self._unreachable(url, error) from error
         if answer.is_success:
             return answer
-        raise refused(answer)
+        raise response_error(answer)
 
     def _unreachable(self, url: str, error: httpx2.TransportError) -> Unavailable:
         host = self.url if url.startswith("/") else httpx2.URL(url).host
@@ -192,6 +192,6 @@ class Wire:
                 times += 1
 
 
-def _pieces(file: BinaryIO) -> Iterator[bytes]:
-    while piece := file.read(READ_BYTES):
+def _iter_chunks(file: BinaryIO) -> Iterator[bytes]:
+    while piece := file.read(CHUNK_BYTES):
         yield piece

@@ -14,12 +14,12 @@ import numba
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 # What is added in which order stays as it is written.
-IN_ORDER = frozenset({"contract", "nsz"})
+ORDERED_FASTMATH = frozenset({"contract", "nsz"})
 # Sums may run in vector lanes: for each length in one fixed order all the same.
-IN_LANES = IN_ORDER | {"reassoc"}
+REORDERED_FASTMATH = ORDERED_FASTMATH | {"reassoc"}
 
 
-def compiled(arithmetic: frozenset[str]) -> Callable[[Function], Function]:
+def numba_jit(arithmetic: frozenset[str]) -> Callable[[Function], Function]:
     """Compile a function of arrays and numbers. It holds no lock of the interpreter."""
 
     def wrap(function: Function) -> Function:

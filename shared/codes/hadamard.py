@@ -10,15 +10,15 @@ from numba import types
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-from shared.codes.compiled import IN_ORDER, compiled
+from shared.codes.compiled import ORDERED_FASTMATH, numba_jit
 
-Floats = NDArray[np.float32]
+Float32Vector = NDArray[np.float32]
 
-NEAR = 1024  # a stride: twice as many numbers are 8 KiB
+CACHE_BLOCK_FLOATS = 1024  # a stride: twice as many numbers are 8 KiB
 
 
-@compiled(IN_ORDER)
-def _radix4(a: Floats, b: Floats, c: Floats, d: Floats) -> None:
+@numba_jit(ORDERED_FASTMATH)
+def _radix4(a: Float32Vector, b: Float32Vector, c: Float32Vector, d: Float32Vector) -> None:
     """Two stages at once, on four neighbouring runs of equal length."""
     for j in range(a.shape[0]):
         p, q = a[j] + c[j], b[j] + d[j]
@@ -55,8 +55,8 @@ _last_16 = _last_strides(16)
 _last_32 = _last_strides(32)
 
 
-@compiled(IN_ORDER)
-def _wide_strides(x: Floats, stride: int, least: int) -> int:
+@numba_jit(ORDERED_FASTMATH)
+def _wide_strides(x: Float32Vector, stride: int, least: int) -> int:
     """The stages of these strides, two at a time, down to `least`; the next stride."""
     while stride >= 2 * least:
         half = stride >> 1
@@ -67,14 +67,14 @@ def _wide_strides(x: Floats, stride: int, least: int) -> int:
     return stride
 
 
-@compiled(IN_ORDER)
-def hadamard(x: Floats) -> None:
+@numba_jit(ORDERED_FASTMATH)
+def hadamard(x: Float32Vector) -> None:
     """Multiply x, (n,) float32, by the n x n Hadamard matrix (Sylvester's, unscaled), in place.
 
     n is a power of two and at least 16; x is contiguous. Every loop runs over neighbours, so that
     it compiles to vector instructions, and most of them over parts that the nearest cache holds.
     """
-    wide = _wide_strides(x, x.shape[0] >> 1, NEAR)
+    wide = _wide_strides(x, x.shape[0] >> 1, CACHE_BLOCK_FLOATS)
     for begin in range(0, x.shape[0], 2 * wide):
         near = x[begin : begin + 2 * wide]
         address = near.ctypes.data

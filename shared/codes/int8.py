@@ -33,14 +33,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.codes.compiled import IN_LANES, compiled
-from shared.codes.rotation import Floats, rotation
-from shared.codes.signs import ROWS_AT_ONCE
+from shared.codes.compiled import REORDERED_FASTMATH, numba_jit
+from shared.codes.rotation import Floats, get_rotation
+from shared.codes.signs import ROWS_PER_BLOCK
 
-MOST = 127
-MOST_OF_QUERY = 127 * 128 + 63  # so that both of its parts are bytes: 128 high + low
-SAFETY = 1e-9
-TINY = 1e-30  # rows with nothing larger are kept as zeros: their scale would be no number
+INT8_MAX = 127
+QUERY_MAX = 127 * 128 + 63  # so that both of its parts are bytes: 128 high + low
+ROUNDING_MARGIN = 1e-9
+MIN_SCALE = 1e-30  # rows with nothing larger are kept as zeros: their scale would be no number
 
 Bytes = NDArray[np.int8]
 Shorts = NDArray[np.int16]
@@ -79,16 +79,16 @@ class Int8Query:
     """|Ru - tW| at most."""
 
     @classmethod
-    def of(cls, row: Floats) -> Int8Query:
+    def from_row(cls, row: Floats) -> Int8Query:
         """Of a (dimension,) float32 row of any length but 0."""
         exact = row.astype(np.float64)
         unit: Floats = (exact / np.linalg.norm(exact)).astype(np.float32)
-        turn = rotation(len(row))
+        turn = get_rotation(len(row))
         numbers = np.empty((1, turn.padded), np.int16)
         figures = np.empty((1, 4))
-        _round(turn.rotate(unit[np.newaxis]), MOST_OF_QUERY, numbers, figures)
+        _quantize(turn.rotate(unit[np.newaxis]), QUERY_MAX, numbers, figures)
         scale, left, _, _ = figures[0].tolist()
-        error = (left + 1.01 * (turn.error + 2.0**-24)) * (1 + SAFETY)
+        error = (left + 1.01 * (turn.error + 2.0**-24)) * (1 + ROUNDING_MARGIN)
         return cls(numbers[0], scale, error)
 
     @property
@@ -100,27 +100,27 @@ class Int8Query:
 
 def int8_codes(rows: Floats) -> Int8Codes:
     """The codes of (n, dimension) float32 rows; of rows of zeros: zeros."""
-    turn = rotation(rows.shape[1])
+    turn = get_rotation(rows.shape[1])
     numbers = np.empty((len(rows), turn.padded), np.int8)
     figures = np.empty((len(rows), 4))
-    at_once = max(ROWS_AT_ONCE, (1 << 22) // turn.padded)
+    at_once = max(ROWS_PER_BLOCK, (1 << 22) // turn.padded)
     for begin in range(0, len(rows), at_once):
         part = slice(begin, begin + at_once)
-        _round(turn.rotate(rows[part]), MOST, numbers[part], figures[part])
+        _quantize(turn.rotate(rows[part]), INT8_MAX, numbers[part], figures[part])
     scales, left, rounded, whole = figures.T
     errors = left + turn.error * whole / (1 - turn.error)
-    return Int8Codes(numbers, scales.astype(np.float32), _above(errors), _above(rounded))
+    return Int8Codes(numbers, scales.astype(np.float32), _round_up(errors), _round_up(rounded))
 
 
-def _above(bounds: NDArray[np.float64]) -> Floats:
+def _round_up(bounds: NDArray[np.float64]) -> Floats:
     """Rounded up; 0 stays 0."""
-    single = (bounds * (1 + SAFETY)).astype(np.float32)
+    single = (bounds * (1 + ROUNDING_MARGIN)).astype(np.float32)
     found: Floats = np.where(bounds > 0, np.nextafter(single, np.float32(math.inf)), single)
     return found
 
 
-@compiled(IN_LANES)
-def _round(
+@numba_jit(REORDERED_FASTMATH)
+def _quantize(
     rotated: Floats, most: int, numbers: Bytes | Shorts, figures: NDArray[np.float64]
 ) -> None:
     """Round each of (n, m) float32 rows to whole numbers of -most to most, and measure the result.
@@ -134,7 +134,7 @@ def _round(
         for j in range(row.shape[0]):
             largest = max(largest, abs(row[j]))
         scale = inverse = np.float32(0.0)
-        if largest > np.float32(TINY):
+        if largest > np.float32(MIN_SCALE):
             scale = largest / np.float32(most)
             inverse = np.float32(most) / largest
         left = rounded = whole = 0.0

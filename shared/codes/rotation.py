@@ -27,14 +27,14 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.codes.compiled import IN_ORDER, compiled
+from shared.codes.compiled import ORDERED_FASTMATH, numba_jit
 from shared.codes.hadamard import hadamard
 
 SEED = 20_240_611
 ROUNDS = 2
 BLOCKS = (1, 3, 5, 7)
-LEAST_BLOCK = 64
-RUN = 16
+MIN_BLOCK = 64
+SIGN_RUN = 16
 COLUMNS = 1024  # that are mixed at once: of all blocks they lie in the nearest cache
 
 Floats = NDArray[np.float32]
@@ -85,7 +85,7 @@ class Rotation:
 
 
 @lru_cache(maxsize=8)
-def rotation(dimension: int) -> Rotation:
+def get_rotation(dimension: int) -> Rotation:
     """The rotation of this dimension: the same one everywhere and always."""
     if dimension < 1:
         raise ValueError(f"no rotation of {dimension} dimensions")
@@ -99,17 +99,17 @@ def rotation(dimension: int) -> Rotation:
     bits = np.unpackbits(draw.random_raw(ROUNDS * length // 64).astype("<u8").view(np.uint8))
     signs = (2.0 * bits.reshape(ROUNDS, length) - 1.0).astype(np.float32)
     signs[-1] *= np.float32(math.sqrt(1.0 / block) ** ROUNDS)
-    runs = np.argsort(draw.random_raw(length // RUN), kind="stable").astype(np.uint64)
+    runs = np.argsort(draw.random_raw(length // SIGN_RUN), kind="stable").astype(np.uint64)
     return Rotation(dimension, blocks, block, signs, runs)
 
 
 def _block(dimension: int, blocks: int) -> int:
-    needed = max(LEAST_BLOCK, -(-dimension // blocks))
+    needed = max(MIN_BLOCK, -(-dimension // blocks))
     return 1 << (needed - 1).bit_length()
 
 
-@compiled(IN_ORDER)
-def _mix(x: Floats, total: Floats) -> None:
+@numba_jit(ORDERED_FASTMATH)
+def _householder(x: Floats, total: Floats) -> None:
     """(n, b): each column minus 2/n times its sum; `total` is room for the sums of some."""
     blocks, block = x.shape
     share = np.float32(2.0 / blocks)
@@ -127,7 +127,7 @@ def _mix(x: Floats, total: Floats) -> None:
                 part[j] -= share * some[j]
 
 
-@compiled(IN_ORDER)
+@numba_jit(ORDERED_FASTMATH)
 def _rotate(
     rows: Floats, signs: Floats, runs: NDArray[np.uint64], blocks: int, out: Floats
 ) -> None:
@@ -142,14 +142,14 @@ def _rotate(
         for turn in range(signs.shape[0]):
             if turn > 0:
                 before[:] = rotated
-                come, there = before.reshape(-1, RUN), rotated.reshape(-1, RUN)
-                flips = signs[turn].reshape(-1, RUN)
+                come, there = before.reshape(-1, SIGN_RUN), rotated.reshape(-1, SIGN_RUN)
+                flips = signs[turn].reshape(-1, SIGN_RUN)
                 for place in range(runs.shape[0]):
                     run = runs[place]
-                    for j in range(RUN):
+                    for j in range(SIGN_RUN):
                         there[place, j] = come[run, j] * flips[place, j]
             parts = rotated.reshape(blocks, -1)
             for part in range(blocks):
                 hadamard(parts[part])
             if blocks > 1:
-                _mix(parts, total)
+                _householder(parts, total)

@@ -23,15 +23,15 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.codes.rotation import Floats, rotation
+from shared.codes.rotation import Floats, get_rotation
 
-WORD = 64
-FIRST_BITS = 4096
-SECOND_BITS = 16_384
+WORD_BITS = 64
+FIRST_LEVEL_BITS = 4096
+SECOND_LEVEL_BITS = 16_384
 
 Words = NDArray[np.uint64]
 
-ROWS_AT_ONCE = 64  # that are rotated together: 25 MB at 98,304 dimensions
+ROWS_PER_BLOCK = 64  # that are rotated together: 25 MB at 98,304 dimensions
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,19 +55,21 @@ def level_words(padded: int) -> tuple[int, ...]:
 @lru_cache(maxsize=8)
 def level_ends(padded: int) -> NDArray[np.int64]:
     """(levels,): up to which word each level of a code of `padded` bits goes."""
-    firsts = [end // WORD for end in (FIRST_BITS, SECOND_BITS) if 2 * end <= padded]
-    ends = np.array([*firsts, padded // WORD], np.int64)
+    firsts = [
+        end // WORD_BITS for end in (FIRST_LEVEL_BITS, SECOND_LEVEL_BITS) if 2 * end <= padded
+    ]
+    ends = np.array([*firsts, padded // WORD_BITS], np.int64)
     ends.flags.writeable = False
     return ends
 
 
-def sign_codes(rows: Floats) -> SignCodes:
+def encode_signs(rows: Floats) -> SignCodes:
     """The codes of (n, dimension) float32 rows of length 1 or 0."""
-    turn = rotation(rows.shape[1])
-    words = np.empty((len(rows), turn.padded // WORD), np.uint64)
+    turn = get_rotation(rows.shape[1])
+    words = np.empty((len(rows), turn.padded // WORD_BITS), np.uint64)
     norms = np.empty(len(rows), np.float32)
-    for begin in range(0, len(rows), ROWS_AT_ONCE):
-        part = slice(begin, begin + ROWS_AT_ONCE)
+    for begin in range(0, len(rows), ROWS_PER_BLOCK):
+        part = slice(begin, begin + ROWS_PER_BLOCK)
         rotated = turn.rotate(rows[part])
         words[part] = pack_signs(rotated)
         norms[part] = np.abs(rotated).sum(axis=1, dtype=np.float64)

@@ -25,65 +25,65 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared.codes.int8 import Int8Codes, int8_codes
-from shared.codes.rotation import ROUNDS, SEED, Floats, rotation
-from shared.codes.signs import SignCodes, level_words, sign_codes
+from shared.codes.rotation import ROUNDS, SEED, Floats, get_rotation
+from shared.codes.signs import SignCodes, encode_signs, level_words
 
-FORMAT = 1
-INT8_FORMAT = 1
-ALIGNED = 64
-MOST_HEADER_BYTES = 4096
+SIGN_CODES_FORMAT = 1
+INT8_CODES_FORMAT = 1
+ALIGNMENT_BYTES = 64
+MAX_HEADER_BYTES = 4096
 
 Layout = tuple[str, tuple[int, ...]]
 """The dtype of an array, and the shape of what it has for each row."""
 
 
-def encode_codes(rows: Floats, chunk_sha256: str) -> bytes:
+def encode_sign_codes(rows: Floats, chunk_sha256: str) -> bytes:
     """The file of the sign codes of (n, dimension) rows, whose chunk has this hash."""
-    codes = sign_codes(rows)
-    return _encode(_signs_made(rows.shape[1]), [codes.norms, *codes.levels], chunk_sha256)
+    codes = encode_signs(rows)
+    return _encode(_sign_codes_spec(rows.shape[1]), [codes.norms, *codes.levels], chunk_sha256)
 
 
-def decode_codes(data: Any, *, rows: int, dimension: int, chunk_sha256: str) -> SignCodes:
+def decode_sign_codes(data: Any, *, rows: int, dimension: int, chunk_sha256: str) -> SignCodes:
     """The sign codes in a file's bytes, or in any buffer of them, which they go on using.
 
     ValueError says why they are not those of this chunk, as they are made now.
     """
-    made = _signs_made(dimension)
+    made = _sign_codes_spec(dimension)
     layout: list[Layout] = [("<f4", ()), *(("<u8", (words,)) for words in made["levels"])]
     norms, *levels = _decode(data, made, layout, rows, chunk_sha256)
     return SignCodes(tuple(levels), norms)
 
 
-def encode_int8(rows: Floats, chunk_sha256: str) -> bytes:
+def encode_int8_codes(rows: Floats, chunk_sha256: str) -> bytes:
     """The file of the int8 codes of (n, dimension) rows, whose chunk has this hash."""
     codes = int8_codes(rows)
     arrays: list[NDArray[Any]] = [codes.scales, codes.errors, codes.lengths, codes.numbers]
-    return _encode(_int8_made(rows.shape[1]), arrays, chunk_sha256)
+    return _encode(_int8_codes_spec(rows.shape[1]), arrays, chunk_sha256)
 
 
-def decode_int8(data: Any, *, rows: int, dimension: int, chunk_sha256: str) -> Int8Codes:
-    """The int8 codes in a file's bytes, as `decode_codes` reads sign codes."""
+def decode_int8_codes(data: Any, *, rows: int, dimension: int, chunk_sha256: str) -> Int8Codes:
+    """The int8 codes in a file's bytes, as `decode_sign_codes` reads sign codes."""
     single: Layout = ("<f4", ())
-    layout: list[Layout] = [single, single, single, ("|i1", (rotation(dimension).padded,))]
-    arrays = _decode(data, _int8_made(dimension), layout, rows, chunk_sha256)
+    layout: list[Layout] = [single, single, single, ("|i1", (get_rotation(dimension).padded,))]
+    arrays = _decode(data, _int8_codes_spec(dimension), layout, rows, chunk_sha256)
     scales, errors, lengths, numbers = arrays
     return Int8Codes(numbers, scales, errors, lengths)
 
 
-def _signs_made(dimension: int) -> dict[str, Any]:
+def _sign_codes_spec(dimension: int) -> dict[str, Any]:
     """How sign codes are made: others are not compared with them."""
     return {
-        "format": FORMAT,
+        "format": SIGN_CODES_FORMAT,
         "dimension": dimension,
         "seed": SEED,
         "rounds": ROUNDS,
-        "levels": list(level_words(rotation(dimension).padded)),
+        "levels": list(level_words(get_rotation(dimension).padded)),
     }
 
 
-def _int8_made(dimension: int) -> dict[str, Any]:
+def _int8_codes_spec(dimension: int) -> dict[str, Any]:
     return {
-        "format": INT8_FORMAT,
+        "format": INT8_CODES_FORMAT,
         "kind": "int8",
         "dimension": dimension,
         "seed": SEED,
@@ -110,7 +110,7 @@ def _decode(
 ) -> list[NDArray[Any]]:
     """The arrays of a file that was made so; ValueError when it is another."""
     view = memoryview(data)
-    line, _, _ = bytes(view[:MOST_HEADER_BYTES]).partition(b"\n")
+    line, _, _ = bytes(view[:MAX_HEADER_BYTES]).partition(b"\n")
     header = json.loads(line)  # a JSONDecodeError is a ValueError
     if not isinstance(header, dict):
         raise ValueError("no codes: the file begins otherwise")
@@ -133,9 +133,9 @@ def _array(
 ) -> tuple[NDArray[Any], int]:
     """The array that begins there, and where the next one does."""
     array = np.frombuffer(body, dtype, math.prod(shape), at).reshape(shape)
-    return array, at + -(-array.nbytes // ALIGNED) * ALIGNED
+    return array, at + -(-array.nbytes // ALIGNMENT_BYTES) * ALIGNMENT_BYTES
 
 
 def _padded(data: bytes, filling: bytes = b"\0", end: bytes = b"") -> bytes:
-    missing = -(len(data) + len(end)) % ALIGNED
+    missing = -(len(data) + len(end)) % ALIGNMENT_BYTES
     return data + filling * missing + end

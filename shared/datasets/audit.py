@@ -12,18 +12,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.datasets.distances import metres_apart
-from shared.datasets.ground_truth import degrees_apart
-from shared.datasets.rules import Rule, parse_rule
-from shared.datasets.shots import EvaluationSet, Indices, Shot
+from shared.datasets.distances import pairwise_distances_m
+from shared.datasets.ground_truth import heading_differences
+from shared.datasets.rules import PositiveRule, parse_rule
+from shared.datasets.shots import DatasetPhoto, EvaluationSet, Indices
 from shared.errors import InvalidRequest
 
-TIMES_THE_RULE = 4.0
+MAX_RULE_MULTIPLE = 4.0
 """How far outside of the rule a match is still worth a look."""
 
 
 @dataclass(frozen=True, slots=True)
-class Suspect:
+class SuspectLabel:
     """A query whose confident first match counts as wrong."""
 
     query: int
@@ -38,13 +38,13 @@ class Suspect:
     """between the ways they look, 0 to 180; None where one has no heading"""
 
 
-def find_suspects(
+def find_suspect_labels(
     evaluation: EvaluationSet,
     ranked: Indices,
     scores: NDArray[np.float32] | None = None,
     *,
     min_score: float | None = None,
-) -> list[Suspect]:
+) -> list[SuspectLabel]:
     """First matches that are no positives, are confident, and lie just outside the set's rule.
 
     `ranked` is (queries, k) database indices and `scores` (queries, k), the higher the better. A
@@ -81,16 +81,16 @@ def find_suspects(
 
 def _near(
     evaluation: EvaluationSet, first: Indices, asked: Indices, scores: NDArray[np.float32] | None
-) -> list[Suspect]:
+) -> list[SuspectLabel]:
     queries = [evaluation.queries[number] for number in asked]
     matches = [evaluation.database[number] for number in first[asked]]
     rule = _rule_of(evaluation)
-    metres = metres_apart(queries, matches)
+    metres = pairwise_distances_m(queries, matches)
     suspects = []
     for number, query, match, away in zip(asked.tolist(), queries, matches, metres, strict=True):
-        if _just_outside(rule, query, match, float(away)):
+        if _is_just_outside(rule, query, match, float(away)):
             suspects.append(
-                Suspect(
+                SuspectLabel(
                     number,
                     int(first[number]),
                     query.name,
@@ -103,22 +103,24 @@ def _near(
     return suspects
 
 
-def _just_outside(rule: Rule, query: Shot, match: Shot, metres: float) -> bool:
+def _is_just_outside(
+    rule: PositiveRule, query: DatasetPhoto, match: DatasetPhoto, metres: float
+) -> bool:
     if rule.kind == "frames":
         if query.frame is None or match.frame is None:
             return False
-        return abs(query.frame - match.frame) <= TIMES_THE_RULE * max(rule.frames, 1)
-    return metres <= TIMES_THE_RULE * rule.radius_m  # never of NaN
+        return abs(query.frame - match.frame) <= MAX_RULE_MULTIPLE * max(rule.frames, 1)
+    return metres <= MAX_RULE_MULTIPLE * rule.radius_m  # never of NaN
 
 
-def _rule_of(evaluation: EvaluationSet) -> Rule:
+def _rule_of(evaluation: EvaluationSet) -> PositiveRule:
     try:
         return parse_rule(evaluation.rule)
     except InvalidRequest:  # a ground truth of unknown making, named after its file
-        return Rule("radius")
+        return PositiveRule("radius")
 
 
-def _degrees(query: Shot, match: Shot) -> float | None:
+def _degrees(query: DatasetPhoto, match: DatasetPhoto) -> float | None:
     if query.heading is None or match.heading is None:
         return None
-    return float(degrees_apart(np.array([match.heading]), query.heading)[0])
+    return float(heading_differences(np.array([match.heading]), query.heading)[0])

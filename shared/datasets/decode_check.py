@@ -9,38 +9,38 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from shared.errors import Unprocessable
-from shared.photo_formats import BROKEN, check_pixels, open_photo
+from shared.photo_formats import PHOTO_READ_ERRORS, check_pixel_count, open_photo
 
-MOST_PIXELS = 100_000_000
+MAX_DECODED_PIXELS = 100_000_000
 """Of a photo that is decoded: more is an attack on memory, or no photo of a street."""
-AT_ONCE = 1024
+PHOTOS_PER_TASK = 1024
 
 
-def undecodable(
-    paths: Sequence[Path], done: Callable[[int], None] = lambda count: None
+def find_undecodable(
+    paths: Sequence[Path], on_progress: Callable[[int], None] = lambda count: None
 ) -> list[tuple[Path, str]]:
-    """Each photo that can't be decoded, with what is wrong; `done` is told of each photo."""
+    """Each photo that can't be decoded, with what is wrong; `on_progress` is told of each photo."""
     broken = []
     # Pillow decodes without the lock. Its warnings, of strange EXIF, are ignored around all threads
     # at once: the filters are the process's, not a thread's.
     with warnings.catch_warnings(), ThreadPoolExecutor(os.cpu_count()) as pool:
         warnings.simplefilter("ignore")
-        for start in range(0, len(paths), AT_ONCE):
-            some = paths[start : start + AT_ONCE]
-            for path, fault in zip(some, pool.map(_fault_of, some), strict=True):
-                done(1)
+        for start in range(0, len(paths), PHOTOS_PER_TASK):
+            some = paths[start : start + PHOTOS_PER_TASK]
+            for path, fault in zip(some, pool.map(_decode_error, some), strict=True):
+                on_progress(1)
                 if fault is not None:
                     broken.append((path, fault))
     return broken
 
 
-def _fault_of(path: Path) -> str | None:
+def _decode_error(path: Path) -> str | None:
     try:
         with path.open("rb") as file, open_photo(file) as image:
-            check_pixels(image.width, image.height, MOST_PIXELS)
+            check_pixel_count(image.width, image.height, MAX_DECODED_PIXELS)
             image.load()
     except Unprocessable as error:
         return error.detail
-    except BROKEN as error:
+    except PHOTO_READ_ERRORS as error:
         return str(error) or type(error).__name__
     return None

@@ -11,14 +11,16 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from shared.datasets.recall import true_positives
-from shared.datasets.rules import Rule
-from shared.datasets.shots import Indices, Shot
-from shared.datasets.zones import planes, positions_of
+from shared.datasets.recall import positives_within
+from shared.datasets.rules import PositiveRule
+from shared.datasets.shots import DatasetPhoto, Indices
+from shared.datasets.zones import group_by_utm_plane, utm_positions
 from shared.errors import InvalidRequest
 
 
-def find_positives(rule: Rule, queries: Sequence[Shot], database: Sequence[Shot]) -> list[Indices]:
+def find_positives(
+    rule: PositiveRule, queries: Sequence[DatasetPhoto], database: Sequence[DatasetPhoto]
+) -> list[Indices]:
     """For each query the ascending indices of its positives in the database.
 
     Raises InvalidRequest where photos don't say what the rule needs: `no_positions`, `no_headings`,
@@ -28,62 +30,74 @@ def find_positives(rule: Rule, queries: Sequence[Shot], database: Sequence[Shot]
         case "radius":
             return _within(rule, queries, database)
         case "heading":
-            return _looking_alike(rule, queries, database)
+            return _same_heading(rule, queries, database)
         case "frames":
             return _frames(rule, queries, database)
         case "place-label":
             return _same_place(queries, database)
 
 
-def _within(rule: Rule, queries: Sequence[Shot], database: Sequence[Shot]) -> list[Indices]:
+def _within(
+    rule: PositiveRule, queries: Sequence[DatasetPhoto], database: Sequence[DatasetPhoto]
+) -> list[Indices]:
     found: list[Indices] = [np.empty(0, np.int64)] * len(queries)
-    for asked, kept, query_metres, metres in planes(positions_of(queries), positions_of(database)):
-        near = true_positives(query_metres, metres, rule.radius_m)
+    for asked, kept, query_metres, metres in group_by_utm_plane(
+        utm_positions(queries), utm_positions(database)
+    ):
+        near = positives_within(query_metres, metres, rule.radius_m)
         for number, positives in zip(asked.tolist(), near, strict=True):
             found[number] = kept[positives]
     return found
 
 
-def _looking_alike(rule: Rule, queries: Sequence[Shot], database: Sequence[Shot]) -> list[Indices]:
-    asked = _said("heading", "no_headings", queries, lambda shot: shot.heading)
-    looking = _said("heading", "no_headings", database, lambda shot: shot.heading)
+def _same_heading(
+    rule: PositiveRule, queries: Sequence[DatasetPhoto], database: Sequence[DatasetPhoto]
+) -> list[Indices]:
+    asked = _required_values("heading", "no_headings", queries, lambda shot: shot.heading)
+    looking = _required_values("heading", "no_headings", database, lambda shot: shot.heading)
     found = _within(rule, queries, database)
     return [
-        near[degrees_apart(looking[near], heading) <= rule.degrees]
+        near[heading_differences(looking[near], heading) <= rule.degrees]
         for near, heading in zip(found, asked, strict=True)
     ]
 
 
-def degrees_apart(
+def heading_differences(
     headings: np.ndarray[tuple[int, ...], np.dtype[np.float64]], heading: float
 ) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
     """Angles between looking ways, 0 to 180 degrees; a heading may be of any turn, such as 370."""
     return np.abs(np.mod(headings - heading + 180.0, 360.0) - 180.0)
 
 
-def _frames(rule: Rule, queries: Sequence[Shot], database: Sequence[Shot]) -> list[Indices]:
-    asked = _said("frame number", "no_frames", queries, lambda shot: shot.frame).astype(np.int64)
-    frames = _said("frame number", "no_frames", database, lambda shot: shot.frame).astype(np.int64)
+def _frames(
+    rule: PositiveRule, queries: Sequence[DatasetPhoto], database: Sequence[DatasetPhoto]
+) -> list[Indices]:
+    asked = _required_values("frame number", "no_frames", queries, lambda shot: shot.frame).astype(
+        np.int64
+    )
+    frames = _required_values(
+        "frame number", "no_frames", database, lambda shot: shot.frame
+    ).astype(np.int64)
     groups: dict[str | None, list[int]] = {}
     for number, shot in enumerate(database):
-        groups.setdefault(shot.sequence if rule.in_sequence else None, []).append(number)
+        groups.setdefault(shot.sequence if rule.same_sequence else None, []).append(number)
     ordered = {
         key: np.array(numbers)[np.argsort(frames[numbers], kind="stable")]
         for key, numbers in groups.items()
     }
     found = []
     for shot, frame in zip(queries, asked, strict=True):
-        order = ordered.get(shot.sequence if rule.in_sequence else None, np.empty(0, np.int64))
+        order = ordered.get(shot.sequence if rule.same_sequence else None, np.empty(0, np.int64))
         first = np.searchsorted(frames[order], frame - rule.frames, "left")
         last = np.searchsorted(frames[order], frame + rule.frames, "right")
         found.append(np.sort(order[first:last]))
     return found
 
 
-def _same_place(queries: Sequence[Shot], database: Sequence[Shot]) -> list[Indices]:
+def _same_place(queries: Sequence[DatasetPhoto], database: Sequence[DatasetPhoto]) -> list[Indices]:
     for shots in (queries, database):
         if all(shot.place is None for shot in shots):
-            raise _lacking("place label", "no_places", shots)
+            raise _missing_values_error("place label", "no_places", shots)
     by_place: dict[str, list[int]] = {}
     for number, shot in enumerate(database):
         if shot.place is not None:
@@ -92,17 +106,17 @@ def _same_place(queries: Sequence[Shot], database: Sequence[Shot]) -> list[Indic
     return [np.array(by_place.get(shot.place or "", []), np.int64) for shot in queries]
 
 
-def _said(
-    what: str, code: str, shots: Sequence[Shot], of: Callable[[Shot], float | None]
+def _required_values(
+    what: str, code: str, shots: Sequence[DatasetPhoto], of: Callable[[DatasetPhoto], float | None]
 ) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
     values = [of(shot) for shot in shots]
     lacking = [shot for shot, value in zip(shots, values, strict=True) if value is None]
     if lacking:
-        raise _lacking(what, code, lacking)
+        raise _missing_values_error(what, code, lacking)
     return np.array(values, np.float64)
 
 
-def _lacking(what: str, code: str, shots: Sequence[Shot]) -> InvalidRequest:
+def _missing_values_error(what: str, code: str, shots: Sequence[DatasetPhoto]) -> InvalidRequest:
     return InvalidRequest(
         code,
         f"{len(shots)} photos say no {what} (the first: {shots[0].name}), which this rule needs. "

@@ -32,7 +32,7 @@ def write_ground_truth(
         "database": {"count": len(database), "sha256": list_fingerprint(database)},
         "queries": {"count": len(queries), "sha256": list_fingerprint(queries)},
     }
-    said_path(path).write_text(json.dumps(said, indent=1) + "\n", encoding="utf-8")
+    sidecar_path(path).write_text(json.dumps(said, indent=1) + "\n", encoding="utf-8")
 
 
 def read_ground_truth(
@@ -44,23 +44,27 @@ def read_ground_truth(
     `ground_truth_of_other_lists`).
     """
     found = read_integer_lists(path)
-    rule = _check_said(path, database, queries)
+    rule = _check_sidecar(path, database, queries)
     if len(found) != len(queries):
-        raise _other(path, f"it has {len(found)} rows, and there are {len(queries)} queries")
+        raise _mismatch_error(
+            path, f"it has {len(found)} rows, and there are {len(queries)} queries"
+        )
     largest = max((int(row[-1]) for row in found if len(row)), default=-1)
     if largest >= len(database):
-        raise _other(path, f"it speaks of photo {largest}, and there are {len(database)} from 0")
+        raise _mismatch_error(
+            path, f"it speaks of photo {largest}, and there are {len(database)} from 0"
+        )
     return found, rule
 
 
-def said_path(path: Path) -> Path:
+def sidecar_path(path: Path) -> Path:
     """`gt.npy` -> `gt.json`"""
     return path.with_suffix(".json")
 
 
-def _check_said(path: Path, database: Sequence[str], queries: Sequence[str]) -> str | None:
+def _check_sidecar(path: Path, database: Sequence[str], queries: Sequence[str]) -> str | None:
     """The rule; None where nothing is said, as with every published ground truth."""
-    beside = said_path(path)
+    beside = sidecar_path(path)
     try:
         said: Any = json.loads(beside.read_text(encoding="utf-8"))
         kept = {role: (said[role]["count"], said[role]["sha256"]) for role in ROLES}
@@ -76,16 +80,18 @@ def _check_said(path: Path, database: Sequence[str], queries: Sequence[str]) -> 
     for role, names in zip(ROLES, (database, queries), strict=True):
         count, fingerprint = kept[role]
         if count != len(names):
-            raise _other(path, f"it was made for {count} {role}, and here are {len(names)}")
+            raise _mismatch_error(
+                path, f"it was made for {count} {role}, and here are {len(names)}"
+            )
         if fingerprint != list_fingerprint(names):
-            raise _other(path, f"the {role} are others, or in another order")
+            raise _mismatch_error(path, f"the {role} are others, or in another order")
     return rule
 
 
 ROLES = ("database", "queries")
 
 
-def _other(path: Path, fault: str) -> PlacewiseError:
+def _mismatch_error(path: Path, fault: str) -> PlacewiseError:
     return InvalidRequest(
         "ground_truth_of_other_lists",
         f"{path} was made for other lists: {fault}. Take the lists that it was made for, or make "

@@ -50,10 +50,10 @@ def read_integer_lists(path: Path) -> list[Indices]:
                 raise ValueError(f"it holds {dtype}, and lists of integers are needed")
             return [_row(value, path) for value in _unpickled(file, shape)]
     except (OSError, ValueError, EOFError, pickle.UnpicklingError) as error:
-        raise _bad(path, str(error)) from error
+        raise _bad_list_error(path, str(error)) from error
     except (TypeError, AttributeError, LookupError, RecursionError, MemoryError) as error:
         # What a pickle that is no pickle, or a malicious one, makes the unpickler stumble over.
-        raise _bad(path, f"its pickle is broken ({type(error).__name__})") from error
+        raise _bad_list_error(path, f"its pickle is broken ({type(error).__name__})") from error
 
 
 def read_names(path: Path) -> list[str]:
@@ -95,7 +95,7 @@ def _row(value: Any, path: Path) -> Indices:
         value = [value]
     plain = [one.value() if isinstance(one, _Scalar) else one for one in value]
     if not all(isinstance(one, int | np.integer) and one >= 0 for one in plain):
-        raise _bad(path, "a row holds something else than indices from 0")
+        raise _bad_list_error(path, "a row holds something else than indices from 0")
     return np.unique(np.array(plain, np.int64))
 
 
@@ -112,7 +112,7 @@ def _unpickled(file: BinaryIO, shape: tuple[int, ...]) -> list[Any]:
     return [values[start : start + shape[1]] for start in range(0, len(values), shape[1] or 1)]
 
 
-def _bad(path: Path, fault: str) -> InvalidRequest:
+def _bad_list_error(path: Path, fault: str) -> InvalidRequest:
     return InvalidRequest(
         "bad_ground_truth",
         f"{path} is no ground truth: {fault}. It has to be an array of lists of database indices, "

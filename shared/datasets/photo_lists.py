@@ -5,20 +5,20 @@ from __future__ import annotations
 from pathlib import Path
 
 from shared.datasets.integer_lists import read_names
-from shared.datasets.layouts.named_photos import located_by_exif, shot_of
-from shared.datasets.layouts.tables import bad_row, number, read_table, whole_number
-from shared.datasets.shots import Shot
-from shared.datasets.zones import with_utm
+from shared.datasets.layouts.named_photos import add_exif_positions, photo_from_filename
+from shared.datasets.layouts.tables import bad_row_error, parse_integer, parse_number, read_table
+from shared.datasets.shots import DatasetPhoto
+from shared.datasets.zones import add_utm_positions
 from shared.errors import InvalidRequest
 
 PATH_COLUMNS = ("path", "filename", "file")
-NAMES = {"lat": "latitude", "lon": "longitude", "UTMx": "easting", "UTMy": "northing"}
+COLUMN_ALIASES = {"lat": "latitude", "lon": "longitude", "UTMx": "easting", "UTMy": "northing"}
 """columns by the names that other data sets give them"""
-NUMBERS = ("latitude", "longitude", "easting", "northing", "heading")
-TEXTS = ("zone", "place", "sequence")
+NUMBER_COLUMNS = ("latitude", "longitude", "easting", "northing", "heading")
+TEXT_COLUMNS = ("zone", "place", "sequence")
 
 
-def read_list(path: Path, folder: Path | None = None) -> tuple[Shot, ...]:
+def read_photo_list(path: Path, folder: Path | None = None) -> tuple[DatasetPhoto, ...]:
     """The photos in the list's order, whose paths begin at `folder` (left out: the list's own).
 
     Their positions stand in a CSV's columns, in `@UTM@` file names, or in the EXIF of those that
@@ -37,11 +37,11 @@ def read_list(path: Path, folder: Path | None = None) -> tuple[Shot, ...]:
             shots = [_named(root, name) for name in _lines(path)]
     if not shots:
         raise InvalidRequest("bad_list", f"{path} names no photo.")
-    return with_utm(located_by_exif(with_utm(shots)))
+    return add_utm_positions(add_exif_positions(add_utm_positions(shots)))
 
 
-def _named(root: Path, name: str) -> Shot:
-    return shot_of(root / name.lstrip("/"), name)
+def _named(root: Path, name: str) -> DatasetPhoto:
+    return photo_from_filename(root / name.lstrip("/"), name)
 
 
 def _lines(path: Path) -> list[str]:
@@ -63,19 +63,25 @@ def _path_column(path: Path, row: dict[str, str]) -> str:
     return column
 
 
-def _row(path: Path, line: int, row: dict[str, str], root: Path, path_column: str) -> Shot:
+def _row(path: Path, line: int, row: dict[str, str], root: Path, path_column: str) -> DatasetPhoto:
     """Empty cells are not said; further columns are the set's own business."""
     name = row[path_column].strip()
     if not name:
-        raise bad_row(path, line, f"its {path_column} is empty")
-    said = {NAMES.get(column, column): cell for column, cell in row.items() if cell.strip()}
-    numbers = {column: number(path, line, said, column) for column in NUMBERS if column in said}
+        raise bad_row_error(path, line, f"its {path_column} is empty")
+    said = {
+        COLUMN_ALIASES.get(column, column): cell for column, cell in row.items() if cell.strip()
+    }
+    numbers = {
+        column: parse_number(path, line, said, column)
+        for column in NUMBER_COLUMNS
+        if column in said
+    }
     for one, other in (("latitude", "longitude"), ("easting", "northing")):
         if (one in numbers) != (other in numbers):
-            raise bad_row(path, line, f"{one} and {other} come in pairs")
+            raise bad_row_error(path, line, f"{one} and {other} come in pairs")
     by_name = _named(root, name)
     placed = by_name if not numbers.keys() & {"latitude", "easting"} else None
-    return Shot(
+    return DatasetPhoto(
         by_name.path,
         name,
         easting=numbers.get("easting", placed.easting if placed else None),
@@ -85,6 +91,6 @@ def _row(path: Path, line: int, row: dict[str, str], root: Path, path_column: st
         longitude=numbers.get("longitude", placed.longitude if placed else None),
         heading=numbers["heading"] % 360 if "heading" in numbers else by_name.heading,
         place=said.get("place"),
-        frame=whole_number(path, line, said, "frame") if "frame" in said else None,
+        frame=parse_integer(path, line, said, "frame") if "frame" in said else None,
         sequence=said.get("sequence"),
     )

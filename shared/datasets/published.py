@@ -16,7 +16,7 @@ from shared.datasets.shots import EvaluationSet
 
 
 @dataclass(frozen=True, slots=True)
-class Published:
+class PublishedResult:
     protocol: str
     fingerprint: str
     """`EvaluationSet.fingerprint` of the very set"""
@@ -29,15 +29,15 @@ class Published:
         return asdict(self) | {"recall": {str(k): share for k, share in self.recall.items()}}
 
 
-PUBLISHED: tuple[Published, ...] = ()
+PUBLISHED_RESULTS: tuple[PublishedResult, ...] = ()
 
 
-def published_on(
-    asked: EvaluationSet, known: tuple[Published, ...] = PUBLISHED
-) -> tuple[Published, ...]:
+def find_published_results(
+    evaluation: EvaluationSet, known: tuple[PublishedResult, ...] = PUBLISHED_RESULTS
+) -> tuple[PublishedResult, ...]:
     """What has been published of exactly this set."""
     return tuple(
         found
         for found in known
-        if (found.protocol, found.fingerprint) == (asked.protocol, asked.fingerprint)
+        if (found.protocol, found.fingerprint) == (evaluation.protocol, evaluation.fingerprint)
     )

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 POSITIVE_WITHIN_M = 25.0
-QUERIES_AT_ONCE = 256
-CANDIDATES_AT_ONCE = 2_000_000
+QUERIES_PER_BLOCK = 256
+MAX_CANDIDATES_PER_BLOCK = 2_000_000
 """pairs that are measured at a time: about 150 MB"""
 
 Positions = NDArray[np.float64]
@@ -21,7 +21,7 @@ Descriptors = NDArray[np.float32]
 Indices = NDArray[np.int64]
 
 
-def true_positives(
+def positives_within(
     queries: Positions, database: Positions, within_m: float = POSITIVE_WITHIN_M
 ) -> list[Indices]:
     """(n, 2) and (m, 2) UTM metres of one zone -> for each query its positives, ascending.
@@ -31,20 +31,20 @@ def true_positives(
     """
     if not len(queries) or not len(database):
         return [np.empty(0, np.int64) for _ in queries]
-    cells = _Cells(database, within_m)
+    cells = _PositionGrid(database, within_m)
     first, last = cells.candidates(queries)
     counts = (last - first).sum(axis=0)
     found: list[Indices] = []
     start = 0
     while start < len(queries):
-        taken = np.searchsorted(np.cumsum(counts[start:]), CANDIDATES_AT_ONCE, "right")
+        taken = np.searchsorted(np.cumsum(counts[start:]), MAX_CANDIDATES_PER_BLOCK, "right")
         stop = start + max(1, int(taken))
         found += cells.near(queries[start:stop], first[:, start:stop], last[:, start:stop])
         start = stop
     return found
 
 
-class _Cells:
+class _PositionGrid:
     """(m, 2) positions, sorted by the square cell that they lie in."""
 
     def __init__(self, positions: Positions, within_m: float) -> None:
@@ -92,21 +92,21 @@ class _Cells:
         return np.split(number[ordered], ends[:-1])
 
 
-def rank(queries: Descriptors, database: Descriptors, k: int) -> Indices:
+def rank_by_similarity(queries: Descriptors, database: Descriptors, k: int) -> Indices:
     """(n, D) and (m, D) unit rows -> (n, min(k, m)) database indices, most similar first.
 
     Of equally similar ones the lower index comes first, so that a tie is nobody's luck.
     """
     ranked = []
-    for start in range(0, len(queries), QUERIES_AT_ONCE):
-        scores = queries[start : start + QUERIES_AT_ONCE] @ database.T
+    for start in range(0, len(queries), QUERIES_PER_BLOCK):
+        scores = queries[start : start + QUERIES_PER_BLOCK] @ database.T
         ranked.append(np.argsort(-scores, axis=1, kind="stable")[:, :k])
     if not ranked:
         return np.empty((0, min(k, len(database))), np.int64)
     return np.concatenate(ranked)
 
 
-def recall_at(
+def recall_at_k(
     ranked: Indices, positives: Sequence[Indices], ks: Sequence[int] = (1, 5, 10)
 ) -> dict[int, float]:
     """The share of queries, 0 to 1, that have a positive among their first k, for each k.

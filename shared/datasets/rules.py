@@ -10,7 +10,9 @@ from shared.errors import InvalidRequest
 
 Kind = Literal["radius", "heading", "frames", "place-label"]
 
-KNOWN = "radius METRES, heading METRES DEGREES, frames COUNT, frames COUNT in sequence, place-label"
+RULE_SYNTAX = (
+    "radius METRES, heading METRES DEGREES, frames COUNT, frames COUNT in sequence, place-label"
+)
 _NUMBER = r"(\d+(?:\.\d+)?)"
 _PATTERNS = {
     "radius": re.compile(rf"radius(?:[ :]+{_NUMBER}(?: ?m)?)?"),
@@ -21,7 +23,7 @@ _PATTERNS = {
 
 
 @dataclass(frozen=True, slots=True)
-class Rule:
+class PositiveRule:
     """A database photo is a positive of a query when they meet all that is said here."""
 
     kind: Kind
@@ -31,7 +33,7 @@ class Rule:
     """`heading`: looking ways that differ by at most so much"""
     frames: int = 0
     """`frames`: at most so many frames apart"""
-    in_sequence: bool = False
+    same_sequence: bool = False
     """`frames`: and of the same sequence"""
 
     def __str__(self) -> str:
@@ -41,23 +43,23 @@ class Rule:
             case "heading":
                 return f"heading {self.radius_m:g} m {self.degrees:g} deg"
             case "frames":
-                return f"frames {self.frames}" + (" in sequence" if self.in_sequence else "")
+                return f"frames {self.frames}" + (" in sequence" if self.same_sequence else "")
             case "place-label":
                 return "place-label"
 
 
-def parse_rule(text: str) -> Rule:
+def parse_rule(text: str) -> PositiveRule:
     """`radius 25 m`, `heading 25 m 40 deg`, `frames 5 in sequence`, `place-label`; units may be
     left out. Raises InvalidRequest (`unknown_rule`)."""
     cleaned = " ".join(text.lower().split())
     if match := _PATTERNS["radius"].fullmatch(cleaned):
-        return Rule("radius", radius_m=float(match[1] or 25))
+        return PositiveRule("radius", radius_m=float(match[1] or 25))
     if match := _PATTERNS["heading"].fullmatch(cleaned):
         degrees = float(match[2] or 40)
         if degrees <= 180:
-            return Rule("heading", radius_m=float(match[1] or 25), degrees=degrees)
+            return PositiveRule("heading", radius_m=float(match[1] or 25), degrees=degrees)
     if match := _PATTERNS["frames"].fullmatch(cleaned):
-        return Rule("frames", frames=int(match[1]), in_sequence=bool(match[2]))
+        return PositiveRule("frames", frames=int(match[1]), same_sequence=bool(match[2]))
     if _PATTERNS["place-label"].fullmatch(cleaned):
-        return Rule("place-label")
-    raise InvalidRequest("unknown_rule", f"There is no rule {text!r}. Known are: {KNOWN}.")
+        return PositiveRule("place-label")
+    raise InvalidRequest("unknown_rule", f"There is no rule {text!r}. Known are: {RULE_SYNTAX}.")

@@ -15,16 +15,16 @@ from pathlib import Path
 import numpy as np
 
 from shared.datasets.ground_truth import find_positives
-from shared.datasets.layouts.layout import EvaluationLayout, Listed, TrainingLayout
+from shared.datasets.layouts.layout import EvaluationLayout, ListedSet, TrainingLayout
 from shared.datasets.layouts.registry import EVALUATION_LAYOUTS, TRAINING_LAYOUTS
 from shared.datasets.rules import parse_rule
-from shared.datasets.shots import EvaluationSet, Shot, TrainingPlace, TrainingSet
+from shared.datasets.shots import DatasetPhoto, EvaluationSet, TrainingPlace, TrainingSet
 from shared.errors import InvalidRequest, NotFound
 
 __all__ = [
     "EvaluationSet",
-    "FoundSet",
-    "Shot",
+    "DiscoveredSet",
+    "DatasetPhoto",
     "TrainingPlace",
     "TrainingSet",
     "evaluation_set_names",
@@ -34,13 +34,13 @@ __all__ = [
     "open_training_set",
 ]
 
-PARTS = frozenset({"database", "queries", "train", "val", "test", "train_val", "images"})
+PART_FOLDERS = frozenset({"database", "queries", "train", "val", "test", "train_val", "images"})
 """folders of a data set that are never a data set of their own"""
-HOW_SETS_LIE = "docs/how-to/data-sets.md shows every layout."
+LAYOUTS_HELP = "docs/how-to/data-sets.md shows every layout."
 
 
 @dataclass(frozen=True, slots=True)
-class FoundSet:
+class DiscoveredSet:
     """An evaluation set that is there to be opened."""
 
     name: str
@@ -51,7 +51,7 @@ class FoundSet:
 
 def find_training_layout(root: Path) -> tuple[TrainingLayout, Path] | None:
     """The layout of the places to learn from, and the folder at or below `root` that has it."""
-    for _, bases in _homes(root):
+    for _, bases in _candidate_folders(root):
         for base in bases:
             for layout in TRAINING_LAYOUTS:
                 if layout.recognises(base):
@@ -71,13 +71,13 @@ def open_training_set(
     Raises NotFound (`no_training_set`, `city_missing`), InvalidRequest (`missing_column`,
     `bad_table`, `no_places`).
     """
-    found = find_training_layout(_checked(root))
+    found = find_training_layout(_existing_folder(root))
     if found is None:
         raise NotFound(
             "no_training_set",
             f"{root} holds no places to learn from: neither gsv_xs (train/CITY and "
             f"dataframes/CITY.csv) nor GSV-Cities (Images/CITY and Dataframes/CITY.csv) nor a "
-            f"train.csv. {HOW_SETS_LIE}",
+            f"train.csv. {LAYOUTS_HELP}",
         )
     layout, base = found
     opened = layout.open(base, cities, min_photos)
@@ -90,20 +90,20 @@ def open_training_set(
     return opened
 
 
-def find_evaluation_sets(root: Path) -> tuple[FoundSet, ...]:
+def find_evaluation_sets(root: Path) -> tuple[DiscoveredSet, ...]:
     """Every evaluation set at or below `root`, by name.
 
     Of two layouts of one name in the same data set the first is taken: lists before folders. Data
     sets that share a name are told apart by a number: `city`, `city_2`.
     """
-    found: dict[str, FoundSet] = {}
-    for home, bases in _homes(_checked(root)):
-        here: dict[str, FoundSet] = {}
+    found: dict[str, DiscoveredSet] = {}
+    for home, bases in _candidate_folders(_existing_folder(root)):
+        here: dict[str, DiscoveredSet] = {}
         prefix = set_prefix(home.resolve().name)
         for base in bases:
             for layout in EVALUATION_LAYOUTS:
                 for name, key in layout.sets(base, prefix).items():
-                    here.setdefault(name, FoundSet(name, layout, base, key))
+                    here.setdefault(name, DiscoveredSet(name, layout, base, key))
         for name, one in here.items():
             free = next(n for n in _numbered(name) if n not in found)
             found[free] = replace(one, name=free)
@@ -127,7 +127,7 @@ def open_evaluation_set(
     Raises NotFound (`no_evaluation_set`, `set_missing`), InvalidRequest (`which_set`,
     `unknown_protocol`, `unknown_rule`, `no_positions`, `ground_truth_of_other_lists`, ...).
     """
-    chosen = _choose(root, find_evaluation_sets(root), name)
+    chosen = _choose_set(root, find_evaluation_sets(root), name)
     protocols = chosen.layout.protocols
     if protocol is not None and protocol not in protocols:
         raise InvalidRequest(
@@ -141,10 +141,12 @@ def open_evaluation_set(
     for role, shots in (("database photo", listed.database), ("query", listed.queries)):
         if not shots:
             raise InvalidRequest("empty_set", f"{chosen.name} in {chosen.base} has no {role}.")
-    return _measured(chosen, listed, meant, str(asked) if asked else None)
+    return _make_evaluation_set(chosen, listed, meant, str(asked) if asked else None)
 
 
-def _measured(chosen: FoundSet, listed: Listed, protocol: str, rule: str | None) -> EvaluationSet:
+def _make_evaluation_set(
+    chosen: DiscoveredSet, listed: ListedSet, protocol: str, rule: str | None
+) -> EvaluationSet:
     if rule is None and listed.positives is not None:
         meant, positives = listed.rule, listed.positives
     else:
@@ -167,13 +169,13 @@ def _measured(chosen: FoundSet, listed: Listed, protocol: str, rule: str | None)
     )
 
 
-def _choose(root: Path, found: Sequence[FoundSet], name: str | None) -> FoundSet:
+def _choose_set(root: Path, found: Sequence[DiscoveredSet], name: str | None) -> DiscoveredSet:
     names = ", ".join(one.name for one in found)
     if not found:
         raise NotFound(
             "no_evaluation_set",
             f"{root} holds no set to measure on: neither database/ and queries/ nor lists as "
-            f".npy nor another layout that is known. {HOW_SETS_LIE}",
+            f".npy nor another layout that is known. {LAYOUTS_HELP}",
         )
     if name is None:
         if len(found) > 1:
@@ -185,12 +187,12 @@ def _choose(root: Path, found: Sequence[FoundSet], name: str | None) -> FoundSet
     raise NotFound("set_missing", f"{root} has no set {name}. There are: {names}.")
 
 
-def _homes(root: Path) -> Iterator[tuple[Path, list[Path]]]:
+def _candidate_folders(root: Path) -> Iterator[tuple[Path, list[Path]]]:
     """Folders that may be a data set, each with the folders in which its parts may lie."""
     children = sorted(
         child
         for child in root.iterdir()
-        if child.is_dir() and child.name not in PARTS and not child.name.startswith(".")
+        if child.is_dir() and child.name not in PART_FOLDERS and not child.name.startswith(".")
     )
     for home in (root, *children):
         images = home / "images"
@@ -208,7 +210,7 @@ def set_prefix(name: str) -> str:
     return re.sub(r"[^a-z0-9]", "", name.lower()) or "set"
 
 
-def _checked(root: Path) -> Path:
+def _existing_folder(root: Path) -> Path:
     if not root.is_dir():
         raise NotFound("no_data_set", f"There is no folder {root}.")
     return root

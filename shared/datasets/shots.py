@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 
 Indices = NDArray[np.int64]
 
-NO_FILE = -1
+MISSING_FILE_BYTES = -1
 """the size that a fingerprint takes for a photo that is not there"""
 
 
 @dataclass(frozen=True, slots=True)
-class Shot:
+class DatasetPhoto:
     """One photo of a set. None means "not said"."""
 
     path: Path
@@ -51,8 +51,8 @@ class EvaluationSet:
 
     name: str
     root: Path
-    database: tuple[Shot, ...]
-    queries: tuple[Shot, ...]
+    database: tuple[DatasetPhoto, ...]
+    queries: tuple[DatasetPhoto, ...]
     positives: tuple[Indices, ...]
     """Ascending database indices, of each query; empty where it has none."""
     rule: str
@@ -79,13 +79,13 @@ class EvaluationSet:
         """
         digest = hashlib.sha256()
         for text in ("evaluation", self.protocol):
-            _add(digest, text)
+            _update_digest(digest, text)
         for role, shots in (("database", self.database), ("queries", self.queries)):
-            _add(digest, f"{role} {len(shots)}")
+            _update_digest(digest, f"{role} {len(shots)}")
             for shot in shots:
-                _add(digest, f"{shot.name} {_size(shot.path)}")
+                _update_digest(digest, f"{shot.name} {_size(shot.path)}")
         for found in self.positives:
-            _add(digest, " ".join(map(str, found.tolist())))
+            _update_digest(digest, " ".join(map(str, found.tolist())))
         return digest.hexdigest()
 
 
@@ -122,11 +122,11 @@ class TrainingSet:
         """sha256 over cities, place numbers and photo names in their order, not over sizes: half
         a million photos on a disk far away would take minutes."""
         digest = hashlib.sha256()
-        _add(digest, "training")
+        _update_digest(digest, "training")
         for place in self.places:
-            _add(digest, f"{place.city} {place.place_id} {len(place.photos)}")
+            _update_digest(digest, f"{place.city} {place.place_id} {len(place.photos)}")
             for photo in place.photos:
-                _add(digest, photo.name)
+                _update_digest(digest, photo.name)
         return digest.hexdigest()
 
 
@@ -134,11 +134,11 @@ def list_fingerprint(names: Iterable[str]) -> str:
     """sha256 over the names of a list in their order: what a ground truth is true of."""
     digest = hashlib.sha256()
     for name in names:
-        _add(digest, name)
+        _update_digest(digest, name)
     return digest.hexdigest()
 
 
-def _add(digest: hashlib._Hash, text: str) -> None:
+def _update_digest(digest: hashlib._Hash, text: str) -> None:
     # A name may hold any character but NUL, so that NUL ends it beyond doubt.
     digest.update(text.encode("utf-8", "surrogateescape") + b"\0")
 
@@ -147,4 +147,4 @@ def _size(path: Path) -> int:
     try:
         return path.stat().st_size
     except OSError:
-        return NO_FILE
+        return MISSING_FILE_BYTES

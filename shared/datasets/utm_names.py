@@ -21,7 +21,7 @@ FULL_DATES = {8: "%Y%m%d", 14: "%Y%m%d%H%M%S"}  # by their length; a year or a m
 
 
 @dataclass(frozen=True, slots=True)
-class PhotoName:
+class UtmFileName:
     """What a name of the convention says of a photo that is about to be written."""
 
     east: float
@@ -62,7 +62,7 @@ class PhotoName:
 
 
 @dataclass(frozen=True, slots=True)
-class Spot:
+class FileNameLocation:
     """Where a photo was taken, as its name says; None means "not said"."""
 
     east: float
@@ -79,19 +79,19 @@ class Spot:
     """free text; gsv_xs has the place and the city there"""
 
 
-def spot_of_name(name: str) -> Spot | None:
+def parse_utm_file_name(name: str) -> FileNameLocation | None:
     """What a file name of the convention says of its place; None for any other name.
 
     `name` is that of the file alone: an `@` in a folder's name has no meaning. Raises
     InvalidRequest (`bad_coordinates`).
     """
-    position = position_of_name(name)
+    position = utm_position_of_file_name(name)
     if position is None:
         return None
     parts = name.split("@")
     parts += [""] * (FIELDS - len(parts))
     number, letter, latitude, longitude = parts[3:7]
-    return Spot(
+    return FileNameLocation(
         *position,
         zone=f"{number}{letter}" if number and letter else None,
         latitude=_number(latitude) if longitude else None,
@@ -101,7 +101,7 @@ def spot_of_name(name: str) -> Spot | None:
     )
 
 
-def position_of_name(name: str) -> tuple[float, float] | None:
+def utm_position_of_file_name(name: str) -> tuple[float, float] | None:
     """UTM east and north in metres as the name says them; None for any other name.
 
     Raises InvalidRequest (`bad_coordinates`) where the convention's two numbers are none.
@@ -118,7 +118,7 @@ def position_of_name(name: str) -> tuple[float, float] | None:
     return east, north
 
 
-def fields_of_name(name: str, utm_zone: str | None) -> dict[str, str]:
+def upload_fields_of_file_name(name: str, utm_zone: str | None) -> dict[str, str]:
     """What a name says, in the upload form's names; {} for a name of no such convention.
 
     `utm_zone` (such as `32T`) is meant where the name has none. A timestamp becomes `captured_at`

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-BINS = 8
+COLOUR_BINS = 8
 """per channel"""
-THUMBNAIL = 16
+THUMBNAIL_PIXELS = 16
 """pixels each way"""
 
 Rows = NDArray[np.float32]
@@ -32,19 +32,19 @@ def average_colour(photo: Image.Image) -> Rows:
 
 def colour_histogram(photo: Image.Image) -> Rows:
     """(BINS ** 3,) joint histogram, square roots taken: their cosine is Bhattacharyya's."""
-    levels = np.asarray(photo, np.int32) * BINS // 256
-    cells = (levels[..., 0] * BINS + levels[..., 1]) * BINS + levels[..., 2]
-    return _unit(np.sqrt(np.bincount(cells.ravel(), minlength=BINS**3)).astype(np.float32))
+    levels = np.asarray(photo, np.int32) * COLOUR_BINS // 256
+    cells = (levels[..., 0] * COLOUR_BINS + levels[..., 1]) * COLOUR_BINS + levels[..., 2]
+    return _unit(np.sqrt(np.bincount(cells.ravel(), minlength=COLOUR_BINS**3)).astype(np.float32))
 
 
 def thumbnail(photo: Image.Image) -> Rows:
     """(THUMBNAIL ** 2,) grey pixels less their mean: the cosine is normalised correlation."""
-    small = photo.convert("L").resize((THUMBNAIL, THUMBNAIL), Image.Resampling.BOX)
+    small = photo.convert("L").resize((THUMBNAIL_PIXELS, THUMBNAIL_PIXELS), Image.Resampling.BOX)
     pixels = np.asarray(small, np.float32).ravel()
     return _unit(pixels - pixels.mean())
 
 
-WEAK_BASELINES: dict[str, Callable[[Image.Image], Rows]] = {
+BASELINE_DESCRIPTORS: dict[str, Callable[[Image.Image], Rows]] = {
     "average colour": average_colour,
     "colour histogram": colour_histogram,
     "thumbnail 16x16": thumbnail,

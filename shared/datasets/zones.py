@@ -9,32 +9,32 @@ import numpy as np
 import utm
 from numpy.typing import NDArray
 
-from shared.datasets.shots import Shot
+from shared.datasets.shots import DatasetPhoto
 from shared.errors import InvalidRequest
 
-Grid = tuple[int, bool]
+UtmGrid = tuple[int, bool]
 """zone number, and whether it is counted from the equator northwards: metres of one grid compare"""
 Positions = NDArray[np.float64]
 
-REACH_DEGREES = 9.0
+MAX_ZONE_SPAN_DEGREES = 9.0
 """Of longitude from a zone's meridian. No zone is wider than 6 degrees to one side; beyond 9 the
 series of the projection loses millimetres, and nothing there is within any rule's radius."""
 
 
-def positions_of(shots: Sequence[Shot]) -> tuple[Positions, list[Grid | None]]:
+def utm_positions(shots: Sequence[DatasetPhoto]) -> tuple[Positions, list[UtmGrid | None]]:
     """(n, 2) UTM metres and each photo's grid, None where no zone is said.
 
     A photo with latitude and longitude alone is put into the zone that it lies in. Raises
     InvalidRequest (`no_positions`, `bad_coordinates`).
     """
     metres = np.full((len(shots), 2), np.nan)
-    grids: list[Grid | None] = [None] * len(shots)
+    grids: list[UtmGrid | None] = [None] * len(shots)
     degrees: list[int] = []
     missing: list[str] = []
     for number, shot in enumerate(shots):
         if shot.easting is not None and shot.northing is not None:
             metres[number] = shot.easting, shot.northing
-            grids[number] = None if shot.zone is None else grid_of(shot.zone, shot.name)
+            grids[number] = None if shot.zone is None else parse_utm_grid(shot.zone, shot.name)
         elif shot.latitude is not None and shot.longitude is not None:
             degrees.append(number)
         else:
@@ -51,9 +51,9 @@ def positions_of(shots: Sequence[Shot]) -> tuple[Positions, list[Grid | None]]:
     return metres, grids
 
 
-def planes(
-    queries: tuple[Positions, Sequence[Grid | None]],
-    database: tuple[Positions, Sequence[Grid | None]],
+def group_by_utm_plane(
+    queries: tuple[Positions, Sequence[UtmGrid | None]],
+    database: tuple[Positions, Sequence[UtmGrid | None]],
 ) -> list[tuple[NDArray[np.int64], NDArray[np.int64], Positions, Positions]]:
     """Query indices, database indices, and the (n, 2) and (m, 2) metres of both on one plane.
 
@@ -78,7 +78,7 @@ def planes(
     for plane in np.unique(query_numbers):
         grid = known[plane]
         own = numbers == plane
-        near = own | (np.abs(_apart(longitudes, _meridian(grid[0]))) <= REACH_DEGREES)
+        near = own | (np.abs(_apart(longitudes, _meridian(grid[0]))) <= MAX_ZONE_SPAN_DEGREES)
         guests = near & ~own
         metres = database[0].copy()
         if guests.any():
@@ -95,14 +95,14 @@ def planes(
     return found
 
 
-def degrees_of(grid: Grid, metres: Positions) -> tuple[float, float]:
+def utm_to_degrees(grid: UtmGrid, metres: Positions) -> tuple[float, float]:
     """Latitude and longitude of one position, (2,) UTM metres of the grid."""
     east, north = metres.tolist()
     latitude, longitude = utm.to_latlon(east, north, grid[0], northern=grid[1], strict=False)
     return float(latitude), float(longitude)
 
 
-def grid_of(zone: str, name: str) -> Grid:
+def parse_utm_grid(zone: str, name: str) -> UtmGrid:
     """`32T` -> (32, True). Raises InvalidRequest (`bad_coordinates`), which names the photo."""
     number, letter = zone[:-1], zone[-1:].upper()
     if number.isdecimal() and 1 <= int(number) <= 60 and letter in "CDEFGHJKLMNPQRSTUVWX":
@@ -110,7 +110,7 @@ def grid_of(zone: str, name: str) -> Grid:
     raise InvalidRequest("bad_coordinates", f"{name}: there is no UTM zone {zone!r}.")
 
 
-def with_utm(shots: Sequence[Shot]) -> tuple[Shot, ...]:
+def add_utm_positions(shots: Sequence[DatasetPhoto]) -> tuple[DatasetPhoto, ...]:
     """The photos, those with latitude and longitude alone also in UTM metres and with a zone."""
     degrees = [
         number
@@ -118,7 +118,7 @@ def with_utm(shots: Sequence[Shot]) -> tuple[Shot, ...]:
         if shot.easting is None and shot.latitude is not None and shot.longitude is not None
     ]
     metres = np.full((len(shots), 2), np.nan)
-    grids: list[Grid | None] = [None] * len(shots)
+    grids: list[UtmGrid | None] = [None] * len(shots)
     _project(shots, degrees, metres, grids)
     known = list(shots)
     for number in degrees:
@@ -133,10 +133,13 @@ def with_utm(shots: Sequence[Shot]) -> tuple[Shot, ...]:
 
 
 def _project(
-    shots: Sequence[Shot], degrees: Sequence[int], metres: Positions, grids: list[Grid | None]
+    shots: Sequence[DatasetPhoto],
+    degrees: Sequence[int],
+    metres: Positions,
+    grids: list[UtmGrid | None],
 ) -> None:
     """Fill in UTM metres and grids of the photos of these indices, all of one zone at once."""
-    by_grid: dict[Grid, list[int]] = {}
+    by_grid: dict[UtmGrid, list[int]] = {}
     for number in degrees:
         latitude, longitude = shots[number].latitude, shots[number].longitude
         assert latitude is not None
@@ -161,13 +164,13 @@ def _project(
             grids[number] = grid
 
 
-def _numbered(known: Sequence[Grid], grids: Sequence[Grid | None]) -> NDArray[np.int64]:
+def _numbered(known: Sequence[UtmGrid], grids: Sequence[UtmGrid | None]) -> NDArray[np.int64]:
     number = {grid: index for index, grid in enumerate(known)}
     return np.array([number[grid] for grid in grids if grid is not None], np.int64)
 
 
 def _degrees(
-    known: Sequence[Grid], numbers: NDArray[np.int64], metres: Positions
+    known: Sequence[UtmGrid], numbers: NDArray[np.int64], metres: Positions
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     latitudes, longitudes = np.empty(len(metres)), np.empty(len(metres))
     for plane in np.unique(numbers):

@@ -18,18 +18,18 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
-from shared.estimate.evidence import Evidence
+from shared.estimate.evidence import PlaceEvidence
 
-FALSE_ACCEPTS = 0.05  # of impostors
-LEAST_IMPOSTORS = 20  # fewer, and one in twenty can't be told
-LEAST_LABELLED = 40
-LEAST_OF_A_KIND = 8  # right ones and wrong ones: with fewer the slope is a guess
-RIDGE = 0.1  # in units of standardised evidence: keeps separable data finite
+FALSE_ACCEPT_RATE = 0.05  # of impostors
+MIN_IMPOSTORS = 20  # fewer, and one in twenty can't be told
+MIN_LABELLED_QUERIES = 40
+MIN_QUERIES_PER_CLASS = 8  # right ones and wrong ones: with fewer the slope is a guess
+L2_PENALTY = 0.1  # in units of standardised evidence: keeps separable data finite
 NEWTON_STEPS = 50
 FOLDS = 5
 
 
-class Logistic(BaseModel):
+class LogisticRegression(BaseModel):
     """P = 1 / (1 + exp(-(intercept + sum of weight * (evidence - mean) / scale)))."""
 
     model_config = ConfigDict(frozen=True)
@@ -39,7 +39,7 @@ class Logistic(BaseModel):
     means: tuple[float, ...]
     scales: tuple[float, ...]
 
-    def probability(self, evidence: Evidence) -> float:
+    def probability(self, evidence: PlaceEvidence) -> float:
         """P(right) of one piece of evidence, in (0, 1)."""
         return float(self.probabilities(_matrix([evidence]))[0])
 
@@ -59,7 +59,7 @@ class Calibration(BaseModel):
     """Evidence with less support is "not in this map"; None with too few impostors."""
     impostors: int
     labelled_queries: int
-    confidence: Logistic | None
+    confidence: LogisticRegression | None
     """None: uncalibrated."""
 
     @property
@@ -67,35 +67,38 @@ class Calibration(BaseModel):
         """`calibrated` or `uncalibrated`: whether answers carry a confidence."""
         return "uncalibrated" if self.confidence is None else "calibrated"
 
-    def accepts(self, evidence: Evidence) -> bool | None:
+    def accepts(self, evidence: PlaceEvidence) -> bool | None:
         """Whether the ranking shows a place of the map; None where that can't be told yet."""
         return None if self.support_threshold is None else evidence.support > self.support_threshold
 
 
-def learn_threshold(impostors: Sequence[Evidence]) -> float | None:
+def fit_threshold(impostors: Sequence[PlaceEvidence]) -> float | None:
     """The support that FALSE_ACCEPTS of the impostors exceed; None for fewer than LEAST_IMPOSTORS.
 
     The smallest order statistic whose rank is high enough: on average at most that share of new
     impostors exceeds it, whatever their distribution (conformal bound, Vovk et al. 2005).
     """
-    if len(impostors) < LEAST_IMPOSTORS:
+    if len(impostors) < MIN_IMPOSTORS:
         return None
     supports = np.sort([evidence.support for evidence in impostors])
-    rank = int(np.ceil((1 - FALSE_ACCEPTS) * (len(supports) + 1)))
+    rank = int(np.ceil((1 - FALSE_ACCEPT_RATE) * (len(supports) + 1)))
     return float(supports[min(rank, len(supports)) - 1])
 
 
-def learn_confidence(labelled: Sequence[tuple[Evidence, bool]]) -> Logistic | None:
+def fit_confidence(labelled: Sequence[tuple[PlaceEvidence, bool]]) -> LogisticRegression | None:
     """P(right) from (evidence, was it right); None with too few of them, or of one kind."""
     right = sum(ok for _, ok in labelled)
-    if len(labelled) < LEAST_LABELLED or min(right, len(labelled) - right) < LEAST_OF_A_KIND:
+    if (
+        len(labelled) < MIN_LABELLED_QUERIES
+        or min(right, len(labelled) - right) < MIN_QUERIES_PER_CLASS
+    ):
         return None
     rows = _matrix([evidence for evidence, _ in labelled])
     truth = np.array([ok for _, ok in labelled], dtype=np.float64)
     means, scales = rows.mean(axis=0), rows.std(axis=0)
     scales = np.where(scales > 1e-9, scales, 1.0)
     design = np.column_stack([np.ones(len(rows)), (rows - means) / scales])
-    ridge = np.diag([0.0, *[RIDGE] * rows.shape[1]])
+    ridge = np.diag([0.0, *[L2_PENALTY] * rows.shape[1]])
     beta = np.zeros(design.shape[1])
     for _ in range(NEWTON_STEPS):
         probability = _sigmoid(design @ beta)
@@ -105,7 +108,7 @@ def learn_confidence(labelled: Sequence[tuple[Evidence, bool]]) -> Logistic | No
         beta += step
         if float(np.abs(step).max()) < 1e-8:
             break
-    return Logistic(
+    return LogisticRegression(
         intercept=float(beta[0]),
         weights=tuple(beta[1:].tolist()),
         means=tuple(means.tolist()),
@@ -113,14 +116,14 @@ def learn_confidence(labelled: Sequence[tuple[Evidence, bool]]) -> Logistic | No
     )
 
 
-def cross_validated(labelled: Sequence[tuple[Evidence, bool]]) -> list[float] | None:
+def cross_validate(labelled: Sequence[tuple[PlaceEvidence, bool]]) -> list[float] | None:
     """P(right) of each, learnt from the other folds: what the confidence is worth on new queries.
 
     None where there are too few to learn from.
     """
     predicted = [0.0] * len(labelled)
     for fold in range(FOLDS):
-        learnt = learn_confidence([pair for i, pair in enumerate(labelled) if i % FOLDS != fold])
+        learnt = fit_confidence([pair for i, pair in enumerate(labelled) if i % FOLDS != fold])
         if learnt is None:
             return None
         for index in range(fold, len(labelled), FOLDS):
@@ -128,7 +131,7 @@ def cross_validated(labelled: Sequence[tuple[Evidence, bool]]) -> list[float] | 
     return predicted
 
 
-def _matrix(evidence: Sequence[Evidence]) -> NDArray[np.float64]:
+def _matrix(evidence: Sequence[PlaceEvidence]) -> NDArray[np.float64]:
     return np.array([(e.support, e.agreement) for e in evidence], dtype=np.float64)
 
 

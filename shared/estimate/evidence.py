@@ -7,23 +7,25 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from shared.estimate.places import Spot, elsewhere, same_place
-from shared.geodesy import centre_of
+from shared.estimate.places import PhotoLocation, is_different_place, is_same_place
+from shared.geodesy import weighted_centroid
 
-DEPTH = 50  # ranks looked at; a rival that is not among them scores at most what the last does
-VOTERS = 10  # of them, those that may agree with the first
+EVIDENCE_DEPTH = (
+    50  # ranks looked at; a rival that is not among them scores at most what the last does
+)
+VOTING_PHOTOS = 10  # of them, those that may agree with the first
 
 
 @dataclass(frozen=True, slots=True)
-class Ranked:
+class RankedPhoto:
     """One photo of a ranking: the score that ranks it (a cosine) and where it was taken."""
 
     score: float
-    spot: Spot
+    spot: PhotoLocation
 
 
 @dataclass(frozen=True, slots=True)
-class Evidence:
+class PlaceEvidence:
     """How the first ten photos speak for the place of the best one.
 
     `support`: the sum, over those of them that show that place, of how much higher their cosine is
@@ -37,7 +39,9 @@ class Evidence:
     agreement: float
 
 
-def weigh(ranking: Sequence[Ranked], radius_m: float, place: Spot | None = None) -> Evidence | None:
+def compute_evidence(
+    ranking: Sequence[RankedPhoto], radius_m: float, place: PhotoLocation | None = None
+) -> PlaceEvidence | None:
     """How a ranking, best first, speaks for `place`; left out: for the place of its best photo.
 
     A filter takes rivals away, and what is left would look sure of itself: weigh the ranking of the
@@ -49,14 +53,14 @@ def weigh(ranking: Sequence[Ranked], radius_m: float, place: Spot | None = None)
     first = place or ranking[0].spot
     if not first.is_known:
         return None
-    rival = next((r.score for r in ranking if elsewhere(first, r.spot)), ranking[-1].score)
-    voters = ranking[:VOTERS]
-    agreeing = [r.score for r in voters if same_place(first, r.spot, radius_m)]
+    rival = next((r.score for r in ranking if is_different_place(first, r.spot)), ranking[-1].score)
+    voters = ranking[:VOTING_PHOTOS]
+    agreeing = [r.score for r in voters if is_same_place(first, r.spot, radius_m)]
     support = sum(max(0.0, score - rival) for score in agreeing)
-    return Evidence(support, len(agreeing) / len(voters))
+    return PlaceEvidence(support, len(agreeing) / len(voters))
 
 
-def locate(ranking: Sequence[Ranked], radius_m: float) -> Spot:
+def estimate_location(ranking: Sequence[RankedPhoto], radius_m: float) -> PhotoLocation:
     """Where the ranking points to: the first photo's label, and the centre of the first ten that
     lie within `radius_m` of it, each weighed by its score's lead over the last of the ranking."""
     first = ranking[0].spot
@@ -65,19 +69,19 @@ def locate(ranking: Sequence[Ranked], radius_m: float) -> Spot:
     floor = ranking[-1].score
     near = [
         r
-        for r in ranking[:VOTERS]
+        for r in ranking[:VOTING_PHOTOS]
         if r.spot.latitude is not None
-        and same_place(
-            Spot(first.latitude, first.longitude, None),
-            Spot(r.spot.latitude, r.spot.longitude, None),
+        and is_same_place(
+            PhotoLocation(first.latitude, first.longitude, None),
+            PhotoLocation(r.spot.latitude, r.spot.longitude, None),
             radius_m,
         )
     ]
     weights = np.array([r.score - floor for r in near]) + 1e-9
-    latitude, longitude = centre_of(
+    latitude, longitude = weighted_centroid(
         np.array([r.spot.latitude for r in near], dtype=np.float64),
         np.array([r.spot.longitude for r in near], dtype=np.float64),
         weights,
     )
     # Seven digits are a centimetre; more would be rounding errors.
-    return Spot(round(latitude, 7), round(longitude, 7), first.place)
+    return PhotoLocation(round(latitude, 7), round(longitude, 7), first.place)

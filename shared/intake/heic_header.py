@@ -15,7 +15,7 @@ from typing import BinaryIO
 
 MAX_META_BYTES = 4 * 1024 * 1024
 MAX_EXIF_BYTES = 1024 * 1024
-MOST_BOXES = 100_000
+MAX_BOXES = 100_000
 HEVC = (b"hvc1", b"grid")  # a picture, or one put together of tiles: what phones write
 QUARTER_TURNS = 4
 
@@ -52,7 +52,7 @@ def read_heic_header(file: BinaryIO) -> HeicHeader:
 def _meta(file: BinaryIO) -> bytes:
     """The content of the box `meta`, which is looked for among the outermost ones."""
     offset = 0
-    for _ in range(MOST_BOXES):
+    for _ in range(MAX_BOXES):
         file.seek(offset)
         head = file.read(16)
         if len(head) < 8:
@@ -121,7 +121,7 @@ def _properties_of(data: bytes, item: int) -> Iterator[int]:
     version, wide = data[0], data[3] & 1
     (entries,) = struct.unpack_from(">I", data, 4)
     offset = 8
-    for _ in range(min(entries, MOST_BOXES)):
+    for _ in range(min(entries, MAX_BOXES)):
         of, count = struct.unpack_from(">HB" if version == 0 else ">IB", data, offset)
         offset += 3 if version == 0 else 5
         if of == item:
@@ -167,7 +167,7 @@ def _place(data: bytes, item: int) -> tuple[int, int] | None:
         at += size
         return value
 
-    for _ in range(min(entries, MOST_BOXES)):
+    for _ in range(min(entries, MAX_BOXES)):
         of = number(4 if wide else 2)
         method = number(2) & 15 if version else 0
         source, base, extents = number(2), number(base_size), number(2)

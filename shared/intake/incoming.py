@@ -7,15 +7,15 @@ from uuid import UUID
 
 from shared.intake.photo_fields import PhotoFields, read_form_fields
 from shared.intake.photo_header import PhotoHeader, read_photo_header
-from shared.intake.received import Received, check_photo_begin
+from shared.intake.received import StoredUpload, check_photo_signature
 from shared.objects import ObjectStore
 
 
 @dataclass(frozen=True, slots=True)
-class Incoming:
+class ValidatedPhoto:
     """A checked photo whose bytes lie in the object store."""
 
-    received: Received
+    received: StoredUpload
     media_type: str
     header: PhotoHeader
     fields: PhotoFields
@@ -23,16 +23,16 @@ class Incoming:
     """That it came in with."""
 
 
-def examine(
-    store: ObjectStore, received: Received, max_pixels: int, key_id: UUID | None = None
-) -> Incoming:
+def validate_photo(
+    store: ObjectStore, upload: StoredUpload, max_pixels: int, key_id: UUID | None = None
+) -> ValidatedPhoto:
     """What the photo is and what is said of it.
 
-    Raises UnsupportedMedia (`unsupported_photo`) and Unprocessable (`invalid_field`,
+    Raises UnsupportedMedia (`unsupported_photo`) and Unprocessable (`invalid_field_error`,
     `undecodable_photo`, `too_many_pixels`).
     """
-    media_type = check_photo_begin(received.begin)
-    fields = read_form_fields(received.fields)
-    with received.open(store) as file:
+    media_type = check_photo_signature(upload.begin)
+    fields = read_form_fields(upload.fields)
+    with upload.open(store) as file:
         header = read_photo_header(file, max_pixels)
-    return Incoming(received, media_type, header, fields, key_id)
+    return ValidatedPhoto(upload, media_type, header, fields, key_id)

@@ -21,11 +21,11 @@ MAX_MANIFEST_BYTES = 32 * 1024 * 1024
 NAME_COLUMNS = ("filename", "file", "path")
 CSV_COLUMNS = ("latitude", "longitude", "heading", "captured_at", "place", "tags")
 KEY_FIELD = "key"  # of a manifest of objects that lie in the store
-MOST_NAMED = 20  # bad lines that a refusal names
+MAX_REPORTED_LINES = 20  # bad lines that a refusal names
 
 
 @dataclass(frozen=True, slots=True)
-class Said:
+class ManifestEntry:
     """What one line says of one photo."""
 
     line: int
@@ -34,10 +34,10 @@ class Said:
     """In the upload form's names; what is empty is left out."""
 
 
-def read_csv(data: bytes, called: str) -> list[Said]:
+def read_csv_manifest(data: bytes, source_name: str) -> list[ManifestEntry]:
     """The rows of a table with a column of names (NAME_COLUMNS) and any of CSV_COLUMNS.
 
-    Raises InvalidRequest (`bad_table`) that calls the table `called`.
+    Raises InvalidRequest (`bad_table`) that calls the table `source_name`.
     """
     try:
         reader = csv.DictReader(io.StringIO(data.decode("utf-8-sig"), newline=""))
@@ -46,7 +46,7 @@ def read_csv(data: bytes, called: str) -> list[Said]:
         if name_column is None:
             raise InvalidRequest(
                 "bad_table",
-                f"{called} has no column {' or '.join(NAME_COLUMNS)}; "
+                f"{source_name} has no column {' or '.join(NAME_COLUMNS)}; "
                 f"beside it may stand {', '.join(CSV_COLUMNS)}. Its first line, read as "
                 f"separated by commas, is {', '.join(columns) or 'empty'}.",
             )
@@ -54,35 +54,41 @@ def read_csv(data: bytes, called: str) -> list[Said]:
         if unknown:
             raise InvalidRequest(
                 "bad_table",
-                f"{called}: the columns {', '.join(unknown)} mean nothing here. Known are "
+                f"{source_name}: the columns {', '.join(unknown)} mean nothing here. Known are "
                 f"{name_column}, {', '.join(CSV_COLUMNS)}: rename them, or take them out.",
             )
-        said: list[Said] = []
+        said: list[ManifestEntry] = []
         seen: dict[str, int] = {}
         for row in reader:
             name = row[name_column] or ""  # a short row has None
             if name in seen:
                 fault = f"{name!r} stands in line {seen[name]} already"
-                raise bad_lines("bad_table", called, [(reader.line_num, fault)])
+                raise bad_lines_error("bad_table", source_name, [(reader.line_num, fault)])
             seen[name] = reader.line_num
             if None in row:
-                raise bad_lines("bad_table", called, [(reader.line_num, "has too many columns")])
+                raise bad_lines_error(
+                    "bad_table", source_name, [(reader.line_num, "has too many columns")]
+                )
             if any("\0" in cell for cell in row.values() if cell):
-                raise bad_lines("bad_table", called, [(reader.line_num, "holds a NUL character")])
+                raise bad_lines_error(
+                    "bad_table", source_name, [(reader.line_num, "holds a NUL character")]
+                )
             fields = {c: row[c] for c in CSV_COLUMNS if row.get(c)}
-            said.append(Said(reader.line_num, name, fields))
+            said.append(ManifestEntry(reader.line_num, name, fields))
         return said
     except (UnicodeDecodeError, csv.Error) as error:
-        raise InvalidRequest("bad_table", f"Can't read {called}: {error}") from error
+        raise InvalidRequest("bad_table", f"Can't read {source_name}: {error}") from error
 
 
-def read_jsonl(data: bytes, called: str, name_fields: Sequence[str] = NAME_COLUMNS) -> list[Said]:
+def read_jsonl_manifest(
+    data: bytes, source_name: str, name_fields: Sequence[str] = NAME_COLUMNS
+) -> list[ManifestEntry]:
     """The lines of a manifest: JSON objects with a name and any of the upload form's fields.
 
     `tags` may be a list, `metadata` an object. Empty lines are passed over. Raises InvalidRequest
     (`bad_manifest`), which names the first MOST_NAMED bad lines.
     """
-    said: list[Said] = []
+    said: list[ManifestEntry] = []
     bad: list[tuple[int, str]] = []
     seen: dict[str, int] = {}
     for number, line in _lines(data):
@@ -95,18 +101,20 @@ def read_jsonl(data: bytes, called: str, name_fields: Sequence[str] = NAME_COLUM
                 bad.append((number, f"{one.name!r} stands in line {seen[one.name]} already"))
             seen.setdefault(one.name, number)
             said.append(one)
-        if len(bad) == MOST_NAMED:
+        if len(bad) == MAX_REPORTED_LINES:
             break
     if bad:
-        raise bad_lines("bad_manifest", called, bad)
+        raise bad_lines_error("bad_manifest", source_name, bad)
     return said
 
 
-def bad_lines(code: str, called: str, lines: Sequence[tuple[int, str]]) -> PlacewiseError:
+def bad_lines_error(
+    code: str, source_name: str, lines: Sequence[tuple[int, str]]
+) -> PlacewiseError:
     """The refusal of a list for what is wrong in its lines, by their numbers from 1."""
     return InvalidRequest(
         code,
-        "; ".join(f"{called}, line {line}: {detail}" for line, detail in lines) + ".",
+        "; ".join(f"{source_name}, line {line}: {detail}" for line, detail in lines) + ".",
         errors=[{"line": line, "detail": detail} for line, detail in lines],
     )
 
@@ -117,7 +125,7 @@ def _lines(data: bytes) -> Iterator[tuple[int, bytes]]:
             yield number, line
 
 
-def _read_line(number: int, line: bytes, name_fields: Sequence[str]) -> Said:
+def _read_line(number: int, line: bytes, name_fields: Sequence[str]) -> ManifestEntry:
     """ValueError says what is wrong with the line."""
     try:
         values = json.loads(line)
@@ -138,7 +146,7 @@ def _read_line(number: int, line: bytes, name_fields: Sequence[str]) -> Said:
             raise ValueError(f"{field} is unknown; known are {', '.join(FORM_FIELDS)}")
         if value is not None:
             fields[field] = _as_form_text(field, value)
-    return Said(number, name, fields)
+    return ManifestEntry(number, name, fields)
 
 
 def _as_form_text(field: str, value: Any) -> str:

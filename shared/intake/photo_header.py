@@ -18,15 +18,15 @@ from PIL.ExifTags import GPS, IFD, Base
 from shared.errors import Unprocessable
 from shared.intake.heic_header import read_heic_header
 from shared.photo_formats import (
-    BROKEN,
-    HEIC,
-    SNIFFED_BYTES,
-    check_pixels,
+    HEIC_MEDIA_TYPE,
+    PHOTO_READ_ERRORS,
+    PHOTO_SIGNATURE_BYTES,
+    check_pixel_count,
+    detect_media_type,
     open_photo,
-    sniff_media_type,
 )
 
-ROTATED = (5, 6, 7, 8)  # EXIF orientations that swap width and height
+ROTATED_ORIENTATIONS = (5, 6, 7, 8)  # EXIF orientations that swap width and height
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,14 +47,14 @@ def read_photo_header(file: BinaryIO, max_pixels: int) -> PhotoHeader:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # strange EXIF is no reason to refuse a photo
-            begin = file.read(SNIFFED_BYTES)
+            begin = file.read(PHOTO_SIGNATURE_BYTES)
             file.seek(0)
-            if sniff_media_type(begin) == HEIC:
+            if detect_media_type(begin) == HEIC_MEDIA_TYPE:
                 return _heic_header(file, max_pixels)
             with open_photo(file) as image:
-                check_pixels(image.width, image.height, max_pixels)
+                check_pixel_count(image.width, image.height, max_pixels)
                 return _header(image)
-    except BROKEN as error:
+    except PHOTO_READ_ERRORS as error:
         raise Unprocessable(
             "undecodable_photo", "The photo's header is broken: it can't be decoded."
         ) from error
@@ -64,7 +64,7 @@ def _header(image: Image.Image) -> PhotoHeader:
     width, height = image.size
     exif = _exif(image)
     # Pillow gives the size of a TIFF as it stands upright, that of all others as stored.
-    if image.format != "TIFF" and _orientation(exif) in ROTATED:
+    if image.format != "TIFF" and _orientation(exif) in ROTATED_ORIENTATIONS:
         width, height = height, width
     return _with_exif(width, height, exif)
 
@@ -72,10 +72,10 @@ def _header(image: Image.Image) -> PhotoHeader:
 def _heic_header(file: BinaryIO, max_pixels: int) -> PhotoHeader:
     """Its size is that of the boxes: EXIF's orientation does not count in HEIC."""
     found = read_heic_header(file)
-    check_pixels(found.width, found.height, max_pixels)
+    check_pixel_count(found.width, found.height, max_pixels)
     exif = Image.Exif()
     if found.exif:
-        with contextlib.suppress(*BROKEN):
+        with contextlib.suppress(*PHOTO_READ_ERRORS):
             exif.load(found.exif)
     return _with_exif(found.width, found.height, exif)
 
@@ -105,7 +105,7 @@ def _exif(image: Image.Image) -> Image.Exif:
             return image.getexif()
         if block := image.info.get("exif"):
             exif.load(block)
-    except BROKEN:
+    except PHOTO_READ_ERRORS:
         return Image.Exif()
     return exif
 
@@ -113,7 +113,7 @@ def _exif(image: Image.Image) -> Image.Exif:
 def _orientation(exif: Image.Exif) -> Any:
     try:
         return exif.get(Base.Orientation)
-    except BROKEN:
+    except PHOTO_READ_ERRORS:
         return None
 
 
@@ -121,7 +121,7 @@ def _directory(exif: Image.Exif, tag: int) -> dict[int, Any]:
     """One of EXIF's inner directories; empty when it is broken."""
     try:
         return dict(exif.get_ifd(tag))
-    except BROKEN:
+    except PHOTO_READ_ERRORS:
         return {}
 
 

@@ -9,13 +9,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from uuid import UUID
 
-from shared.catalog.keys import count_photos_of
+from shared.catalog.keys import count_photos_of_key
 from shared.catalog.session import Catalog
 from shared.errors import TooManyRequests
 
-LOOK_SECONDS = 10.0
-FULL_LOOK_SECONDS = 1.0  # once the limit is reached
-RETRY_SECONDS = 3600
+RECOUNT_SECONDS = 10.0
+FULL_RECOUNT_SECONDS = 1.0  # once the limit is reached
+QUOTA_RETRY_SECONDS = 3600
 
 
 @dataclass(slots=True)
@@ -23,7 +23,7 @@ class KeyPhotos:
     """The photos of one key as this process knows them, under `lock`."""
 
     lock: threading.Lock = field(default_factory=threading.Lock)
-    counted_at: float = -LOOK_SECONDS
+    counted_at: float = -RECOUNT_SECONDS
     counted: int = 0
     """In the catalog, at `counted_at` (monotonic seconds)."""
     stored: int = 0
@@ -60,16 +60,16 @@ class PhotoQuota:
         age_seconds = time.monotonic() - photos.counted_at
         seems_full = photos.counted < most <= photos.counted + photos.stored
         if seems_full or age_seconds >= (
-            LOOK_SECONDS if photos.counted < most else FULL_LOOK_SECONDS
+            RECOUNT_SECONDS if photos.counted < most else FULL_RECOUNT_SECONDS
         ):
             with self._catalog.read() as session:
-                photos.counted = count_photos_of(session, key_id, most)
+                photos.counted = count_photos_of_key(session, key_id, most)
             photos.counted_at, photos.stored = time.monotonic(), 0
         if photos.counted >= most:
             raise TooManyRequests(
                 "photo_quota_reached",
                 f"{most} photos are stored through this key, and no more may be. Delete some, or "
                 "ask an admin for a key with a higher limit.",
-                retry_after_seconds=RETRY_SECONDS,
+                retry_after_seconds=QUOTA_RETRY_SECONDS,
                 limit=most,
             )

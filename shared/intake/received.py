@@ -11,13 +11,13 @@ from typing import BinaryIO
 
 from shared.errors import PlacewiseError, TooLarge, UnsupportedMedia
 from shared.objects import ObjectStore
-from shared.photo_formats import ACCEPTED, SNIFFED_BYTES, sniff_media_type
+from shared.photo_formats import ACCEPTED_PHOTOS, PHOTO_SIGNATURE_BYTES, detect_media_type
 
 MAX_NAME_CHARACTERS = 255
 
 
 @dataclass(slots=True)
-class Received:
+class StoredUpload:
     """A file that lies whole under `key` of the object store, and what is said of it."""
 
     key: str
@@ -36,7 +36,7 @@ class Received:
         return store.open(self.key) if self.whole is None else io.BytesIO(self.whole)
 
 
-class PassingFile:
+class StreamValidator:
     """Counts, hashes and checks a file of which only a piece is there at a time."""
 
     def __init__(
@@ -44,7 +44,7 @@ class PassingFile:
         max_bytes: int,
         check_begin: Callable[[bytes], object] = lambda begin: None,
         *,
-        begin_bytes: int = SNIFFED_BYTES,
+        begin_bytes: int = PHOTO_SIGNATURE_BYTES,
         too_large: Callable[[int], PlacewiseError] | None = None,
     ) -> None:
         """`check_begin` sees the first `begin_bytes` as soon as they are there, and may raise;
@@ -53,7 +53,7 @@ class PassingFile:
         self.begin = b""
         self._max_bytes = max_bytes
         self._begin_bytes = begin_bytes
-        self._too_large = too_large or file_too_large
+        self._too_large = too_large or file_too_large_error
         self._check_begin = check_begin
         self._checked = False
         self._hash = hashlib.sha256()
@@ -64,7 +64,7 @@ class PassingFile:
         return self._hash.hexdigest()
 
     def add(self, piece: bytes) -> None:
-        """The next bytes. Raises TooLarge (`file_too_large`, unless another refusal was
+        """The next bytes. Raises TooLarge (`file_too_large_error`, unless another refusal was
         given) and what `check_begin` raises."""
         self.size_bytes += len(piece)
         if self.size_bytes > self._max_bytes:
@@ -72,26 +72,26 @@ class PassingFile:
         if len(self.begin) < self._begin_bytes:
             self.begin = (self.begin + piece)[: self._begin_bytes]
         if not self._checked and len(self.begin) == self._begin_bytes:
-            self._check()
+            self._check_first_bytes()
         self._hash.update(piece)
 
     def end(self) -> None:
         """That was all: a file shorter than its signature is checked now; an empty one never."""
         if not self._checked and self.size_bytes:
-            self._check()
+            self._check_first_bytes()
 
-    def _check(self) -> None:
+    def _check_first_bytes(self) -> None:
         self._checked = True
         self._check_begin(self.begin)
 
 
-def check_photo_begin(begin: bytes) -> str:
+def check_photo_signature(first_bytes: bytes) -> str:
     """The photo's media type by its content; 415 for anything that is not accepted."""
-    media_type = sniff_media_type(begin)
+    media_type = detect_media_type(first_bytes)
     if media_type is None:
         raise UnsupportedMedia(
             "unsupported_photo",
-            f"By its content this is not a photo that Placewise reads: send {ACCEPTED}.",
+            f"By its content this is not a photo that Placewise reads: send {ACCEPTED_PHOTOS}.",
         )
     return media_type
 
@@ -102,7 +102,7 @@ def base_name(filename: str) -> str:
     return "".join(c for c in name if c.isprintable())[:MAX_NAME_CHARACTERS] or "photo"
 
 
-def file_too_large(max_bytes: int) -> PlacewiseError:
+def file_too_large_error(max_bytes: int) -> PlacewiseError:
     return TooLarge(
         "file_too_large",
         f"The file is larger than {max_bytes} bytes (MAX_FILE_SIZE).",

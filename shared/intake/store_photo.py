@@ -15,48 +15,52 @@ from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
 from shared.catalog.maps import get_map
-from shared.catalog.photos import Photo, PhotoRole, find_live_by_sha256
+from shared.catalog.photos import Photo, PhotoRole, find_photo_by_sha256
 from shared.catalog.session import Catalog
 from shared.errors import Conflict
 from shared.ids import new_id
-from shared.intake.incoming import Incoming
+from shared.intake.incoming import ValidatedPhoto
 from shared.intake.photo_fields import PhotoFields
-from shared.jobs import Hints, Job, JobKind, JobState, Priority
-from shared.jobs.finish import requeue
+from shared.jobs import Job, JobKind, JobState, Priority, Wakeups
+from shared.jobs.finish import requeue_job
 
-SAME_DEGREES = 1e-7  # about a centimetre
+COORDINATE_TOLERANCE_DEGREES = 1e-7  # about a centimetre
 
 Result = TypeVar("Result")
 
 
 @dataclass(frozen=True, slots=True)
-class Stored:
+class StoreResult:
     photo: Photo
     job: Job | None
     queued: bool
     """False: the same bytes were there already and need no work."""
 
 
-Keep = Callable[[Session, Stored], Stored]
+BeforeCommit = Callable[[Session, StoreResult], StoreResult]
 """Writes down what was stored in the transaction that stores it, and hands it on."""
 
 
 def store_photo(
-    catalog: Catalog, hints: Hints, map_name: str, incoming: Incoming, keep: Keep
-) -> Stored:
+    catalog: Catalog,
+    hints: Wakeups,
+    map_name: str,
+    incoming: ValidatedPhoto,
+    before_commit: BeforeCommit,
+) -> StoreResult:
     """Acknowledge the photo, or the one with the same bytes that the map has already.
 
     Raises NotFound (`map_not_found`), and Conflict (`photo_differs`) when something else was said
     of that one.
     """
-    stored = try_again_once(lambda: _store(catalog, map_name, incoming, keep))
+    stored = retry_on_conflict(lambda: _store(catalog, map_name, incoming, before_commit))
     if stored.queued:
         hints.send()
     return stored
 
 
-def try_again_once(store: Callable[[], Result]) -> Result:
-    """`store`, a transaction with `put_photo`; once more when it lost the race for its bytes."""
+def retry_on_conflict(store: Callable[[], Result]) -> Result:
+    """`store`, a transaction with `insert_photo`; once more when it lost the race for its bytes."""
     try:
         return store()
     except IntegrityError:
@@ -64,18 +68,18 @@ def try_again_once(store: Callable[[], Result]) -> Result:
         return store()
 
 
-def put_photo(
-    session: Session, map_id: UUID, incoming: Incoming, priority: Priority = Priority.UPLOAD
-) -> Stored:
+def insert_photo(
+    session: Session, map_id: UUID, incoming: ValidatedPhoto, priority: Priority = Priority.UPLOAD
+) -> StoreResult:
     """The photo's row and its job's, in the caller's transaction.
 
     Raises Conflict (`photo_differs`), and IntegrityError when the same bytes were committed since
     the transaction has looked for them.
     """
     received, header, fields = incoming.received, incoming.header, incoming.fields
-    existing = find_live_by_sha256(session, map_id, received.sha256)
+    existing = find_photo_by_sha256(session, map_id, received.sha256)
     if existing is not None:
-        return _same_again(session, existing, fields)
+        return _match_existing_photo(session, existing, fields)
     photo_id, job_id = new_id(), new_id()
     said_where = fields.latitude is not None
     photo = Photo(
@@ -104,16 +108,18 @@ def put_photo(
     job = Job(id=job_id, map_id=map_id, kind=JobKind.INDEX, priority=priority, photo_id=photo_id)
     session.add(job)
     session.flush()
-    return Stored(photo, job, queued=True)
+    return StoreResult(photo, job, queued=True)
 
 
-def _store(catalog: Catalog, map_name: str, incoming: Incoming, keep: Keep) -> Stored:
+def _store(
+    catalog: Catalog, map_name: str, incoming: ValidatedPhoto, keep: BeforeCommit
+) -> StoreResult:
     with catalog.write() as session:
-        return keep(session, put_photo(session, get_map(session, map_name).id, incoming))
+        return keep(session, insert_photo(session, get_map(session, map_name).id, incoming))
 
 
-def _same_again(session: Session, photo: Photo, fields: PhotoFields) -> Stored:
-    differing = _differing(photo, fields)
+def _match_existing_photo(session: Session, photo: Photo, fields: PhotoFields) -> StoreResult:
+    differing = _differing_fields(photo, fields)
     if differing:
         raise Conflict(
             "photo_differs",
@@ -125,12 +131,12 @@ def _same_again(session: Session, photo: Photo, fields: PhotoFields) -> Stored:
         )
     job = session.get(Job, photo.job_id, with_for_update=True) if photo.job_id else None
     if job is not None and job.state in (JobState.FAILED, JobState.CANCELLED):
-        requeue(job)
-        return Stored(photo, job, queued=True)
-    return Stored(photo, job, queued=False)
+        requeue_job(job)
+        return StoreResult(photo, job, queued=True)
+    return StoreResult(photo, job, queued=False)
 
 
-def _differing(photo: Photo, fields: PhotoFields) -> list[str]:
+def _differing_fields(photo: Photo, fields: PhotoFields) -> list[str]:
     """The fields that say something else of the photo than is stored."""
     stored = {
         "latitude": photo.latitude,
@@ -146,11 +152,11 @@ def _differing(photo: Photo, fields: PhotoFields) -> list[str]:
     return [
         name
         for name, value in said.items()
-        if value is not None and not _alike(value, stored[name])
+        if value is not None and not _values_match(value, stored[name])
     ]
 
 
-def _alike(said: Any, stored: Any) -> bool:
+def _values_match(said: Any, stored: Any) -> bool:
     if isinstance(said, float) and isinstance(stored, float):
-        return abs(said - stored) <= SAME_DEGREES
+        return abs(said - stored) <= COORDINATE_TOLERANCE_DEGREES
     return bool(said == stored)

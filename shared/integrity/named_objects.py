@@ -20,13 +20,13 @@ from shared.catalog.vocabularies import Vocabulary
 from shared.catalog.whitenings import StoredWhitening
 from shared.chunks import manifest_key
 from shared.jobs.batches import BatchItem
-from shared.jobs.table import UNFINISHED, Job, JobKind, JobState
+from shared.jobs.table import UNFINISHED_STATES, Job, JobKind, JobState
 from shared.objects.keys import ORIGINALS
 
-ROWS_AT_ONCE = 1000
+ROWS_PER_QUERY = 1000
 
 
-class What(StrEnum):
+class ObjectKind(StrEnum):
     ORIGINAL = "original"
     CHUNK = "chunk"
     MANIFEST = "manifest"
@@ -38,14 +38,14 @@ class What(StrEnum):
     FILE = "file"  # of such a batch, not a photo yet
 
 
-BROUGHT = {JobKind.BATCH: What.ARCHIVE, JobKind.ADD_MODEL: What.CHECKPOINT}
+KIND_BY_JOB = {JobKind.BATCH: ObjectKind.ARCHIVE, JobKind.ADD_MODEL: ObjectKind.CHECKPOINT}
 """What came with a job, and goes when it ends."""
 
 
 @dataclass(frozen=True, slots=True)
-class NamedObject:
+class ReferencedObject:
     key: str
-    what: What
+    what: ObjectKind
     row_id: UUID
     """Of the photo, chunk, vocabulary, whitening, model or job."""
     size_bytes: int | None = None
@@ -54,14 +54,16 @@ class NamedObject:
     """Of the object's bytes, hexadecimal; None: not known."""
 
 
-def named_objects(session: Session) -> Iterator[NamedObject]:
+def list_referenced_objects(session: Session) -> Iterator[ReferencedObject]:
     """Those of live photos and of what answers or is being built, of maps that are not deleted."""
     photos = select(Photo.id, Photo.object_key, Photo.size_bytes, Photo.sha256).join(
         Map, Map.id == Photo.map_id
     )
     photos = photos.where(Photo.deleted_at.is_(None), Map.deleted_at.is_(None))
-    for row in session.execute(photos.execution_options(yield_per=ROWS_AT_ONCE)):
-        yield NamedObject(row.object_key, What.ORIGINAL, row.id, row.size_bytes, row.sha256)
+    for row in session.execute(photos.execution_options(yield_per=ROWS_PER_QUERY)):
+        yield ReferencedObject(
+            row.object_key, ObjectKind.ORIGINAL, row.id, row.size_bytes, row.sha256
+        )
     chunks = (
         select(Chunk.id, Chunk.object_key, Chunk.size_bytes, Chunk.sha256)
         .join(Generation, Generation.id == Chunk.generation_id)
@@ -72,27 +74,29 @@ def named_objects(session: Session) -> Iterator[NamedObject]:
             Map.deleted_at.is_(None),
         )
     )
-    for row in session.execute(chunks.execution_options(yield_per=ROWS_AT_ONCE)):
-        yield NamedObject(row.object_key, What.CHUNK, row.id, row.size_bytes, row.sha256)
-        yield NamedObject(manifest_key(row.object_key), What.MANIFEST, row.id)
+    for row in session.execute(chunks.execution_options(yield_per=ROWS_PER_QUERY)):
+        yield ReferencedObject(row.object_key, ObjectKind.CHUNK, row.id, row.size_bytes, row.sha256)
+        yield ReferencedObject(manifest_key(row.object_key), ObjectKind.MANIFEST, row.id)
     for table, what in (
-        (Vocabulary, What.VOCABULARY),
-        (StoredWhitening, What.WHITENING),
+        (Vocabulary, ObjectKind.VOCABULARY),
+        (StoredWhitening, ObjectKind.WHITENING),
     ):
         # Their hashes are those of the numbers inside.
         found = select(table.id, table.object_key).join(Map, Map.id == table.map_id)
         for one in session.execute(found.where(Map.deleted_at.is_(None))):
-            yield NamedObject(one.object_key, what, one.id)
+            yield ReferencedObject(one.object_key, what, one.id)
     models = select(Model.id, Model.object_key, Model.size_bytes, Model.sha256)
     for model in session.execute(models.where(Model.object_key.is_not(None))):
-        yield NamedObject(model.object_key, What.MODEL, model.id, model.size_bytes, model.sha256)
-    for kind, what in BROUGHT.items():
-        jobs = select(Job.id, Job.params).where(Job.kind == kind, Job.state.in_(UNFINISHED))
+        yield ReferencedObject(
+            model.object_key, ObjectKind.MODEL, model.id, model.size_bytes, model.sha256
+        )
+    for kind, what in KIND_BY_JOB.items():
+        jobs = select(Job.id, Job.params).where(Job.kind == kind, Job.state.in_(UNFINISHED_STATES))
         for job in session.execute(jobs).all():
             if (key := job.params.get("object_key")) is not None:
-                yield NamedObject(key, what, job.id)
+                yield ReferencedObject(key, what, job.id)
     files = select(BatchItem.object_key, BatchItem.job_id).where(
         BatchItem.state == JobState.QUEUED, BatchItem.object_key.startswith(ORIGINALS)
     )
-    for item in session.execute(files.execution_options(yield_per=ROWS_AT_ONCE)):
-        yield NamedObject(item.object_key, What.FILE, item.job_id)
+    for item in session.execute(files.execution_options(yield_per=ROWS_PER_QUERY)):
+        yield ReferencedObject(item.object_key, ObjectKind.FILE, item.job_id)

@@ -11,17 +11,17 @@ from sqlalchemy.orm import Session
 from shared.catalog.base import db_now
 from shared.catalog.chunks import Chunk, Descriptor
 from shared.catalog.generations import GenerationState, lock_generation
-from shared.catalog.maps import bump_version, lock_map
-from shared.catalog.photos import Photo, live_photos
+from shared.catalog.maps import increment_map_version, lock_map
+from shared.catalog.photos import Photo, get_live_photos
 from shared.catalog.session import Catalog
 from shared.ids import new_id
-from shared.integrity.report import Report
-from shared.jobs.finish import requeue
-from shared.jobs.hints import Hints
-from shared.jobs.table import UNFINISHED, Job, JobKind, Priority
+from shared.integrity.report import IntegrityReport
+from shared.jobs.finish import requeue_job
+from shared.jobs.hints import Wakeups
+from shared.jobs.table import UNFINISHED_STATES, Job, JobKind, Priority
 
 
-def repair(catalog: Catalog, hints: Hints, report: Report) -> int:
+def repair_descriptors(catalog: Catalog, hints: Wakeups, report: IntegrityReport) -> int:
     """Queue the photos of damaged chunks, and those without a descriptor; how many.
 
     The chunks' rows leave the catalog in the same transaction: until a photo is described again, it
@@ -32,7 +32,7 @@ def repair(catalog: Catalog, hints: Hints, report: Report) -> int:
         queued += catalog.run(partial(give_up_chunk, chunk_id=chunk_id))
     lost = [fault.photo_id for fault in report.faults if fault.photo_id is not None]
     if lost:
-        queued += catalog.run(lambda session: _queue(session, lost))
+        queued += catalog.run(lambda session: _queue_photos(session, lost))
     if queued:
         hints.send()
     return queued
@@ -50,9 +50,9 @@ def give_up_chunk(session: Session, chunk_id: UUID) -> int:
     )
     session.execute(delete(Descriptor).where(Descriptor.chunk_id == chunk_id))
     chunk.superseded_at = db_now()
-    bump_version(session, generation.map_id)
+    increment_map_version(session, generation.map_id)
     if generation.state == GenerationState.ACTIVE:
-        return _queue(session, photo_ids)
+        return _queue_photos(session, photo_ids)
     # Of one that is being built: the steward queues what has neither a row nor a job there.
     session.execute(
         delete(Job).where(
@@ -64,19 +64,19 @@ def give_up_chunk(session: Session, chunk_id: UUID) -> int:
     return len(photo_ids)
 
 
-def _queue(session: Session, photo_ids: list[UUID]) -> int:
-    live = live_photos(session, photo_ids)
+def _queue_photos(session: Session, photo_ids: list[UUID]) -> int:
+    live = get_live_photos(session, photo_ids)
     for photo in live.values():
-        _queue_one(session, photo)
+        _queue_photo(session, photo)
     return len(live)
 
 
-def _queue_one(session: Session, photo: Photo) -> None:
+def _queue_photo(session: Session, photo: Photo) -> None:
     job = session.get(Job, photo.job_id, with_for_update=True) if photo.job_id else None
-    if job is not None and job.state in UNFINISHED:
+    if job is not None and job.state in UNFINISHED_STATES:
         return
     if job is not None:
-        requeue(job)
+        requeue_job(job)
         return
     photo.job_id = new_id()
     session.add(

@@ -8,7 +8,7 @@ from enum import StrEnum
 from uuid import UUID
 
 
-class Wrong(StrEnum):
+class FaultKind(StrEnum):
     MISSING = "missing"  # the catalog names an object that is not there
     DAMAGED = "damaged"  # its bytes are not those that were written
     DIFFERENT = "different"  # the catalog says something else of it than it does itself
@@ -16,8 +16,8 @@ class Wrong(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Fault:
-    wrong: Wrong
+class IntegrityFault:
+    wrong: FaultKind
     what: str
     """`original`, `chunk`, `manifest`, ..., or `photo`."""
     name: str
@@ -30,11 +30,11 @@ class Fault:
 
 
 @dataclass(slots=True)
-class Report:
+class IntegrityReport:
     checked: Counter[str] = field(default_factory=Counter)
     """By what they are."""
     read_bytes: int = 0
-    faults: list[Fault] = field(default_factory=list)
+    faults: list[IntegrityFault] = field(default_factory=list)
     orphans: int = 0
     """Objects that no row knows. The steward moves them to the trash when they are old enough."""
     orphan_bytes: int = 0

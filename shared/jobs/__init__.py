@@ -3,21 +3,21 @@
 The `jobs` table is the queue. A hint (`shared.jobs.hints`) only wakes a worker sooner.
 """
 
-from shared.jobs.claim import begin, claim
-from shared.jobs.hints import Hints, InProcessHints
-from shared.jobs.leases import extend_lease, free_expired_leases, hold_lease
+from shared.jobs.claim import claim_jobs, mark_started
+from shared.jobs.hints import InProcessWakeups, Wakeups
+from shared.jobs.leases import extend_lease, maintain_lease, reclaim_expired_leases
 from shared.jobs.table import Job, JobKind, JobState, Priority
 
 __all__ = [
-    "Hints",
-    "InProcessHints",
+    "Wakeups",
+    "InProcessWakeups",
     "Job",
     "JobKind",
     "JobState",
     "Priority",
-    "begin",
-    "claim",
+    "mark_started",
+    "claim_jobs",
     "extend_lease",
-    "free_expired_leases",
-    "hold_lease",
+    "reclaim_expired_leases",
+    "maintain_lease",
 ]

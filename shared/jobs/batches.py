@@ -42,7 +42,7 @@ from shared.catalog.generations import active_generation
 from shared.catalog.maps import lock_map
 from shared.ids import new_id
 from shared.jobs.table import (
-    UNFINISHED,
+    UNFINISHED_STATES,
     Job,
     JobKind,
     JobState,
@@ -50,7 +50,7 @@ from shared.jobs.table import (
     WaitingFor,
 )
 
-AT_ONCE = 1000  # rows written by one statement, jobs looked up by one
+ITEMS_PER_STATEMENT = 1000  # rows written by one statement, jobs looked up by one
 
 
 class BatchSource(StrEnum):
@@ -97,7 +97,7 @@ class BatchItem(Base):
     )
 
 
-def start_batch(
+def create_batch(
     session: Session, map_id: UUID, source: BatchSource, params: dict[str, Any] | None = None
 ) -> Job:
     """A queued batch without items."""
@@ -114,7 +114,7 @@ def start_batch(
     return job
 
 
-def list_batch(session: Session, job: Job, items: Iterable[dict[str, Any]]) -> None:
+def add_batch_items(session: Session, job: Job, items: Iterable[dict[str, Any]]) -> None:
     """All the batch's items at once: columns of BatchItem without `job_id` and `number`."""
     rows = (
         {
@@ -132,7 +132,7 @@ def list_batch(session: Session, job: Job, items: Iterable[dict[str, Any]]) -> N
         for number, item in enumerate(items, start=1)
     )
     total = 0
-    while some := list(islice(rows, AT_ONCE)):
+    while some := list(islice(rows, ITEMS_PER_STATEMENT)):
         session.execute(insert(BatchItem), some)
         total += len(some)
     job.params = {**job.params, "listed": True}
@@ -141,12 +141,12 @@ def list_batch(session: Session, job: Job, items: Iterable[dict[str, Any]]) -> N
     job.attempts = 0
 
 
-def is_listed_batch(job: Job) -> bool:
+def has_batch_items(job: Job) -> bool:
     """Is it a batch that has its items?"""
     return job.kind == JobKind.BATCH and bool(job.params["listed"])
 
 
-def queued_items(session: Session, job_id: UUID, limit: int) -> list[BatchItem]:
+def next_queued_items(session: Session, job_id: UUID, limit: int) -> list[BatchItem]:
     """The next items to bring in."""
     return list(
         session.scalars(
@@ -158,7 +158,7 @@ def queued_items(session: Session, job_id: UUID, limit: int) -> list[BatchItem]:
     )
 
 
-def list_items(
+def list_batch_items(
     session: Session, job_id: UUID, states: list[JobState], limit: int, after: int
 ) -> list[BatchItem]:
     """In their order, up to `limit`, behind the number `after`; no states mean "any"."""
@@ -168,26 +168,26 @@ def list_items(
     return list(session.scalars(wanted.order_by(BatchItem.number).limit(limit)))
 
 
-def photos_ahead(session: Session, most: int) -> int:
-    """How many photos the extractors have before them, counted up to `most`.
+def count_queued_photos(session: Session, limit: int) -> int:
+    """How many photos the extractors have before them, counted up to `limit`.
 
     Those that wait for a vocabulary are not: more of them may be what makes one.
     """
     waiting = (
         select(Job.id)
         .where(
-            Job.state.in_(UNFINISHED),
+            Job.state.in_(UNFINISHED_STATES),
             Job.lease_token.is_(None),
             Job.priority >= Priority.BATCH,
             Job.kind == JobKind.INDEX,
             Job.waiting_for.is_(None),
         )
-        .limit(most)
+        .limit(limit)
     )
     return session.scalar(select(func.count()).select_from(waiting.subquery())) or 0
 
 
-def follow_items(session: Session, job: Job) -> Counter[JobState]:
+def sync_item_states(session: Session, job: Job) -> Counter[JobState]:
     """Let items end as their photos' jobs have ended, and note the progress; counts by state."""
     ended = session.execute(
         select(BatchItem.number, Job.state, Job.error)
@@ -195,7 +195,7 @@ def follow_items(session: Session, job: Job) -> Counter[JobState]:
         .where(
             BatchItem.job_id == job.id,
             BatchItem.state == JobState.RUNNING,
-            or_(Job.id.is_(None), Job.state.not_in(UNFINISHED)),
+            or_(Job.id.is_(None), Job.state.not_in(UNFINISHED_STATES)),
         )
     ).all()
     if ended:
@@ -218,18 +218,18 @@ def follow_items(session: Session, job: Job) -> Counter[JobState]:
         .group_by(BatchItem.state)
     )
     counts = Counter({JobState(state): count for state, count in counted})
-    note_progress(job, counts)
+    update_batch_progress(job, counts)
     return counts
 
 
-def note_progress(job: Job, counts: Counter[JobState]) -> None:
+def update_batch_progress(job: Job, counts: Counter[JobState]) -> None:
     """What `progress` says: searchable photos, failed ones, all."""
     job.progress_done = counts[JobState.SUCCEEDED]
     job.progress_failed = counts[JobState.FAILED]
     job.progress_total = counts.total()
 
 
-def batch_result(session: Session, job: Job, counts: Counter[JobState]) -> dict[str, Any]:
+def summarise_batch(session: Session, job: Job, counts: Counter[JobState]) -> dict[str, Any]:
     """What an ended batch has come to, in photos; `ignored` counts an archive's other members."""
     already_there = session.scalar(
         select(func.count())
@@ -250,7 +250,7 @@ def batch_result(session: Session, job: Job, counts: Counter[JobState]) -> dict[
     }
 
 
-def waits_for_vocabulary(session: Session, job: Job) -> bool:
+def is_waiting_for_vocabulary(session: Session, job: Job) -> bool:
     """Do all running items wait for a vocabulary that the map still lacks? Call it under the map's
     lock: whoever brings one wakes what waits by then."""
     if active_generation(session, job.map_id) is not None:
@@ -268,7 +268,7 @@ def waits_for_vocabulary(session: Session, job: Job) -> bool:
     return session.scalar(other) is None
 
 
-def lock_map_and_batch(session: Session, job: Job, token: UUID) -> Job | None:
+def lock_batch(session: Session, job: Job, token: UUID) -> Job | None:
     """The batch if it still carries the token, both rows locked in the order of everyone."""
     lock_map(session, job.map_id)
     return session.scalar(

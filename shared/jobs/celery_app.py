@@ -12,17 +12,17 @@ from celery import Celery
 from kombu.entity import Exchange, Queue
 
 from shared.errors import Misconfigured
-from shared.jobs.hints import Lane
+from shared.jobs.hints import WakeupQueue
 from shared.settings import Settings
 
 DRAIN_TASK = "placewise.drain"
 
 # A look at Redis for messages whose worker fell silent; kombu's own 10 s x 10 would make it 100 s.
-RESTORE_SECONDS = 5
+UNACKED_RESTORE_SECONDS = 5
 BROKER_TIMEOUT_SECONDS = 5
 
 
-def make_celery(settings: Settings) -> Celery:
+def create_celery_app(settings: Settings) -> Celery:
     """The application, for sending and for working; Misconfigured without REDIS_URL.
 
     JSON only, no result backend. A message is acknowledged when its drain has ended, so a killed
@@ -44,8 +44,8 @@ def make_celery(settings: Settings) -> Celery:
         task_acks_late=True,
         task_reject_on_worker_lost=True,
         worker_prefetch_multiplier=1,
-        task_queues=[_queue(lane) for lane in Lane],
-        task_default_queue=Lane.BULK,
+        task_queues=[_queue(lane) for lane in WakeupQueue],
+        task_default_queue=WakeupQueue.BULK,
         task_create_missing_queues=False,
         task_track_started=False,
         task_send_sent_event=False,
@@ -61,7 +61,7 @@ def make_celery(settings: Settings) -> Celery:
         broker_pool_acquire_timeout=BROKER_TIMEOUT_SECONDS,
         broker_transport_options={
             "visibility_timeout": settings.visibility_seconds,
-            "unacked_restore_interval": RESTORE_SECONDS,
+            "unacked_restore_interval": UNACKED_RESTORE_SECONDS,
             "unacked_restore_throttle": 1,
             "queue_order_strategy": "priority",  # in the order of `task_queues`: queries first
             "socket_timeout": BROKER_TIMEOUT_SECONDS,
@@ -74,6 +74,6 @@ def make_celery(settings: Settings) -> Celery:
     return app
 
 
-def _queue(lane: Lane) -> Queue:
+def _queue(lane: WakeupQueue) -> Queue:
     # With an exchange of its own: on the default one every hint would reach both lanes.
     return Queue(lane, Exchange(lane), routing_key=lane)  # type: ignore[no-untyped-call]

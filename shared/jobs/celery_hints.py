@@ -12,21 +12,21 @@ from redis import Redis
 from redis.exceptions import RedisError
 
 from shared.jobs.celery_app import BROKER_TIMEOUT_SECONDS, DRAIN_TASK
-from shared.jobs.hints import Lane
+from shared.jobs.hints import WakeupQueue
 from shared.settings import Settings
 
 log = logging.getLogger(__name__)
 
 # Waiting messages that are worth having: one wakes one free worker, and a worker that finds more
 # than it can do sends the next.
-MOST_WAITING = 16
+MAX_PENDING_WAKEUPS = 16
 # A burst of uploads is one hint.
-GATHER_SECONDS = 0.01
-SAID_SECONDS = 60.0  # between two lines of the log about Redis being away
-AWAY = (OperationalError, KombuError, RedisError, OSError, TimeoutError)
+DEBOUNCE_SECONDS = 0.01
+WARNING_INTERVAL_SECONDS = 60.0  # between two lines of the log about Redis being away
+BROKER_ERRORS = (OperationalError, KombuError, RedisError, OSError, TimeoutError)
 
 
-class CeleryHints:
+class CeleryWakeups:
     """Sends hints; `close` ends its thread. While Redis is away, hints are dropped."""
 
     def __init__(self, app: Celery, settings: Settings) -> None:
@@ -37,14 +37,16 @@ class CeleryHints:
             socket_timeout=BROKER_TIMEOUT_SECONDS,
             socket_connect_timeout=BROKER_TIMEOUT_SECONDS,
         )
-        self._wanted: dict[Lane, threading.Event] = {lane: threading.Event() for lane in Lane}
+        self._wanted: dict[WakeupQueue, threading.Event] = {
+            lane: threading.Event() for lane in WakeupQueue
+        }
         self._any = threading.Event()
         self._stop = threading.Event()
         self._silent_until = 0.0
         self._sender = threading.Thread(target=self._run, name="hints", daemon=True)
         self._sender.start()
 
-    def send(self, lane: Lane = Lane.BULK) -> None:
+    def send(self, lane: WakeupQueue = WakeupQueue.BULK) -> None:
         self._wanted[lane].set()
         self._any.set()
 
@@ -59,19 +61,19 @@ class CeleryHints:
             self._any.wait()
             if self._stop.is_set():
                 return
-            self._stop.wait(GATHER_SECONDS)
+            self._stop.wait(DEBOUNCE_SECONDS)
             self._any.clear()
-            for lane in Lane:
+            for lane in WakeupQueue:
                 if self._wanted[lane].is_set():
                     self._wanted[lane].clear()
                     self._publish(lane)
 
-    def _publish(self, lane: Lane) -> None:
+    def _publish(self, lane: WakeupQueue) -> None:
         try:
-            if int(self._redis.llen(lane)) >= MOST_WAITING:
+            if int(self._redis.llen(lane)) >= MAX_PENDING_WAKEUPS:
                 return
             self._app.send_task(DRAIN_TASK, queue=lane, ignore_result=True, retry=False)
-        except AWAY as error:
+        except BROKER_ERRORS as error:
             if time.monotonic() > self._silent_until:
-                self._silent_until = time.monotonic() + SAID_SECONDS
+                self._silent_until = time.monotonic() + WARNING_INTERVAL_SECONDS
                 log.warning("Redis can't be reached, hints are dropped for now: %s", error)

@@ -10,12 +10,12 @@ from sqlalchemy.orm import Session, object_session
 from shared.catalog.base import Condition, db_now, db_now_plus
 from shared.catalog.maps import Map
 from shared.catalog.photos import Photo
-from shared.catalog.webhooks import EventKind, announce, wanted
+from shared.catalog.webhooks import EventKind, enqueue_event, subscribed_webhook_ids
 from shared.errors import Conflict
 from shared.jobs.table import (
-    MODEL_CHANGES,
-    SLICED_JOBS,
-    UNFINISHED,
+    CHECKPOINTED_JOBS,
+    MODEL_CHANGE_JOBS,
+    UNFINISHED_STATES,
     Job,
     JobKind,
     JobState,
@@ -29,36 +29,36 @@ def _drop_lease(job: Job) -> None:
     job.lease_until = None
 
 
-def _wait_for_nothing(job: Job) -> None:
+def _clear_waiting(job: Job) -> None:
     job.waiting_for = None
     job.awaited = None
 
 
-def succeed(job: Job, result: dict[str, Any] | None = None) -> None:
+def succeed_job(job: Job, result: dict[str, Any] | None = None) -> None:
     """The job has done what it promised."""
     job.state = JobState.SUCCEEDED
     job.result = result
     job.error = None
-    _wait_for_nothing(job)
+    _clear_waiting(job)
     job.progress_done = job.progress_total - job.progress_failed
     job.finished_at = db_now()
     _drop_lease(job)
-    _announce(job, EventKind.JOB_SUCCEEDED)
+    _enqueue_job_event(job, EventKind.JOB_SUCCEEDED)
 
 
-def fail(job: Job, problem: dict[str, Any]) -> None:
+def fail_job(job: Job, problem: dict[str, Any]) -> None:
     """The job ends with a stored reason: an RFC 9457 problem."""
     job.state = JobState.FAILED
     job.error = problem
-    _wait_for_nothing(job)
+    _clear_waiting(job)
     if job.progress_total == 1:
         job.progress_failed = 1
     job.finished_at = db_now()
     _drop_lease(job)
-    _announce(job, EventKind.JOB_FAILED)
+    _enqueue_job_event(job, EventKind.JOB_FAILED)
 
 
-def _announce(job: Job, event: EventKind) -> None:
+def _enqueue_job_event(job: Job, event: EventKind) -> None:
     """Tell the webhooks of it; not of each photo of a model change, which is told of as a whole."""
     session = object_session(job)
     assert session is not None, "a job ends in a transaction"
@@ -66,11 +66,11 @@ def _announce(job: Job, event: EventKind) -> None:
     if job.kind == JobKind.BATCH:
         events.append(EventKind.BATCH_FINISHED)
     for one in events:
-        if wanted(session, one):
-            announce(session, one, _said_of(session, job))
+        if subscribed_webhook_ids(session, one):
+            enqueue_event(session, one, _event_data(session, job))
 
 
-def _said_of(session: Session, job: Job) -> dict[str, Any]:
+def _event_data(session: Session, job: Job) -> dict[str, Any]:
     map_ = session.get(Map, job.map_id)
     return {
         "job_id": str(job.id),
@@ -83,18 +83,20 @@ def _said_of(session: Session, job: Job) -> dict[str, Any]:
     }
 
 
-def release(job: Job, *, after_seconds: float = 0.0, waiting_for: WaitingFor | None = None) -> None:
+def release_job(
+    job: Job, *, after_seconds: float = 0.0, waiting_for: WaitingFor | None = None
+) -> None:
     """Give the job back without counting an attempt: to go on later, or once something is there.
 
     A sliced job stays `running` between its slices; everything else is `queued` again.
     """
-    job.state = JobState.RUNNING if job.kind in SLICED_JOBS else JobState.QUEUED
+    job.state = JobState.RUNNING if job.kind in CHECKPOINTED_JOBS else JobState.QUEUED
     job.waiting_for = waiting_for
     job.run_after = db_now_plus(after_seconds) if after_seconds else None
     _drop_lease(job)
 
 
-def release_waiting(session: Session, condition: Condition) -> None:
+def wake_waiting_jobs(session: Session, condition: Condition) -> None:
     """What the jobs waited for is there: they may be claimed."""
     session.execute(
         update(Job)
@@ -104,9 +106,9 @@ def release_waiting(session: Session, condition: Condition) -> None:
     )
 
 
-def cancel(job: Job) -> None:
+def cancel_job(job: Job) -> None:
     """End the job at once; a worker that has it computes in vain, its token is gone."""
-    if job.state not in UNFINISHED:
+    if job.state not in UNFINISHED_STATES:
         raise Conflict(
             "job_finished",
             f"The job {job.id} is {job.state} and can't be cancelled.",
@@ -114,16 +116,16 @@ def cancel(job: Job) -> None:
             state=job.state,
         )
     job.state = JobState.CANCELLED
-    _wait_for_nothing(job)
+    _clear_waiting(job)
     job.finished_at = db_now()
     _drop_lease(job)
 
 
-def cancel_all(session: Session, condition: Condition) -> None:
+def cancel_jobs(session: Session, condition: Condition) -> None:
     """Cancel every unfinished job that the condition names, as `cancel` does one."""
     unfinished = (
         select(Job.id)
-        .where(condition, Job.state.in_(UNFINISHED))
+        .where(condition, Job.state.in_(UNFINISHED_STATES))
         .order_by(Job.id)  # as `held` locks them
         .with_for_update()
     )
@@ -142,7 +144,7 @@ def cancel_all(session: Session, condition: Condition) -> None:
     )
 
 
-def retry(session: Session, job: Job) -> None:
+def retry_job(session: Session, job: Job) -> None:
     """Queue a failed or cancelled job again, with all its attempts."""
     if job.state not in (JobState.FAILED, JobState.CANCELLED):
         raise Conflict(
@@ -154,7 +156,7 @@ def retry(session: Session, job: Job) -> None:
     photo = session.get_one(Photo, job.photo_id) if job.photo_id is not None else None
     # A failed reindex job becomes its photo's own job at the switch: from then on it may.
     part_of_a_change = job.kind == JobKind.REINDEX and (photo is None or photo.job_id != job.id)
-    if job.kind in MODEL_CHANGES or part_of_a_change:
+    if job.kind in MODEL_CHANGE_JOBS or part_of_a_change:
         raise Conflict(
             "job_not_retryable",
             "A model change is started anew, not retried: POST /api/v1/vocabularies or "
@@ -171,10 +173,10 @@ def retry(session: Session, job: Job) -> None:
         if photo.deleted_at is not None:
             raise Conflict("photo_deleted", "The job's photo was deleted.", job_id=str(job.id))
         photo.job_id = job.id
-    requeue(job)
+    requeue_job(job)
 
 
-def requeue(job: Job) -> None:
+def requeue_job(job: Job) -> None:
     """Back to the start, as if it were new."""
     if job.kind == JobKind.REINDEX:
         # The generation that it failed in may be gone: the photo goes to the one that answers.
@@ -184,7 +186,7 @@ def requeue(job: Job) -> None:
     job.alone = False
     job.error = None
     job.result = None
-    _wait_for_nothing(job)
+    _clear_waiting(job)
     job.run_after = None
     job.progress_done = 0
     job.progress_failed = 0

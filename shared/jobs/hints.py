@@ -13,31 +13,31 @@ from typing import Protocol
 from shared.jobs.table import Priority
 
 
-class Lane(StrEnum):
+class WakeupQueue(StrEnum):
     QUERY = "placewise.query"  # someone waits for the answer
     BULK = "placewise.bulk"
 
 
-def lane_of(priority: int) -> Lane:
+def queue_for_priority(priority: int) -> WakeupQueue:
     """The lane that a job of this priority is hinted on."""
-    return Lane.QUERY if priority >= Priority.QUERY else Lane.BULK
+    return WakeupQueue.QUERY if priority >= Priority.QUERY else WakeupQueue.BULK
 
 
-class Hints(Protocol):
+class Wakeups(Protocol):
     """The port over which whoever queued a job wakes a worker."""
 
-    def send(self, lane: Lane = Lane.BULK) -> None:
+    def send(self, lane: WakeupQueue = WakeupQueue.BULK) -> None:
         """Wake a worker. Never raises and never waits: the job is already committed and will be
         found anyway."""
 
 
-class InProcessHints:
+class InProcessWakeups:
     """Hints inside one process, for the embedded mode: at most one is outstanding."""
 
     def __init__(self) -> None:
         self._event = threading.Event()
 
-    def send(self, lane: Lane = Lane.BULK) -> None:
+    def send(self, lane: WakeupQueue = WakeupQueue.BULK) -> None:
         self._event.set()
 
     def wait(self, seconds: float) -> bool:

@@ -13,19 +13,19 @@ from sqlalchemy import select, update
 from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.orm import Session
 
-from shared.catalog.away import Outage
-from shared.catalog.base import db_now, db_now_plus, rowcount
+from shared.catalog.away import OutageLog
+from shared.catalog.base import affected_rows, db_now, db_now_plus
 from shared.catalog.session import Catalog
-from shared.jobs.batches import is_listed_batch
-from shared.jobs.cancel_batch import cancel_items
-from shared.jobs.finish import fail, release
+from shared.jobs.batches import has_batch_items
+from shared.jobs.cancel_batch import cancel_batch_items
+from shared.jobs.finish import fail_job, release_job
 from shared.jobs.model_changes import abandon_generation
-from shared.jobs.table import Job, locked_under
+from shared.jobs.table import Job, select_locked_job_ids
 
 log = logging.getLogger(__name__)
 
 
-def token_of(job: Job) -> UUID:
+def get_lease_token(job: Job) -> UUID:
     """The token that a claimed job carries."""
     assert job.lease_token is not None, "a claimed job carries a token"
     return job.lease_token
@@ -35,18 +35,18 @@ def extend_lease(session: Session, token: UUID, lease_seconds: float) -> bool:
     """Keep what was claimed under `token`; False when all of it has been taken over or ended."""
     touched = session.execute(
         update(Job)
-        .where(Job.id.in_(session.scalars(locked_under(token)).all()))
+        .where(Job.id.in_(session.scalars(select_locked_job_ids(token)).all()))
         .values(lease_until=db_now_plus(lease_seconds))
         .execution_options(synchronize_session=False)
     )
-    return rowcount(touched) > 0
+    return affected_rows(touched) > 0
 
 
 @contextlib.contextmanager
-def hold_lease(catalog: Catalog, token: UUID, lease_seconds: float) -> Iterator[None]:
+def maintain_lease(catalog: Catalog, token: UUID, lease_seconds: float) -> Iterator[None]:
     """Extends the lease from a thread while the block runs, three times per lease."""
     done = threading.Event()
-    outage = Outage(f"lease {token}")
+    outage = OutageLog(f"lease {token}")
 
     def keep() -> None:
         while not done.wait(lease_seconds / 3):
@@ -56,7 +56,7 @@ def hold_lease(catalog: Catalog, token: UUID, lease_seconds: float) -> Iterator[
                         return
             except SQLAlchemyError as error:
                 # The lease may run out, and then the token fences the commit.
-                outage.met(error)
+                outage.record_error(error)
 
     keeper = threading.Thread(target=keep, name=f"lease-{token}", daemon=True)
     keeper.start()
@@ -67,7 +67,7 @@ def hold_lease(catalog: Catalog, token: UUID, lease_seconds: float) -> Iterator[
         keeper.join()
 
 
-def held(session: Session, token: UUID, jobs: Sequence[Job]) -> list[Job]:
+def lock_leased_jobs(session: Session, token: UUID, jobs: Sequence[Job]) -> list[Job]:
     """Those of the jobs that still carry the token, locked: only these may be finished."""
     return list(
         session.scalars(
@@ -80,43 +80,45 @@ def held(session: Session, token: UUID, jobs: Sequence[Job]) -> list[Job]:
     )
 
 
-def free_expired_leases(session: Session, max_attempts: int, *, everyone: bool = False) -> int:
+def reclaim_expired_leases(session: Session, max_attempts: int, *, all_leases: bool = False) -> int:
     """Give back what dead workers held; returns how many jobs that were.
 
     A job that fell with others is marked `alone`: it may be innocent. One that fell alone has
-    used an attempt, and after `max_attempts` it is failed. `everyone` frees all leases, for a
+    used an attempt, and after `max_attempts` it is failed. `all_leases` frees all leases, for a
     process that knows that no other worker lives.
     """
     expired = select(Job).where(Job.lease_token.is_not(None))
-    if not everyone:
+    if not all_leases:
         expired = expired.where(Job.lease_until < db_now())
     jobs = session.scalars(expired.order_by(Job.id).with_for_update(skip_locked=True)).all()
     for job in jobs:
-        fallen(session, job, max_attempts, cause=None)
+        handle_worker_crash(session, job, max_attempts, cause=None)
     return len(jobs)
 
 
-def fallen(session: Session, job: Job, max_attempts: int, *, cause: str | None) -> None:
+def handle_worker_crash(
+    session: Session, job: Job, max_attempts: int, *, cause: str | None
+) -> None:
     """The worker that had the job died, or crashed (`cause`): who is to blame is not known yet.
 
     What fell in a batch is tried again alone, and no attempt is counted.
     """
     if job.claimed_together == 0:  # nothing had begun that the job could be blamed for
-        release(job)
+        release_job(job)
         return
     fell_alone = job.claimed_together == 1
     job.attempts += fell_alone
     # A batch goes on without the one photo that may be to blame; its worker sees to that.
-    if job.attempts >= max_attempts and not is_listed_batch(job):
-        fail(job, _fallen_problem(job, cause))
+    if job.attempts >= max_attempts and not has_batch_items(job):
+        fail_job(job, _worker_crash_problem(job, cause))
         abandon_generation(session, job)
-        cancel_items(session, job)
+        cancel_batch_items(session, job)
         return
     job.alone = job.alone or not fell_alone
-    release(job)
+    release_job(job)
 
 
-def _fallen_problem(job: Job, cause: str | None) -> dict[str, Any]:
+def _worker_crash_problem(job: Job, cause: str | None) -> dict[str, Any]:
     what = f"crashed ({cause})" if cause else "died"
     return {
         "type": "urn:placewise:problem:worker_fell",

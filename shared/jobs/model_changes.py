@@ -26,13 +26,13 @@ from shared.catalog.generations import (
     active_generation,
     lock_generation,
 )
-from shared.catalog.maps import bump_version, lock_map
+from shared.catalog.maps import increment_map_version, lock_map
 from shared.errors import Conflict
 from shared.ids import new_id
-from shared.jobs.finish import cancel, cancel_all, release, release_waiting
+from shared.jobs.finish import cancel_job, cancel_jobs, release_job, wake_waiting_jobs
 from shared.jobs.table import (
-    MODEL_CHANGES,
-    UNFINISHED,
+    MODEL_CHANGE_JOBS,
+    UNFINISHED_STATES,
     Job,
     JobKind,
     Priority,
@@ -45,7 +45,7 @@ def start_model_change(
 ) -> Job:
     """Queue a model change; 409 (`model_change_running`) names the one under way."""
     lock_map(session, map_id)
-    running = unfinished_model_change(session, map_id)
+    running = get_unfinished_model_change(session, map_id)
     if running is not None:
         raise Conflict(
             "model_change_running",
@@ -65,16 +65,16 @@ def start_model_change(
     return job
 
 
-def unfinished_model_change(session: Session, map_id: UUID) -> Job | None:
+def get_unfinished_model_change(session: Session, map_id: UUID) -> Job | None:
     """The model change that is under way in the map, if any."""
     return session.scalar(
         select(Job).where(
-            Job.map_id == map_id, Job.kind.in_(MODEL_CHANGES), Job.state.in_(UNFINISHED)
+            Job.map_id == map_id, Job.kind.in_(MODEL_CHANGE_JOBS), Job.state.in_(UNFINISHED_STATES)
         )
     )
 
 
-def begin_generation(session: Session, job: Job, **columns: Any) -> Generation:
+def create_generation(session: Session, job: Job, **columns: Any) -> Generation:
     """The generation that the model change `job` leads to; the job now waits for descriptors.
 
     In a map without an active generation it answers at once, and photos that waited for a
@@ -93,22 +93,22 @@ def begin_generation(session: Session, job: Job, **columns: Any) -> Generation:
     session.flush()
     if first:
         map_.extractor = generation.extractor
-        release_vocabulary_waiters(session, job.map_id)
-        bump_version(session, job.map_id)
+        wake_vocabulary_waiters(session, job.map_id)
+        increment_map_version(session, job.map_id)
     job.generation_id = generation.id
     job.stage = "describe"
-    release(job, waiting_for=WaitingFor.DESCRIPTORS)
+    release_job(job, waiting_for=WaitingFor.DESCRIPTORS)
     return generation
 
 
-def release_vocabulary_waiters(session: Session, map_id: UUID) -> None:
+def wake_vocabulary_waiters(session: Session, map_id: UUID) -> None:
     """The map has a vocabulary: photos and queries that waited for one may go on."""
-    release_waiting(session, (Job.map_id == map_id) & (Job.waiting_for == WaitingFor.VOCABULARY))
+    wake_waiting_jobs(session, (Job.map_id == map_id) & (Job.waiting_for == WaitingFor.VOCABULARY))
 
 
 def cancel_model_change(session: Session, job: Job) -> None:
     """Cancel the job, and give up the generation that it was building."""
-    cancel(job)
+    cancel_job(job)
     abandon_generation(session, job)
 
 
@@ -117,11 +117,11 @@ def abandon_generation(session: Session, job: Job) -> None:
 
     Any other job, one of those photos' too, ends without touching its generation.
     """
-    if job.kind not in MODEL_CHANGES or job.generation_id is None:
+    if job.kind not in MODEL_CHANGE_JOBS or job.generation_id is None:
         return
     generation = lock_generation(session, job.generation_id)
     if generation.state != GenerationState.BUILDING:
         return
     generation.state = GenerationState.ABANDONED
     generation.ended_at = db_now()
-    cancel_all(session, (Job.generation_id == generation.id) & (Job.kind == JobKind.REINDEX))
+    cancel_jobs(session, (Job.generation_id == generation.id) & (Job.kind == JobKind.REINDEX))

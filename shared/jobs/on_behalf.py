@@ -6,17 +6,17 @@ import contextlib
 from collections.abc import Iterator, Sequence
 
 from shared.jobs.table import Job
-from shared.telemetry.request_id import under_request_id
+from shared.telemetry.request_id import request_id_context
 from shared.telemetry.traces import span
 
 
 @contextlib.contextmanager
-def on_behalf_of(jobs: Sequence[Job], step: str) -> Iterator[None]:
+def job_trace_context(jobs: Sequence[Job], step: str) -> Iterator[None]:
     """The block as a span that leads back to the requests of the jobs; where all of them are of one
     request, log lines carry its id, and jobs that are made belong to it."""
-    ids = request_ids(jobs)
+    ids = distinct_request_ids(jobs)
     with (
-        under_request_id(ids[0] if len(ids) == 1 else None),
+        request_id_context(ids[0] if len(ids) == 1 else None),
         span(
             step,
             [job.traceparent for job in jobs],
@@ -29,6 +29,6 @@ def on_behalf_of(jobs: Sequence[Job], step: str) -> Iterator[None]:
         yield
 
 
-def request_ids(jobs: Sequence[Job]) -> list[str]:
+def distinct_request_ids(jobs: Sequence[Job]) -> list[str]:
     """Each once, in the jobs' order; jobs that nobody's request has made add none."""
     return list(dict.fromkeys(job.request_id for job in jobs if job.request_id is not None))

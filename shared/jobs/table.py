@@ -53,7 +53,7 @@ from shared.catalog.base import (
 )
 from shared.errors import NotFound
 from shared.ids import new_id
-from shared.telemetry.request_id import MOST_CHARACTERS, current_request_id
+from shared.telemetry.request_id import MAX_REQUEST_ID_CHARACTERS, current_request_id
 from shared.telemetry.traces import current_traceparent
 
 
@@ -65,7 +65,7 @@ class JobState(StrEnum):
     CANCELLED = "cancelled"  # ended on request; may be retried
 
 
-UNFINISHED = (JobState.QUEUED, JobState.RUNNING)
+UNFINISHED_STATES = (JobState.QUEUED, JobState.RUNNING)
 
 
 class JobKind(StrEnum):
@@ -83,7 +83,7 @@ class JobKind(StrEnum):
     BATCH = "batch"  # bring in many photos; each has a job of its own (`shared.jobs.batches`)
 
 
-MODEL_CHANGES = (JobKind.FIT, JobKind.IMPORT, JobKind.SWITCH, JobKind.PCA)
+MODEL_CHANGE_JOBS = (JobKind.FIT, JobKind.IMPORT, JobKind.SWITCH, JobKind.PCA)
 
 # Someone waits for their result, which is kept for QUERY_TTL_SECONDS.
 QUERY_JOBS = (JobKind.DESCRIBE, JobKind.COMPARE)
@@ -94,15 +94,15 @@ EXTRACTOR_JOBS = (
     JobKind.REINDEX,
     JobKind.ADD_MODEL,
     *QUERY_JOBS,
-    *MODEL_CHANGES,
+    *MODEL_CHANGE_JOBS,
 )
 STEWARD_JOBS = (JobKind.EVALUATE, JobKind.WORD_WEIGHTS, JobKind.BATCH)
 
 # Done in slices: between two of them they are running, and no one holds their lease.
-SLICED_JOBS = (*MODEL_CHANGES, JobKind.BATCH)
+CHECKPOINTED_JOBS = (*MODEL_CHANGE_JOBS, JobKind.BATCH)
 
 # Claimed one at a time: each is as much work as a batch, or changes what the next one finds.
-LONE_JOBS = (*MODEL_CHANGES, JobKind.ADD_MODEL, JobKind.COMPARE)
+SINGLE_CLAIM_JOBS = (*MODEL_CHANGE_JOBS, JobKind.ADD_MODEL, JobKind.COMPARE)
 
 
 class Priority(IntEnum):
@@ -123,9 +123,9 @@ class WaitingFor(StrEnum):
     DISK_SPACE = "disk_space"  # a batch: the disk or the bucket has no room for its photos
 
 
-def _ready(state: Any, lease_token: Any, waiting_for: Any) -> Condition:
+def _ready_condition(state: Any, lease_token: Any, waiting_for: Any) -> Condition:
     """What `claimable` asks of every row: indexes of such rows serve claims."""
-    return and_(state.in_(UNFINISHED), lease_token.is_(None), waiting_for.is_(None))
+    return and_(state.in_(UNFINISHED_STATES), lease_token.is_(None), waiting_for.is_(None))
 
 
 class Job(Base):
@@ -163,14 +163,17 @@ class Job(Base):
     finished_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
     # Of the request that made it, or of the job that did: logs and traces follow them.
     request_id: Mapped[str | None] = mapped_column(
-        String(MOST_CHARACTERS), default=current_request_id
+        String(MAX_REQUEST_ID_CHARACTERS), default=current_request_id
     )
     traceparent: Mapped[str | None] = mapped_column(String(55), default=current_traceparent)
 
     __table_args__ = (
         # Claiming: whatever goes first, then the rest of its batch.
         partial_index(
-            "ix_jobs_ready", priority.desc(), "id", only=_ready(state, lease_token, waiting_for)
+            "ix_jobs_ready",
+            priority.desc(),
+            "id",
+            only=_ready_condition(state, lease_token, waiting_for),
         ),
         partial_index(
             "ix_jobs_ready_batch",
@@ -178,7 +181,7 @@ class Job(Base):
             "map_id",
             priority.desc(),
             "id",
-            only=_ready(state, lease_token, waiting_for),
+            only=_ready_condition(state, lease_token, waiting_for),
         ),
         partial_index("ix_jobs_leased", "lease_until", only=lease_token.is_not(None)),
         partial_index(
@@ -195,10 +198,10 @@ class Job(Base):
     )
 
 
-def claimable(kinds: Sequence[JobKind] = EXTRACTOR_JOBS) -> Condition:
+def claimable_condition(kinds: Sequence[JobKind] = EXTRACTOR_JOBS) -> Condition:
     """True for jobs of these kinds that a worker may take now."""
     return and_(
-        Job.state.in_(UNFINISHED),
+        Job.state.in_(UNFINISHED_STATES),
         Job.kind.in_(kinds),
         Job.lease_token.is_(None),
         Job.waiting_for.is_(None),
@@ -206,7 +209,7 @@ def claimable(kinds: Sequence[JobKind] = EXTRACTOR_JOBS) -> Condition:
     )
 
 
-def locked_under(token: UUID) -> Select[UUID]:
+def select_locked_job_ids(token: UUID) -> Select[UUID]:
     """The ids of the jobs under the token, locked in the order in which everyone locks jobs.
 
     The lease's thread and the transaction that finishes run at once: in two orders they would

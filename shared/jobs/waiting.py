@@ -10,20 +10,20 @@ from sqlalchemy.orm import Session
 
 from shared.catalog.base import db_now_plus
 from shared.catalog.maps import Map
-from shared.jobs.table import QUERY_JOBS, UNFINISHED, Job, JobKind, Priority
+from shared.jobs.table import QUERY_JOBS, UNFINISHED_STATES, Job, JobKind, Priority
 
-RATE_SECONDS = 60.0
-MOST_FINISHED = 100_000  # counted in RATE_SECONDS at most: nobody is faster
+THROUGHPUT_WINDOW_SECONDS = 60.0
+MAX_COUNTED_FINISHED = 100_000  # counted in RATE_SECONDS at most: nobody is faster
 
 # All but `reindex`: a model change queues every photo of its map, behind everything that is asked.
-ASKED_FOR = (Priority.UPLOAD, Priority.BATCH, Priority.MODEL_CHANGE, Priority.EVALUATION)
+BACKLOG_PRIORITIES = (Priority.UPLOAD, Priority.BATCH, Priority.MODEL_CHANGE, Priority.EVALUATION)
 
 
 @dataclass(frozen=True, slots=True)
-class Waiting:
+class QueueDepth:
     """Jobs that a worker could take and none has; those that wait for a vocabulary are no queue."""
 
-    of_maps: Mapping[str, int]
+    jobs_by_map: Mapping[str, int]
     """Name of a map -> its jobs, without queries."""
     queries: int
     """Query photos and comparisons, of all maps."""
@@ -32,24 +32,24 @@ class Waiting:
 
     @property
     def jobs(self) -> int:
-        return sum(self.of_maps.values())
+        return sum(self.jobs_by_map.values())
 
 
-def look_at_queue(session: Session, most: int) -> Waiting:
-    """Counts `most` jobs and as many queries at most, by the index that workers claim by."""
-    of_maps = _count(session, ASKED_FOR, most)
-    queries = sum(_count(session, (Priority.QUERY,), most).values())
+def measure_queue_depth(session: Session, limit: int) -> QueueDepth:
+    """Counts `limit` jobs and as many queries at most, by the index that workers claim by."""
+    of_maps = _count(session, BACKLOG_PRIORITIES, limit)
+    queries = sum(_count(session, (Priority.QUERY,), limit).values())
     finished = (
         select(Job.id)
         .where(
             Job.kind.in_((JobKind.INDEX, *QUERY_JOBS)),
-            Job.finished_at > db_now_plus(-RATE_SECONDS),
+            Job.finished_at > db_now_plus(-THROUGHPUT_WINDOW_SECONDS),
         )
-        .limit(MOST_FINISHED)
+        .limit(MAX_COUNTED_FINISHED)
         .subquery()
     )
     done = session.scalar(select(func.count()).select_from(finished)) or 0
-    return Waiting(of_maps, queries, done / RATE_SECONDS)
+    return QueueDepth(of_maps, queries, done / THROUGHPUT_WINDOW_SECONDS)
 
 
 def _count(session: Session, priorities: Sequence[Priority], most: int) -> dict[str, int]:
@@ -57,7 +57,7 @@ def _count(session: Session, priorities: Sequence[Priority], most: int) -> dict[
     some = (
         select(Job.map_id)
         .where(
-            Job.state.in_(UNFINISHED),
+            Job.state.in_(UNFINISHED_STATES),
             Job.lease_token.is_(None),
             Job.waiting_for.is_(None),
             Job.priority.in_(priorities),

@@ -10,7 +10,7 @@ from functools import partial
 from sqlalchemy import bindparam, exists, literal, select, union_all, update
 from sqlalchemy.orm import Session
 
-from shared.catalog.installation import REBUILDING, Installation, ensure_installation
+from shared.catalog.installation import REBUILDING, Installation, get_or_create_installation
 from shared.catalog.session import Catalog
 from shared.journal.lag import Lag, lag_of
 from shared.journal.segments import (
@@ -59,7 +59,7 @@ def write_journal(catalog: Catalog, store: ObjectStore) -> Written:
         # A segment that a killed steward has left keeps its number.
         number = max([sequence, *(segment.last for segment in segments)]) + 1
         with catalog.write() as session:
-            installation_id = ensure_installation(session).id
+            installation_id = get_or_create_installation(session).id
         key = put_segment(store, number, number, installation_id, (line.encode() for line in lines))
         if not catalog.run(partial(_commit, before=sequence, number=number, lines=lines)):
             store.delete(key)  # another steward was faster: what it left out is pending still
@@ -75,7 +75,7 @@ def accept_segments(catalog: Catalog, store: ObjectStore) -> None:
     """Let the catalog's journal continue after the last segment of the store, whoever wrote it."""
     last = max((segment.last for segment in list_segments(store)), default=0)
     with catalog.write() as session:
-        installation = ensure_installation(session)
+        installation = get_or_create_installation(session)
         if installation.journal_sequence != REBUILDING:
             installation.journal_sequence = max(installation.journal_sequence, last)
 

@@ -27,16 +27,16 @@ Notes of the store itself are no objects: `.placewise` (whose store it is, `stor
 
 from shared.objects.folder import FolderStore
 from shared.objects.port import (
-    DirectStore,
     ObjectInfo,
     ObjectStore,
     ObjectWriter,
     OwnedStore,
     PresignedPut,
+    PresigningStore,
 )
 
 __all__ = [
-    "DirectStore",
+    "PresigningStore",
     "FolderStore",
     "ObjectInfo",
     "ObjectStore",

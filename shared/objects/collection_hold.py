@@ -10,10 +10,10 @@ import json
 from dataclasses import asdict, dataclass
 from enum import StrEnum
 
-from shared.objects.folder import MARK
+from shared.objects.folder import OWNER_MARK
 from shared.objects.port import OwnedStore
 
-HOLD = f"{MARK}-hold"
+HOLD = f"{OWNER_MARK}-hold"
 
 
 class HoldReason(StrEnum):

@@ -20,18 +20,20 @@ from typing import BinaryIO
 from shared.disk_reserve import DISK_FULL
 from shared.errors import NotFound, StorageFull, Unavailable
 from shared.ids import new_id
-from shared.objects.keys import TRASH, check_key, is_key
+from shared.objects.keys import TRASH, check_key, is_valid_key
 from shared.objects.port import ObjectInfo
 from shared.private_files import create_private_file, make_private_folder, write_private
 
 log = logging.getLogger(__name__)
 
 # No file there, or a folder on the way or at the end: to a store of keys it is all the same.
-MISSING = (FileNotFoundError, NotADirectoryError, IsADirectoryError)
-PARTIAL = ".partial"  # the folder of files being written: same file system, so rename is atomic
-MARK = ".placewise"  # the file that says whose folder it is (`shared.objects.upload_dir`)
+NOT_FOUND_ERRORS = (FileNotFoundError, NotADirectoryError, IsADirectoryError)
+PARTIAL_SUFFIX = (
+    ".partial"  # the folder of files being written: same file system, so rename is atomic
+)
+OWNER_MARK = ".placewise"  # the file that says whose folder it is (`shared.objects.upload_dir`)
 # Another folder's part of the trash, on its own disk: so a move into the trash is a rename.
-TRASH_ELSEWHERE = f"{MARK}-trash"
+TRASH_ELSEWHERE = f"{OWNER_MARK}-trash"
 FULL_RETRY_SECONDS = 60
 PIECE_BYTES = 1024 * 1024
 KEPT_FREE_BYTES = 16 * 1024 * 1024  # the last of the disk is the catalog's: it deletes with that
@@ -52,20 +54,20 @@ class FolderStore:
         self.root = root
         self._elsewhere = dict(elsewhere or {})
         for folder in self._folders():
-            make_private_folder(folder / PARTIAL)
-            for left_over in (folder / PARTIAL).iterdir() if alone else ():
+            make_private_folder(folder / PARTIAL_SUFFIX)
+            for left_over in (folder / PARTIAL_SUFFIX).iterdir() if alone else ():
                 left_over.unlink()
 
     def path(self, key: str) -> Path:
         """The file of a key. Keys are names joined by single slashes, none of them `.` or `..`."""
-        folder, parts = self._place(key)
+        folder, parts = self._locate(key)
         return folder.joinpath(*parts)
 
     def writer(self, key: str) -> FolderWriter:
-        folder, parts = self._place(key)
+        folder, parts = self._locate(key)
         return FolderWriter(
             folder.joinpath(*parts),
-            folder / PARTIAL / str(new_id()),
+            folder / PARTIAL_SUFFIX / str(new_id()),
             lambda: self._empty_trash(folder) > 0,
         )
 
@@ -84,7 +86,7 @@ class FolderStore:
     def open(self, key: str) -> BinaryIO:
         try:
             return self.path(key).open("rb")
-        except MISSING:
+        except NOT_FOUND_ERRORS:
             raise _not_found(key) from None
 
     def read_range(self, key: str, begin: int, size_bytes: int) -> bytes:
@@ -98,23 +100,23 @@ class FolderStore:
     def head(self, key: str) -> ObjectInfo | None:
         try:
             status = self.path(key).stat()
-        except MISSING:
+        except NOT_FOUND_ERRORS:
             return None
         return _info(key, status) if stat.S_ISREG(status.st_mode) else None
 
     def delete(self, key: str) -> None:
         path = self.path(key)
-        with contextlib.suppress(*MISSING):
+        with contextlib.suppress(*NOT_FOUND_ERRORS):
             path.unlink()
         if key.startswith(TRASH):  # or a folder would be left for each day
-            _remove_empty_folders(path.parent, self._trash_of(self._place(key)[0]))
+            _remove_empty_folders(path.parent, self._trash_of(self._locate(key)[0]))
 
     def list(self, prefix: str) -> Iterator[ObjectInfo]:
         yield from self._list_folder(self.root, "", prefix)
         for name, folder in self._elsewhere.items():
             yield from self._list_folder(folder, f"{name}/", prefix)
             if TRASH.startswith(prefix) or prefix.startswith(TRASH):
-                with contextlib.suppress(*MISSING):
+                with contextlib.suppress(*NOT_FOUND_ERRORS):
                     for day in sorted((folder / TRASH_ELSEWHERE).iterdir()):
                         yield from self._list_folder(day, f"{TRASH}{day.name}/{name}/", prefix)
 
@@ -132,7 +134,7 @@ class FolderStore:
                     raise
                 self._copy(old, target)  # one of the folders is a mount of its own
                 old.unlink()
-        except MISSING:
+        except NOT_FOUND_ERRORS:
             raise _not_found(source) from None
         for folder in (*made, old.parent):
             _sync_folder(folder)
@@ -147,7 +149,7 @@ class FolderStore:
             return None
 
     def write_note(self, name: str, data: bytes, *, replace: bool = True) -> None:
-        note, partial = self._note(name), self.root / PARTIAL / str(new_id())
+        note, partial = self._note(name), self.root / PARTIAL_SUFFIX / str(new_id())
         write_private(partial, data.decode())
         if replace:
             partial.replace(note)
@@ -162,7 +164,7 @@ class FolderStore:
 
     def check(self) -> None:
         for folder in self._folders():
-            probe = folder / PARTIAL / str(new_id())
+            probe = folder / PARTIAL_SUFFIX / str(new_id())
             try:
                 with create_private_file(probe) as file:
                     file.write(b"ok")
@@ -180,7 +182,7 @@ class FolderStore:
         yield self.root
         yield from self._elsewhere.values()
 
-    def _place(self, key: str) -> tuple[Path, Sequence[str]]:
+    def _locate(self, key: str) -> tuple[Path, Sequence[str]]:
         """The folder that a key lies in, and the names that lead to it from there."""
         folder, parts = self.root, check_key(key).split("/")
         if f"{parts[0]}/" == TRASH and len(parts) > 3 and parts[2] in self._elsewhere:
@@ -192,7 +194,7 @@ class FolderStore:
         return folder, parts
 
     def _note(self, name: str) -> Path:
-        if not name.startswith(MARK) or not is_key(name) or "/" in name:
+        if not name.startswith(OWNER_MARK) or not is_valid_key(name) or "/" in name:
             raise ValueError(f"not the name of a note: {name!r}")
         return self.root / name
 
@@ -203,14 +205,14 @@ class FolderStore:
         """Delete what lies in the trash of this folder, oldest day first, all or until its disk has
         this much free; how many files."""
         trash, deleted = self._trash_of(folder), 0
-        with contextlib.suppress(*MISSING):
+        with contextlib.suppress(*NOT_FOUND_ERRORS):
             for day in sorted(trash.iterdir()):
                 free = shutil.disk_usage(folder).free
                 if least_free_bytes is not None and free >= least_free_bytes:
                     break
                 for directory, _, names in os.walk(day):
                     for name in names:
-                        with contextlib.suppress(*MISSING):
+                        with contextlib.suppress(*NOT_FOUND_ERRORS):
                             Path(directory, name).unlink()
                             deleted += 1
                 for directory, _, _ in os.walk(day, topdown=False):
@@ -242,7 +244,11 @@ class FolderStore:
                 path = Path(directory, name)
                 inside = path.relative_to(folder)
                 key = begin + inside.as_posix()
-                if _is_reserved(inside.parts[0]) or not key.startswith(prefix) or not is_key(key):
+                if (
+                    _is_reserved(inside.parts[0])
+                    or not key.startswith(prefix)
+                    or not is_valid_key(key)
+                ):
                     continue
                 if self.path(key) != path:
                     continue  # in the root's own folder of a name that lies elsewhere
@@ -251,7 +257,7 @@ class FolderStore:
 
 
 @contextlib.contextmanager
-def _room() -> Iterator[None]:
+def _raise_storage_full() -> Iterator[None]:
     """StorageFull (`disk_full`) for a disk, or a quota, that takes no more."""
     try:
         yield
@@ -273,7 +279,7 @@ class FolderWriter:
     """Writes beside the target and renames on `commit`. On a full disk it goes on where
     `make_room` could delete something."""
 
-    @_room()
+    @_raise_storage_full()
     def __init__(self, target: Path, partial: Path, make_room: Callable[[], bool]) -> None:
         self._target = target
         self._partial = partial
@@ -284,7 +290,7 @@ class FolderWriter:
         # Unbuffered: what a full disk did not take is not tried again by closing the file.
         self._file = create_private_file(partial, buffering=0)
 
-    @_room()
+    @_raise_storage_full()
     def write(self, data: bytes) -> None:
         left = memoryview(data)
         while left:
@@ -294,7 +300,7 @@ class FolderWriter:
                 if error.errno not in DISK_FULL or not self._make_room():
                     raise
 
-    @_room()
+    @_raise_storage_full()
     def commit(self) -> None:
         os.fsync(self._file.fileno())
         self._file.close()
@@ -319,7 +325,7 @@ def _not_found(key: str) -> NotFound:
 
 def _is_reserved(name: str) -> bool:
     """Whether a name directly in one of the folders is the store's own: no object lies there."""
-    return name == PARTIAL or name.startswith(MARK)
+    return name == PARTIAL_SUFFIX or name.startswith(OWNER_MARK)
 
 
 def _make_parents(file: Path) -> Sequence[Path]:

@@ -22,7 +22,7 @@ VOCABULARIES = "vocabularies/"
 WHITENINGS = "whitenings/"
 WORK = "work/"
 
-OWN = (
+OWN_PREFIXES = (
     ARCHIVES,
     CHECKPOINTS,
     "chunks/",
@@ -39,7 +39,7 @@ OWN = (
 )
 
 
-def is_key(key: str) -> bool:
+def is_valid_key(key: str) -> bool:
     """Is it names joined by single slashes, none of them `.` or `..`, without NUL and backslash
     (which some S3 servers take for a slash)? Such a key means the same in every store."""
     return not any(part in ("", ".", "..") for part in key.split("/")) and not set(key) & set(
@@ -49,7 +49,7 @@ def is_key(key: str) -> bool:
 
 def check_key(key: str) -> str:
     """The key itself; ValueError where it is none."""
-    if not is_key(key):
+    if not is_valid_key(key):
         raise ValueError(f"not an object key: {key!r}")
     return key
 
@@ -74,16 +74,16 @@ def new_archive_key() -> str:
 
 def check_import_prefix(prefix: str) -> None:
     """Misconfigured (`bad_setting`) unless the prefix is a folder, and none of Placewise's own."""
-    if not prefix.endswith("/") or not is_key(prefix[:-1]) or prefix.startswith("."):
+    if not prefix.endswith("/") or not is_valid_key(prefix[:-1]) or prefix.startswith("."):
         raise Misconfigured(
             "bad_setting",
             f"IMPORT_PREFIX is {prefix!r}; it is a folder of the object store, such as imports/.",
         )
-    if prefix.startswith(OWN):
+    if prefix.startswith(OWN_PREFIXES):
         raise Misconfigured(
             "bad_setting",
             f"IMPORT_PREFIX is {prefix!r}, and there lies what belongs to Placewise. Take another "
-            f"folder than {', '.join(OWN)}.",
+            f"folder than {', '.join(OWN_PREFIXES)}.",
         )
 
 
@@ -120,11 +120,11 @@ def query_vector_key(job_id: UUID) -> str:
 
 
 def comparison_key(job_id: UUID) -> str:
-    """What a comparison has come to: the JSON of a `shared.comparison.Compared`."""
+    """What a comparison has come to: the JSON of a `shared.comparison.CompareResult`."""
     return f"{QUERIES}{job_id}.json"
 
 
-def keys_of_query(job_id: UUID) -> tuple[str, ...]:
+def query_object_keys(job_id: UUID) -> tuple[str, ...]:
     """All that lies there of a query, or of a comparison."""
     return query_key(job_id), query_vector_key(job_id), comparison_key(job_id)
 
@@ -157,6 +157,6 @@ def new_model_key(sha256: str) -> str:
     return f"{MODELS}{sha256}/{new_id()}.safetensors"
 
 
-def work_key(job_id: UUID, name: str) -> str:
+def job_work_key(job_id: UUID, name: str) -> str:
     """What a sliced job keeps between its slices."""
     return f"{WORK}{job_id}/{name}"

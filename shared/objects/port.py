@@ -110,7 +110,7 @@ class OwnedStore(ObjectStore, Protocol):
         """Remove the note; a missing one is not an error."""
 
 
-class DirectStore(OwnedStore, Protocol):
+class PresigningStore(OwnedStore, Protocol):
     """A store that callers may send objects to themselves: a bucket."""
 
     def presign_put(

@@ -14,7 +14,7 @@ from typing import TypedDict
 from uuid import UUID
 
 from shared.errors import Misconfigured
-from shared.objects.folder import MARK, PARTIAL, FolderStore
+from shared.objects.folder import OWNER_MARK, PARTIAL_SUFFIX, FolderStore
 from shared.objects.keys import ORIGINALS, QUERIES, WORK, is_original_key
 from shared.objects.port import OwnedStore
 from shared.objects.s3 import S3Store
@@ -69,13 +69,13 @@ def claim_store(
             raise Misconfigured(
                 "object_store_changed",
                 f"The objects lie in the bucket {before['bucket']} at {before['endpoint']}; "
-                f"S3_BUCKET is {place['bucket']} at {place['endpoint']}, which has no {MARK} of "
-                f"it. To move them: copy the whole bucket, {MARK} too.",
+                f"S3_BUCKET is {place['bucket']} at {place['endpoint']}, which has no {OWNER_MARK} of "
+                f"it. To move them: copy the whole bucket, {OWNER_MARK} too.",
             )
         if place is not None and before is None:
             _check_no_objects(folder)
         _check_unmarked(store, named_keys(), import_prefix)
-        store.write_note(MARK, str(owner).encode(), replace=False)
+        store.write_note(OWNER_MARK, str(owner).encode(), replace=False)
         found = read_owner(store)  # another catalog's process may have come at the same moment
     if found != str(owner):
         raise taken(store, "belongs to another catalog than this one")
@@ -91,7 +91,7 @@ def place_of(store: OwnedStore) -> Place | None:
 
 def read_owner(store: OwnedStore) -> str | None:
     """The id of the catalog that owns the store; None for a store without a mark."""
-    mark = store.read_note(MARK)
+    mark = store.read_note(OWNER_MARK)
     return None if mark is None else mark.decode().strip()
 
 
@@ -134,7 +134,7 @@ def _holds_objects(store: OwnedStore, import_prefix: str) -> bool:
     a folder, which earlier releases did not mark, neither does count what was put into UPLOAD_DIR
     by hand, nor what a query has left for an hour."""
     for info in store.list(""):
-        if info.key.startswith((MARK, import_prefix)):
+        if info.key.startswith((OWNER_MARK, import_prefix)):
             continue
         by_hand = info.key.startswith(ORIGINALS) and not is_original_key(info.key)
         if isinstance(store, S3Store) or not (by_hand or info.key.startswith((QUERIES, WORK))):
@@ -150,8 +150,8 @@ def _name_of(store: OwnedStore) -> str:
 
 
 def _check_no_objects(folder: Path) -> None:
-    files = (path for path in folder.rglob("*") if path.is_file() and path.name != MARK)
-    if any(PARTIAL not in path.parts for path in files):
+    files = (path for path in folder.rglob("*") if path.is_file() and path.name != OWNER_MARK)
+    if any(PARTIAL_SUFFIX not in path.parts for path in files):
         raise Misconfigured(
             "object_store_changed",
             f"Objects lie in {folder} already, and would be out of reach in a bucket. Unset "

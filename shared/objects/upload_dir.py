@@ -14,14 +14,14 @@ from pathlib import Path
 
 from shared.errors import Misconfigured
 from shared.ids import new_id
-from shared.objects.folder import MARK
+from shared.objects.folder import OWNER_MARK
 from shared.objects.keys import ORIGINALS
 from shared.private_files import make_private_folder, write_private
 
-NAME = ORIGINALS.rstrip("/")
+ORIGINALS_FOLDER = ORIGINALS.rstrip("/")
 
 
-def place_originals(home: Path, objects: Path, upload_dir: Path | None) -> Mapping[str, Path]:
+def resolve_upload_dir(home: Path, objects: Path, upload_dir: Path | None) -> Mapping[str, Path]:
     """What lies outside of `objects`, as FolderStore wants it: {} or the originals.
 
     Marks a folder that is used for the first time. Raises Misconfigured: `upload_dir_overlaps`,
@@ -35,11 +35,11 @@ def place_originals(home: Path, objects: Path, upload_dir: Path | None) -> Mappi
             raise Misconfigured(
                 "upload_dir_changed",
                 f"The photos lie in {before['folder']}, and UPLOAD_DIR is not set. Set it; or move "
-                f"what is in that folder to {objects / NAME} and delete {note}.",
+                f"what is in that folder to {objects / ORIGINALS_FOLDER} and delete {note}.",
             )
         return {}
     _check_apart(objects, upload_dir)
-    mark = upload_dir / MARK
+    mark = upload_dir / OWNER_MARK
     try:
         make_private_folder(upload_dir)
         found = mark.read_text().strip() if mark.exists() else None
@@ -50,10 +50,10 @@ def place_originals(home: Path, objects: Path, upload_dir: Path | None) -> Mappi
                 raise Misconfigured(
                     "upload_dir_changed",
                     f"The photos lie in {before['folder']}, and UPLOAD_DIR is {upload_dir}, which "
-                    f"has no {MARK} of that folder. Is its disk mounted? To move the photos: all "
-                    f"that is in {before['folder']}, {MARK} too.",
+                    f"has no {OWNER_MARK} of that folder. Is its disk mounted? To move the photos: all "
+                    f"that is in {before['folder']}, {OWNER_MARK} too.",
                 )
-            _check_none_stored(objects / NAME, upload_dir)
+            _check_none_stored(objects / ORIGINALS_FOLDER, upload_dir)
             found = str(new_id())
             write_private(mark, f"{found}\n")
         elif found != before.get("id"):
@@ -72,7 +72,7 @@ def place_originals(home: Path, objects: Path, upload_dir: Path | None) -> Mappi
     now = {"folder": str(upload_dir), "id": found}
     if now != before:
         write_private(note, json.dumps(now))
-    return {NAME: upload_dir}
+    return {ORIGINALS_FOLDER: upload_dir}
 
 
 def _check_apart(objects: Path, upload_dir: Path) -> None:

@@ -7,9 +7,14 @@ from uuid import UUID
 from sqlalchemy import delete, select
 from sqlalchemy.orm import Session
 
-from shared.backup.rows import tables
-from shared.catalog.figures import MapFigures
-from shared.catalog.installation import REBUILDING, Installation, adopt_store, ensure_installation
+from shared.backup.rows import backup_tables
+from shared.catalog.figures import CachedMapStatistics
+from shared.catalog.installation import (
+    REBUILDING,
+    Installation,
+    adopt_store,
+    get_or_create_installation,
+)
 from shared.catalog.keys import ApiKey
 from shared.catalog.maps import DEFAULT_MAP, Map
 from shared.catalog.models import Model
@@ -20,7 +25,9 @@ from shared.objects import ObjectStore, OwnedStore
 from shared.objects.store_owner import read_owner
 
 # What a first start, or an interrupted rebuild, may have left.
-MAY_HAVE_ROWS = {table.__tablename__ for table in (ApiKey, Installation, Map, MapFigures, Model)}
+MAY_HAVE_ROWS = {
+    table.__tablename__ for table in (ApiKey, Installation, Map, CachedMapStatistics, Model)
+}
 
 
 def begin_rebuild(catalog: Catalog, store: OwnedStore) -> None:
@@ -32,10 +39,10 @@ def begin_rebuild(catalog: Catalog, store: OwnedStore) -> None:
     mark = read_owner(store)
     owner = UUID(mark) if mark else _writer_of_journal(store)
     with catalog.write() as session:
-        installation = ensure_installation(session)
+        installation = get_or_create_installation(session)
         if installation.journal_sequence != REBUILDING:
             _check_empty(session)
-            session.execute(delete(MapFigures))
+            session.execute(delete(CachedMapStatistics))
             session.execute(delete(Map))
             installation.journal_sequence = REBUILDING
         if owner is not None:
@@ -46,7 +53,7 @@ def begin_rebuild(catalog: Catalog, store: OwnedStore) -> None:
 def _check_empty(session: Session) -> None:
     filled = [
         table.name
-        for table in tables()
+        for table in backup_tables()
         if table.name not in MAY_HAVE_ROWS
         and session.execute(select(table).limit(1)).first() is not None
     ]

@@ -12,12 +12,12 @@ from uuid import UUID
 from sqlalchemy import insert, select
 from sqlalchemy.orm import Session
 
-from shared.catalog.chunks import Chunk, Descriptor, take_slot
+from shared.catalog.chunks import Chunk, Descriptor, allocate_slot
 from shared.catalog.generations import Generation, GenerationState, lock_generation
-from shared.catalog.maps import bump_version, lock_map
-from shared.catalog.photos import live_photos
+from shared.catalog.maps import increment_map_version, lock_map
+from shared.catalog.photos import get_live_photos
 from shared.catalog.session import Catalog
-from shared.chunks import are_whole, decode_rows, manifest_key
+from shared.chunks import decode_rows, manifest_key, rows_are_valid
 from shared.errors import NotFound
 from shared.objects import ObjectStore
 from shared.rebuild.states import AT_ONCE, Progress
@@ -96,7 +96,7 @@ def _take_in(
         found.damaged.append(key)
         return
     rows = decode_rows(data)
-    if len(rows) != len(manifest.photo_ids) or not are_whole(rows).all():
+    if len(rows) != len(manifest.photo_ids) or not rows_are_valid(rows).all():
         found.damaged.append(key)
         return
     descriptors = catalog.run(
@@ -132,7 +132,7 @@ def _commit(
     chunk = Chunk(
         id=manifest.chunk_id,
         generation_id=generation.id,
-        slot=take_slot(generation, rows, slot_rows),
+        slot=allocate_slot(generation, rows, slot_rows),
         object_key=object_key,
         rows=rows,
         size_bytes=size_bytes,
@@ -150,7 +150,7 @@ def _commit(
         for row, photo_id in missing
     ]
     session.execute(insert(Descriptor), descriptors)
-    bump_version(session, map_id)
+    increment_map_version(session, map_id)
     return len(descriptors)
 
 
@@ -161,7 +161,7 @@ def _without_row(session: Session, manifest: _Manifest) -> list[tuple[int, UUID]
     live: set[UUID] = set()
     for begin in range(0, len(manifest.photo_ids), AT_ONCE):
         some = manifest.photo_ids[begin : begin + AT_ONCE]
-        live |= {p.id for p in live_photos(session, some).values() if p.map_id == map_id}
+        live |= {p.id for p in get_live_photos(session, some).values() if p.map_id == map_id}
         described |= set(
             session.scalars(
                 select(Descriptor.photo_id).where(

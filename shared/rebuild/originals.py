@@ -13,17 +13,17 @@ from uuid import UUID
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from shared.catalog.maps import DEFAULT_MAP, Map, ensure_default_map
+from shared.catalog.maps import DEFAULT_MAP, Map, get_or_create_default_map
 from shared.catalog.photos import Photo
 from shared.catalog.session import Catalog
 from shared.errors import Misconfigured, NotFound, PlacewiseError, Unavailable
-from shared.intake.incoming import Incoming, examine
-from shared.intake.received import Received
-from shared.intake.store_photo import put_photo, try_again_once
+from shared.intake.incoming import ValidatedPhoto, validate_photo
+from shared.intake.received import StoredUpload
+from shared.intake.store_photo import insert_photo, retry_on_conflict
 from shared.jobs.batches import BatchItem
 from shared.objects import ObjectStore
 from shared.objects.keys import ORIGINALS
-from shared.photo_formats import SNIFFED_BYTES
+from shared.photo_formats import PHOTO_SIGNATURE_BYTES
 from shared.rebuild.states import Progress
 from shared.settings import Settings
 
@@ -59,7 +59,7 @@ def take_in_originals(
                 continue
         try:
             received = _receive(store, key, size_bytes)
-            incoming = examine(store, received, settings.max_image_pixels)
+            incoming = validate_photo(store, received, settings.max_image_pixels)
         except NotFound:
             continue  # deleted since it was listed
         except Unavailable:
@@ -68,7 +68,7 @@ def take_in_originals(
             taken.unreadable.append(key)
             continue
         uploaded_at = datetime.fromtimestamp(modified_at, UTC)
-        taken.photos += try_again_once(
+        taken.photos += retry_on_conflict(
             partial(_store, catalog, settings, incoming, uploaded_at, extractor)
         )
     return taken
@@ -77,7 +77,7 @@ def take_in_originals(
 def _store(
     catalog: Catalog,
     settings: Settings,
-    incoming: Incoming,
+    incoming: ValidatedPhoto,
     uploaded_at: datetime,
     extractor: str | None,
 ) -> bool:
@@ -88,7 +88,7 @@ def _store(
         if session.scalar(same.limit(1)) is not None:
             return False  # a second upload of the same bytes, which was not acknowledged
         map_id = _default_map(session, settings, extractor)
-        put_photo(session, map_id, incoming).photo.uploaded_at = uploaded_at
+        insert_photo(session, map_id, incoming).photo.uploaded_at = uploaded_at
         return True
 
 
@@ -101,7 +101,7 @@ def _default_map(session: Session, settings: Settings, extractor: str | None) ->
         # Else one that this installation may not load any more: its photos are described anew.
         with contextlib.suppress(Misconfigured):
             name = settings.recipe(extractor).name
-    return ensure_default_map(session, name).id
+    return get_or_create_default_map(session, name).id
 
 
 def _is_known(session: Session, key: str) -> bool:
@@ -113,11 +113,11 @@ def _is_known(session: Session, key: str) -> bool:
     )
 
 
-def _receive(store: ObjectStore, key: str, size_bytes: int) -> Received:
+def _receive(store: ObjectStore, key: str, size_bytes: int) -> StoredUpload:
     digest, begin = hashlib.sha256(), b""
     with store.open(key) as file:
         while piece := file.read(PIECE_BYTES):
-            begin = begin or piece[:SNIFFED_BYTES]
+            begin = begin or piece[:PHOTO_SIGNATURE_BYTES]
             digest.update(piece)
     name = f"{key.removeprefix(ORIGINALS)}.photo"
-    return Received(key, name, size_bytes, digest.hexdigest(), begin)
+    return StoredUpload(key, name, size_bytes, digest.hexdigest(), begin)

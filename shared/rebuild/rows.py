@@ -13,7 +13,7 @@ from sqlalchemy.orm import Session
 
 from shared.catalog.base import db_now
 from shared.catalog.generations import Generation, GenerationState
-from shared.catalog.maps import DELETED, Map, bump_version
+from shared.catalog.maps import DELETED_NAME_PREFIX, Map, increment_map_version
 from shared.catalog.models import Model
 from shared.catalog.photos import Photo
 from shared.catalog.session import Catalog
@@ -138,7 +138,7 @@ class _Rows:
         if columns["deleted_at"] is not None:
             if known is None:
                 return False  # what is left of it belongs to no row
-            columns["name"] = f"{DELETED}{line.id}"
+            columns["name"] = f"{DELETED_NAME_PREFIX}{line.id}"
         elif known is not None and known.row["deleted_at"] is not None:
             return False
         taken_name = session.scalar(
@@ -230,6 +230,6 @@ class _Rows:
             self._taken.changed_photos += 1
         map_id = columns["map_id"]
         if map_id not in self._versions:
-            self._versions[map_id] = bump_version(session, map_id)
+            self._versions[map_id] = increment_map_version(session, map_id)
         columns["changed_version"] = self._versions[map_id]
         return True

@@ -18,7 +18,7 @@ from sqlalchemy.orm import Session
 from shared.catalog.base import Condition
 from shared.catalog.chunks import Descriptor
 from shared.catalog.generations import Generation, GenerationState
-from shared.catalog.installation import ensure_installation
+from shared.catalog.installation import get_or_create_installation
 from shared.catalog.maps import Map
 from shared.catalog.photos import Photo
 from shared.catalog.session import Catalog
@@ -78,7 +78,7 @@ def take_in(
         taken.unnamed_photos, taken.unreadable_originals = originals.photos, originals.unreadable
         taken.queued_photos = originals.photos + _queue_photos(catalog, progress)
         with catalog.write() as session:
-            installation = ensure_installation(session)
+            installation = get_or_create_installation(session)
             installation.journal_sequence = max(installation.journal_sequence, states.sequence)
     return taken
 

@@ -4,6 +4,6 @@
 one answer of theirs. One worker that holds everything is the case of a single shard.
 """
 
-from shared.search_http.port import HttpSearch
+from shared.search_http.port import HttpSearchClient
 
-__all__ = ["HttpSearch"]
+__all__ = ["HttpSearchClient"]

@@ -14,24 +14,24 @@ from typing import Self
 import httpx2
 
 from shared.errors import Unavailable
-from shared.search_http.merge import merge, merge_status
-from shared.search_http.worker_call import WorkerAway, ask
-from shared.search_http.workers import LOOK_SECONDS, Workers
+from shared.search_http.merge import merge_responses, merge_statuses
+from shared.search_http.worker_call import WorkerUnavailable, call_search
+from shared.search_http.workers import REFRESH_SECONDS, WorkerDirectory
 from shared.search_protocol import SearchRequest, SearchResponse, SearchStatus
 from shared.shards import Shard
 
 log = logging.getLogger(__name__)
 
-CALLS_AT_ONCE = 64  # to all shards together; more wait for their turn
-LATE_SECONDS = 0.2  # for a call that ends at the deadline to say why
-PAUSE_SECONDS = 0.05  # before workers that are behind are asked again
+MAX_CONCURRENT_CALLS = 64  # to all shards together; more wait for their turn
+RESPONSE_MARGIN_SECONDS = 0.2  # for a call that ends at the deadline to say why
+RETRY_PAUSE_SECONDS = 0.05  # before workers that are behind are asked again
 
 BEHIND, UNREADABLE = "search_behind", "chunk_unreadable"
-NOT_YET = (BEHIND, "codes_being_made")  # who refuses so may answer in a moment
-FINAL = (UNREADABLE, "codes_not_made")
+RETRYABLE_CODES = (BEHIND, "codes_being_made")  # who refuses so may answer in a moment
+PERMANENT_CODES = (UNREADABLE, "codes_not_made")
 
 
-class HttpSearch:
+class HttpSearchClient:
     """Every search worker behind one port; a context manager.
 
     Of each shard one worker is asked, and the next one when that fails. A shard of which no worker
@@ -43,11 +43,15 @@ class HttpSearch:
 
     def __init__(self, urls: Sequence[str], timeout_seconds: float) -> None:
         self._timeout_seconds = timeout_seconds
-        self._http = httpx2.Client(limits=httpx2.Limits(max_keepalive_connections=CALLS_AT_ONCE))
-        self._workers = Workers(urls, self._http)
-        self._calls = ThreadPoolExecutor(CALLS_AT_ONCE, thread_name_prefix="search-call")
+        self._http = httpx2.Client(
+            limits=httpx2.Limits(max_keepalive_connections=MAX_CONCURRENT_CALLS)
+        )
+        self._workers = WorkerDirectory(urls, self._http)
+        self._calls = ThreadPoolExecutor(MAX_CONCURRENT_CALLS, thread_name_prefix="search-call")
         self._stop = threading.Event()
-        self._following = threading.Thread(target=self._follow, name="search-workers", daemon=True)
+        self._following = threading.Thread(
+            target=self._refresh_workers, name="search-workers", daemon=True
+        )
 
     def __enter__(self) -> Self:
         self._workers.look()
@@ -66,8 +70,8 @@ class HttpSearch:
         self._workers.close()
         self._http.close()
 
-    def _follow(self) -> None:
-        while not self._stop.wait(LOOK_SECONDS):
+    def _refresh_workers(self) -> None:
+        while not self._stop.wait(REFRESH_SECONDS):
             self._workers.look()
 
     def search(self, request: SearchRequest) -> SearchResponse:
@@ -79,17 +83,17 @@ class HttpSearch:
         calls = {
             # In the request's context: its id and its trace go along.
             shard: self._calls.submit(
-                copy_context().run, self._ask_shard, shard, urls, request, deadline
+                copy_context().run, self._search_shard, shard, urls, request, deadline
             )
             for shard, urls in layout.items()
         }
-        wait(calls.values(), timeout=deadline + LATE_SECONDS - time.monotonic())
+        wait(calls.values(), timeout=deadline + RESPONSE_MARGIN_SECONDS - time.monotonic())
         answers, away, behind = _collect(calls)
         if not answers:
             raise behind or Unavailable(
                 "search_unavailable", "No search worker answers. Ask again in a moment."
             )
-        return merge(answers, request.k, away)
+        return merge_responses(answers, request.k, away)
 
     def status(self) -> SearchStatus:
         """Of the workers as they are now; Unavailable (`search_unavailable`) when all are away."""
@@ -97,9 +101,9 @@ class HttpSearch:
         found, away = self._workers.statuses()
         if not found:
             raise Unavailable("search_unavailable", "No search worker answers.")
-        return merge_status(found, away)
+        return merge_statuses(found, away)
 
-    def _ask_shard(
+    def _search_shard(
         self, shard: Shard, urls: Sequence[str], request: SearchRequest, deadline: float
     ) -> SearchResponse:
         """The answer of one of the shard's workers. Workers that are behind are asked again until
@@ -117,24 +121,24 @@ class HttpSearch:
                 # Who is not the last to be asked may not take all the time that there is.
                 seconds = left if url == order[-1] or place == len(order) - 1 else left / 2
                 try:
-                    return ask(self._http, url, request, seconds)
-                except WorkerAway as error:
+                    return call_search(self._http, url, request, seconds)
+                except WorkerUnavailable as error:
                     log.info(
                         "a call for %s failed, the next worker is asked: %s", shard.name, error
                     )
                     self._workers.failed(url)
                 except Unavailable as error:
                     log.debug("%s: %s: %s", shard.name, url, error.detail)
-                    if error.code in NOT_YET:
+                    if error.code in RETRYABLE_CODES:
                         behind, again = error, True
-                    elif error.code in FINAL:
+                    elif error.code in PERMANENT_CODES:
                         unreadable = error
             if unreadable is not None:
                 raise unreadable  # no other worker could, and this one has the last word
-            if not again or time.monotonic() + PAUSE_SECONDS > deadline:
+            if not again or time.monotonic() + RETRY_PAUSE_SECONDS > deadline:
                 # Who was behind and ran out of time at the next try is still behind.
-                raise behind or WorkerAway(shard.name, "no worker answers")
-            time.sleep(PAUSE_SECONDS)
+                raise behind or WorkerUnavailable(shard.name, "no worker answers")
+            time.sleep(RETRY_PAUSE_SECONDS)
 
 
 def _collect(
@@ -150,7 +154,7 @@ def _collect(
     for shard, call in calls.items():
         try:
             answers.append(call.result(timeout=0))
-        except (WorkerAway, TimeoutError):
+        except (WorkerUnavailable, TimeoutError):
             call.cancel()
             away.append(shard)
         except Unavailable as error:

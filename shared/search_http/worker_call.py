@@ -7,9 +7,9 @@ from typing import TypeVar
 import httpx2
 from pydantic import BaseModel, ValidationError
 
-from shared.errors import PlacewiseError, refusal
+from shared.errors import PlacewiseError, error_from_response
 from shared.search_protocol import SearchRequest, SearchResponse, SearchStatus
-from shared.telemetry.request_id import HEADER as REQUEST_HEADER
+from shared.telemetry.request_id import REQUEST_ID_HEADER as REQUEST_HEADER
 from shared.telemetry.request_id import current_request_id
 from shared.telemetry.traces import current_traceparent
 
@@ -19,7 +19,7 @@ CONNECT_SECONDS = 1.0  # inside one network: who takes longer is away
 Message = TypeVar("Message", bound=BaseModel)
 
 
-class WorkerAway(Exception):
+class WorkerUnavailable(Exception):
     """The worker did not answer, or not as a search worker does. `silent`: it took the call, and
     let its time run out."""
 
@@ -28,7 +28,7 @@ class WorkerAway(Exception):
         self.silent = silent
 
 
-def ask(
+def call_search(
     http: httpx2.Client, url: str, request: SearchRequest, timeout_seconds: float
 ) -> SearchResponse:
     """The worker's answer. Raises WorkerAway, or the PlacewiseError that it answered with."""
@@ -42,7 +42,7 @@ def ask(
     return _read(SearchResponse, url, body)
 
 
-def read_status(http: httpx2.Client, url: str, timeout_seconds: float) -> SearchStatus:
+def fetch_status(http: httpx2.Client, url: str, timeout_seconds: float) -> SearchStatus:
     """What the worker holds. Raises as `ask` does."""
     return _read(SearchStatus, url, _call(http, "GET", f"{url}/status", timeout_seconds))
 
@@ -51,7 +51,7 @@ def _read(kind: type[Message], url: str, body: bytes) -> Message:
     try:
         return kind.model_validate_json(body)
     except ValidationError as error:
-        raise WorkerAway(url, f"no {kind.__name__} came back") from error
+        raise WorkerUnavailable(url, f"no {kind.__name__} came back") from error
 
 
 def _call(
@@ -73,11 +73,11 @@ def _call(
         answer = http.request(method, url, timeout=timeout, content=content, headers=headers)
     except httpx2.TransportError as error:
         silent = isinstance(error, httpx2.ReadTimeout)
-        raise WorkerAway(url, type(error).__name__, silent=silent) from error
+        raise WorkerUnavailable(url, type(error).__name__, silent=silent) from error
     if answer.is_success:
         return answer.content
-    said = refusal(answer.status_code, answer.text)
+    said = error_from_response(answer.status_code, answer.text)
     # A proxy's page, or the worker's own fault.
     if said.code == "bad_answer" or type(said) is PlacewiseError:
-        raise WorkerAway(url, said.detail)
+        raise WorkerUnavailable(url, said.detail)
     raise said

@@ -19,16 +19,16 @@ from shared.settings import Settings
 from shared.telemetry.request_id import current_request_id
 from shared.telemetry.traces import current_trace_id
 
-TEXT = "%(asctime)s %(levelname)s %(name)s: %(message)s"
-OURS = ("services", "shared")
+TEXT_FORMAT = "%(asctime)s %(levelname)s %(name)s: %(message)s"
+OWN_LOGGERS = ("services", "shared")
 # Of others, never each statement, call or message.
-QUIET = ("alembic", "celery", "httpx2", "kombu", "opentelemetry", "sqlalchemy", "urllib3")
+QUIET_LOGGERS = ("alembic", "celery", "httpx2", "kombu", "opentelemetry", "sqlalchemy", "urllib3")
 
 # C0 and C1 controls, DEL, Unicode's line breaks and bidirectional controls, halves of characters.
 UNSAFE = re.compile("[\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
 
 # What every record has; the rest came as `extra`. `taskName` is asyncio's.
-USUAL = frozenset(logging.makeLogRecord({}).__dict__) | {
+STANDARD_ATTRIBUTES = frozenset(logging.makeLogRecord({}).__dict__) | {
     "asctime",
     "color_message",  # uvicorn's message once more, for terminals
     "message",
@@ -39,7 +39,7 @@ USUAL = frozenset(logging.makeLogRecord({}).__dict__) | {
 }
 
 
-class Origin(logging.Filter):
+class ContextFilter(logging.Filter):
     """Adds to each record the service, the request and the trace that it belongs to."""
 
     def __init__(self, service: str) -> None:
@@ -55,7 +55,7 @@ class Origin(logging.Filter):
         return True
 
 
-class JsonLines(logging.Formatter):
+class JsonFormatter(logging.Formatter):
     """One JSON object a line: `time` (UTC), `level`, `logger`, `service`, `message`, then
     `request_id` and `trace_id` where there are any, `error` with a trace, and what came as `extra`.
     """
@@ -78,12 +78,12 @@ class JsonLines(logging.Formatter):
         return UNSAFE.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
 
 
-class TextLines(logging.Formatter):
+class TextFormatter(logging.Formatter):
     """A line for people; the request's id and what came as `extra` stand at its end. The lines of a
     traceback are indented: whatever an error says, no line of it can look like one of the log."""
 
     def __init__(self) -> None:
-        super().__init__(TEXT)
+        super().__init__(TEXT_FORMAT)
 
     def format(self, record: logging.LogRecord) -> str:
         line, *trace = super().format(record).split("\n")
@@ -103,19 +103,21 @@ def _escaped(text: str) -> str:
 
 
 def _extra(record: logging.LogRecord) -> dict[str, Any]:
-    return {name: value for name, value in record.__dict__.items() if name not in USUAL}
+    return {
+        name: value for name, value in record.__dict__.items() if name not in STANDARD_ATTRIBUTES
+    }
 
 
-def set_up_logs(settings: Settings, service: str) -> None:
+def configure_logging(settings: Settings, service: str) -> None:
     """Every line of this process to stderr, in the format of LOG_FORMAT; ours in detail with DEBUG.
     What was set up before goes."""
     handler = logging.StreamHandler()
-    handler.addFilter(Origin(service))
-    handler.setFormatter(JsonLines() if settings.log_format == "json" else TextLines())
+    handler.addFilter(ContextFilter(service))
+    handler.setFormatter(JsonFormatter() if settings.log_format == "json" else TextFormatter())
     root = logging.getLogger()
     root.handlers[:] = [handler]
     root.setLevel(logging.INFO)
-    for name in OURS:
+    for name in OWN_LOGGERS:
         logging.getLogger(name).setLevel(logging.DEBUG if settings.debug else logging.INFO)
-    for name in QUIET:
+    for name in QUIET_LOGGERS:
         logging.getLogger(name).setLevel(logging.WARNING)

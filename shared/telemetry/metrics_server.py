@@ -13,12 +13,12 @@ from shared.settings import Settings
 
 log = logging.getLogger(__name__)
 
-CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
+METRICS_CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 """Of Prometheus' text format."""
 
 
 @contextlib.contextmanager
-def serving_metrics(settings: Settings, registry: CollectorRegistry) -> Iterator[int | None]:
+def serve_metrics(settings: Settings, registry: CollectorRegistry) -> Iterator[int | None]:
     """While the block runs, the registry's figures are answered on HOST and METRICS_PORT, from a
     thread; gives the port, None where none is set. Misconfigured: `address_in_use`."""
     if settings.metrics_port is None:

@@ -13,9 +13,9 @@ from opentelemetry.sdk.trace.export import BatchSpanProcessor, SpanExporter
 from opentelemetry.trace import Link, SpanContext
 from opentelemetry.trace.propagation.tracecontext import TraceContextTextMapPropagator
 
-from shared.telemetry.traces import Attribute, Describe
+from shared.telemetry.traces import Attribute, SpanUpdate
 
-MOST_LINKS = 64  # of a span: more are cut off by most backends anyway
+MAX_SPAN_LINKS = 64  # of a span: more are cut off by most backends anyway
 
 
 class OpenTelemetryTracer:
@@ -36,13 +36,13 @@ class OpenTelemetryTracer:
     @contextlib.contextmanager
     def span(
         self, name: str, parents: Sequence[str], attributes: dict[str, Attribute]
-    ) -> Iterator[Describe]:
+    ) -> Iterator[SpanUpdate]:
         around = context.get_current()
         links: list[Link] = []
         if len(parents) == 1:
             around = self._propagator.extract({"traceparent": parents[0]}, around)
         elif parents:
-            links = [Link(self._context(one)) for one in dict.fromkeys(parents)][:MOST_LINKS]
+            links = [Link(self._context(one)) for one in dict.fromkeys(parents)][:MAX_SPAN_LINKS]
         with self._tracer.start_as_current_span(
             name, context=around, links=links, attributes=attributes
         ) as made:

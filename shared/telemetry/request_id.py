@@ -13,29 +13,29 @@ from contextvars import ContextVar
 
 from shared.ids import new_id
 
-HEADER = "X-Request-ID"
-MOST_CHARACTERS = 128
+REQUEST_ID_HEADER = "X-Request-ID"
+MAX_REQUEST_ID_CHARACTERS = 128
 # What every log, header and column takes as it stands.
-GOOD = re.compile(rf"[A-Za-z0-9._:/+=@-]{{1,{MOST_CHARACTERS}}}")
+REQUEST_ID_PATTERN = re.compile(rf"[A-Za-z0-9._:/+=@-]{{1,{MAX_REQUEST_ID_CHARACTERS}}}")
 
-_current: ContextVar[str | None] = ContextVar("request_id", default=None)
+_request_id: ContextVar[str | None] = ContextVar("request_id", default=None)
 
 
 def current_request_id() -> str | None:
     """None outside of a request and its work."""
-    return _current.get()
+    return _request_id.get()
 
 
-def accept_request_id(sent: str | None) -> str:
+def request_id_or_new(sent: str | None) -> str:
     """The caller's id where it can be used as it stands, else a fresh one."""
-    return sent if sent is not None and GOOD.fullmatch(sent) else str(new_id())
+    return sent if sent is not None and REQUEST_ID_PATTERN.fullmatch(sent) else str(new_id())
 
 
 @contextlib.contextmanager
-def under_request_id(request_id: str | None) -> Iterator[None]:
+def request_id_context(request_id: str | None) -> Iterator[None]:
     """What the block does, it does for that request; None: for nobody's."""
-    token = _current.set(request_id)
+    token = _request_id.set(request_id)
     try:
         yield
     finally:
-        _current.reset(token)
+        _request_id.reset(token)

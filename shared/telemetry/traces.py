@@ -21,21 +21,21 @@ if TYPE_CHECKING:
 Attribute = str | int | float | bool | Sequence[str]
 
 
-class Describe(Protocol):
+class SpanUpdate(Protocol):
     """Says of a span under way what it is after all."""
 
     def __call__(self, name: str, **attributes: Attribute) -> object: ...
 
 
 class Tracer(Protocol):
-    """What `set_up_traces` puts in the place of doing nothing."""
+    """What `configure_tracing` puts in the place of doing nothing."""
 
     def span(
         self,
         name: str,
         parents: Sequence[str],
         attributes: dict[str, Attribute],
-    ) -> contextlib.AbstractContextManager[Describe]: ...
+    ) -> contextlib.AbstractContextManager[SpanUpdate]: ...
 
     def traceparent(self) -> str | None: ...
 
@@ -49,12 +49,12 @@ _trace_id: ContextVar[str | None] = ContextVar("trace_id", default=None)
 @contextlib.contextmanager
 def span(
     name: str, parents: Sequence[str | None] = (), **attributes: Attribute | None
-) -> Iterator[Describe]:
+) -> Iterator[SpanUpdate]:
     """The block as a span. `parents` are `traceparent`s that it comes from: of one, it is a child;
     with several (a batch of many requests' jobs) it is linked to all. Without any it is a child of
     the span around it. What the block raises is noted in the span."""
     if _tracer is None:
-        yield _say_nothing
+        yield _ignore_update
         return
     known = [parent for parent in parents if parent is not None]
     given = {key: value for key, value in attributes.items() if value is not None}
@@ -67,7 +67,7 @@ def span(
             _trace_id.reset(token)
 
 
-def _say_nothing(name: str, **attributes: Attribute) -> None:
+def _ignore_update(name: str, **attributes: Attribute) -> None:
     pass
 
 
@@ -81,7 +81,7 @@ def current_trace_id() -> str | None:
     return _trace_id.get()
 
 
-def set_up_traces(
+def configure_tracing(
     settings: Settings, service: str, exporter: SpanExporter | None = None
 ) -> contextlib.AbstractContextManager[None]:
     """Trace this process while the block runs, and send what is left at its end.

@@ -10,7 +10,7 @@ import torch
 BLOCK_BYTES = 16_000_000  # read at once: a store on another machine is slow for each batch alone
 
 
-class Points(Protocol):
+class PointSource(Protocol):
     """(n, D) float32 unit vectors."""
 
     width: int
@@ -22,7 +22,7 @@ class Points(Protocol):
         """(end - begin, D) on the CPU."""
 
 
-class PointsInMemory:
+class InMemoryPoints:
     """Points that are few enough to be held."""
 
     def __init__(self, points: torch.Tensor) -> None:
@@ -37,10 +37,10 @@ class PointsInMemory:
         return self._points[begin:end]
 
 
-class Batches:
+class PointBatches:
     """Points in batches of about equal size. Neighbours lie in one block, which is held."""
 
-    def __init__(self, points: Points, rows: int) -> None:
+    def __init__(self, points: PointSource, rows: int) -> None:
         """`rows` are wanted in a batch."""
         self._points = points
         count = max(1, round(len(points) / rows))

@@ -17,20 +17,20 @@ from PIL.ExifTags import Base
 
 from shared.errors import Unprocessable
 from shared.photo_formats import (
-    ACCEPTED,
-    BROKEN,
-    HEIC,
-    SNIFFED_BYTES,
-    check_pixels,
+    ACCEPTED_PHOTOS,
+    HEIC_MEDIA_TYPE,
+    PHOTO_READ_ERRORS,
+    PHOTO_SIGNATURE_BYTES,
+    check_pixel_count,
+    detect_media_type,
     open_photo,
-    sniff_media_type,
 )
 from shared.vision.preprocessing import Preprocessing
 from shared.vision.resample import Pixels
 
 THUMBNAIL_PIXELS = 256  # the longer side
 DECODER = f"pillow-{pillow_version}"
-UPRIGHT = {  # by EXIF orientation; 1 is upright already
+EXIF_TRANSPOSITIONS = {  # by EXIF orientation; 1 is upright already
     2: Image.Transpose.FLIP_LEFT_RIGHT,
     3: Image.Transpose.ROTATE_180,
     4: Image.Transpose.FLIP_TOP_BOTTOM,
@@ -42,14 +42,14 @@ UPRIGHT = {  # by EXIF orientation; 1 is upright already
 
 
 @dataclass(frozen=True, slots=True)
-class Decoded:
+class DecodedPhoto:
     pixels: Pixels
     """(height, width, 3) RGB as the preprocessing left it."""
     thumbnail: bytes
     """JPEG without any metadata, its longer side at most THUMBNAIL_PIXELS."""
 
 
-def decode(data: bytes, preprocessing: Preprocessing, max_pixels: int) -> Decoded:
+def decode_photo(data: bytes, preprocessing: Preprocessing, max_pixels: int) -> DecodedPhoto:
     """The photo in RGB as the preprocessing brings it, and its thumbnail, which is upright.
 
     Only the first frame is read. Transparent parts show black, samples of 16 bits keep their upper
@@ -59,19 +59,19 @@ def decode(data: bytes, preprocessing: Preprocessing, max_pixels: int) -> Decode
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # a strange tag is no reason to refuse the pixels
-            with _opened(data) as image:
-                check_pixels(image.width, image.height, max_pixels)
+            with _open_checked(data) as image:
+                check_pixel_count(image.width, image.height, max_pixels)
                 image.load()
                 as_stored = to_rgb(image)
-                upright = turn_upright(image, as_stored)
+                upright = apply_exif_orientation(image, as_stored)
             pixels = preprocessing.apply(upright if preprocessing.upright else as_stored)
-            return Decoded(pixels=pixels, thumbnail=_thumbnail(upright))
+            return DecodedPhoto(pixels=pixels, thumbnail=_thumbnail(upright))
     except UnidentifiedImageError as error:
         raise Unprocessable(
             "undecodable_photo",
-            f"The photo can't be decoded: it is not {ACCEPTED}, or its header is damaged.",
+            f"The photo can't be decoded: it is not {ACCEPTED_PHOTOS}, or its header is damaged.",
         ) from error
-    except BROKEN as error:
+    except PHOTO_READ_ERRORS as error:
         raise Unprocessable(
             "undecodable_photo",
             f"The photo can't be decoded: {error or type(error).__name__}.",
@@ -83,8 +83,8 @@ def decode(data: bytes, preprocessing: Preprocessing, max_pixels: int) -> Decode
         ) from error
 
 
-def _opened(data: bytes) -> Image.Image:
-    if sniff_media_type(data[:SNIFFED_BYTES]) != HEIC:
+def _open_checked(data: bytes) -> Image.Image:
+    if detect_media_type(data[:PHOTO_SIGNATURE_BYTES]) != HEIC_MEDIA_TYPE:
         return open_photo(io.BytesIO(data))
     try:
         import pillow_heif  # an extra: its wheels bring libraries under licences of their own
@@ -99,15 +99,15 @@ def _opened(data: bytes) -> Image.Image:
     return Image.open(io.BytesIO(data), formats=("HEIF",))
 
 
-def turn_upright(image: Image.Image, rgb: Image.Image) -> Image.Image:
+def apply_exif_orientation(image: Image.Image, rgb: Image.Image) -> Image.Image:
     """`rgb` turned as the EXIF of `image` says. Not Pillow's `exif_transpose`: that also writes
     the EXIF anew, and fails where any other tag of it is broken.
     """
     try:
         orientation = image.getexif().get(Base.Orientation)
-    except BROKEN:
+    except PHOTO_READ_ERRORS:
         return rgb  # broken EXIF is no reason to refuse the pixels
-    method = UPRIGHT.get(orientation) if isinstance(orientation, int) else None
+    method = EXIF_TRANSPOSITIONS.get(orientation) if isinstance(orientation, int) else None
     return rgb if method is None else rgb.transpose(method)
 
 

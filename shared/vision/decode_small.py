@@ -14,15 +14,17 @@ from PIL import Image, UnidentifiedImageError
 from PIL.ExifTags import Base
 
 from shared.errors import Unprocessable
-from shared.photo_formats import ACCEPTED, BROKEN, check_pixels, open_photo
-from shared.vision.decode import to_rgb, turn_upright
+from shared.photo_formats import ACCEPTED_PHOTOS, PHOTO_READ_ERRORS, check_pixel_count, open_photo
+from shared.vision.decode import apply_exif_orientation, to_rgb
 
-ON_ITS_SIDE = (5, 6, 7, 8)
+SIDEWAYS_ORIENTATIONS = (5, 6, 7, 8)
 """EXIF orientations whose upright photo is as wide as the stored one is high"""
-MAX_PIXELS = 100_000_000
+MAX_TRAINING_PIXELS = 100_000_000
 
 
-def decode_small(path: Path, size: tuple[int, int], max_pixels: int = MAX_PIXELS) -> Image.Image:
+def decode_resized(
+    path: Path, size: tuple[int, int], max_pixels: int = MAX_TRAINING_PIXELS
+) -> Image.Image:
     """The photo in RGB, upright, squeezed to `size` (height, width) by antialiased bilinear.
 
     Raises Unprocessable (`undecodable_photo`, `too_many_pixels`), which says why, not which.
@@ -32,21 +34,21 @@ def decode_small(path: Path, size: tuple[int, int], max_pixels: int = MAX_PIXELS
         with warnings.catch_warnings(), path.open("rb") as file:
             warnings.simplefilter("ignore")  # a strange tag is no reason to refuse the pixels
             with open_photo(file) as image:
-                check_pixels(image.width, image.height, max_pixels)
-                image.draft("RGB", (height, width) if _on_its_side(image) else (width, height))
+                check_pixel_count(image.width, image.height, max_pixels)
+                image.draft("RGB", (height, width) if _is_sideways(image) else (width, height))
                 image.load()
-                upright = turn_upright(image, to_rgb(image))
+                upright = apply_exif_orientation(image, to_rgb(image))
             return upright.resize((width, height), Image.Resampling.BILINEAR)
     except UnidentifiedImageError as error:
         raise Unprocessable(
-            "undecodable_photo", f"it is not {ACCEPTED}, or its header is damaged"
+            "undecodable_photo", f"it is not {ACCEPTED_PHOTOS}, or its header is damaged"
         ) from error
-    except BROKEN as error:
+    except PHOTO_READ_ERRORS as error:
         raise Unprocessable("undecodable_photo", f"{error or type(error).__name__}") from error
 
 
-def _on_its_side(image: Image.Image) -> bool:
+def _is_sideways(image: Image.Image) -> bool:
     try:
-        return image.getexif().get(Base.Orientation) in ON_ITS_SIDE
-    except BROKEN:
+        return image.getexif().get(Base.Orientation) in SIDEWAYS_ORIENTATIONS
+    except PHOTO_READ_ERRORS:
         return False  # broken EXIF is no reason to refuse the pixels

@@ -8,7 +8,7 @@ import torch
 
 
 @dataclass(frozen=True, slots=True)
-class DeviceMemory:
+class GpuMemory:
     name: str
     """`cuda:0`"""
     used_bytes: int
@@ -16,12 +16,12 @@ class DeviceMemory:
     total_bytes: int
 
 
-def device_memory() -> list[DeviceMemory]:
+def gpu_memory() -> list[GpuMemory]:
     """Of each GPU that this process has begun to use: none on a CPU."""
     if not torch.cuda.is_initialized():  # type: ignore[no-untyped-call]
         return []
     return [
-        DeviceMemory(
+        GpuMemory(
             f"cuda:{number}",
             torch.cuda.memory_reserved(number),
             torch.cuda.get_device_properties(number).total_memory,

@@ -18,15 +18,15 @@ from filelock import FileLock
 from shared.errors import Misconfigured
 
 TIMEOUT_SECONDS = 30.0  # without a byte
-TRIES = 5  # in a row that brought nothing
-PAUSE_SECONDS = 1.0  # after the first; twice as long after each further one
+MAX_DOWNLOAD_ATTEMPTS = 5  # in a row that brought nothing
+RETRY_PAUSE_SECONDS = 1.0  # after the first; twice as long after each further one
 PARTIAL_CONTENT, RANGE_NOT_SATISFIABLE = 206, 416
 
 OnProgress = Callable[[int, int | None], object]
 """Called with the bytes that are here, and with all there will be if the server says that."""
 
 
-def download(
+def download_file(
     url: str,
     target: Path,
     *,
@@ -41,9 +41,9 @@ def download(
     network or the server fails: what has come is kept for the next call; OSError.
     """
     target.parent.mkdir(parents=True, exist_ok=True)
-    part = _beside(target, ".part")
+    part = _sibling_path(target, ".part")
     with (
-        FileLock(_beside(target, ".part.lock")),
+        FileLock(_sibling_path(target, ".part.lock")),
         httpx2.Client(follow_redirects=True, timeout=TIMEOUT_SECONDS, headers=headers) as client,
     ):
         if target.exists():  # another process was first
@@ -52,16 +52,16 @@ def download(
         while True:
             before = _size(part)
             try:
-                _go_on(client, url, part, on_progress)
+                _resume_download(client, url, part, on_progress)
                 break
             except httpx2.HTTPError as error:
                 failures = failures + 1 if _size(part) <= before else 1
-                if failures == TRIES or not _may_pass(error):
+                if failures == MAX_DOWNLOAD_ATTEMPTS or not _is_transient(error):
                     raise
-                time.sleep(PAUSE_SECONDS * 2 ** (failures - 1))
-        _check(url, part, sha256)
+                time.sleep(RETRY_PAUSE_SECONDS * 2 ** (failures - 1))
+        _check_hash(url, part, sha256)
         part.replace(target)
-        _beside(part, ".etag").unlink(missing_ok=True)
+        _sibling_path(part, ".etag").unlink(missing_ok=True)
 
 
 def file_sha256(path: Path) -> str:
@@ -70,9 +70,9 @@ def file_sha256(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def _go_on(client: httpx2.Client, url: str, part: Path, on_progress: OnProgress) -> None:
+def _resume_download(client: httpx2.Client, url: str, part: Path, on_progress: OnProgress) -> None:
     """One answer of the server appended to `part`, from where it ends; all of it, or an error."""
-    etag = _beside(part, ".etag")
+    etag = _sibling_path(part, ".etag")
     begun = _size(part) if etag.exists() else 0
     asked = {"Accept-Encoding": "identity"}
     if begun:
@@ -92,7 +92,7 @@ def _go_on(client: httpx2.Client, url: str, part: Path, on_progress: OnProgress)
         length = answer.headers.get("Content-Length")
         total = done + int(length) if length is not None else None
         if not resumed:
-            _remember(etag, answer.headers.get("ETag"))
+            _store_etag(etag, answer.headers.get("ETag"))
         with part.open("ab" if resumed else "wb") as file:
             on_progress(done, total)
             for block in answer.iter_raw():
@@ -103,7 +103,7 @@ def _go_on(client: httpx2.Client, url: str, part: Path, on_progress: OnProgress)
             raise httpx2.RemoteProtocolError(f"{url} ended after {done} of {total} bytes")
 
 
-def _remember(path: Path, etag: str | None) -> None:
+def _store_etag(path: Path, etag: str | None) -> None:
     """Only a strong ETag says that two answers are of the same bytes."""
     if etag is None or etag.startswith("W/"):
         path.unlink(missing_ok=True)
@@ -111,21 +111,21 @@ def _remember(path: Path, etag: str | None) -> None:
         path.write_text(etag)
 
 
-def _may_pass(error: httpx2.HTTPError) -> bool:
+def _is_transient(error: httpx2.HTTPError) -> bool:
     """Whether the same call may work a moment later."""
     if isinstance(error, httpx2.HTTPStatusError):
         return error.response.status_code >= 500 or error.response.status_code == 429
     return not isinstance(error, httpx2.UnsupportedProtocol)
 
 
-def _check(url: str, part: Path, sha256: str | None) -> None:
+def _check_hash(url: str, part: Path, sha256: str | None) -> None:
     if sha256 is None:
         return
     found = file_sha256(part)
     if found.startswith(sha256.lower()):
         return
     part.unlink()
-    _beside(part, ".etag").unlink(missing_ok=True)
+    _sibling_path(part, ".etag").unlink(missing_ok=True)
     raise Misconfigured(
         "download_corrupt",
         f"{url} is not the file that it should be: its sha256 is {found[:16]}..., expected "
@@ -138,5 +138,5 @@ def _size(path: Path) -> int:
     return path.stat().st_size if path.exists() else 0
 
 
-def _beside(path: Path, suffix: str) -> Path:
+def _sibling_path(path: Path, suffix: str) -> Path:
     return path.with_name(path.name + suffix)

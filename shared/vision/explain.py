@@ -27,15 +27,15 @@ import torch
 from numpy.typing import NDArray
 from torch.nn.functional import normalize
 
-from shared.recipes import Recipe
-from shared.vision.vlad import hard_weights, soft_weights
-from shared.vision.vocabulary import Centres
+from shared.recipes import ExtractorConfig
+from shared.vision.vlad import hard_assignment, soft_assignment
+from shared.vision.vocabulary import ClusterCentres
 
 Shares = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
-class Shared:
+class SimilarityShares:
     """The shares of one similarity."""
 
     patches: Shares
@@ -44,50 +44,52 @@ class Shared:
     """(K,); None without a vocabulary."""
 
 
-def explain(
-    recipe: Recipe,
+def explain_similarities(
+    recipe: ExtractorConfig,
     features: torch.Tensor,
-    centres: Centres | None,
+    centres: ClusterCentres | None,
     rows: NDArray[np.float32],
     word_weights: Sequence[float] = (),
-) -> list[Shared]:
+) -> list[SimilarityShares]:
     """The shares of each candidate's similarity to the query.
 
     `features` are the query's, (Q, D); `rows` the candidates' descriptors, (n, dimension), as they
     were stored; `word_weights`, (K,), are for VLAD. ValueError for an aggregator that is no sum
-    (`check_can_explain` says so before).
+    (`check_explainable` says so before).
     """
     x = features.double()
     match recipe.aggregator:
         case "avg":
-            return [Shared(share, None) for share in _of_mean(x, torch.from_numpy(rows))]
+            return [
+                SimilarityShares(share, None) for share in _mean_shares(x, torch.from_numpy(rows))
+            ]
         case "vlad" | "soft-vlad":
             assert centres is not None
             c = torch.from_numpy(centres.array)
             # In the precision in which the descriptor was made: a tie goes to the same cluster.
             weights = (
-                hard_weights(features, c)
+                hard_assignment(features, c)
                 if recipe.aggregator == "vlad"
-                else soft_weights(features, c, recipe.temperature)
+                else soft_assignment(features, c, recipe.temperature)
             )
             words = torch.tensor(word_weights or [1.0] * len(c), dtype=torch.float64)
-            return _of_vlad(x, c.double(), weights.double(), words, torch.from_numpy(rows))
+            return _vlad_shares(x, c.double(), weights.double(), words, torch.from_numpy(rows))
         case other:
             raise ValueError(f"a descriptor of {other!r} is no sum over patches")
 
 
-def _of_mean(x: torch.Tensor, rows: torch.Tensor) -> list[Shares]:
+def _mean_shares(x: torch.Tensor, rows: torch.Tensor) -> list[Shares]:
     length = x.mean(dim=0).norm().clamp(min=torch.finfo(torch.float32).tiny)
     return [(x @ row.double() / (len(x) * length)).numpy() for row in rows]
 
 
-def _of_vlad(
+def _vlad_shares(
     x: torch.Tensor,
     centres: torch.Tensor,
     weights: torch.Tensor,
     words: torch.Tensor,
     rows: torch.Tensor,
-) -> list[Shared]:
+) -> list[SimilarityShares]:
     """(Q, D), (K, D), (Q, K), (K,), (n, K * D)."""
     sums = weights.T @ x - weights.sum(dim=0).unsqueeze(-1) * centres
     lengths = sums.norm(dim=1)
@@ -100,5 +102,5 @@ def _of_vlad(
         blocks = row.double().reshape(centres.shape)
         along = x @ blocks.T - (centres * blocks).sum(dim=1)  # (Q, K): <x_q - c_k, d_k>
         shares = weights * along * scale
-        found.append(Shared(shares.sum(dim=1).numpy(), shares.sum(dim=0).numpy()))
+        found.append(SimilarityShares(shares.sum(dim=1).numpy(), shares.sum(dim=0).numpy()))
     return found

@@ -13,56 +13,56 @@ import torch
 from numpy.typing import NDArray
 
 from shared.errors import Misconfigured, Unprocessable
-from shared.recipes import SLOW, TORCHHUB, TRAINED, Recipe
+from shared.recipes import SLOW_TEST_BACKBONE, TORCHHUB_BACKBONE, TRAINED_BACKBONE, ExtractorConfig
 from shared.vision.backbones import Backbone
 from shared.vision.backbones.dinov2 import SHAPES, Dinov2
 from shared.vision.backbones.efficientnet_lite0 import EfficientNetLite0
 from shared.vision.backbones.slow import SlowBackbone
 from shared.vision.backbones.tiny import TinyBackbone
-from shared.vision.backbones.torchhub import HubModule
-from shared.vision.backbones.trained import TrainedModel
+from shared.vision.backbones.torchhub import TorchHubBackbone
+from shared.vision.backbones.trained import TrainedBackbone
 from shared.vision.decode import DECODER
-from shared.vision.passes import PassLimit, PhotoDoesNotFit, in_passes
-from shared.vision.pca import Projection
-from shared.vision.pooling import average, gem
-from shared.vision.precision import Precision, computing_in
+from shared.vision.passes import BatchSizeLimit, PhotoTooLargeForGpu, run_in_batches
+from shared.vision.pca import PcaProjection
+from shared.vision.pooling import average_pooling, gem_pooling
+from shared.vision.precision import Precision, autocast
 from shared.vision.preprocessing import Preprocessing, get_preprocessing
 from shared.vision.resample import Pixels
 from shared.vision.vlad import soft_vlad, vlad
-from shared.vision.vocabulary import Centres, decode_centres
+from shared.vision.vocabulary import ClusterCentres, decode_centres
 
-SHIPPED = Path(__file__).parent / "vocabularies"
+SHIPPED_VOCABULARIES = Path(__file__).parent / "vocabularies"
 
 
-def _dinov2(recipe: Recipe, device: torch.device, weights: Path | None) -> Backbone:
+def _dinov2(recipe: ExtractorConfig, device: torch.device, weights: Path | None) -> Backbone:
     assert recipe.layer is not None
     assert recipe.facet is not None
     size = recipe.backbone.removeprefix("dinov2-")
     return Dinov2(size, recipe.layer, recipe.facet, device, weights)
 
 
-def _slow(recipe: Recipe, device: torch.device, _weights: Path | None) -> Backbone:
+def _slow(recipe: ExtractorConfig, device: torch.device, _weights: Path | None) -> Backbone:
     assert recipe.width is not None
     return SlowBackbone(recipe.width, recipe.milliseconds / 1000, device)
 
 
-def _torchhub(recipe: Recipe, device: torch.device, _weights: Path | None) -> Backbone:
+def _torchhub(recipe: ExtractorConfig, device: torch.device, _weights: Path | None) -> Backbone:
     assert recipe.hub is not None
-    return HubModule(recipe.hub, device)
+    return TorchHubBackbone(recipe.hub, device)
 
 
-def _trained(recipe: Recipe, device: torch.device, _weights: Path | None) -> Backbone:
+def _trained(recipe: ExtractorConfig, device: torch.device, _weights: Path | None) -> Backbone:
     assert recipe.trained is not None
     assert recipe.trained.file is not None, "an added model is loaded by who knows the catalog"
-    return TrainedModel.of_checkpoint(recipe.name, Path(recipe.trained.file), device)
+    return TrainedBackbone.from_checkpoint(recipe.name, Path(recipe.trained.file), device)
 
 
-BACKBONES: dict[str, Callable[[Recipe, torch.device, Path | None], Backbone]] = {
+BACKBONES: dict[str, Callable[[ExtractorConfig, torch.device, Path | None], Backbone]] = {
     "efficientnet-lite0": lambda _recipe, device, _weights: EfficientNetLite0(device),
-    SLOW: _slow,
+    SLOW_TEST_BACKBONE: _slow,
     "test-tiny": lambda _recipe, device, _weights: TinyBackbone(device),
-    TORCHHUB: _torchhub,
-    TRAINED: _trained,
+    TORCHHUB_BACKBONE: _torchhub,
+    TRAINED_BACKBONE: _trained,
     **{f"dinov2-{size}": _dinov2 for size in SHAPES},
 }
 
@@ -85,13 +85,13 @@ class Extractor:
 
     def __init__(
         self,
-        recipe: Recipe,
+        recipe: ExtractorConfig,
         device: torch.device,
         *,
         precision: Precision = "float32",
         dino_weights: Path | None = None,
         backbone: Backbone | None = None,
-        limit: PassLimit | None = None,
+        limit: BatchSizeLimit | None = None,
     ) -> None:
         """`dino_weights`: DINO_WEIGHTS, for the recipes on DINOv2; None takes timm's on the hub.
         `backbone`: one that is loaded already, of the same `recipe.local_features`, as that of an
@@ -102,7 +102,7 @@ class Extractor:
         """
         self.recipe = recipe
         self.precision: Precision = precision
-        self.limit = limit or PassLimit()
+        self.limit = limit or BatchSizeLimit()
         self.backbone = backbone or BACKBONES[recipe.backbone](recipe, device, dino_weights)
         self.preprocessing: Preprocessing = _preprocessing(recipe, self.backbone)
         told = recipe.width
@@ -120,11 +120,11 @@ class Extractor:
             limit=self.limit,
         )
 
-    def shipped_vocabulary(self) -> tuple[Centres, dict[str, Any]] | None:
+    def shipped_vocabulary(self) -> tuple[ClusterCentres, dict[str, Any]] | None:
         """The vocabulary that comes with the extractor, with its provenance; None without one."""
         if self.recipe.shipped_vocabulary is None:
             return None
-        path = SHIPPED / self.recipe.shipped_vocabulary
+        path = SHIPPED_VOCABULARIES / self.recipe.shipped_vocabulary
         centres = decode_centres(path.read_bytes(), width=self.backbone.width)
         provenance = json.loads(path.with_suffix(".json").read_text())
         if provenance["backbone_fingerprint"] != self.backbone.fingerprint:
@@ -136,7 +136,9 @@ class Extractor:
             )
         return centres, provenance
 
-    def spec(self, centres: Centres | None, projection: Projection | None = None) -> dict[str, Any]:
+    def spec(
+        self, centres: ClusterCentres | None, projection: PcaProjection | None = None
+    ) -> dict[str, Any]:
         """Everything that decides a descriptor's value."""
         spec: dict[str, Any] = {
             "extractor": self.recipe.name,
@@ -159,13 +161,15 @@ class Extractor:
             }
         if self.recipe.aggregator == "soft-vlad":
             spec["temperature"] = self.recipe.temperature
-        if isinstance(self.backbone, HubModule):
+        if isinstance(self.backbone, TorchHubBackbone):
             spec["code_fingerprint"] = self.backbone.code_fingerprint
-        if isinstance(self.backbone, TrainedModel):
+        if isinstance(self.backbone, TrainedBackbone):
             spec |= self.backbone.as_spec()
         return spec
 
-    def dimension(self, centres: Centres | None, projection: Projection | None = None) -> int:
+    def dimension(
+        self, centres: ClusterCentres | None, projection: PcaProjection | None = None
+    ) -> int:
         """Length of a descriptor."""
         if projection is not None:
             return projection.kept
@@ -177,13 +181,13 @@ class Extractor:
 
         Misconfigured (`gpu_out_of_memory`) where not even one photo of the usual size fits.
         """
-        height, width = self.preprocessing.usual_size
+        height, width = self.preprocessing.typical_size
         at_once = self.limit.photos(photos, height * width)
         blank = [np.zeros((height, width, 3), np.uint8)] * at_once
         try:
-            for _ in self._in_passes(blank, lambda features: features):
+            for _ in self._run_in_batches(blank, lambda features: features):
                 pass
-        except PhotoDoesNotFit as error:
+        except PhotoTooLargeForGpu as error:
             raise Misconfigured(
                 "gpu_out_of_memory",
                 f"The GPU holds the weights of {self.recipe.name}, but not one photo beside them. "
@@ -192,7 +196,7 @@ class Extractor:
 
     def features(self, pixels: Pixels) -> torch.Tensor:
         """(B, H, W, 3) of one size -> (B, patches, width) float32 local features on the device."""
-        with computing_in(self.precision, self.backbone.device):
+        with autocast(self.precision, self.backbone.device):
             return self.backbone.features(torch.from_numpy(np.ascontiguousarray(pixels)))
 
     def local_features(self, photos: Collection[Pixels]) -> list[torch.Tensor]:
@@ -201,7 +205,7 @@ class Extractor:
         Raises PhotoDoesNotFit.
         """
         found: list[torch.Tensor] = [torch.empty(0)] * len(photos)
-        for places, features in self._in_passes(photos, torch.Tensor.cpu):
+        for places, features in self._run_in_batches(photos, torch.Tensor.cpu):
             for place, one in zip(places, features, strict=True):
                 found[place] = one
         return found
@@ -209,13 +213,13 @@ class Extractor:
     def describe(
         self,
         photos: Collection[Pixels],
-        centres: Centres | None,
-        projection: Projection | None = None,
+        centres: ClusterCentres | None,
+        projection: PcaProjection | None = None,
     ) -> NDArray[np.float32]:
         """Photos (H, W, 3) as `preprocessing` brings them, of any sizes -> (n, dimension) float32.
 
         Rows in the photos' order, of length 1; or 0, see `shared.vision.vlad`; or NaN throughout
-        where the network's features are not finite: these must not be stored (`not_finite`).
+        where the network's features are not finite: these must not be stored (`not_finite_error`).
 
         Raises PhotoDoesNotFit for a photo that is too much for the GPU even alone.
         """
@@ -230,15 +234,15 @@ class Extractor:
             return (described if projection is None else projection(described)).cpu()
 
         rows = np.empty((len(photos), self.dimension(centres, projection)), np.float32)
-        for places, found in self._in_passes(photos, row):
+        for places, found in self._run_in_batches(photos, row):
             rows[places] = found.numpy()
         return rows
 
-    def _in_passes(
+    def _run_in_batches(
         self, photos: Collection[Pixels], then: Callable[[torch.Tensor], torch.Tensor]
     ) -> Iterator[tuple[list[int], torch.Tensor]]:
         """Places in `photos`, and what `then` makes of the local features of those."""
-        return in_passes(
+        return run_in_batches(
             photos, lambda pixels: then(self.features(pixels)), self.limit, self.backbone.device
         )
 
@@ -246,9 +250,9 @@ class Extractor:
         """(B, patches, width), (K, width) -> (B, dimension)."""
         match self.recipe.aggregator:
             case "avg":
-                rows = average(features)
+                rows = average_pooling(features)
             case "gem":
-                rows = gem(features)
+                rows = gem_pooling(features)
             case "vlad":
                 assert centres is not None
                 rows = vlad(features, centres)
@@ -264,14 +268,14 @@ class Extractor:
         return torch.where(finite, rows, torch.nan)
 
 
-def _preprocessing(recipe: Recipe, backbone: Backbone) -> Preprocessing:
+def _preprocessing(recipe: ExtractorConfig, backbone: Backbone) -> Preprocessing:
     if recipe.preprocessing is not None:
         return get_preprocessing(recipe.preprocessing)
-    assert isinstance(backbone, TrainedModel), "only a trained model brings its own"
+    assert isinstance(backbone, TrainedBackbone), "only a trained model brings its own"
     return backbone.preprocessing
 
 
-def not_finite() -> Unprocessable:
+def not_finite_error() -> Unprocessable:
     """Why a photo whose row is NaN has no descriptor."""
     return Unprocessable(
         "features_not_finite",

@@ -21,9 +21,9 @@ import torch
 from numpy.typing import NDArray
 
 from shared.errors import Unprocessable
-from shared.vision.batches import Batches, Points
-from shared.vision.kmeans import Pass, Seeding
-from shared.vision.vocabulary import Centres, check_centres
+from shared.vision.batches import PointBatches, PointSource
+from shared.vision.kmeans import KMeansPass, KMeansPlusPlus
+from shared.vision.vocabulary import ClusterCentres, parse_centres
 
 PATCHES_PER_CLUSTER = 50  # fewer, and a centre is an accident of the sample
 SEEDING_BYTES = 16_000_000  # of patches for k-means++, which looks at all of them for each centre
@@ -34,7 +34,7 @@ TOLERANCE = 1e-4  # sum of squared movements of all centres at which they have s
 
 
 @dataclass(frozen=True, slots=True)
-class Effort:
+class FitEffort:
     """How long a fit tries."""
 
     mini_batch_passes: int = 10
@@ -42,27 +42,27 @@ class Effort:
     """At most."""
 
 
-EFFORT = Effort()
+DEFAULT_EFFORT = FitEffort()
 
 
-class Stage(StrEnum):
+class VocabularyFitStage(StrEnum):
     SEED = "seed"
     MINI_BATCH = "mini-batch"
     SETTLE = "settle"
     DONE = "done"
 
 
-class Fit:
+class VocabularyFit:
     """Finds K centres for points; `step` until `done`. The same for the same points and seed,
     whether or not it was saved and resumed between two steps.
     """
 
     def __init__(
         self,
-        points: Points,
+        points: PointSource,
         clusters: int,
         seed: int,
-        effort: Effort = EFFORT,
+        effort: FitEffort = DEFAULT_EFFORT,
     ) -> None:
         """`clusters` are asked for; so few points that a centre had less than
         PATCHES_PER_CLUSTER of them bear fewer.
@@ -78,15 +78,15 @@ class Fit:
         self.clusters = max(1, min(clusters, len(points) // PATCHES_PER_CLUSTER))
         self._seed = seed
         self._effort = effort
-        self._batches = Batches(points, max(BATCH_PATCHES, BATCH_PER_CLUSTER * self.clusters))
-        self.stage = Stage.SEED
+        self._batches = PointBatches(points, max(BATCH_PATCHES, BATCH_PER_CLUSTER * self.clusters))
+        self.stage = VocabularyFitStage.SEED
         self.passes = 0
         """Ended ones."""
         self.similarity: float | None = None
         """Mean cosine of the points to their centres, as the last pass saw it."""
-        self._seeding: Seeding | None = None
+        self._seeding: KMeansPlusPlus | None = None
         self._centres = torch.empty(0, points.width)
-        self._pass = Pass.begin(self._centres)
+        self._pass = KMeansPass.begin(self._centres)
         self._batch = 0
         """Batches that the pass has seen."""
         self._order: list[int] = []
@@ -99,7 +99,7 @@ class Fit:
 
     @property
     def done(self) -> bool:
-        return self.stage == Stage.DONE
+        return self.stage == VocabularyFitStage.DONE
 
     @property
     def progress(self) -> tuple[int, int]:
@@ -107,7 +107,7 @@ class Fit:
         batches = len(self._batches)
         passes = self._effort.mini_batch_passes + self._effort.settling_passes
         most = self.clusters + passes * batches
-        if self.stage == Stage.SEED:
+        if self.stage == VocabularyFitStage.SEED:
             return (len(self._seeding.chosen) if self._seeding else 0), most
         if self.done:
             return most, most
@@ -115,23 +115,23 @@ class Fit:
 
     def step(self) -> None:
         """One seed, or one batch of points: milliseconds."""
-        if self.stage == Stage.SEED:
+        if self.stage == VocabularyFitStage.SEED:
             self._choose_seed()
         else:
-            self._learn_batch()
+            self._update_centres()
 
-    def centres(self) -> Centres:
+    def centres(self) -> ClusterCentres:
         """The centres of a fit that is done.
 
         Photos that are all alike can bear fewer than asked for: the distinct ones are kept.
         """
         assert self.done
         distinct: NDArray[np.float32] = np.unique(self._centres.numpy(), axis=0)
-        return check_centres(distinct[np.linalg.norm(distinct, axis=1) > 1e-6])
+        return parse_centres(distinct[np.linalg.norm(distinct, axis=1) > 1e-6])
 
     def _choose_seed(self) -> None:
         if self._seeding is None:
-            self._seeding = Seeding(self._seeding_points(), self._seed)
+            self._seeding = KMeansPlusPlus(self._seeding_points(), self._seed)
         else:
             self._seeding.next()
         if len(self._seeding.chosen) == self.clusters:
@@ -146,10 +146,10 @@ class Fit:
         )
         return self._points.read(0, min(size, len(self._points)))
 
-    def _learn_batch(self) -> None:
+    def _update_centres(self) -> None:
         points = self._batches.read(self._order[self._batch])
-        self._pass.see(points, self._centres)
-        if self.stage == Stage.MINI_BATCH:
+        self._pass.accumulate(points, self._centres)
+        if self.stage == VocabularyFitStage.MINI_BATCH:
             self._centres = self._pass.means(self._centres)
         self._batch += 1
         if self._batch == len(self._batches):
@@ -159,27 +159,27 @@ class Fit:
         moved = self._pass.end(self._centres)
         movement = float(((moved - self._centres) ** 2).sum())
         self.similarity = self._pass.similarity / len(self._points)
-        settled = self.stage == Stage.SETTLE and movement <= TOLERANCE
+        settled = self.stage == VocabularyFitStage.SETTLE and movement <= TOLERANCE
         self._centres = moved
         self.passes += 1
         self._begin_pass()
         if settled:
-            self.stage = Stage.DONE
+            self.stage = VocabularyFitStage.DONE
 
     def _begin_pass(self) -> None:
         self._batch = 0
-        self._pass = Pass.begin(self._centres)
+        self._pass = KMeansPass.begin(self._centres)
         mini_batch = self._effort.mini_batch_passes
         if self.passes < mini_batch:
-            self.stage = Stage.MINI_BATCH
+            self.stage = VocabularyFitStage.MINI_BATCH
         elif self.passes < mini_batch + self._effort.settling_passes:
-            self.stage = Stage.SETTLE
+            self.stage = VocabularyFitStage.SETTLE
         else:
-            self.stage = Stage.DONE
+            self.stage = VocabularyFitStage.DONE
         self._set_order()
 
     def _set_order(self) -> None:
-        if self.stage == Stage.MINI_BATCH:
+        if self.stage == VocabularyFitStage.MINI_BATCH:
             self._order = self._batches.shuffled([self._seed, self.passes])
         else:
             self._order = list(range(len(self._batches)))
@@ -213,9 +213,9 @@ class Fit:
             self.passes, self._batch = map(int, saved["numbers"])
             similarity = float(saved["similarity"])
             self.similarity = None if np.isnan(similarity) else similarity
-            self.stage = Stage(str(saved["stage"]))
+            self.stage = VocabularyFitStage(str(saved["stage"]))
             self._centres = torch.from_numpy(saved["centres"])
-            self._pass = Pass(
+            self._pass = KMeansPass(
                 counts=torch.from_numpy(saved["counts"]),
                 sums=torch.from_numpy(saved["sums"]),
                 similarity=float(saved["seen"]),
@@ -223,7 +223,7 @@ class Fit:
                 worst_distances=torch.from_numpy(saved["worst_distances"]),
             )
             if "chosen" in saved:
-                self._seeding = Seeding.resume(
+                self._seeding = KMeansPlusPlus.resume(
                     self._seeding_points(),
                     chosen=saved["chosen"].tolist(),
                     distances=torch.from_numpy(saved["distances"]),

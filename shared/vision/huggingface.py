@@ -10,10 +10,10 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from shared.vision.download import OnProgress, download
+from shared.vision.download import OnProgress, download_file
 
 
-def bring_file(repository: str, filename: str, on_progress: OnProgress) -> Path:
+def download_hub_file(repository: str, filename: str, on_progress: OnProgress) -> Path:
     """The file in the cache of this machine, the newest that the hub has.
 
     Misconfigured (`download_corrupt`) when it has another hash; OSError, RuntimeError or
@@ -31,7 +31,7 @@ def bring_file(repository: str, filename: str, on_progress: OnProgress) -> Path:
     folder = repo_folder_name(repo_id=repository, repo_type="model")
     # Small files have git's hash, which is of more than their content.
     sha256 = metadata.etag if re.fullmatch(r"[0-9a-f]{64}", metadata.etag) else None
-    download(
+    download_file(
         url,
         Path(constants.HF_HUB_CACHE, folder, "blobs", metadata.etag),
         sha256=sha256,

@@ -18,7 +18,7 @@ import torch
 from torch.nn.functional import normalize
 
 
-class Seeding:
+class KMeansPlusPlus:
     """k-means++ (Arthur and Vassilvitskii 2007) on (n, D) points, one seed at a time."""
 
     def __init__(self, points: torch.Tensor, seed: int) -> None:
@@ -38,7 +38,7 @@ class Seeding:
         chosen: list[int],
         distances: torch.Tensor,
         generator_state: torch.Tensor,
-    ) -> Seeding:
+    ) -> KMeansPlusPlus:
         """One that had chosen these of the same points; `generator_state` is `generator`'s."""
         found = cls.__new__(cls)
         found.points, found.chosen, found.distances = points, chosen, distances
@@ -66,7 +66,7 @@ class Seeding:
 
 
 @dataclass(slots=True)
-class Pass:
+class KMeansPass:
     """What one pass over the points has seen so far, of K clusters in D dimensions."""
 
     counts: torch.Tensor
@@ -81,7 +81,7 @@ class Pass:
     """Theirs, squared."""
 
     @classmethod
-    def begin(cls, centres: torch.Tensor) -> Pass:
+    def begin(cls, centres: torch.Tensor) -> KMeansPass:
         return cls(
             counts=torch.zeros(len(centres), dtype=torch.int64),
             sums=torch.zeros_like(centres),
@@ -90,7 +90,7 @@ class Pass:
             worst_distances=centres[:0, 0],
         )
 
-    def see(self, points: torch.Tensor, centres: torch.Tensor) -> None:
+    def accumulate(self, points: torch.Tensor, centres: torch.Tensor) -> None:
         """Count the (n, D) unit points to the centres that describe them best."""
         cosines, labels = (points @ normalize(centres, dim=-1).T).max(dim=-1)
         self.counts += torch.bincount(labels, minlength=len(centres))

@@ -16,9 +16,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from shared.vision.vocabulary import NO_ARRAY
+from shared.vision.vocabulary import ARRAY_READ_ERRORS
 
-HALF = np.dtype("<f2")
+FLOAT16 = np.dtype("<f2")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -28,9 +28,9 @@ class LocalFeatures:
     array: NDArray[np.float16]
 
     @classmethod
-    def of(cls, features: torch.Tensor, grid: tuple[int, int]) -> LocalFeatures:
+    def from_features(cls, features: torch.Tensor, grid: tuple[int, int]) -> LocalFeatures:
         """(patches, D) float32 on the CPU, row by row of the grid (rows, columns)."""
-        return cls(features.numpy().astype(HALF).reshape(*grid, -1))
+        return cls(features.numpy().astype(FLOAT16).reshape(*grid, -1))
 
     @property
     def grid(self) -> tuple[int, int]:
@@ -56,9 +56,9 @@ class LocalFeatures:
         """What `encode` has made; ValueError for anything else, and for another width than D."""
         try:
             array = np.load(io.BytesIO(data), allow_pickle=False)
-        except NO_ARRAY as error:
+        except ARRAY_READ_ERRORS as error:
             raise ValueError(f"no array: {error}") from error
-        if array.dtype != HALF or array.ndim != 3 or array.shape[2] != width or not array.size:
+        if array.dtype != FLOAT16 or array.ndim != 3 or array.shape[2] != width or not array.size:
             raise ValueError(
                 f"{array.dtype} of {array.shape}, not float16 (rows, columns, {width})"
             )

@@ -28,13 +28,13 @@ import torch
 from shared.vision.local_features import LocalFeatures
 
 SCALES = (0.5, 0.71, 1.0, 1.41, 2.0)
-SIGMA = 0.085  # sides of the photo: 1.2 patches of a 14 x 14 grid
+SHIFT_SIGMA = 0.085  # sides of the photo: 1.2 patches of a 14 x 14 grid
 # Chosen on a generated city whose queries are in no figure: from 0.2 to 1 it gained, and the vote
 # alone, without the similarity, lost.
-WEIGHT = 0.5
+VOTE_WEIGHT = 0.5
 
 ROWS_AT_ONCE = 2048  # of the query's patches: of two large photos, all similarities are gigabytes
-MOST_SHIFTS = 512  # tried, those of the strongest matches
+MAX_SHIFTS = 512  # tried, those of the strongest matches
 
 Matches = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
 
@@ -43,7 +43,7 @@ def rerank_score(
     similarity: float, query: LocalFeatures, candidate: LocalFeatures, device: torch.device
 ) -> float:
     """The cosine similarity of two photos' descriptors, raised by what their patches vote."""
-    return similarity + WEIGHT * spatial_vote(query, candidate, device)
+    return similarity + VOTE_WEIGHT * spatial_vote(query, candidate, device)
 
 
 @torch.inference_mode()
@@ -53,14 +53,14 @@ def spatial_vote(query: LocalFeatures, candidate: LocalFeatures, device: torch.d
     of_query, of_candidate, similarities = mutual_matches(x, y)
     if not len(similarities):
         return 0.0
-    begin = _places(query.grid, device)[of_query]
-    end = _places(candidate.grid, device)[of_candidate]
-    strongest = similarities.argsort(descending=True, stable=True)[:MOST_SHIFTS]
+    begin = _patch_centres(query.grid, device)[of_query]
+    end = _patch_centres(candidate.grid, device)[of_candidate]
+    strongest = similarities.argsort(descending=True, stable=True)[:MAX_SHIFTS]
     best = 0.0
     for scale in SCALES:
         shifts = end - scale * begin
         apart = (shifts[strongest, None] - shifts[None]).square().sum(dim=-1)
-        votes = torch.exp(-apart / (2 * SIGMA**2)) @ similarities
+        votes = torch.exp(-apart / (2 * SHIFT_SIGMA**2)) @ similarities
         best = max(best, float(votes.max()))
     return best / min(len(x), len(y))
 
@@ -89,7 +89,7 @@ def mutual_matches(x: torch.Tensor, y: torch.Tensor) -> Matches:
     return all_rows[mutual], nearest_of_x[mutual], similarities[mutual]
 
 
-def _places(grid: tuple[int, int], device: torch.device) -> torch.Tensor:
+def _patch_centres(grid: tuple[int, int], device: torch.device) -> torch.Tensor:
     """(rows * columns, 2) centres of the patches, from the photo's middle, in its sides."""
     rows, columns = ((torch.arange(count, device=device) + 0.5) / count - 0.5 for count in grid)
     return torch.cartesian_prod(rows, columns)

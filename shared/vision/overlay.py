@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 # Told apart by every kind of sight.
-FOR = (230, 97, 1)  # orange: the patch speaks for the match
-AGAINST = (94, 60, 153)  # violet: it speaks against it
+POSITIVE_COLOUR = (230, 97, 1)  # orange: the patch speaks for the match
+NEGATIVE_COLOUR = (94, 60, 153)  # violet: it speaks against it
 
 
 def draw_overlay(shares: NDArray[np.float64]) -> tuple[str, float]:
@@ -23,7 +23,7 @@ def draw_overlay(shares: NDArray[np.float64]) -> tuple[str, float]:
     strength = np.abs(shares)
     full = float(strength.max())
     pixels = np.zeros((*shares.shape, 4), np.uint8)
-    pixels[..., :3] = np.where((shares >= 0)[..., np.newaxis], FOR, AGAINST)
+    pixels[..., :3] = np.where((shares >= 0)[..., np.newaxis], POSITIVE_COLOUR, NEGATIVE_COLOUR)
     if full > 0:
         pixels[..., 3] = np.round(255 * strength / full)
     buffer = io.BytesIO()

@@ -20,21 +20,21 @@ from shared.vision.resample import Pixels
 
 log = logging.getLogger(__name__)
 
-USUAL_PIXELS = 224 * 224  # of a photo, by which the size of a pass is chosen
+DEFAULT_PHOTO_PIXELS = 224 * 224  # of a photo, by which the size of a pass is chosen
 
 # All threads of a process queue their work on one GPU in one line: side by side they would gain
 # nothing, and need memory for both.
-_turn = threading.Lock()
+_gpu_lock = threading.Lock()
 
 
-class PhotoDoesNotFit(Unprocessable):
+class PhotoTooLargeForGpu(Unprocessable):
     """One photo alone is too much for the GPU: code `gpu_out_of_memory`."""
 
     place = 0
     """Which of the photos that were to be described, counted from 0."""
 
     @classmethod
-    def at(cls, place: int, height: int, width: int) -> PhotoDoesNotFit:
+    def for_photo(cls, place: int, height: int, width: int) -> PhotoTooLargeForGpu:
         error = cls(
             "gpu_out_of_memory",
             "The GPU's memory does not suffice for this photo alone, of which the preprocessing "
@@ -46,7 +46,7 @@ class PhotoDoesNotFit(Unprocessable):
         return error
 
 
-class PassLimit:
+class BatchSizeLimit:
     """What one loaded network can take at once. Kept as long as the process lives."""
 
     def __init__(self) -> None:
@@ -56,9 +56,9 @@ class PassLimit:
         """How many photos of that size make one pass of a batch of `batch` photos: together no more
         pixels than the batch would have at 224 x 224, or else one photo.
         """
-        return max(1, int(min(batch * USUAL_PIXELS, self._most_pixels)) // photo_pixels)
+        return max(1, int(min(batch * DEFAULT_PHOTO_PIXELS, self._most_pixels)) // photo_pixels)
 
-    def ran_out(self, photos: int, photo_pixels: int) -> None:
+    def record_out_of_memory(self, photos: int, photo_pixels: int) -> None:
         """A pass of several such photos did not fit: the next ones have half of it at most."""
         self._most_pixels = min(self._most_pixels, photos * photo_pixels // 2)
         log.warning(
@@ -68,10 +68,10 @@ class PassLimit:
         )
 
 
-def in_passes(
+def run_in_batches(
     photos: Collection[Pixels],
     run: Callable[[Pixels], torch.Tensor],
-    limit: PassLimit,
+    limit: BatchSizeLimit,
     device: torch.device,
 ) -> Iterator[tuple[list[int], torch.Tensor]]:
     """Pass by pass: the places of its photos in `photos`, and what `run` makes of them.
@@ -86,21 +86,23 @@ def in_passes(
     for (height, width, _), left in of_shape.items():
         while left:
             chosen = left[: limit.photos(len(listed), height * width)]
-            found = _if_it_fits(run, np.stack([listed[place] for place in chosen]), device)
+            found = _run_unless_out_of_memory(
+                run, np.stack([listed[place] for place in chosen]), device
+            )
             if found is not None:
                 left = left[len(chosen) :]
                 yield chosen, found
             elif len(chosen) > 1:
-                limit.ran_out(len(chosen), height * width)
+                limit.record_out_of_memory(len(chosen), height * width)
             else:
-                raise PhotoDoesNotFit.at(chosen[0], height, width)
+                raise PhotoTooLargeForGpu.for_photo(chosen[0], height, width)
 
 
-def _if_it_fits(
+def _run_unless_out_of_memory(
     run: Callable[[Pixels], torch.Tensor], pixels: Pixels, device: torch.device
 ) -> torch.Tensor | None:
     """None where the GPU has no memory for it."""
-    with _turn if device.type == "cuda" else contextlib.nullcontext():
+    with _gpu_lock if device.type == "cuda" else contextlib.nullcontext():
         try:
             return run(pixels)
         except torch.cuda.OutOfMemoryError:

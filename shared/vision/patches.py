@@ -15,21 +15,23 @@ from numpy.typing import NDArray
 from shared.objects import ObjectStore
 
 PATCHES_BYTES = 256_000_000  # of all photos together, in the store
-FLOAT = np.dtype("<f4")
+FLOAT32 = np.dtype("<f4")
 
 
-def most_photos(width: int) -> int:
+def max_photos_to_sample(width: int) -> int:
     """How many photos can give one patch each; `width` is the length of a local feature."""
-    return max(1, PATCHES_BYTES // (FLOAT.itemsize * width))
+    return max(1, PATCHES_BYTES // (FLOAT32.itemsize * width))
 
 
-def choose_photos(there: int, sample: int, width: int, seed: int) -> list[int]:
+def sample_photos(available: int, sample: int, width: int, seed: int) -> list[int]:
     """Which of so many photos to learn from, at most `sample`: their numbers, in a random order.
 
     The order lets each batch of patches stand for all photos.
     """
-    size = min(sample, there, most_photos(width))
-    chosen: list[int] = np.random.default_rng(seed).choice(there, size=size, replace=False).tolist()
+    size = min(sample, available, max_photos_to_sample(width))
+    chosen: list[int] = (
+        np.random.default_rng(seed).choice(available, size=size, replace=False).tolist()
+    )
     return chosen
 
 
@@ -47,7 +49,7 @@ class PatchStore:
         following of all `photos`. Each gives an equal share of PATCHES_BYTES, chosen by `seed` and
         its place.
         """
-        share = max(1, PATCHES_BYTES // (FLOAT.itemsize * self.width * photos))
+        share = max(1, PATCHES_BYTES // (FLOAT32.itemsize * self.width * photos))
         kept = [
             one[np.random.default_rng([seed, place]).permutation(len(one))[:share]].cpu().numpy()
             for place, one in enumerate(features, first)
@@ -57,22 +59,24 @@ class PatchStore:
         # not finite is refused when the photo is described.
         lengths = np.linalg.norm(rows, axis=1)
         rows = rows[np.isfinite(lengths) & (lengths > 0)]
-        self._store.put(f"{self._prefix}{first:08d}.f32", rows.astype(FLOAT, copy=False).tobytes())
+        self._store.put(
+            f"{self._prefix}{first:08d}.f32", rows.astype(FLOAT32, copy=False).tobytes()
+        )
 
-    def open(self) -> Patches:
+    def open(self) -> StoredPatches:
         """What is there now, in the order of the photos."""
         found = sorted((info.key, info.size_bytes) for info in self._store.list(self._prefix))
-        return Patches(self._store, found, self.width)
+        return StoredPatches(self._store, found, self.width)
 
 
-class Patches:
+class StoredPatches:
     """The rows of all objects as one (n, width) array that is read piece by piece."""
 
     def __init__(self, store: ObjectStore, objects: list[tuple[str, int]], width: int) -> None:
         """`objects`: key and size in bytes of each."""
         self._store = store
         self._keys = [key for key, _ in objects]
-        self._row_bytes = FLOAT.itemsize * width
+        self._row_bytes = FLOAT32.itemsize * width
         rows = [size // self._row_bytes for _, size in objects]
         self._begins = [0, *accumulate(rows)]
         self.width = width
@@ -91,6 +95,6 @@ class Patches:
                 data = self._store.read_range(
                     self._keys[at], start, (until - begin) * self._row_bytes
                 )
-                parts.append(np.frombuffer(data, FLOAT).reshape(-1, self.width))
+                parts.append(np.frombuffer(data, FLOAT32).reshape(-1, self.width))
             begin, at = until, at + 1
         return torch.from_numpy(np.concatenate(parts).astype(np.float32, copy=False))

@@ -24,7 +24,7 @@ Rows = NDArray[np.float32]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Whitening:
+class PcaWhitening:
     """A fitted projection."""
 
     mean: NDArray[np.float32]
@@ -56,10 +56,10 @@ class Whitening:
         return digest.hexdigest()
 
 
-class Projection:
+class PcaProjection:
     """A whitening on a device, at work."""
 
-    def __init__(self, whitening: Whitening, device: torch.device) -> None:
+    def __init__(self, whitening: PcaWhitening, device: torch.device) -> None:
         self.dimension = whitening.dimension
         """Length of a descriptor before."""
         self.kept = whitening.kept

@@ -14,17 +14,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared.errors import Unprocessable
-from shared.vision.pca import Whitening
+from shared.vision.pca import PcaWhitening
 
-NAMES = ("mean", "directions", "variances", "explained", "rows")
+TENSOR_NAMES = ("mean", "directions", "variances", "explained", "rows")
 
 # What changes a descriptor by its last bits alone: a whitening outlives it.
-MINOR = ("decoder", "precision")
+IGNORED_SPEC_FIELDS = ("decoder", "precision")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class WhiteningFile:
-    whitening: Whitening
+class PcaWhiteningFile:
+    whitening: PcaWhitening
     spec: dict[str, Any] | None
     """Of the rows that it was fitted on; None where that is unknown."""
 
@@ -44,13 +44,13 @@ class WhiteningFile:
             None if self.spec is None else {"spec": json.dumps(self.spec, sort_keys=True)},
         )
 
-    def check_fits(self, spec: dict[str, Any]) -> None:
+    def check_compatible(self, spec: dict[str, Any]) -> None:
         """Unprocessable (`pca_unfit`) naming what differs unless descriptors of `spec`, which are
         not projected yet, are like the rows that it was fitted on. Of unknown rows only the
         dimension can be compared.
         """
         if self.whitening.dimension != spec["dimension"]:
-            raise _unfit(
+            raise _pca_unfit_error(
                 f"it is for descriptors of {self.whitening.dimension} dimensions, and these have "
                 f"{spec['dimension']}"
             )
@@ -59,13 +59,13 @@ class WhiteningFile:
         differing = [
             f"{key} is {spec.get(key)!r}, was {self.spec.get(key)!r}"
             for key in sorted(spec.keys() | self.spec.keys())
-            if key not in MINOR and spec.get(key) != self.spec.get(key)
+            if key not in IGNORED_SPEC_FIELDS and spec.get(key) != self.spec.get(key)
         ]
         if differing:
-            raise _unfit(f"it was fitted on other descriptors ({'; '.join(differing)})")
+            raise _pca_unfit_error(f"it was fitted on other descriptors ({'; '.join(differing)})")
 
 
-def decode_whitening(data: bytes) -> WhiteningFile:
+def decode_whitening(data: bytes) -> PcaWhiteningFile:
     """The whitening in such bytes; Unprocessable (`pca_unfit`) says what is wrong with it."""
     from safetensors import SafetensorError
     from safetensors.numpy import load
@@ -73,8 +73,10 @@ def decode_whitening(data: bytes) -> WhiteningFile:
     try:
         stored = load(data)
     except SafetensorError as error:
-        raise _unfit(f"it is no safetensors file, or not a whole one ({error})") from error
-    return WhiteningFile(_whitening(stored), _spec(data))
+        raise _pca_unfit_error(
+            f"it is no safetensors file, or not a whole one ({error})"
+        ) from error
+    return PcaWhiteningFile(_whitening(stored), _spec(data))
 
 
 def _spec(data: bytes) -> dict[str, Any] | None:
@@ -86,34 +88,34 @@ def _spec(data: bytes) -> dict[str, Any] | None:
     try:
         spec = json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise _unfit(f"the spec in it can't be read ({error})") from error
+        raise _pca_unfit_error(f"the spec in it can't be read ({error})") from error
     if not isinstance(spec, dict):
-        raise _unfit("the spec in it is none")
+        raise _pca_unfit_error("the spec in it is none")
     return spec
 
 
-def _whitening(stored: dict[str, NDArray[np.generic]]) -> Whitening:
-    missing = [name for name in NAMES if name not in stored]
+def _whitening(stored: dict[str, NDArray[np.generic]]) -> PcaWhitening:
+    missing = [name for name in TENSOR_NAMES if name not in stored]
     if missing:
-        raise _unfit(f"it has no {', '.join(missing)}")
-    mean, directions, variances = (_floats(stored, name) for name in NAMES[:3])
+        raise _pca_unfit_error(f"it has no {', '.join(missing)}")
+    mean, directions, variances = (_floats(stored, name) for name in TENSOR_NAMES[:3])
     shapes = (mean.shape, variances.shape)
     if directions.ndim != 2 or shapes != (directions.shape[1:], directions.shape[:1]):
-        raise _unfit(
+        raise _pca_unfit_error(
             f"its mean {mean.shape}, directions {directions.shape} and variances "
             f"{variances.shape} do not belong together: (D,), (d, D) and (d,) are expected"
         )
     kept, made_for = directions.shape
     if not 0 < kept <= made_for:
-        raise _unfit(f"it makes {kept} dimensions of {made_for}")
+        raise _pca_unfit_error(f"it makes {kept} dimensions of {made_for}")
     if not (variances > 0).all():
-        raise _unfit("a variance is not positive")
+        raise _pca_unfit_error("a variance is not positive")
     # A unit direction divided by its standard deviation, as far as float32 goes.
     lengths = np.linalg.norm(directions, axis=1) * np.sqrt(variances)
     if not np.allclose(lengths, 1.0, rtol=0.01):
-        raise _unfit("its directions are not those of its variances")
+        raise _pca_unfit_error("its directions are not those of its variances")
     try:
-        return Whitening(
+        return PcaWhitening(
             mean,
             directions,
             variances,
@@ -121,20 +123,20 @@ def _whitening(stored: dict[str, NDArray[np.generic]]) -> Whitening:
             rows=int(stored["rows"].item()),
         )
     except ValueError as error:
-        raise _unfit(f"explained and rows are one number each ({error})") from error
+        raise _pca_unfit_error(f"explained and rows are one number each ({error})") from error
 
 
 def _floats(stored: dict[str, NDArray[np.generic]], name: str) -> NDArray[np.float32]:
     array = stored[name]
     if array.dtype != np.float32:
-        raise _unfit(f"its {name} is {array.dtype}, not float32")
+        raise _pca_unfit_error(f"its {name} is {array.dtype}, not float32")
     floats = array.astype(np.float32, copy=False)
     if not np.isfinite(floats).all():
-        raise _unfit(f"its {name} holds NaN or infinite numbers")
+        raise _pca_unfit_error(f"its {name} holds NaN or infinite numbers")
     return floats
 
 
-def _unfit(reason: str) -> Unprocessable:
+def _pca_unfit_error(reason: str) -> Unprocessable:
     return Unprocessable(
         "pca_unfit", f"The PCA file can't be used: {reason}. Fit a new one on the map's rows."
     )

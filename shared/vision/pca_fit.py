@@ -20,16 +20,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared.errors import Unprocessable
-from shared.vision.pca import Rows, Whitening
-from shared.vision.pca_rows import BLOCK_BYTES, ArrayColumns, Columns, blocks_of
+from shared.vision.pca import PcaWhitening, Rows
+from shared.vision.pca_rows import BLOCK_BYTES, ArrayColumns, ColumnSource, block_count
 
 # Of the largest one: below, float32's rounding of the rows is what would be made strong.
-LEAST_VARIANCE = 1e-9
+MIN_VARIANCE = 1e-9
 
 Matrix = NDArray[np.float64]
 
 
-class Stage(StrEnum):
+class PcaFitStage(StrEnum):
     PRODUCTS = "products"  # between all rows
     VARIANCES = "variances"  # the largest of them
     DIRECTIONS = "directions"
@@ -37,7 +37,7 @@ class Stage(StrEnum):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Part:
+class PcaBlock:
     """A block of columns of the result."""
 
     mean: Rows
@@ -51,13 +51,13 @@ class PcaFit:
     saved and resumed between two steps.
     """
 
-    def __init__(self, rows: Columns, kept: int) -> None:
-        """Raises Unprocessable as `check_can_fit` does."""
-        check_can_fit(rows.count, rows.dimension, kept)
+    def __init__(self, rows: ColumnSource, kept: int) -> None:
+        """Raises Unprocessable as `check_pca_fittable` does."""
+        check_pca_fittable(rows.count, rows.dimension, kept)
         self._rows = rows
         self._kept = kept
-        self._blocks = blocks_of(rows)
-        self.stage = Stage.PRODUCTS
+        self._blocks = block_count(rows)
+        self.stage = PcaFitStage.PRODUCTS
         self._block = 0
         """Blocks of columns that the stage has seen."""
         # Of rows (XX') or of columns (X'X), whichever are fewer.
@@ -71,12 +71,16 @@ class PcaFit:
 
     @property
     def done(self) -> bool:
-        return self.stage == Stage.DONE
+        return self.stage == PcaFitStage.DONE
 
     @property
     def progress(self) -> tuple[int, int]:
         """Steps done, and all of them."""
-        before = {Stage.PRODUCTS: 0, Stage.VARIANCES: 0, Stage.DIRECTIONS: self._blocks + 1}
+        before = {
+            PcaFitStage.PRODUCTS: 0,
+            PcaFitStage.VARIANCES: 0,
+            PcaFitStage.DIRECTIONS: self._blocks + 1,
+        }
         most = 2 * self._blocks + 1
         return (most if self.done else before[self.stage] + self._block), most
 
@@ -85,36 +89,36 @@ class PcaFit:
         """Blocks of the result that there are."""
         if self.done:
             return self._blocks
-        return self._block if self.stage == Stage.DIRECTIONS else 0
+        return self._block if self.stage == PcaFitStage.DIRECTIONS else 0
 
-    def step(self) -> Part | None:
+    def step(self) -> PcaBlock | None:
         """A block of columns, or the variances; of the last stage, what came of the block.
 
         Unprocessable (`pca_too_many_dimensions`) when the rows vary in too few directions.
         """
-        if self.stage == Stage.VARIANCES:
+        if self.stage == PcaFitStage.VARIANCES:
             self._find_variances()
             return None
         block, mean = _centred(self._rows.read(self._block))
         part = None
-        if self.stage == Stage.PRODUCTS:
+        if self.stage == PcaFitStage.PRODUCTS:
             self._products += block.T @ block if self._by_columns else block @ block.T
         else:
             found = self._basis.T if self._by_columns else self._basis.T @ block
-            part = Part(mean.astype(np.float32), found.astype(np.float32))
+            part = PcaBlock(mean.astype(np.float32), found.astype(np.float32))
         self._block += 1
         if self._block == self._blocks:
-            if self.stage == Stage.DIRECTIONS:
-                self.stage = Stage.DONE
+            if self.stage == PcaFitStage.DIRECTIONS:
+                self.stage = PcaFitStage.DONE
             else:
-                self.stage = Stage.VARIANCES
+                self.stage = PcaFitStage.VARIANCES
         return part
 
-    def whitening(self, parts: Sequence[Part]) -> Whitening:
+    def whitening(self, parts: Sequence[PcaBlock]) -> PcaWhitening:
         """What the parts of a fit that is done come to, in their order."""
         assert self.done
         directions = np.concatenate([part.directions for part in parts], axis=1)
-        return Whitening(
+        return PcaWhitening(
             mean=np.concatenate([part.mean for part in parts]),
             directions=_with_fixed_signs(directions),
             variances=self._variances.astype(np.float32),
@@ -124,14 +128,14 @@ class PcaFit:
 
     def _find_variances(self) -> None:
         freedom = self._rows.count - 1
-        squares, vectors = _largest(self._products, self._kept)
+        squares, vectors = _largest_eigenpairs(self._products, self._kept)
         self._variances = squares / freedom
         self._total = float(np.trace(self._products)) / freedom
         # p / sqrt(l) = X'u / s * sqrt(n - 1) / s; by columns the vectors are the directions p.
         scale = 1 / np.sqrt(self._variances) if self._by_columns else np.sqrt(freedom) / squares
         self._basis = vectors * scale
         self._products = np.empty((0, 0))
-        self.stage, self._block = Stage.DIRECTIONS, 0
+        self.stage, self._block = PcaFitStage.DIRECTIONS, 0
 
     # --- between two steps ---------------------------------------------------------------------
 
@@ -152,13 +156,13 @@ class PcaFit:
     def resume(self, data: bytes) -> None:
         """Go on where a fit of the same rows was saved."""
         with np.load(io.BytesIO(data), allow_pickle=False) as saved:
-            self.stage = Stage(str(saved["stage"]))
+            self.stage = PcaFitStage(str(saved["stage"]))
             self._block = int(saved["block"])
             self._products, self._basis = saved["products"], saved["basis"]
             self._variances, self._total = saved["variances"], float(saved["total"])
 
 
-def check_can_fit(rows: int, dimension: int, kept: int) -> None:
+def check_pca_fittable(rows: int, dimension: int, kept: int) -> None:
     """Unprocessable: `pca_too_few_rows` unless there are more than `kept`;
     `pca_too_many_dimensions` when they have fewer dimensions.
     """
@@ -175,18 +179,18 @@ def check_can_fit(rows: int, dimension: int, kept: int) -> None:
         )
 
 
-def fit(rows: Rows, kept: int, *, block_bytes: int = BLOCK_BYTES) -> Whitening:
+def fit_pca(rows: Rows, kept: int, *, block_bytes: int = BLOCK_BYTES) -> PcaWhitening:
     """The whitening of (n, D) rows, which may be mapped from a file, to `kept` dimensions.
 
     Raises as `PcaFit` does.
     """
-    return fit_columns(ArrayColumns(rows, block_bytes), kept)
+    return fit_pca_columns(ArrayColumns(rows, block_bytes), kept)
 
 
-def fit_columns(
-    rows: Columns, kept: int, told: Callable[[int, int], None] = lambda done, most: None
-) -> Whitening:
-    """The whitening of rows to `kept` dimensions in one go; `told` hears how many steps are done,
+def fit_pca_columns(
+    rows: ColumnSource, kept: int, on_progress: Callable[[int, int], None] = lambda done, most: None
+) -> PcaWhitening:
+    """The whitening of rows to `kept` dimensions in one go; `on_progress` hears how many steps are done,
     and of how many."""
     finding = PcaFit(rows, kept)
     parts = []
@@ -194,15 +198,15 @@ def fit_columns(
         part = finding.step()
         if part is not None:
             parts.append(part)
-        told(*finding.progress)
+        on_progress(*finding.progress)
     return finding.whitening(parts)
 
 
-def _largest(matrix: Matrix, kept: int) -> tuple[Matrix, Matrix]:
+def _largest_eigenpairs(matrix: Matrix, kept: int) -> tuple[Matrix, Matrix]:
     """The `kept` largest eigenvalues, largest first, and their (N, kept) unit eigenvectors."""
     values, vectors = np.linalg.eigh(matrix)
     values, vectors = values[::-1][:kept], vectors[:, ::-1][:, :kept]
-    usable = int((values > LEAST_VARIANCE * max(values[0], 0)).sum())
+    usable = int((values > MIN_VARIANCE * max(values[0], 0)).sum())
     if usable < kept:
         raise Unprocessable(
             "pca_too_many_dimensions",

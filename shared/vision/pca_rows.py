@@ -12,9 +12,9 @@ from shared.vision.pca import Rows
 
 BLOCK_BYTES = 64_000_000  # of float64 columns that are looked at together
 SAMPLE_BYTES = 1_000_000_000  # of rows, where they lie while a fit works on them
-LEAST_SAMPLE = 1000
+MIN_SAMPLE_ROWS = 1000
 SAMPLE_PER_DIMENSION = 4
-FLOAT = np.dtype("<f4")
+FLOAT32 = np.dtype("<f4")
 
 
 def sample_size(dimension: int, kept: int) -> int:
@@ -23,23 +23,25 @@ def sample_size(dimension: int, kept: int) -> int:
     Several for each direction that is kept, as far as SAMPLE_BYTES go, but always twice as many:
     the time that a fit takes grows with the square of their number.
     """
-    wanted = max(LEAST_SAMPLE, SAMPLE_PER_DIMENSION * kept)
-    return min(wanted, max(2 * kept, SAMPLE_BYTES // (FLOAT.itemsize * dimension)))
+    wanted = max(MIN_SAMPLE_ROWS, SAMPLE_PER_DIMENSION * kept)
+    return min(wanted, max(2 * kept, SAMPLE_BYTES // (FLOAT32.itemsize * dimension)))
 
 
-def choose_rows(there: int, sample: int, seed: int) -> NDArray[np.int64]:
+def sample_rows(available: int, sample: int, seed: int) -> NDArray[np.int64]:
     """Which of so many rows to learn from, at most `sample`: their numbers, ascending."""
-    chosen = np.random.default_rng(seed).choice(there, size=min(sample, there), replace=False)
+    chosen = np.random.default_rng(seed).choice(
+        available, size=min(sample, available), replace=False
+    )
     return np.sort(chosen)
 
 
-def usable(rows: Rows) -> NDArray[np.bool_]:
+def usable_rows(rows: Rows) -> NDArray[np.bool_]:
     """(n,) which of (n, D) rows say something of their photo: neither zero nor with a NaN."""
     lengths = np.linalg.norm(rows, axis=1)
     return np.asarray(np.isfinite(lengths) & (lengths > 0))
 
 
-class Columns(Protocol):
+class ColumnSource(Protocol):
     """(count, dimension) float32 rows that are read by columns."""
 
     @property
@@ -56,7 +58,7 @@ class Columns(Protocol):
         """(count, width) of the block, the first being 0."""
 
 
-def blocks_of(rows: Columns) -> int:
+def block_count(rows: ColumnSource) -> int:
     """How many blocks of columns there are."""
     return -(-rows.dimension // rows.width)
 
@@ -105,9 +107,9 @@ class StoredColumns:
         """Keep (n, dimension) more rows. Those that were added before a crash, and not counted, are
         written again.
         """
-        for block in range(blocks_of(self)):
+        for block in range(block_count(self)):
             begin = block * self.width
-            piece = rows[:, begin : begin + self.width].astype(FLOAT)
+            piece = rows[:, begin : begin + self.width].astype(FLOAT32)
             self._store.put(self._key(block, self.count), piece.tobytes())
         self.count += len(rows)
 
@@ -117,7 +119,7 @@ class StoredColumns:
         filled = 0
         while filled < self.count:
             data = self._store.get(self._key(block, filled))
-            piece = np.frombuffer(data, FLOAT).reshape(-1, width)
+            piece = np.frombuffer(data, FLOAT32).reshape(-1, width)
             rows[filled : filled + len(piece)] = piece
             filled += len(piece)
         return rows

@@ -7,33 +7,37 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from shared.objects import FolderStore
-from shared.vision.pca import Rows, Whitening
-from shared.vision.pca_fit import fit_columns
-from shared.vision.pca_rows import StoredColumns, block_width, usable
+from shared.vision.pca import PcaWhitening, Rows
+from shared.vision.pca_fit import fit_pca_columns
+from shared.vision.pca_rows import StoredColumns, block_width, usable_rows
 
-ROWS = "rows-"
+ROWS_FOLDER_PREFIX = "rows-"
 
 
-def fit_stream(
+def fit_pca_stream(
     batches: Iterable[Rows],
-    most: int,
+    max_rows: int,
     dimension: int,
     kept: int,
-    told: Callable[[str, int, int], None] = lambda what, done, most: None,
-) -> Whitening:
-    """The whitening to `kept` dimensions of at most `most` rows, in batches of (n, dimension).
+    on_progress: Callable[[str, int, int], None] = lambda what, done, max_rows: None,
+) -> PcaWhitening:
+    """The whitening to `kept` dimensions of at most `max_rows` rows, in batches of (n, dimension).
 
-    Rows that say nothing of their photo are passed over. `told` hears what is being done
+    Rows that say nothing of their photo are passed over. `on_progress` hears what is being done
     (`gathering`, `reducing`), how far it is and where it ends. Raises as `PcaFit` does.
     """
     with tempfile.TemporaryDirectory(prefix="placewise-pca-") as folder:
         store = FolderStore(Path(folder))
-        stored = StoredColumns(store, ROWS, dimension, block_width(most, dimension))
+        stored = StoredColumns(
+            store, ROWS_FOLDER_PREFIX, dimension, block_width(max_rows, dimension)
+        )
         seen = 0
         for batch in batches:
-            rows = batch[usable(batch)]
+            rows = batch[usable_rows(batch)]
             if len(rows):
                 stored.add(rows)
             seen += len(batch)
-            told("gathering", seen, most)
-        return fit_columns(stored, kept, lambda done, steps: told("reducing", done, steps))
+            on_progress("gathering", seen, max_rows)
+        return fit_pca_columns(
+            stored, kept, lambda done, steps: on_progress("reducing", done, steps)
+        )

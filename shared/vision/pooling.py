@@ -22,13 +22,13 @@ GEM_EPS = 1e-6
 
 
 @torch.inference_mode()
-def average(features: torch.Tensor) -> torch.Tensor:
+def average_pooling(features: torch.Tensor) -> torch.Tensor:
     """(B, patches, D) float32 -> (B, D) unit rows. Zero patches change the length alone."""
     return normalize(features.mean(dim=1), dim=-1)
 
 
 @torch.inference_mode()
-def gem(features: torch.Tensor) -> torch.Tensor:
+def gem_pooling(features: torch.Tensor) -> torch.Tensor:
     """(B, patches, D) float32 -> (B, D) unit rows."""
     there = (features != 0).any(dim=-1, keepdim=True)  # (B, patches, 1)
     powers = features.clamp(min=GEM_EPS) ** GEM_POWER * there

@@ -16,28 +16,28 @@ from typing import Literal, get_args
 
 import torch
 
-from shared.recipes import Recipe
+from shared.recipes import ExtractorConfig
 
 Precision = Literal["float32", "bfloat16"]
 PRECISIONS: tuple[Precision, ...] = get_args(Precision)
 
 
 def choose_precision(
-    asked: Literal["auto", "float32", "bfloat16"], recipe: Recipe, device: torch.device
+    requested: Literal["auto", "float32", "bfloat16"], recipe: ExtractorConfig, device: torch.device
 ) -> Precision:
-    """What a new generation is made in; `asked` is PRECISION.
+    """What a new generation is made in; `requested` is PRECISION.
 
     `auto` is bfloat16 for DINOv2 on CUDA, and float32 for all else: EfficientNet-Lite0, which takes
     no time anyway, sums in bfloat16 from block to block and loses too much by it
     (`benchmarks/RESULTS.md`), and of torch.hub entries nobody has tried it.
     """
-    if asked != "auto":
-        return asked
+    if requested != "auto":
+        return requested
     return "bfloat16" if device.type == "cuda" and recipe.depth is not None else "float32"
 
 
 @contextlib.contextmanager
-def computing_in(precision: Precision, device: torch.device) -> Iterator[None]:
+def autocast(precision: Precision, device: torch.device) -> Iterator[None]:
     """What the block computes on `device` is computed in `precision`."""
     # For the whole process, and each time: code from torch.hub may have said otherwise meanwhile.
     torch.backends.cudnn.allow_tf32 = False

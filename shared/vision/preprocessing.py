@@ -22,7 +22,7 @@ from shared.errors import Misconfigured, Unprocessable
 from shared.vision.resample import BICUBIC, BILINEAR, Pixels, resample
 
 PATCH = 14  # pixels; of DINOv2
-ROUND14_MOST_PIXELS = 4_194_304  # 2048 x 2048: 21,316 patches, which all attend to each other
+ROUND14_MAX_PIXELS = 4_194_304  # 2048 x 2048: 21,316 patches, which all attend to each other
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,9 +33,9 @@ class Preprocessing:
     """Whether the photo is turned as its EXIF says. The published ways don't look at EXIF."""
     most_pixels: int
     """height x width of what comes out, at most"""
-    usual_size: tuple[int, int]
+    typical_size: tuple[int, int]
     """Height and width of what comes out of most photos: those of 4 : 3 where they keep theirs."""
-    bring: Callable[[Image.Image], Pixels]
+    resize: Callable[[Image.Image], Pixels]
     """A function of a module: it travels to the decoding children."""
 
     def apply(self, image: Image.Image) -> Pixels:
@@ -47,7 +47,7 @@ class Preprocessing:
         Unprocessable: `photo_too_small` where not one patch is left of it, `too_many_pixels` where
         it keeps its size and that is too much for a network in which every patch sees every other.
         """
-        return self.bring(image)
+        return self.resize(image)
 
     def as_spec(self) -> dict[str, str | int]:
         return {"name": self.name, "version": self.version}
@@ -70,14 +70,14 @@ def _demo1024(image: Image.Image) -> Pixels:
     if longest > 1024:
         height, width = int(height * 1024 / longest), int(width * 1024 / longest)
     _check_patches(image, height, width, "demo1024")
-    return _middle(resample(np.asarray(image), height, width, BICUBIC, antialias=False))
+    return _centre_crop(resample(np.asarray(image), height, width, BICUBIC, antialias=False))
 
 
 def _paper480x640(image: Image.Image) -> Pixels:
     """As AnyLoc's scripts/dino_v2_vlad.py on its data sets: 480 x 640 whatever the aspect, bilinear
     and, as above, not antialiased; of these the middle 476 x 630, which are 34 x 45 patches.
     """
-    return _middle(resample(np.asarray(image), 480, 640, BILINEAR, antialias=False))
+    return _centre_crop(resample(np.asarray(image), 480, 640, BILINEAR, antialias=False))
 
 
 def _round14(image: Image.Image) -> Pixels:
@@ -86,11 +86,11 @@ def _round14(image: Image.Image) -> Pixels:
     """
     height, width = (round(side / PATCH) * PATCH for side in (image.height, image.width))
     _check_patches(image, height, width, "round14")
-    if height * width > ROUND14_MOST_PIXELS:
+    if height * width > ROUND14_MAX_PIXELS:
         raise Unprocessable(
             "too_many_pixels",
             f"The photo has {image.width} x {image.height} pixels, and round14 keeps its size; it "
-            f"takes up to {ROUND14_MOST_PIXELS} in all. Make it smaller, or use demo1024.",
+            f"takes up to {ROUND14_MAX_PIXELS} in all. Make it smaller, or use demo1024.",
         )
     return resample(np.asarray(image), height, width, BILINEAR, antialias=True)
 
@@ -104,7 +104,7 @@ def _check_patches(image: Image.Image, height: int, width: int, name: str) -> No
         )
 
 
-def _middle(pixels: Pixels) -> Pixels:
+def _centre_crop(pixels: Pixels) -> Pixels:
     """The middle of the pixels in whole patches; where it lies between two pixels, the even one."""
     height, width = (side // PATCH * PATCH for side in pixels.shape[:2])
     top, left = round((pixels.shape[0] - height) / 2), round((pixels.shape[1] - width) / 2)
@@ -123,7 +123,7 @@ PREPROCESSINGS = {
         ),
         Preprocessing("demo1024", 1, False, 1022 * 1022, (756, 1022), _demo1024),
         Preprocessing("paper480x640", 1, False, 476 * 630, (476, 630), _paper480x640),
-        Preprocessing("round14", 1, False, ROUND14_MOST_PIXELS, (770, 1022), _round14),
+        Preprocessing("round14", 1, False, ROUND14_MAX_PIXELS, (770, 1022), _round14),
     )
 }
 

@@ -10,20 +10,20 @@ from __future__ import annotations
 from typing import Any
 
 from shared.errors import Unprocessable
-from shared.recipes import Recipe
+from shared.recipes import ExtractorConfig
 from shared.vision.extractors import Extractor
-from shared.vision.fit import Fit
-from shared.vision.vocabulary import Centres
-from shared.vocabulary_npz import is_known
+from shared.vision.fit import VocabularyFit
+from shared.vision.vocabulary import ClusterCentres
+from shared.vocabulary_npz import has_provenance
 
 Provenance = dict[str, Any]
-"""JSON: what `of_features` says, and of a fit `of_fit`. Without the former the vocabulary is of
+"""JSON: what `feature_provenance` says, and of a fit `fit_provenance`. Without the former the vocabulary is of
 unknown origin, and `learnt_with` says `unknown`."""
 
-UNKNOWN: Provenance = {"learnt_with": "unknown"}
+UNKNOWN_PROVENANCE: Provenance = {"learnt_with": "unknown"}
 
 
-def of_features(extractor: Extractor) -> Provenance:
+def feature_provenance(extractor: Extractor) -> Provenance:
     """What makes the local features that centres are learnt from."""
     backbone = extractor.backbone
     return {
@@ -35,14 +35,20 @@ def of_features(extractor: Extractor) -> Provenance:
     }
 
 
-def of_fit(
-    extractor: Extractor, centres: Centres, fit: Fit, *, clusters_asked: int, photos: int, seed: int
+def fit_provenance(
+    extractor: Extractor,
+    centres: ClusterCentres,
+    fit: VocabularyFit,
+    *,
+    requested_clusters: int,
+    photos: int,
+    seed: int,
 ) -> Provenance:
     """How `centres` were learnt; `photos` were looked at."""
     return {
-        **of_features(extractor),
+        **feature_provenance(extractor),
         "clusters": centres.clusters,
-        "clusters_asked": clusters_asked,
+        "clusters_asked": requested_clusters,
         "photos": photos,
         "patches": fit.patches,
         "seed": seed,
@@ -52,7 +58,9 @@ def of_fit(
     }
 
 
-def check_fits(provenance: Provenance, centres: Centres, extractor: Extractor) -> None:
+def check_vocabulary_fits(
+    provenance: Provenance, centres: ClusterCentres, extractor: Extractor
+) -> None:
     """Unprocessable (`vocabulary_unfit`) naming both specs unless the vocabulary was learnt from
     what the extractor makes. One of unknown origin only has to be as wide.
     """
@@ -60,21 +68,23 @@ def check_fits(provenance: Provenance, centres: Centres, extractor: Extractor) -
         raise Unprocessable(
             "vocabulary_unfit", f"The extractor {extractor.recipe.name} uses no vocabulary."
         )
-    made = of_features(extractor)
-    if is_known(provenance):
+    made = feature_provenance(extractor)
+    if has_provenance(provenance):
         learnt = {key: provenance.get(key) for key in made}
         if learnt != made:
             raise Unprocessable(
                 "vocabulary_unfit",
-                f"The vocabulary was learnt from {_in_words(learnt)}; the extractor "
-                f"{extractor.recipe.name} makes {_in_words(made)}. Fit one with this extractor.",
+                f"The vocabulary was learnt from {_describe_features(learnt)}; the extractor "
+                f"{extractor.recipe.name} makes {_describe_features(made)}. Fit one with this extractor.",
                 learnt_with=learnt,
                 extractor_makes=made,
             )
-    check_width(centres, extractor.recipe, extractor.backbone.width)
+    check_vocabulary_width(centres, extractor.recipe, extractor.backbone.width)
 
 
-def check_width(centres: Centres, recipe: Recipe, width: int | None) -> None:
+def check_vocabulary_width(
+    centres: ClusterCentres, recipe: ExtractorConfig, width: int | None
+) -> None:
     """Unprocessable (`vocabulary_unfit`) unless the centres are as wide as the recipe's local
     features; None: only the loaded network tells."""
     if width is not None and centres.dimension != width:
@@ -85,7 +95,7 @@ def check_width(centres: Centres, recipe: Recipe, width: int | None) -> None:
         )
 
 
-def _in_words(features: Provenance) -> str:
+def _describe_features(features: Provenance) -> str:
     pixels = features["preprocessing"]
     if isinstance(pixels, dict):
         pixels = " ".join(f"{key} {value}" for key, value in pixels.items())

@@ -60,14 +60,14 @@ def resample(pixels: Pixels, height: int, width: int, kernel: Kernel, *, antiali
     order = (0, 1) if height * had_width <= had_height * width else (1, 0)
     for axis in order:
         if pixels.shape[axis] != sizes[axis]:
-            pixels = _along(pixels, axis, sizes[axis], kernel, antialias)
+            pixels = _resample_axis(pixels, axis, sizes[axis], kernel, antialias)
     return pixels
 
 
-def _along(
+def _resample_axis(
     pixels: Pixels, axis: int, onto: int, kernel: Kernel, antialias: bool
 ) -> NDArray[np.float32]:
-    taken, weights = _taps(pixels.shape[axis], onto, kernel, antialias)
+    taken, weights = _axis_weights(pixels.shape[axis], onto, kernel, antialias)
     shape = [1] * pixels.ndim
     shape[axis] = onto
     total = np.zeros((*pixels.shape[:axis], onto, *pixels.shape[axis + 1 :]), np.float32)
@@ -76,7 +76,7 @@ def _along(
     return total
 
 
-def _taps(
+def _axis_weights(
     size: int, onto: int, kernel: Kernel, antialias: bool
 ) -> tuple[NDArray[np.intp], Weights]:
     """(onto, taps) indices of the samples that each output sample is made of, and their weights."""

@@ -19,11 +19,11 @@ import numpy as np
 import torch
 from PIL import Image
 
-from shared.recipes import RECIPES
-from shared.vision.extractors import SHIPPED, Extractor, choose_device
+from shared.recipes import EXTRACTOR_CONFIGS
+from shared.vision.extractors import SHIPPED_VOCABULARIES, Extractor, choose_device
 from shared.vision.fit import TOLERANCE
-from shared.vision.kmeans import Pass, Seeding
-from shared.vision.vocabulary import check_centres, encode_centres
+from shared.vision.kmeans import KMeansPass, KMeansPlusPlus
+from shared.vision.vocabulary import encode_centres, parse_centres
 
 # Photographs only: no drawings, scans, microscope or depth pictures, none of them generated.
 PHOTOGRAPHS = {
@@ -45,17 +45,19 @@ PHOTOGRAPHS = {
     ),
 }
 PACKAGES = {"sklearn": "scikit-learn", "skimage": "scikit-image"}
-SCALES = (1.0, 0.6, 0.35)  # of the photograph's shorter side
-STEPS = 4  # views along each side, at every scale below the whole
+VIEW_SCALES = (1.0, 0.6, 0.35)  # of the photograph's shorter side
+VIEWS_PER_SIDE = 4  # views along each side, at every scale below the whole
 SEED = 0
-MOST_PASSES = 100
+MAX_KMEANS_PASSES = 100
 
 
 def main() -> None:
     """Fit the centres and write them beside their provenance."""
-    recipe = RECIPES["efficientnet-lite0-vlad"]
+    recipe = EXTRACTOR_CONFIGS["efficientnet-lite0-vlad"]
     extractor = Extractor(recipe, choose_device("cpu"))
-    views = [view for path in photographs() for view in cut(Image.open(path).convert("RGB"))]
+    views = [
+        view for path in list_photographs() for view in cut_views(Image.open(path).convert("RGB"))
+    ]
     points = torch.cat(
         [
             extractor.features(
@@ -65,7 +67,7 @@ def main() -> None:
         ]
     )
     centres, iterations = _find_centres(points, recipe.clusters)
-    checked = check_centres(centres.numpy(), width=extractor.backbone.width)
+    checked = parse_centres(centres.numpy(), width=extractor.backbone.width)
     provenance = {
         "backbone": extractor.backbone.name,
         "backbone_fingerprint": extractor.backbone.fingerprint,
@@ -87,10 +89,10 @@ def main() -> None:
             for package, (_, names) in PHOTOGRAPHS.items()
         },
         "photographs_sha256": {
-            path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in photographs()
+            path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in list_photographs()
         },
     }
-    target = SHIPPED / str(recipe.shipped_vocabulary)
+    target = SHIPPED_VOCABULARIES / str(recipe.shipped_vocabulary)
     target.write_bytes(encode_centres(checked))
     target.with_suffix(".json").write_text(json.dumps(provenance, indent=2) + "\n")
     print(f"{checked.clusters} centres from {len(points)} patches of {len(views)} views: {target}")
@@ -100,14 +102,14 @@ def _find_centres(points: torch.Tensor, clusters: int) -> tuple[torch.Tensor, in
     """(clusters, D) centres and the passes that they took: all points fit into memory, so that
     Lloyd's passes over all of them do without mini-batches.
     """
-    seeding = Seeding(points, SEED)
+    seeding = KMeansPlusPlus(points, SEED)
     while len(seeding.chosen) < clusters:
         seeding.next()
     centres = seeding.centres()
     passes, movement = 0, float("inf")
-    while passes < MOST_PASSES and movement > TOLERANCE:
-        one = Pass.begin(centres)
-        one.see(points, centres)
+    while passes < MAX_KMEANS_PASSES and movement > TOLERANCE:
+        one = KMeansPass.begin(centres)
+        one.accumulate(points, centres)
         moved = one.end(centres)
         movement = float(((moved - centres) ** 2).sum())
         centres = moved
@@ -115,7 +117,7 @@ def _find_centres(points: torch.Tensor, clusters: int) -> tuple[torch.Tensor, in
     return centres, passes
 
 
-def photographs() -> list[Path]:
+def list_photographs() -> list[Path]:
     """The photographs' files inside the installed packages."""
     found = []
     for package, (folder, names) in PHOTOGRAPHS.items():
@@ -127,14 +129,14 @@ def photographs() -> list[Path]:
     return found
 
 
-def cut(photograph: Image.Image) -> list[Image.Image]:
+def cut_views(photograph: Image.Image) -> list[Image.Image]:
     """Square views: the middle of the whole, and a grid of overlapping ones at smaller scales."""
     width, height = photograph.size
     views = []
-    for scale in SCALES:
+    for scale in VIEW_SCALES:
         side = int(min(width, height) * scale)
-        lefts = np.linspace(0, width - side, STEPS) if side < width else np.zeros(1)
-        tops = np.linspace(0, height - side, STEPS) if side < height else np.zeros(1)
+        lefts = np.linspace(0, width - side, VIEWS_PER_SIDE) if side < width else np.zeros(1)
+        tops = np.linspace(0, height - side, VIEWS_PER_SIDE) if side < height else np.zeros(1)
         views += [
             photograph.crop((int(left), int(top), int(left) + side, int(top) + side))
             for top in tops

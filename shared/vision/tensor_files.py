@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from safetensors import SafetensorError
 
-UNREADABLE = (
+TENSOR_READ_ERRORS = (
     OSError,
     EOFError,
     RuntimeError,
@@ -68,6 +68,6 @@ def _check_entries(path: Path) -> None:
         )
 
 
-def first_line(error: BaseException) -> str:
+def first_error_line(error: BaseException) -> str:
     """What an error says, in one line; its name where it says nothing."""
     return (str(error).strip() or type(error).__name__).splitlines()[0]

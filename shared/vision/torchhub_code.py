@@ -25,20 +25,20 @@ import httpx2
 import torch
 
 from shared.errors import Misconfigured, PlacewiseError
-from shared.torchhub_names import PREFIX, HubEntry
-from shared.vision.download import OnProgress, download
+from shared.torchhub_names import TORCHHUB_PREFIX, TorchHubEntry
+from shared.vision.download import OnProgress, download_file
 
 GITHUB = "https://github.com"
 HUBCONF = "hubconf.py"
 LICENCE_FILES = re.compile(r"(licen[cs]e|copying)([.-].*)?", re.IGNORECASE)
-AWAY = (URLError, httpx2.HTTPError, ConnectionError, TimeoutError)
+NETWORK_ERRORS = (URLError, httpx2.HTTPError, ConnectionError, TimeoutError)
 
 
-def no_progress(_done: int, _total: int | None) -> None:
+def ignore_progress(_done: int, _total: int | None) -> None:
     """For who does not want to see bytes come."""
 
 
-def code_folder(hub: HubEntry) -> Path:
+def cached_code_folder(hub: TorchHubEntry) -> Path:
     """Where the code lies, or would lie once it was brought."""
     if hub.folder is not None:
         return Path(hub.folder)
@@ -46,31 +46,33 @@ def code_folder(hub: HubEntry) -> Path:
     return Path(torch.hub.get_dir(), f"{hub.repository.replace('/', '_')}_{hub.commit}")
 
 
-def bring_code(hub: HubEntry, on_progress: OnProgress = no_progress) -> Path:
+def find_or_download_code(hub: TorchHubEntry, on_progress: OnProgress = ignore_progress) -> Path:
     """The folder of the code; a repository's is downloaded from GitHub if it is not there.
 
     Misconfigured: `weights_missing` with the three ways to get it, `download_corrupt`.
     """
-    folder = code_folder(hub)
+    folder = cached_code_folder(hub)
     if hub.folder is None and not folder.exists():
         try:
             _download_repository(hub, folder, on_progress)
-        except (*AWAY, OSError) as error:
-            raise missing(hub, f"its code can't be downloaded: {_first_line(error)}") from error
-    return code_at_hand(hub)
+        except (*NETWORK_ERRORS, OSError) as error:
+            raise code_missing_error(
+                hub, f"its code can't be downloaded: {_first_line(error)}"
+            ) from error
+    return find_local_code(hub)
 
 
-def code_at_hand(hub: HubEntry) -> Path:
-    """As `bring_code`, but what would have to be downloaded is missing."""
-    folder = code_folder(hub)
+def find_local_code(hub: TorchHubEntry) -> Path:
+    """As `find_or_download_code`, but what would have to be downloaded is missing."""
+    folder = cached_code_folder(hub)
     if not (folder / HUBCONF).is_file():
         where = f"there is no {folder / HUBCONF}" if hub.folder else "its code is not here"
-        raise missing(hub, where)
+        raise code_missing_error(hub, where)
     return folder
 
 
 def load_module(
-    hub: HubEntry, folder: Path, on_progress: OnProgress = no_progress
+    hub: TorchHubEntry, folder: Path, on_progress: OnProgress = ignore_progress
 ) -> torch.nn.Module:
     """Execute the entry of the folder's `hubconf.py` with its arguments.
 
@@ -78,7 +80,7 @@ def load_module(
     Misconfigured: `weights_missing`, `torchhub_unfit`, `download_corrupt`.
     """
     try:
-        with _guarded(folder, on_progress):
+        with _import_guard(folder, on_progress):
             # From GitHub, too, it is a folder by now: torch.hub's own question whether it is to be
             # trusted is not asked, and nothing is compared with the repository's branches.
             load: Any = torch.hub.load  # untyped
@@ -90,11 +92,13 @@ def load_module(
         if isinstance(error, EOFError) and "reading a line" in said:
             said += ". It asks a question (as torch.hub does about a further repository), and here "
             said += "nobody answers"
-        if any(isinstance(cause, AWAY) for cause in _chain(error)):
-            raise missing(hub, f"what it needs can't be downloaded: {said}") from error
-        raise unfit(hub, f"loading it ended with {said}") from error
+        if any(isinstance(cause, NETWORK_ERRORS) for cause in _exception_chain(error)):
+            raise code_missing_error(hub, f"what it needs can't be downloaded: {said}") from error
+        raise torchhub_unfit_error(hub, f"loading it ended with {said}") from error
     if not isinstance(module, torch.nn.Module):
-        raise unfit(hub, f"{hub.entry} returns a {type(module).__name__}, not a torch.nn.Module")
+        raise torchhub_unfit_error(
+            hub, f"{hub.entry} returns a {type(module).__name__}, not a torch.nn.Module"
+        )
     return module
 
 
@@ -112,7 +116,7 @@ def code_fingerprint(folder: Path) -> str:
     return digest.hexdigest()
 
 
-def licence(folder: Path) -> str:
+def find_licence(folder: Path) -> str:
     """What the folder's licence file calls itself, with the file's name; or `none found`."""
     for path in sorted(folder.iterdir()):
         if not LICENCE_FILES.fullmatch(path.name) or not path.is_file():
@@ -124,7 +128,7 @@ def licence(folder: Path) -> str:
     return "none found"
 
 
-def missing(hub: HubEntry, reason: str) -> Misconfigured:
+def code_missing_error(hub: TorchHubEntry, reason: str) -> Misconfigured:
     """The refusal of what is not there. Callers of the API read it: it names no folder of this
     machine that is not in the extractor's name.
     """
@@ -140,7 +144,7 @@ def missing(hub: HubEntry, reason: str) -> Misconfigured:
         ways = (
             f"(1) {fetch}; (2) copy {cache} with its checkpoints from a machine that has them; "
             "(3) clone the repository at its commit and name the folder: "
-            f"{PREFIX}/FOLDER:{hub.entry}."
+            f"{TORCHHUB_PREFIX}/FOLDER:{hub.entry}."
         )
     return Misconfigured(
         "weights_missing",
@@ -149,7 +153,7 @@ def missing(hub: HubEntry, reason: str) -> Misconfigured:
     )
 
 
-def unfit(hub: HubEntry, reason: str) -> Misconfigured:
+def torchhub_unfit_error(hub: TorchHubEntry, reason: str) -> Misconfigured:
     """The refusal of what can't be used."""
     return Misconfigured(
         "torchhub_unfit",
@@ -157,12 +161,12 @@ def unfit(hub: HubEntry, reason: str) -> Misconfigured:
         "the entry, or what its network wants to see, in the name "
         "(input.size=HEIGHTxWIDTH,input.mean=R/G/B,input.std=R/G/B); (2) another commit, with the "
         "packages that it needs installed; (3) a copy of the folder, changed by you: "
-        f"{PREFIX}/FOLDER:{hub.entry}.",
+        f"{TORCHHUB_PREFIX}/FOLDER:{hub.entry}.",
     )
 
 
 @contextlib.contextmanager
-def _guarded(folder: Path, on_progress: OnProgress) -> Iterator[None]:
+def _import_guard(folder: Path, on_progress: OnProgress) -> Iterator[None]:
     """While code of others is loaded: it asks nothing, prints nothing on stdout, leaves no bytecode
     in its folder and no module behind that the next repository would take for its own.
     """
@@ -176,12 +180,12 @@ def _guarded(folder: Path, on_progress: OnProgress) -> Iterator[None]:
             torchs_own(url, dst, hash_prefix, progress)
             return
         target = Path(dst).expanduser()
-        download(url, target, sha256=hash_prefix, on_progress=on_progress)
+        download_file(url, target, sha256=hash_prefix, on_progress=on_progress)
 
     with (
-        _replaced(sys, "stdin", io.StringIO()),
-        _replaced(sys, "dont_write_bytecode", True),
-        _replaced(torch.hub, "download_url_to_file", download_url_to_file),
+        _patched(sys, "stdin", io.StringIO()),
+        _patched(sys, "dont_write_bytecode", True),
+        _patched(torch.hub, "download_url_to_file", download_url_to_file),
         contextlib.redirect_stdout(sys.stderr),
     ):
         try:
@@ -191,7 +195,7 @@ def _guarded(folder: Path, on_progress: OnProgress) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _replaced(owner: Any, name: str, value: object) -> Iterator[None]:
+def _patched(owner: Any, name: str, value: object) -> Iterator[None]:
     before = getattr(owner, name)
     setattr(owner, name, value)
     try:
@@ -209,11 +213,11 @@ def _forget_modules(*folders: Path) -> None:
             del sys.modules[name]
 
 
-def _download_repository(hub: HubEntry, folder: Path, on_progress: OnProgress) -> None:
+def _download_repository(hub: TorchHubEntry, folder: Path, on_progress: OnProgress) -> None:
     folder.parent.mkdir(parents=True, exist_ok=True)
     packed = folder.with_name(f"{folder.name}.zip")
     url = f"{GITHUB}/{hub.repository}/zipball/{hub.commit}"
-    download(url, packed, on_progress=on_progress)
+    download_file(url, packed, on_progress=on_progress)
     with tempfile.TemporaryDirectory(dir=folder.parent) as unpacked:
         try:
             with zipfile.ZipFile(packed) as archive:
@@ -225,7 +229,7 @@ def _download_repository(hub: HubEntry, folder: Path, on_progress: OnProgress) -
             raise Misconfigured(
                 "download_corrupt",
                 f"{url} is not the archive of that commit: {error}. Nothing of it was kept. Try "
-                f"again, or clone the repository and name its folder: {PREFIX}/FOLDER:{hub.entry}.",
+                f"again, or clone the repository and name its folder: {TORCHHUB_PREFIX}/FOLDER:{hub.entry}.",
             ) from error
         finally:
             packed.unlink()
@@ -235,7 +239,7 @@ def _download_repository(hub: HubEntry, folder: Path, on_progress: OnProgress) -
             shutil.move(root, folder)
 
 
-def _chain(error: BaseException | None) -> Iterator[BaseException]:
+def _exception_chain(error: BaseException | None) -> Iterator[BaseException]:
     while error is not None:
         yield error
         error = error.__cause__ or error.__context__

@@ -23,7 +23,7 @@ import torch
 from torch.nn.functional import normalize, one_hot
 
 
-def assign(features: torch.Tensor, centres: torch.Tensor) -> torch.Tensor:
+def assign_clusters(features: torch.Tensor, centres: torch.Tensor) -> torch.Tensor:
     """(..., D) features and (K, D) centres -> (...) int64 labels of the most similar centre."""
     return _cosines(features, centres).argmax(dim=-1)
 
@@ -31,7 +31,7 @@ def assign(features: torch.Tensor, centres: torch.Tensor) -> torch.Tensor:
 @torch.inference_mode()
 def vlad(features: torch.Tensor, centres: torch.Tensor) -> torch.Tensor:
     """(B, patches, D) L2-normalised float32 features, (K, D) centres -> (B, K * D) unit rows."""
-    return _sum_residuals(features, centres, hard_weights(features, centres))
+    return _sum_residuals(features, centres, hard_assignment(features, centres))
 
 
 @torch.inference_mode()
@@ -39,22 +39,24 @@ def soft_vlad(features: torch.Tensor, centres: torch.Tensor, temperature: float)
     """As `vlad`, each patch in every cluster. The higher the temperature, the harder: a patch goes
     to its best centre alone as it grows, to all of them alike at 0.
     """
-    return _sum_residuals(features, centres, soft_weights(features, centres, temperature))
+    return _sum_residuals(features, centres, soft_assignment(features, centres, temperature))
 
 
-def hard_weights(features: torch.Tensor, centres: torch.Tensor) -> torch.Tensor:
+def hard_assignment(features: torch.Tensor, centres: torch.Tensor) -> torch.Tensor:
     """(..., D) features, (K, D) centres -> (..., K): 1 for a patch's own cluster, else 0."""
-    weights = one_hot(assign(features, centres), len(centres)).to(features.dtype)
-    return weights * _has_direction(features)
+    weights = one_hot(assign_clusters(features, centres), len(centres)).to(features.dtype)
+    return weights * _is_nonzero(features)
 
 
-def soft_weights(features: torch.Tensor, centres: torch.Tensor, temperature: float) -> torch.Tensor:
+def soft_assignment(
+    features: torch.Tensor, centres: torch.Tensor, temperature: float
+) -> torch.Tensor:
     """(..., D) features, (K, D) centres -> (..., K): a patch's weights in the clusters."""
     weights = (temperature * _cosines(features, centres)).softmax(dim=-1)
-    return weights * _has_direction(features)
+    return weights * _is_nonzero(features)
 
 
-def _has_direction(features: torch.Tensor) -> torch.Tensor:
+def _is_nonzero(features: torch.Tensor) -> torch.Tensor:
     """(..., D) -> (..., 1): false for patches whose feature is zero."""
     return (features != 0).any(dim=-1, keepdim=True)
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from shared.errors import Unprocessable
 
 # What reading raises for bytes that are no array, or whose header promises an impossible one.
-NO_ARRAY = (
+ARRAY_READ_ERRORS = (
     ValueError,
     TypeError,
     LookupError,
@@ -32,7 +32,7 @@ NO_ARRAY = (
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Centres:
+class ClusterCentres:
     """(clusters, dimension) float32 cluster centres and the sha256 of their bytes."""
 
     array: NDArray[np.float32]
@@ -47,7 +47,7 @@ class Centres:
         return int(self.array.shape[1])
 
 
-def check_centres(array: NDArray[np.float32], *, width: int | None = None) -> Centres:
+def parse_centres(array: NDArray[np.float32], *, width: int | None = None) -> ClusterCentres:
     """The array as centres; Unprocessable (`vocabulary_unfit`) says what is wrong with it.
 
     `width` is the length of the local features that they are meant for.
@@ -74,24 +74,24 @@ def check_centres(array: NDArray[np.float32], *, width: int | None = None) -> Ce
     distinct = len(np.unique(array, axis=0))
     if distinct != len(array):
         raise refuse(f"only {distinct} of its {len(array)} centres are distinct")
-    return Centres(array, hashlib.sha256(array.tobytes()).hexdigest())
+    return ClusterCentres(array, hashlib.sha256(array.tobytes()).hexdigest())
 
 
-def encode_centres(centres: Centres) -> bytes:
+def encode_centres(centres: ClusterCentres) -> bytes:
     """The centres as the bytes of a `.npy` file."""
     return encode_array(centres.array)
 
 
-def decode_centres(data: bytes, *, width: int | None = None) -> Centres:
+def decode_centres(data: bytes, *, width: int | None = None) -> ClusterCentres:
     """The centres in the bytes of a `.npy` file, checked."""
     try:
         array = decode_array(data)
-    except NO_ARRAY as error:
+    except ARRAY_READ_ERRORS as error:
         raise Unprocessable(
             "vocabulary_unfit",
             "This is not a NumPy .npy file of cluster centres, or not a whole one.",
         ) from error
-    return check_centres(array, width=width)
+    return parse_centres(array, width=width)
 
 
 def encode_array(array: NDArray[Any]) -> bytes:
@@ -106,12 +106,12 @@ def decode_array(data: bytes) -> NDArray[Any]:
 
     Nothing is unpickled, and no more is allocated than there are bytes.
     """
-    _check_promise(data)
+    _check_array_size(data)
     array: NDArray[Any] = np.lib.format.read_array(io.BytesIO(data), allow_pickle=False)
     return array
 
 
-def _check_promise(data: bytes) -> None:
+def _check_array_size(data: bytes) -> None:
     """ValueError when a `.npy` header promises other bytes than follow: none are allocated."""
     buffer = io.BytesIO(data)
     major, _ = np.lib.format.read_magic(buffer)

@@ -17,35 +17,35 @@ from pathlib import Path
 from typing import Any
 
 from shared.errors import Unprocessable
-from shared.vision.provenance import UNKNOWN, Provenance
+from shared.vision.provenance import UNKNOWN_PROVENANCE, Provenance
 from shared.vision.vocabulary import (
-    NO_ARRAY,
-    Centres,
-    check_centres,
+    ARRAY_READ_ERRORS,
+    ClusterCentres,
     decode_array,
     decode_centres,
     encode_centres,
+    parse_centres,
 )
-from shared.vocabulary_npz import CENTRES, PROVENANCE, encode_npz, is_known
+from shared.vocabulary_npz import CENTRES, PROVENANCE, encode_vocabulary_npz, has_provenance
 
-MEMBERS = {f"{CENTRES}.npy", f"{PROVENANCE}.npy"}
-MOST_PROVENANCE_BYTES = 100_000
+ARCHIVE_MEMBERS = {f"{CENTRES}.npy", f"{PROVENANCE}.npy"}
+MAX_PROVENANCE_BYTES = 100_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VocabularyFile:
-    centres: Centres
+    centres: ClusterCentres
     provenance: Provenance
 
     @property
     def suffix(self) -> str:
         """`.npz`; `.npy` where the provenance is unknown."""
-        return ".npz" if is_known(self.provenance) else ".npy"
+        return ".npz" if has_provenance(self.provenance) else ".npy"
 
     def encode(self) -> bytes:
         """The bytes of a file of that kind."""
         centres = encode_centres(self.centres)
-        return centres if self.suffix == ".npy" else encode_npz(centres, self.provenance)
+        return centres if self.suffix == ".npy" else encode_vocabulary_npz(centres, self.provenance)
 
 
 def decode_vocabulary(data: bytes) -> VocabularyFile:
@@ -54,20 +54,22 @@ def decode_vocabulary(data: bytes) -> VocabularyFile:
     Raises Unprocessable (`vocabulary_unfit`).
     """
     if not data.startswith(b"PK"):
-        return VocabularyFile(decode_centres(data), UNKNOWN)
+        return VocabularyFile(decode_centres(data), UNKNOWN_PROVENANCE)
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             infos = archive.infolist()
             # Before one is read: many may lie over the same bytes.
-            if sorted(info.filename for info in infos) != sorted(MEMBERS):
-                raise _refuse(f"it holds {_some([info.filename for info in infos]) or 'nothing'}")
+            if sorted(info.filename for info in infos) != sorted(ARCHIVE_MEMBERS):
+                raise _vocabulary_unfit_error(
+                    f"it holds {_some([info.filename for info in infos]) or 'nothing'}"
+                )
             members = {info.filename: _read(archive, info) for info in infos}
-    except (*NO_ARRAY, NotImplementedError, RuntimeError) as error:
-        raise _refuse(f"it can't be read ({error})") from error
+    except (*ARRAY_READ_ERRORS, NotImplementedError, RuntimeError) as error:
+        raise _vocabulary_unfit_error(f"it can't be read ({error})") from error
     centres = decode_centres(members[f"{CENTRES}.npy"])
     provenance = _decode_provenance(members[f"{PROVENANCE}.npy"])
     if provenance.get("sha256") != centres.sha256:
-        raise _refuse("its provenance belongs to other centres (the hash differs)")
+        raise _vocabulary_unfit_error("its provenance belongs to other centres (the hash differs)")
     return VocabularyFile(centres, provenance)
 
 
@@ -75,7 +77,7 @@ def read_vocabulary(path: Path) -> VocabularyFile:
     """The vocabulary in a `.npz`, `.npy` or `.pt` file, checked; Unprocessable as above."""
     if path.suffix != ".pt":
         return decode_vocabulary(path.read_bytes())
-    return VocabularyFile(_read_tensor(path), UNKNOWN)
+    return VocabularyFile(_read_tensor(path), UNKNOWN_PROVENANCE)
 
 
 def _read(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> bytes:
@@ -85,16 +87,16 @@ def _read(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> bytes:
 
 
 def _decode_provenance(data: bytes) -> Provenance:
-    if len(data) > MOST_PROVENANCE_BYTES:
-        raise _refuse("its provenance is too long")
+    if len(data) > MAX_PROVENANCE_BYTES:
+        raise _vocabulary_unfit_error("its provenance is too long")
     try:
         array = decode_array(data)
         text = array.item() if array.dtype.kind == "U" and array.size == 1 else ""
         found: Any = json.loads(text)
-    except (*NO_ARRAY, RecursionError) as error:
-        raise _refuse(f"its provenance can't be read ({error})") from error
-    if not isinstance(found, dict) or not is_known(found):
-        raise _refuse("its provenance does not say what it was learnt with")
+    except (*ARRAY_READ_ERRORS, RecursionError) as error:
+        raise _vocabulary_unfit_error(f"its provenance can't be read ({error})") from error
+    if not isinstance(found, dict) or not has_provenance(found):
+        raise _vocabulary_unfit_error("its provenance does not say what it was learnt with")
     return found
 
 
@@ -103,7 +105,7 @@ def _some(names: list[str]) -> str:
     return ", ".join(sorted(names)[:3]) + more
 
 
-def _refuse(reason: str) -> Unprocessable:
+def _vocabulary_unfit_error(reason: str) -> Unprocessable:
     return Unprocessable(
         "vocabulary_unfit",
         f"This .npz is not a vocabulary as `placewise vocabulary fit DIR --out` writes it: "
@@ -111,16 +113,16 @@ def _refuse(reason: str) -> Unprocessable:
     )
 
 
-def _read_tensor(path: Path) -> Centres:
+def _read_tensor(path: Path) -> ClusterCentres:
     import torch
 
-    from shared.vision.tensor_files import UNREADABLE, check_promise, load_tensors
+    from shared.vision.tensor_files import TENSOR_READ_ERRORS, check_promise, load_tensors
 
     try:
         tensor = load_tensors(path)
         if isinstance(tensor, torch.Tensor):
             check_promise([tensor], path)
-    except UNREADABLE as error:
+    except TENSOR_READ_ERRORS as error:
         raise Unprocessable(
             "vocabulary_unfit", f"{path.name} is not a file of tensors: {error}"
         ) from error
@@ -132,4 +134,4 @@ def _read_tensor(path: Path) -> Centres:
     tensor = tensor.detach().to_dense().clone()  # else mapped from the file, which may change
     if tensor.is_floating_point():
         tensor = tensor.to(torch.float32)  # NumPy has no bfloat16
-    return check_centres(tensor.numpy())
+    return parse_centres(tensor.numpy())

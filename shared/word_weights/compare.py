@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from fractions import Fraction
 
-CHANCE = 0.05
+SIGNIFICANCE_LEVEL = 0.05
 
 
-def rises_by_chance(better: int, worse: int) -> float:
+def sign_test_p_value(better: int, worse: int) -> float:
     """How probable so many improvements or more are where weights change nothing for the better.
 
     `better` queries were right with weights alone, `worse` without them alone. Of those that differ
@@ -19,6 +19,6 @@ def rises_by_chance(better: int, worse: int) -> float:
     return float(Fraction(as_good, 2**differ))
 
 
-def is_a_rise(better: int, worse: int) -> bool:
+def is_significant_improvement(better: int, worse: int) -> bool:
     """More right than without weights, and by more than chance brings in one of twenty cases."""
-    return better > worse and rises_by_chance(better, worse) < CHANCE
+    return better > worse and sign_test_p_value(better, worse) < SIGNIFICANCE_LEVEL

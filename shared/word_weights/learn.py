@@ -15,13 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 # Deviations below are rounding: products of words that occur in no far pair are all 0.
-LEAST_DEVIATION = 1e-9
+MIN_DEVIATION = 1e-9
 
 Rows = NDArray[np.float32]
-Numbers = NDArray[np.float64]
+Float64Array = NDArray[np.float64]
 
 
-def word_products(rows: Rows, pairs: NDArray[np.int64], words: int) -> Numbers:
+def word_products(rows: Rows, pairs: NDArray[np.int64], words: int) -> Float64Array:
     """(n, words) products <a_k, b_k> of the (n, 2) pairs of (m, words * width) rows.
 
     Those of a pair add up to its cosine. Takes no more memory than two rows beside the result.
@@ -36,72 +36,74 @@ def word_products(rows: Rows, pairs: NDArray[np.int64], words: int) -> Numbers:
 
 
 @dataclass(frozen=True, slots=True)
-class Moments:
+class ProductMoments:
     """Sums over the products of so many pairs, word by word; those of two sets of pairs add up."""
 
     pairs: int
-    total: Numbers
+    total: Float64Array
     """(words,)"""
-    squares: Numbers
+    squares: Float64Array
     """(words,) sums of squares."""
 
     @classmethod
-    def of(cls, products: Numbers) -> Moments:
+    def from_products(cls, products: Float64Array) -> ProductMoments:
         """(n, words) products."""
         return cls(len(products), products.sum(axis=0), (products**2).sum(axis=0))
 
-    def __add__(self, other: Moments) -> Moments:
-        return Moments(
+    def __add__(self, other: ProductMoments) -> ProductMoments:
+        return ProductMoments(
             self.pairs + other.pairs, self.total + other.total, self.squares + other.squares
         )
 
     @property
-    def mean(self) -> Numbers:
-        found: Numbers = self.total / self.pairs
+    def mean(self) -> Float64Array:
+        found: Float64Array = self.total / self.pairs
         return found
 
     @property
-    def deviation(self) -> Numbers:
+    def deviation(self) -> Float64Array:
         """Standard deviation over the pairs."""
-        found: Numbers = np.sqrt(np.maximum(0.0, self.squares / self.pairs - self.mean**2))
+        found: Float64Array = np.sqrt(np.maximum(0.0, self.squares / self.pairs - self.mean**2))
         return found
 
 
 @dataclass(frozen=True, slots=True)
-class Taught:
+class PairStatistics:
     """What pairs of one place (`near`) and of two places (`far`) come to."""
 
-    near: Moments
-    far: Moments
+    near: ProductMoments
+    far: ProductMoments
 
     @classmethod
-    def of(cls, rows: Rows, near: NDArray[np.int64], far: NDArray[np.int64], words: int) -> Taught:
+    def from_rows(
+        cls, rows: Rows, near: NDArray[np.int64], far: NDArray[np.int64], words: int
+    ) -> PairStatistics:
         """Pairs of both kinds, (n, 2) and (m, 2), of (r, words * width) rows."""
         return cls(
-            Moments.of(word_products(rows, near, words)),
-            Moments.of(word_products(rows, far, words)),
+            ProductMoments.from_products(word_products(rows, near, words)),
+            ProductMoments.from_products(word_products(rows, far, words)),
         )
 
-    def __add__(self, other: Taught) -> Taught:
-        return Taught(self.near + other.near, self.far + other.far)
+    def __add__(self, other: PairStatistics) -> PairStatistics:
+        return PairStatistics(self.near + other.near, self.far + other.far)
 
-    def weights(self) -> Numbers:
+    def weights(self) -> Float64Array:
         """(words,) weights from 0 up. ValueError without pairs of both kinds."""
         if not (self.near.pairs and self.far.pairs):
             raise ValueError(f"{self.near.pairs} near and {self.far.pairs} far pairs teach nothing")
         noise = self.far.deviation
-        told = noise > LEAST_DEVIATION
+        told = noise > MIN_DEVIATION
         gap = self.near.mean - self.far.mean
         return np.where(told, np.maximum(0.0, gap / np.where(told, noise, 1.0)), 0.0)
 
 
-def nothing_taught(words: int) -> Taught:
+def empty_pair_statistics(words: int) -> PairStatistics:
     """What no pairs come to: the sum's beginning."""
-    none = Moments(0, np.zeros(words), np.zeros(words))
-    return Taught(none, none)
+    none = ProductMoments(0, np.zeros(words), np.zeros(words))
+    return PairStatistics(none, none)
 
 
-def weigh(query: NDArray[np.float32], weights: Sequence[float]) -> Numbers | None:
+def apply_word_weights(query: NDArray[np.float32], weights: Sequence[float]) -> Float64Array | None:
     """(words * width,) query with its words multiplied, and normalised again; None where no word
     of the query has any weight. ValueError when the query's length is no multiple of the words."""
     if len(query) % len(weights):

@@ -18,26 +18,28 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.estimate.places import Spot, metres_between
-from shared.geodesy import EARTH_RADIUS_M, distances_m, latitude_band
+from shared.estimate.places import PhotoLocation, distance_between_m
+from shared.geodesy import EARTH_RADIUS_M, distances_m, latitude_bounds
 
 NEAREST_M, NEAR_M, FAR_M = 5.0, 25.0, 50.0
 CELL_M = 100.0  # side of what is dealt to one half or the other
-MOST_PAIRS = 1000  # of a kind in a half: a mean is then known to 3 % of the deviation
-LEAST_PAIRS = 50  # of a kind in a half: with fewer a weight is a guess
-PARTNERS = 4  # of one photo at most: a place with hundreds of photos is not the whole lesson
-TRIES = 20  # draws for each far pair that is wanted
+MAX_PAIRS = 1000  # of a kind in a half: a mean is then known to 3 % of the deviation
+MIN_PAIRS = 50  # of a kind in a half: with fewer a weight is a guess
+PARTNERS_PER_PHOTO = (
+    4  # of one photo at most: a place with hundreds of photos is not the whole lesson
+)
+MAX_TRIES = 20  # draws for each far pair that is wanted
 
 Indices = NDArray[np.int64]
 
 
-class TaughtBy(StrEnum):
+class PairSource(StrEnum):
     COORDINATES = "coordinates"
     PLACES = "places"  # labels
 
 
 @dataclass(frozen=True, slots=True)
-class Lesson:
+class PairBatch:
     """Photos that are looked at together, and the pairs among them."""
 
     photos: list[int]
@@ -49,62 +51,64 @@ class Lesson:
 
 
 @dataclass(frozen=True, slots=True)
-class Curriculum:
+class PairSplit:
     """The lessons of both halves, and to which half (0 or 1) each of the map's photos belongs."""
 
-    by: TaughtBy
+    by: PairSource
     halves: list[int]
-    lessons: tuple[list[Lesson], list[Lesson]]
+    batches: tuple[list[PairBatch], list[PairBatch]]
 
     def counts(self) -> list[tuple[int, int]]:
         """Near and far pairs of each half."""
         return [
             (sum(len(one.near) for one in half), sum(len(one.far) for one in half))
-            for half in self.lessons
+            for half in self.batches
         ]
 
     @property
     def is_enough(self) -> bool:
-        return min(min(counts) for counts in self.counts()) >= LEAST_PAIRS
+        return min(min(counts) for counts in self.counts()) >= MIN_PAIRS
 
 
-def choose_pairs(spots: Sequence[Spot], seed: int, rows_at_once: int) -> Curriculum:
-    """Up to MOST_PAIRS of each kind in each half, in lessons of up to `rows_at_once` photos.
+def sample_pairs(locations: Sequence[PhotoLocation], seed: int, rows_at_once: int) -> PairSplit:
+    """Up to MOST_PAIRS of each kind in each half, in lessons of up to `photos_per_lesson` photos.
 
     By coordinates where those give enough, else by labels; of two that are not enough the one with
     more near pairs. The same spots in the same order and the same seed give the same pairs.
     """
     found = []
-    for by in TaughtBy:
-        curriculum = _choose(spots, by, np.random.default_rng(seed), rows_at_once)
+    for by in PairSource:
+        curriculum = _sample_from(locations, by, np.random.default_rng(seed), rows_at_once)
         if curriculum.is_enough:
             return curriculum
         found.append(curriculum)
     return max(found, key=lambda one: sum(near for near, _ in one.counts()))
 
 
-def _choose(
-    spots: Sequence[Spot], by: TaughtBy, rng: np.random.Generator, rows_at_once: int
-) -> Curriculum:
-    halves = _deal([_cell(spot, by) for spot in spots], rng)
-    knows: Callable[[Spot], bool] = (
+def _sample_from(
+    spots: Sequence[PhotoLocation], by: PairSource, rng: np.random.Generator, rows_at_once: int
+) -> PairSplit:
+    halves = _assign_halves([_cell(spot, by) for spot in spots], rng)
+    knows: Callable[[PhotoLocation], bool] = (
         (lambda spot: spot.latitude is not None)
-        if by == TaughtBy.COORDINATES
+        if by == PairSource.COORDINATES
         else (lambda spot: spot.place is not None)
     )
-    lessons: list[list[Lesson]] = []
+    lessons: list[list[PairBatch]] = []
     for half in (0, 1):
         here = [i for i, spot in enumerate(spots) if halves[i] == half and knows(spot)]
-        near = (_near_in_metres if by == TaughtBy.COORDINATES else _near_by_label)(spots, here, rng)
-        lessons.append(_as_lessons(spots, near, by, rng, rows_at_once))
-    return Curriculum(by, halves, (lessons[0], lessons[1]))
+        near = (_near_in_metres if by == PairSource.COORDINATES else _near_by_label)(
+            spots, here, rng
+        )
+        lessons.append(_make_batches(spots, near, by, rng, rows_at_once))
+    return PairSplit(by, halves, (lessons[0], lessons[1]))
 
 
-def _cell(spot: Spot, by: TaughtBy) -> Hashable:
+def _cell(spot: PhotoLocation, by: PairSource) -> Hashable:
     """What goes into one half as a whole."""
     if spot.latitude is None or spot.longitude is None:
         return spot.place
-    if by == TaughtBy.PLACES and spot.place is not None:
+    if by == PairSource.PLACES and spot.place is not None:
         return spot.place
     cell_degrees = math.degrees(CELL_M / EARTH_RADIUS_M)
     row = math.floor(spot.latitude / cell_degrees)
@@ -112,7 +116,7 @@ def _cell(spot: Spot, by: TaughtBy) -> Hashable:
     return row, math.floor(spot.longitude * shrunk / cell_degrees)
 
 
-def _deal(cells: Sequence[Hashable], rng: np.random.Generator) -> list[int]:
+def _assign_halves(cells: Sequence[Hashable], rng: np.random.Generator) -> list[int]:
     """Each cell's half: cells come in random order, each to the half with fewer photos so far."""
     sizes: dict[Hashable, int] = {}
     for cell in cells:
@@ -128,7 +132,7 @@ def _deal(cells: Sequence[Hashable], rng: np.random.Generator) -> list[int]:
 
 
 def _near_in_metres(
-    spots: Sequence[Spot], here: Sequence[int], rng: np.random.Generator
+    spots: Sequence[PhotoLocation], here: Sequence[int], rng: np.random.Generator
 ) -> list[tuple[int, int]]:
     at = np.array(
         [(spots[i].latitude, spots[i].longitude) for i in here], dtype=np.float64
@@ -138,7 +142,7 @@ def _near_in_metres(
 
     def partners(anchor: int) -> Indices:
         latitude, longitude = at[anchor].tolist()
-        first, last = np.searchsorted(at[:, 0], latitude_band(latitude, NEAR_M))
+        first, last = np.searchsorted(at[:, 0], latitude_bounds(latitude, NEAR_M))
         away = distances_m(latitude, longitude, at[first:last, 0], at[first:last, 1])
         found: Indices = first + np.flatnonzero((away >= NEAREST_M) & (away <= NEAR_M))
         return found
@@ -150,7 +154,7 @@ def _near_in_metres(
 
 
 def _near_by_label(
-    spots: Sequence[Spot], here: Sequence[int], rng: np.random.Generator
+    spots: Sequence[PhotoLocation], here: Sequence[int], rng: np.random.Generator
 ) -> list[tuple[int, int]]:
     by_label: dict[str | None, list[int]] = {}
     for number, i in enumerate(here):
@@ -172,32 +176,32 @@ def _pairs_of(
     found: dict[tuple[int, int], None] = {}
     for anchor in rng.permutation(count).tolist():
         known = partners(anchor)
-        chosen = rng.choice(known, size=min(PARTNERS, len(known)), replace=False)
+        chosen = rng.choice(known, size=min(PARTNERS_PER_PHOTO, len(known)), replace=False)
         for other in chosen.tolist():
             found[min(anchor, other), max(anchor, other)] = None
-        if len(found) >= MOST_PAIRS:
+        if len(found) >= MAX_PAIRS:
             break
-    return list(found)[:MOST_PAIRS]
+    return list(found)[:MAX_PAIRS]
 
 
-def _as_lessons(
-    spots: Sequence[Spot],
+def _make_batches(
+    spots: Sequence[PhotoLocation],
     near: Sequence[tuple[int, int]],
-    by: TaughtBy,
+    by: PairSource,
     rng: np.random.Generator,
     rows_at_once: int,
-) -> list[Lesson]:
+) -> list[PairBatch]:
     """The near pairs in random order, cut where a lesson is full, with as many far pairs of the
     same photos: no photo is looked at for those alone."""
-    lessons: list[Lesson] = []
+    lessons: list[PairBatch] = []
     place_of: dict[int, int] = {}
     pairs: list[tuple[int, int]] = []
 
     def close() -> None:
         if pairs:
             photos = list(place_of)
-            far = _far_among([spots[i] for i in photos], len(pairs), by, rng)
-            lessons.append(Lesson(photos, np.array(pairs, dtype=np.int64), far))
+            far = _sample_far_pairs([spots[i] for i in photos], len(pairs), by, rng)
+            lessons.append(PairBatch(photos, np.array(pairs, dtype=np.int64), far))
 
     for number in rng.permutation(len(near)).tolist():
         new = [i for i in near[number] if i not in place_of]
@@ -210,12 +214,12 @@ def _as_lessons(
     return lessons
 
 
-def _far_among(
-    spots: Sequence[Spot], wanted: int, by: TaughtBy, rng: np.random.Generator
+def _sample_far_pairs(
+    spots: Sequence[PhotoLocation], wanted: int, by: PairSource, rng: np.random.Generator
 ) -> Indices:
     """Up to `wanted` different random pairs of two places, as (m, 2) indices."""
     found: dict[tuple[int, int], None] = {}
-    for one, other in rng.integers(len(spots), size=(TRIES * wanted, 2)).tolist():
+    for one, other in rng.integers(len(spots), size=(MAX_TRIES * wanted, 2)).tolist():
         if one != other and _are_far(spots[one], spots[other], by):
             found[min(one, other), max(one, other)] = None
         if len(found) == wanted:
@@ -223,8 +227,8 @@ def _far_among(
     return np.array(list(found), dtype=np.int64).reshape(-1, 2)
 
 
-def _are_far(one: Spot, other: Spot, by: TaughtBy) -> bool:
-    if by == TaughtBy.PLACES:
+def _are_far(one: PhotoLocation, other: PhotoLocation, by: PairSource) -> bool:
+    if by == PairSource.PLACES:
         return one.place != other.place
-    away = metres_between(one, other)
+    away = distance_between_m(one, other)
     return away is not None and away > FAR_M

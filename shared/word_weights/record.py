@@ -8,7 +8,7 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict
 
 from shared.estimate.calibration import Calibration
-from shared.word_weights.pairs import TaughtBy
+from shared.word_weights.pairs import PairSource
 
 
 class Outcome(StrEnum):
@@ -42,7 +42,7 @@ class WordWeights(BaseModel):
     outcome: Outcome
     reason: str
     """Why, in a sentence with the numbers."""
-    taught_by: TaughtBy
+    taught_by: PairSource
     near_pairs: int
     far_pairs: int
     seed: int
@@ -60,6 +60,6 @@ class WordWeights(BaseModel):
         return self.weights if self.outcome == Outcome.KEPT else ()
 
 
-def stored_word_weights(record: dict[str, Any] | None) -> WordWeights | None:
+def parse_word_weights(record: dict[str, Any] | None) -> WordWeights | None:
     """What the column `Generation.word_weights` holds."""
     return None if record is None else WordWeights.model_validate(record)

@@ -9,7 +9,7 @@ from typing import Any
 
 from shared.datasets.city.plan import CityOptions, make_plan
 from shared.datasets.city.write import write_city
-from shared.datasets.utm_names import fields_of_name
+from shared.datasets.utm_names import upload_fields_of_file_name
 from tests.support.server import ServerProcess
 
 PLACES = 24
@@ -47,7 +47,7 @@ def build_town(server: ServerProcess, folder: Path, map_name: str) -> list[Path]
 def _bring_in(server: ServerProcess, map_name: str, photos: list[Path], role: str) -> None:
     lines, files = [], []
     for number, photo in enumerate(photos):
-        fields = fields_of_name(photo.name, None)
+        fields = upload_fields_of_file_name(photo.name, None)
         season = SEASON.search(photo.name)
         assert season, photo.name
         name = f"{season[1]}-street-{number:03}.jpg"

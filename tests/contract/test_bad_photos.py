@@ -18,10 +18,10 @@ from PIL import Image
 
 from services.extractor.decoding import DecoderPool
 from shared.errors import PlacewiseError
-from shared.recipes import get_recipe
+from shared.recipes import get_extractor_config
 from shared.settings import Settings
 from shared.vision.extractors import Extractor
-from shared.vision.vocabulary import Centres
+from shared.vision.vocabulary import ClusterCentres
 from tests.support.photos import encoded, photo_bytes, turned_photo
 
 Row = NDArray[np.float32]
@@ -39,7 +39,7 @@ def extractors() -> dict[str, Extractor]:
     """By preprocessing: EfficientNet-Lite0 with its own weights, one copy for all."""
     made: dict[str, Extractor] = {}
     for name in ("square224", "demo1024", "paper480x640", "round14"):
-        recipe = get_recipe(
+        recipe = get_extractor_config(
             f"efficientnet-lite0-vlad:preprocessing={name}", allow_test_extractors=False
         )
         loaded = made["square224"].backbone if made else None
@@ -48,7 +48,7 @@ def extractors() -> dict[str, Extractor]:
 
 
 @pytest.fixture(scope="module")
-def centres(extractors: dict[str, Extractor]) -> Centres:
+def centres(extractors: dict[str, Extractor]) -> ClusterCentres:
     shipped = extractors["square224"].shipped_vocabulary()
     assert shipped is not None
     return shipped[0]
@@ -57,7 +57,7 @@ def centres(extractors: dict[str, Extractor]) -> Centres:
 class Describing:
     """What becomes of a photo's bytes."""
 
-    def __init__(self, pool: DecoderPool, extractor: Extractor, centres: Centres) -> None:
+    def __init__(self, pool: DecoderPool, extractor: Extractor, centres: ClusterCentres) -> None:
         self._pool, self._extractor, self._centres = pool, extractor, centres
 
     def row(self, data: bytes) -> Row:
@@ -79,7 +79,9 @@ class Describing:
 
 
 @pytest.fixture
-def service(pool: DecoderPool, extractors: dict[str, Extractor], centres: Centres) -> Describing:
+def service(
+    pool: DecoderPool, extractors: dict[str, Extractor], centres: ClusterCentres
+) -> Describing:
     return Describing(pool, extractors["square224"], centres)
 
 
@@ -170,7 +172,10 @@ def test_photo_of_one_pixel_has_the_descriptor_of_its_colour(service: Describing
 
 
 def test_very_long_photo_has_the_descriptor_of_what_it_shows_squeezed(
-    service: Describing, pool: DecoderPool, extractors: dict[str, Extractor], centres: Centres
+    service: Describing,
+    pool: DecoderPool,
+    extractors: dict[str, Extractor],
+    centres: ClusterCentres,
 ) -> None:
     strip = photograph().resize((20_000, 10))
     squeezed = strip.resize((224, 224), Image.Resampling.BILINEAR)
@@ -189,7 +194,7 @@ def test_very_long_photo_has_the_descriptor_of_what_it_shows_squeezed(
 def test_photo_of_less_than_a_patch_is_refused_where_sizes_are_kept(
     pool: DecoderPool,
     extractors: dict[str, Extractor],
-    centres: Centres,
+    centres: ClusterCentres,
     name: str,
     size: tuple[int, int],
 ) -> None:
@@ -219,7 +224,7 @@ def test_text_is_refused_whatever_its_file_is_called(service: Describing) -> Non
 
 @pytest.mark.parametrize("name", ["square224", "demo1024", "round14"])
 def test_neither_the_batch_nor_its_other_sizes_change_a_descriptor(
-    pool: DecoderPool, extractors: dict[str, Extractor], centres: Centres, name: str
+    pool: DecoderPool, extractors: dict[str, Extractor], centres: ClusterCentres, name: str
 ) -> None:
     """By a cosine of 1e-4 at most: sums in another order may send a patch that lies between two
     centres to the other one.

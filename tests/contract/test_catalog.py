@@ -17,23 +17,29 @@ from sqlalchemy import select, text
 from sqlalchemy.exc import DBAPIError, IntegrityError, StatementError
 
 from shared.catalog.base import db_now, db_now_plus
-from shared.catalog.chunks import take_slot
+from shared.catalog.chunks import allocate_slot
 from shared.catalog.generations import (
     Generation,
     GenerationState,
     active_generation,
     building_generation,
 )
-from shared.catalog.maps import DEFAULT_MAP, Map, bump_version, ensure_default_map, get_map
-from shared.catalog.metadata_search import MetadataFilter, search_metadata
-from shared.catalog.models import Model, ensure_model
+from shared.catalog.maps import (
+    DEFAULT_MAP,
+    Map,
+    get_map,
+    get_or_create_default_map,
+    increment_map_version,
+)
+from shared.catalog.metadata_search import MetadataFilter, search_photos
+from shared.catalog.models import Model, get_or_create_model
 from shared.catalog.photos import (
     Photo,
-    changed_since,
-    count_live,
-    find_live_by_sha256,
+    count_live_photos,
+    find_photo_by_sha256,
+    get_live_photos,
     get_photo,
-    live_photos,
+    list_photos_changed_since,
 )
 from shared.catalog.session import Catalog
 from shared.errors import NotFound
@@ -70,7 +76,7 @@ def test_a_time_without_an_offset_is_refused(catalog: Catalog, map_id: UUID) -> 
     with pytest.raises(StatementError, match="without an offset"), catalog.write() as session:
         add_photo(session, map_id, captured_at=naive)
     with catalog.read() as session:
-        assert count_live(session, map_id) == 0
+        assert count_live_photos(session, map_id) == 0
 
 
 def test_the_databases_clock_is_in_utc_and_can_be_added_to(catalog: Catalog) -> None:
@@ -99,18 +105,18 @@ def test_write_rolls_back_when_its_block_raises(catalog: Catalog, map_id: UUID) 
     def half_way() -> None:
         with catalog.write() as session:
             add_photo(session, map_id)
-            bump_version(session, map_id)
+            increment_map_version(session, map_id)
             raise RuntimeError("half way")
 
     with pytest.raises(RuntimeError, match="half way"):
         half_way()
     with catalog.read() as session:
-        assert count_live(session, map_id) == 0
+        assert count_live_photos(session, map_id) == 0
         assert session.get_one(Map, map_id).version == 0
     with catalog.write() as session:  # and the next one is not harmed
         add_photo(session, map_id)
     with catalog.read() as session:
-        assert count_live(session, map_id) == 1
+        assert count_live_photos(session, map_id) == 1
 
 
 def test_what_write_gave_stays_readable_after_the_block(catalog: Catalog, map_id: UUID) -> None:
@@ -124,29 +130,29 @@ def test_read_never_writes(catalog: Catalog, map_id: UUID) -> None:
     with pytest.raises(DBAPIError, match=r"read-?only"), catalog.read() as session:
         add_photo(session, map_id)
     with catalog.read() as session:
-        assert count_live(session, map_id) == 0
+        assert count_live_photos(session, map_id) == 0
     with catalog.write() as session:
         add_photo(session, map_id)  # the pooled connection may write again
 
 
 def test_read_sees_one_snapshot_while_others_write(catalog: Catalog, map_id: UUID) -> None:
     with catalog.read() as session:
-        before = count_live(session, map_id), session.scalar(select(Map.version))
+        before = count_live_photos(session, map_id), session.scalar(select(Map.version))
         with catalog.write() as writing:
             add_photo(writing, map_id)
-            bump_version(writing, map_id)
+            increment_map_version(writing, map_id)
         session.expire_all()
-        after = count_live(session, map_id), session.scalar(select(Map.version))
+        after = count_live_photos(session, map_id), session.scalar(select(Map.version))
     assert before == after == (0, 0)
     with catalog.read() as session:
-        assert (count_live(session, map_id), session.scalar(select(Map.version))) == (1, 1)
+        assert (count_live_photos(session, map_id), session.scalar(select(Map.version))) == (1, 1)
 
 
 def test_an_unfinished_write_is_seen_by_no_one(catalog: Catalog, map_id: UUID) -> None:
     with catalog.write() as writing:
         add_photo(writing, map_id)
         with catalog.read() as session:
-            assert count_live(session, map_id) == 0
+            assert count_live_photos(session, map_id) == 0
 
 
 # --- constraints -----------------------------------------------------------------------------
@@ -160,7 +166,7 @@ def test_the_same_live_bytes_twice_in_a_map_are_refused_by_the_database(
     with pytest.raises(IntegrityError), catalog.write() as session:
         add_photo(session, map_id, sha256="a" * 64)
     with catalog.read() as session:
-        found = find_live_by_sha256(session, map_id, "a" * 64)
+        found = find_photo_by_sha256(session, map_id, "a" * 64)
         assert found is not None
         assert found.id == first
 
@@ -177,7 +183,7 @@ def test_the_same_bytes_are_allowed_again_after_deletion_and_in_another_map(
         with catalog.write() as session:
             first = add_photo(session, map_id, sha256="a" * 64).id
     with catalog.read() as session:
-        found = find_live_by_sha256(session, map_id, "a" * 64)
+        found = find_photo_by_sha256(session, map_id, "a" * 64)
         assert found is not None
         assert found.id == first
 
@@ -246,7 +252,7 @@ def test_versions_are_strictly_increasing_under_concurrent_bumps(
         seen = []
         for _ in range(each):
             with catalog.write() as session:
-                seen.append(bump_version(session, map_id))
+                seen.append(increment_map_version(session, map_id))
         return seen
 
     with ThreadPoolExecutor(threads) as pool:
@@ -261,10 +267,10 @@ def test_versions_are_strictly_increasing_under_concurrent_bumps(
 
 def test_a_rolled_back_bump_leaves_no_gap(catalog: Catalog, map_id: UUID) -> None:
     with catalog.write() as session:
-        assert bump_version(session, map_id) == 1
+        assert increment_map_version(session, map_id) == 1
         session.rollback()
     with catalog.write() as session:
-        assert bump_version(session, map_id) == 1
+        assert increment_map_version(session, map_id) == 1
 
 
 def test_the_default_map_is_made_once_by_many_at_once(catalog: Catalog) -> None:
@@ -273,7 +279,7 @@ def test_the_default_map_is_made_once_by_many_at_once(catalog: Catalog) -> None:
     def ensure() -> UUID:
         together.wait()
         with catalog.write() as session:
-            return ensure_default_map(session, "test-tiny-avg").id
+            return get_or_create_default_map(session, "test-tiny-avg").id
 
     with ThreadPoolExecutor(4) as pool:
         found = {future.result() for future in [pool.submit(ensure) for _ in range(4)]}
@@ -288,7 +294,7 @@ def test_a_model_is_registered_once_by_many_at_once(catalog: Catalog) -> None:
     def ensure() -> UUID:
         together.wait()
         with catalog.write() as session:
-            return ensure_model(session, "net", "f" * 64, "MIT", {"made": "here"}).id
+            return get_or_create_model(session, "net", "f" * 64, "MIT", {"made": "here"}).id
 
     with ThreadPoolExecutor(4) as pool:
         found = {future.result() for future in [pool.submit(ensure) for _ in range(4)]}
@@ -314,14 +320,14 @@ def test_a_deleted_photo_shows_in_no_query(catalog: Catalog, map_id: UUID) -> No
     with catalog.read() as session:
         with pytest.raises(NotFound):
             get_photo(session, map_id, goes)
-        assert list(live_photos(session, [stays, goes])) == [stays]
-        assert find_live_by_sha256(session, map_id, "b" * 64) is None
-        assert count_live(session, map_id) == 1
-        page, total = search_metadata(session, map_id, MetadataFilter(), 10, None)
+        assert list(get_live_photos(session, [stays, goes])) == [stays]
+        assert find_photo_by_sha256(session, map_id, "b" * 64) is None
+        assert count_live_photos(session, map_id) == 1
+        page, total = search_photos(session, map_id, MetadataFilter(), 10, None)
         assert ([photo.id for photo in page], total) == ([stays], 1)
-        changed = changed_since(session, map_id, version)
+        changed = list_photos_changed_since(session, map_id, version)
         assert [(facts.photo_id, facts.findable) for facts in changed] == [(goes, False)]
-        assert changed_since(session, map_id, version + 1) == []
+        assert list_photos_changed_since(session, map_id, version + 1) == []
 
 
 def test_a_photo_of_another_map_is_not_found(catalog: Catalog, map_id: UUID) -> None:
@@ -340,7 +346,7 @@ def found(catalog: Catalog, map_id: UUID, **wanted: Any) -> set[str]:
     about = {name: wanted.pop(name) for name in PhotoFilter.model_fields if name in wanted}
     wanted["photos"] = PhotoFilter(**about)
     with catalog.read() as session:
-        page, total = search_metadata(session, map_id, MetadataFilter(**wanted), 1000, None)
+        page, total = search_photos(session, map_id, MetadataFilter(**wanted), 1000, None)
     assert total == len(page)
     return {photo.filename for photo in page}
 
@@ -443,7 +449,7 @@ def test_filters_work_together_and_in_one_map(catalog: Catalog, map_id: UUID) ->
         conditions = MetadataFilter(
             filename="x", upload_before=MOMENT, max_file_size=5, photos=PhotoFilter(tags=("t",))
         )
-        page, total = search_metadata(session, map_id, conditions, 10, None)
+        page, total = search_photos(session, map_id, conditions, 10, None)
     assert ([photo.id for photo in page], total) == ([right], 1)
 
 
@@ -455,7 +461,7 @@ def pages(
     while True:
         after = (seen[-1].uploaded_at, seen[-1].id) if seen else None
         with catalog.read() as session:
-            page, _ = search_metadata(session, map_id, MetadataFilter(), limit, after)
+            page, _ = search_photos(session, map_id, MetadataFilter(), limit, after)
         if not page:
             return seen
         assert len(page) <= limit
@@ -502,12 +508,12 @@ def test_the_total_counts_what_matches_and_not_the_page(catalog: Catalog, map_id
         for number in range(7):
             add_photo(session, map_id, tags=["odd"] if number % 2 else [], uploaded_at=MOMENT)
     with catalog.read() as session:
-        first, total = search_metadata(
+        first, total = search_photos(
             session, map_id, MetadataFilter(photos=PhotoFilter(tags=("odd",))), 2, None
         )
         assert (len(first), total) == (2, 3)
         after = (first[-1].uploaded_at, first[-1].id)
-        rest, total = search_metadata(
+        rest, total = search_photos(
             session, map_id, MetadataFilter(photos=PhotoFilter(tags=("odd",))), 2, after
         )
         assert (len(rest), total) == (1, 3)
@@ -540,7 +546,7 @@ def test_take_slot_never_lets_a_slot_exceed_its_rows(data: some.DataObject, slot
     held: dict[int, int] = {}
     slots = []
     for rows in batches:
-        slot = take_slot(generation, rows, slot_rows)
+        slot = allocate_slot(generation, rows, slot_rows)
         held[slot] = held.get(slot, 0) + rows
         slots.append(slot)
     assert all(rows <= slot_rows for rows in held.values())

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from benchmarks.fleet.proxy import FaultProxy, Mode
+from benchmarks.fleet.proxy import FaultProxy, ProxyMode
 from shared.errors import PlacewiseError
 from shared.objects.s3 import S3Store
 from tests.support.servers import start_moto
@@ -52,7 +52,7 @@ def test_answer_that_is_cut_anywhere_is_no_answer(
     came = 0
     for place in range(0, LONGEST_BYTES, STEP_BYTES):
         fresh = S3Store(server.bucket(bucket.name, s3_endpoint=f"127.0.0.1:{proxy.port}"))
-        with proxy.misbehaving(Mode.CUT_ANSWER, cut_after_bytes=place):
+        with proxy.in_mode(ProxyMode.CUT_ANSWER, cut_after_bytes=place):
             answer, refused = _outcome(call, fresh)
         if refused is not None:
             assert refused == "object_store_unavailable", place

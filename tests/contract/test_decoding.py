@@ -17,10 +17,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from services.extractor.decoding import TRIES, DecoderPool
+from services.extractor.decoding import MAX_DECODE_ATTEMPTS, DecoderPool
 from shared.errors import PlacewiseError, Unavailable, Unprocessable
 from shared.settings import Settings
-from shared.vision.decode import Decoded
+from shared.vision.decode import DecodedPhoto
 from shared.vision.preprocessing import Preprocessing, get_preprocessing
 from shared.vision.resample import Pixels
 from tests.support.photos import photo_bytes
@@ -51,7 +51,7 @@ class Poisoned(Preprocessing):
 
 
 POISONED = Poisoned(
-    "poisoned", 1, SQUARE.upright, SQUARE.most_pixels, SQUARE.usual_size, SQUARE.bring
+    "poisoned", 1, SQUARE.upright, SQUARE.most_pixels, SQUARE.typical_size, SQUARE.resize
 )
 
 
@@ -75,12 +75,12 @@ def in_child(pool: DecoderPool, expression: str) -> Any:
     return pool._pool.schedule(eval, args=[expression]).result()
 
 
-def is_good(outcome: Decoded | PlacewiseError) -> bool:
-    assert isinstance(outcome, Decoded), outcome
+def is_good(outcome: DecodedPhoto | PlacewiseError) -> bool:
+    assert isinstance(outcome, DecodedPhoto), outcome
     return outcome.pixels.shape == (32, 32, 3)
 
 
-def refusal(outcome: Decoded | PlacewiseError) -> str:
+def refusal(outcome: DecodedPhoto | PlacewiseError) -> str:
     assert isinstance(outcome, Unprocessable)
     assert outcome.code == "undecodable_photo"
     return outcome.detail
@@ -96,7 +96,7 @@ def test_good_photos_are_decoded_beside_bad_ones_in_their_order(pool: DecoderPoo
     assert "can't be decoded" in refusal(text)
     assert refusal(truncated)
     for outcome, colour in ((third, [1, 2, 3]), (fifth, [9, 9, 9])):
-        assert isinstance(outcome, Decoded)
+        assert isinstance(outcome, DecodedPhoto)
         assert outcome.pixels[0, 0].tolist() == colour
     assert not np.array_equal(first.pixels, last.pixels)  # type: ignore[union-attr]
 
@@ -114,7 +114,7 @@ def test_too_many_pixels_are_refused_by_the_settings_limit(settings: Settings) -
 
 def test_photo_that_crashes_the_decoder_harms_only_itself(pool: DecoderPool) -> None:
     first, poison, last = pool.decode([GOOD, photo_of(CRASHES), GOOD], POISONED)
-    assert f"crashed on this photo {TRIES} times" in refusal(poison)
+    assert f"crashed on this photo {MAX_DECODE_ATTEMPTS} times" in refusal(poison)
     assert is_good(first)
     assert is_good(last)
     assert is_good(pool.decode([GOOD], POISONED)[0]), "the next batch, too"

@@ -15,15 +15,15 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
-from services.cli.main import tree
-from shared.recipes import get_recipe
+from services.cli.main import build_app
+from shared.recipes import get_extractor_config
 from shared.vision.backbones.dinov2 import SHAPES, Dinov2
 from shared.vision.backbones.tiny import TinyBackbone
-from shared.vision.decode import decode
+from shared.vision.decode import decode_photo
 from shared.vision.extractors import Extractor
 from shared.vision.preprocessing import get_preprocessing
 from shared.vision.vlad import soft_vlad
-from shared.vision.vocabulary import check_centres
+from shared.vision.vocabulary import parse_centres
 from tests.support.photos import encoded, photo_image
 from tests.support.vit import random_weights, save
 
@@ -58,7 +58,7 @@ def out(tmp_path: Path) -> Path:
 
 def run(*arguments: object, code: int = 0) -> str:
     """What the command prints on stdout."""
-    result = CliRunner().invoke(tree(["describe"]), ["describe", *map(str, arguments)])
+    result = CliRunner().invoke(build_app(["describe"]), ["describe", *map(str, arguments)])
     assert result.exit_code == code, result.output
     return result.stdout
 
@@ -69,8 +69,8 @@ def run_json(*arguments: object, code: int = 0) -> dict[str, Any]:
 
 
 def expected(name: str, photos: list[Path], centres: Any = None) -> np.ndarray[Any, Any]:
-    made = Extractor(get_recipe(name, allow_test_extractors=True), CPU)
-    pixels = [decode(path.read_bytes(), made.preprocessing, 10**9).pixels for path in photos]
+    made = Extractor(get_extractor_config(name, allow_test_extractors=True), CPU)
+    pixels = [decode_photo(path.read_bytes(), made.preprocessing, 10**9).pixels for path in photos]
     return np.stack([made.describe([one], centres)[0] for one in pixels])
 
 
@@ -95,9 +95,9 @@ def test_parts_of_an_extractor_are_options(photos: list[Path], out: Path, tmp_pa
     )  # fmt: skip
     name = "test-tiny-vlad:aggregator=soft-vlad,preprocessing=demo1024,temperature=2.5"
     assert answer["spec"]["extractor"] == name
-    assert answer["spec"]["vocabulary_sha256"] == check_centres(array).sha256
+    assert answer["spec"]["vocabulary_sha256"] == parse_centres(array).sha256
     np.testing.assert_allclose(
-        np.load(out), expected(name, photos, check_centres(array)), atol=1e-6
+        np.load(out), expected(name, photos, parse_centres(array)), atol=1e-6
     )
 
 
@@ -146,7 +146,7 @@ def test_every_photo_that_cannot_be_described_is_named_and_nothing_is_written(
     ]
     assert out.read_bytes() == b"what was there before"
     assert [path.name for path in out.parent.iterdir()] == ["rows.npy"]
-    shown = CliRunner().invoke(tree(["describe"]), ["describe", str(text), "--out", str(out)])
+    shown = CliRunner().invoke(build_app(["describe"]), ["describe", str(text), "--out", str(out)])
     assert shown.exit_code == 1
     assert "notes [b].jpg: The photo can't be decoded" in shown.stderr
 

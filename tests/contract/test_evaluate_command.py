@@ -15,19 +15,19 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
-from services.cli.describe_sets import DescribeExtractor
-from services.cli.main import tree
-from services.trainer.evaluation.describe_model import DescribeModel
+from services.cli.describe_sets import ExtractorDescriber
+from services.cli.main import build_app
+from services.trainer.evaluation.describe_model import ModelDescriber
 from shared.datasets.city.plan import CityOptions, make_plan
 from shared.datasets.city.write import write_city
-from shared.datasets.recall import rank, recall_at
+from shared.datasets.recall import rank_by_similarity, recall_at_k
 from shared.datasets.sets import EvaluationSet, open_evaluation_set
-from shared.recipes import get_recipe
-from shared.vision.decode import decode
+from shared.recipes import get_extractor_config
+from shared.vision.decode import decode_photo
 from shared.vision.extractors import Extractor
 from shared.vision.place_models.checkpoint import checkpoint_state
-from shared.vision.place_models.config import ModelConfig
-from shared.vision.place_models.model import build_model
+from shared.vision.place_models.config import VprModelConfig
+from shared.vision.place_models.model import build_vpr_model
 
 CPU = torch.device("cpu")
 
@@ -57,17 +57,17 @@ def town(city: Path) -> EvaluationSet:
 def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """ResNet-18's first two stages and GeM, with random weights."""
     torch.manual_seed(0)
-    config = ModelConfig(
+    config = VprModelConfig(
         pretrained=False, layers_to_crop=(3, 4), agg_arch="GeM", image_size=(48, 64)
     )
     path = tmp_path_factory.mktemp("trained") / "gem.ckpt"
-    torch.save(checkpoint_state(build_model(config)), path)
+    torch.save(checkpoint_state(build_vpr_model(config)), path)
     return path
 
 
 def run(*arguments: object, code: int = 0) -> str:
     command = str(arguments[0])
-    result = CliRunner().invoke(tree([command]), list(map(str, arguments)))
+    result = CliRunner().invoke(build_app([command]), list(map(str, arguments)))
     assert result.exit_code == code, result.output
     return result.stdout
 
@@ -78,8 +78,10 @@ def run_json(*arguments: object, code: int = 0) -> dict[str, Any]:
 
 
 def rows_of(shots: Any) -> np.ndarray[Any, np.dtype[np.float32]]:
-    made = Extractor(get_recipe("test-tiny-avg", allow_test_extractors=True), CPU)
-    pixels = [decode(shot.path.read_bytes(), made.preprocessing, 10**9).pixels for shot in shots]
+    made = Extractor(get_extractor_config("test-tiny-avg", allow_test_extractors=True), CPU)
+    pixels = [
+        decode_photo(shot.path.read_bytes(), made.preprocessing, 10**9).pixels for shot in shots
+    ]
     return made.describe(pixels, None)
 
 
@@ -93,10 +95,10 @@ def test_extractor_is_evaluated_and_everything_is_written(
     out, pairs = tmp_path / "out", tmp_path / "pairs.txt"
     given = ["--data", city, "--extractor", "test-tiny-avg"]
     answer = run_json("evaluate", *given, "--out", out, "--pairs", pairs, "--depth", 7)
-    ranked = rank(rows_of(town.queries), rows_of(town.database), 7)
+    ranked = rank_by_similarity(rows_of(town.queries), rows_of(town.database), 7)
     assert answer["recall"] == {
         str(k): pytest.approx(share)
-        for k, share in recall_at(ranked, town.positives, (1, 5)).items()
+        for k, share in recall_at_k(ranked, town.positives, (1, 5)).items()
     }
     assert answer["fingerprint"] == town.fingerprint
     assert (answer["rule"], answer["protocol"]) == ("radius 25 m", "placewise")
@@ -150,7 +152,7 @@ def test_report_is_one_file_that_fetches_nothing(
     page = _Page()
     page.feed(text)
     assert page.fetched == []
-    ranked = rank(rows_of(town.queries), rows_of(town.database), 5)
+    ranked = rank_by_similarity(rows_of(town.queries), rows_of(town.database), 5)
     right = sum(int(np.isin(r, p).sum()) for r, p in zip(ranked, town.positives, strict=True))
     assert page.framed.count("query") == 6
     assert page.framed.count("right") == right
@@ -177,7 +179,7 @@ def test_second_run_describes_nothing_again(
 ) -> None:
     given = ["evaluate", "--data", city, "--extractor", "test-tiny-avg"]
     before = run_json(*given, "--out", tmp_path / "before")
-    monkeypatch.setattr(DescribeExtractor, "__call__", forbid)
+    monkeypatch.setattr(ExtractorDescriber, "__call__", forbid)
     after = run_json(*given, "--against", tmp_path / "before")
     assert after["recall"] == before["recall"]
     assert after["describe_ms_a_photo"] == before["describe_ms_a_photo"]
@@ -190,17 +192,17 @@ def test_checkpoint_is_evaluated_at_the_size_it_was_trained_for(
     answer = run_json("evaluate", "--data", city, "--checkpoint", checkpoint)
     assert answer["run"]["image size"] == "48 x 64"
     assert answer["dimension"] == 128
-    model = build_model(
-        ModelConfig(pretrained=False, layers_to_crop=(3, 4), agg_arch="GeM", image_size=(48, 64))
+    model = build_vpr_model(
+        VprModelConfig(pretrained=False, layers_to_crop=(3, 4), agg_arch="GeM", image_size=(48, 64))
     )
     stored = torch.load(checkpoint, weights_only=True)["state_dict"]
     model.load_state_dict({name.removeprefix("model."): t for name, t in stored.items()})
-    describe = DescribeModel(model, CPU, (48, 64))
+    describe = ModelDescriber(model, CPU, (48, 64))
     queries, database = (
         np.concatenate(list(describe([shot.path for shot in shots])))
         for shots in (town.queries, town.database)
     )
-    wanted = recall_at(rank(queries, database, 5), town.positives, (1, 5))
+    wanted = recall_at_k(rank_by_similarity(queries, database, 5), town.positives, (1, 5))
     assert answer["recall"]["1"] == pytest.approx(wanted[1])
     assert answer["recall"]["5"] == pytest.approx(wanted[5])
 
@@ -270,8 +272,8 @@ def test_descriptors_are_compared_by_recall_time_and_size(
     for drawing in re.findall(r"<svg.*?</svg>", page, re.DOTALL):
         ET.fromstring(drawing)
     assert page.count("<svg") == 2
-    monkeypatch.setattr(DescribeExtractor, "__call__", forbid)
-    monkeypatch.setattr(DescribeModel, "__call__", forbid)
+    monkeypatch.setattr(ExtractorDescriber, "__call__", forbid)
+    monkeypatch.setattr(ModelDescriber, "__call__", forbid)
     again = run_json("compare", city, "--extractors", asked)
     assert [one["recall"] for one in again["extractors"]] == [
         one["recall"] for one in report["extractors"]

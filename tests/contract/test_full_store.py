@@ -14,14 +14,14 @@ from sqlalchemy import func, select
 from starlette.testclient import TestClient
 
 from services.gateway.app import create_app
-from services.gateway.context import Gateway
-from services.gateway.keys import NoKeys
+from services.gateway.context import GatewayContext
+from services.gateway.keys import LocalhostAuthenticator
 from services.search.worker import SearchWorker
-from shared.catalog.maps import ensure_default_map
+from shared.catalog.maps import get_or_create_default_map
 from shared.catalog.photos import Photo
 from shared.catalog.session import Catalog
 from shared.errors import StorageFull, Unavailable
-from shared.jobs import InProcessHints, Job
+from shared.jobs import InProcessWakeups, Job
 from shared.objects import FolderStore
 from shared.objects.s3 import S3Store
 from shared.settings import Settings
@@ -112,9 +112,11 @@ def test_nothing_is_acknowledged_that_was_not_stored(
     path: str,
 ) -> None:
     with catalog.write() as session:
-        ensure_default_map(session, settings.extractor)
+        get_or_create_default_map(session, settings.extractor)
     search = SearchWorker(catalog, full, settings)
-    gateway = Gateway(catalog, full, InProcessHints(), search, settings, NoKeys())
+    gateway = GatewayContext(
+        catalog, full, InProcessWakeups(), search, settings, LocalhostAuthenticator()
+    )
     client = TestClient(create_app(gateway), base_url="http://localhost")
     answer: httpx2.Response = client.post(
         f"/api/v1{path}",

@@ -11,47 +11,49 @@ import pytest
 from sqlalchemy import func, select, update
 
 from services.steward import retention
-from services.steward.retention import forget_old_keys
+from services.steward.retention import delete_expired_idempotency_keys
 from shared.catalog.base import db_now_plus
 from shared.catalog.idempotency import (
-    CallMade,
-    KeptAnswer,
-    KeyedCall,
-    claim_key,
-    keep_answer,
-    release_key,
+    IdempotencyRecord,
+    RequestIdentity,
+    StoredResponse,
+    claim_idempotency_key,
+    release_idempotency_key,
+    store_response,
 )
 from shared.catalog.session import Catalog
 from shared.errors import Conflict, Unprocessable
 
-CALL = CallMade("someone", "key-1", "POST /api/v1/maps", "f" * 64)
-ANSWER = KeptAnswer(201, {"Location": "/there"}, '{"name":"citè","b":1,"a":null}')
+CALL = RequestIdentity("someone", "key-1", "POST /api/v1/maps", "f" * 64)
+ANSWER = StoredResponse(201, {"Location": "/there"}, '{"name":"citè","b":1,"a":null}')
 
 
-def claim(catalog: Catalog, made: CallMade = CALL, lease_seconds: float = 60) -> UUID | KeptAnswer:
+def claim(
+    catalog: Catalog, made: RequestIdentity = CALL, lease_seconds: float = 60
+) -> UUID | StoredResponse:
     with catalog.write() as session:
-        return claim_key(session, made, lease_seconds=lease_seconds, life_seconds=3600)
+        return claim_idempotency_key(session, made, lease_seconds=lease_seconds, life_seconds=3600)
 
 
-def token(catalog: Catalog, made: CallMade = CALL, lease_seconds: float = 60) -> UUID:
+def token(catalog: Catalog, made: RequestIdentity = CALL, lease_seconds: float = 60) -> UUID:
     claimed = claim(catalog, made, lease_seconds)
     assert isinstance(claimed, UUID)
     return claimed
 
 
-def keep(catalog: Catalog, held: UUID, answer: KeptAnswer = ANSWER) -> None:
+def keep(catalog: Catalog, held: UUID, answer: StoredResponse = ANSWER) -> None:
     with catalog.write() as session:
-        keep_answer(session, held, answer)
+        store_response(session, held, answer)
 
 
 def rows(catalog: Catalog) -> int:
     with catalog.read() as session:
-        return session.scalar(select(func.count()).select_from(KeyedCall)) or 0
+        return session.scalar(select(func.count()).select_from(IdempotencyRecord)) or 0
 
 
 def expire(catalog: Catalog) -> None:
     with catalog.write() as session:
-        session.execute(update(KeyedCall).values(expires_at=db_now_plus(-1)))
+        session.execute(update(IdempotencyRecord).values(expires_at=db_now_plus(-1)))
 
 
 def test_a_kept_answer_is_given_again_as_it_was(catalog: Catalog) -> None:
@@ -95,7 +97,7 @@ def test_a_dead_callers_key_is_taken_over_and_it_can_commit_no_more(catalog: Cat
     with pytest.raises(Conflict):
         keep(catalog, dead)
     with catalog.write() as session:
-        release_key(session, dead)
+        release_idempotency_key(session, dead)
     keep(catalog, living)
     assert claim(catalog) == ANSWER
 
@@ -108,18 +110,18 @@ def test_a_slow_caller_that_no_one_replaced_commits(catalog: Catalog) -> None:
 def test_an_answer_outlives_the_lease_and_can_be_replaced_by_its_caller(catalog: Catalog) -> None:
     held = token(catalog, lease_seconds=-1)
     keep(catalog, held)
-    later = KeptAnswer(200, {}, '{"state":"done"}')
+    later = StoredResponse(200, {}, '{"state":"done"}')
     keep(catalog, held, later)
     assert claim(catalog) == later
     with catalog.write() as session:
-        release_key(session, held)
+        release_idempotency_key(session, held)
     assert claim(catalog) == later, "what was answered is not given back"
 
 
 def test_a_key_that_was_given_back_is_free_at_once(catalog: Catalog) -> None:
     held = token(catalog)
     with catalog.write() as session:
-        release_key(session, held)
+        release_idempotency_key(session, held)
     assert rows(catalog) == 0
     token(catalog, replace(CALL, fingerprint="0" * 64))
 
@@ -128,8 +130,8 @@ def test_an_expired_key_is_free_for_any_call(catalog: Catalog) -> None:
     keep(catalog, token(catalog))
     expire(catalog)
     other = replace(CALL, call="POST /api/v1/upload", fingerprint="0" * 64)
-    keep(catalog, token(catalog, other), KeptAnswer(202, {}, "{}"))
-    assert claim(catalog, other) == KeptAnswer(202, {}, "{}")
+    keep(catalog, token(catalog, other), StoredResponse(202, {}, "{}"))
+    assert claim(catalog, other) == StoredResponse(202, {}, "{}")
     assert rows(catalog) == 1
 
 
@@ -150,14 +152,14 @@ def test_one_of_many_at_once_gets_the_key(catalog: Catalog) -> None:
 def test_expired_keys_are_forgotten_and_others_stay(
     catalog: Catalog, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(retention, "AT_ONCE", 2)
+    monkeypatch.setattr(retention, "RETENTION_ROWS_PER_TRANSACTION", 2)
     for number in range(3):
         keep(catalog, token(catalog, replace(CALL, key=f"old-{number}")))
     expire(catalog)
     keep(catalog, token(catalog))
     left = []
     for _ in range(3):
-        forget_old_keys(catalog)
+        delete_expired_idempotency_keys(catalog)
         left.append(rows(catalog))
     assert left == [2, 1, 1]
     assert claim(catalog) == ANSWER

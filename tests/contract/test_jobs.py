@@ -21,26 +21,33 @@ from shared.catalog.session import Catalog
 from shared.errors import Conflict, NotFound, Unprocessable
 from shared.ids import new_id
 from shared.jobs import (
-    InProcessHints,
+    InProcessWakeups,
     Job,
     JobKind,
     JobState,
-    begin,
-    claim,
+    claim_jobs,
     extend_lease,
-    free_expired_leases,
-    hold_lease,
+    maintain_lease,
+    mark_started,
+    reclaim_expired_leases,
 )
-from shared.jobs.finish import cancel, fail, release, requeue, retry, succeed
-from shared.jobs.leases import held
+from shared.jobs.finish import (
+    cancel_job,
+    fail_job,
+    release_job,
+    requeue_job,
+    retry_job,
+    succeed_job,
+)
+from shared.jobs.leases import lock_leased_jobs
 from shared.jobs.model_changes import (
-    begin_generation,
     cancel_model_change,
-    release_vocabulary_waiters,
+    create_generation,
+    get_unfinished_model_change,
     start_model_change,
-    unfinished_model_change,
+    wake_vocabulary_waiters,
 )
-from shared.jobs.table import MODEL_CHANGES, Priority, WaitingFor, get_job, list_jobs
+from shared.jobs.table import MODEL_CHANGE_JOBS, Priority, WaitingFor, get_job, list_jobs
 from tests.support.catalog_rows import (
     add_generation,
     add_job,
@@ -84,15 +91,15 @@ def token_of(jobs: list[Job]) -> UUID:
 def end(catalog: Catalog, jobs: list[Job]) -> list[UUID]:
     """Finish what of the claimed jobs is still the worker's; the ids of those."""
     with catalog.write() as session:
-        mine = held(session, token_of(jobs), jobs)
+        mine = lock_leased_jobs(session, token_of(jobs), jobs)
         for job in mine:
-            succeed(job, {"done": True})
+            succeed_job(job, {"done": True})
         return ids(mine)
 
 
 def free(catalog: Catalog, **options: Any) -> int:
     with catalog.write() as session:
-        return free_expired_leases(session, MAX_ATTEMPTS, **options)
+        return reclaim_expired_leases(session, MAX_ATTEMPTS, **options)
 
 
 # --- claiming --------------------------------------------------------------------------------
@@ -176,7 +183,7 @@ def test_a_job_marked_alone_comes_alone(catalog: Catalog, map_id: UUID) -> None:
 def test_a_model_change_comes_alone(catalog: Catalog, map_id: UUID) -> None:
     with catalog.write() as session:
         other = add_map(session, "other").id
-    changes = [queue(catalog, of, kind=k)[0] for of in (map_id, other) for k in MODEL_CHANGES]
+    changes = [queue(catalog, of, kind=k)[0] for of in (map_id, other) for k in MODEL_CHANGE_JOBS]
     changes += queue(catalog, map_id, 2, kind=JobKind.FIT)  # not even with one of its kind
     taken = [take(catalog, limit=10) for _ in changes]
     assert [len(jobs) for jobs in taken] == [1] * len(changes)
@@ -189,7 +196,7 @@ def test_a_job_that_waits_for_something_is_held_back(catalog: Catalog, map_id: U
     assert ids(take(catalog)) == ready
     assert take(catalog) == []
     with catalog.write() as session:
-        release_vocabulary_waiters(session, map_id)
+        wake_vocabulary_waiters(session, map_id)
     assert ids(take(catalog)) == waiting
 
 
@@ -199,7 +206,7 @@ def test_waiters_of_another_map_and_for_something_else_stay(catalog: Catalog, ma
     queue(catalog, other, waiting_for=WaitingFor.VOCABULARY)
     queue(catalog, map_id, kind=JobKind.FIT, waiting_for=WaitingFor.DESCRIPTORS)
     with catalog.write() as session:
-        release_vocabulary_waiters(session, map_id)
+        wake_vocabulary_waiters(session, map_id)
     assert take(catalog) == []
 
 
@@ -236,8 +243,8 @@ def test_every_claim_has_a_fresh_token(catalog: Catalog, map_id: UUID) -> None:
         assert len(jobs) == 2
         tokens.add(token_of(jobs))
         with catalog.write() as session:
-            for job in held(session, token_of(jobs), jobs):
-                release(job)
+            for job in lock_leased_jobs(session, token_of(jobs), jobs):
+                release_job(job)
     assert len(tokens) == 4
 
 
@@ -274,7 +281,7 @@ def test_a_claim_passes_over_what_another_one_is_just_taking(postgres: PostgresS
         map_id = add_map(session).id
     waiting = queue(catalog, map_id, 6)
     with catalog.write() as first:
-        one = claim(first, worker="one", limit=2, lease_seconds=60)
+        one = claim_jobs(first, worker="one", limit=2, lease_seconds=60)
         # Without SKIP LOCKED this would wait for the first one's commit, and never end.
         two = take(catalog, limit=3, worker="two")
     assert ids(one) == waiting[:2]
@@ -302,7 +309,7 @@ def test_extending_a_lease_locks_its_jobs_in_the_order_of_finishing_them(
     with ThreadPoolExecutor(1) as pool:
         with catalog.write() as session:
             first = [job for job in jobs if job.id == low]
-            assert ids(held(session, token_of(jobs), first)) == [low]
+            assert ids(lock_leased_jobs(session, token_of(jobs), first)) == [low]
             extending = pool.submit(extend)
             while not _someone_waits_for_a_lock(catalog):
                 assert not extending.done()
@@ -344,7 +351,7 @@ def test_only_those_of_a_batch_that_were_not_cancelled_can_be_finished(
     waiting = queue(catalog, map_id, 3)
     jobs = take(catalog)
     with catalog.write() as session:
-        cancel(get_job(session, map_id, waiting[1], lock=True))
+        cancel_job(get_job(session, map_id, waiting[1], lock=True))
     assert end(catalog, jobs) == [waiting[0], waiting[2]]
     assert states(catalog, waiting) == [
         JobState.SUCCEEDED,
@@ -379,7 +386,7 @@ def test_a_held_lease_is_extended_while_the_block_runs(catalog: Catalog, map_id:
     (job,) = take(catalog, lease_seconds=60)
     first = read_job(catalog, job.id).lease_until
     assert first is not None
-    with hold_lease(catalog, token_of([job]), lease_seconds=0.15):
+    with maintain_lease(catalog, token_of([job]), lease_seconds=0.15):
         # Each extension sets a lease of 0.15 s, and this one did: 60 s are no more.
         until = _wait_for_another_lease(catalog, job.id, first)
         for _ in range(3):
@@ -404,9 +411,9 @@ def test_holding_a_lost_lease_does_not_bring_it_back(catalog: Catalog, map_id: U
     queue(catalog, map_id)
     (job,) = take(catalog)
     expire_lease(catalog, job.id)
-    with hold_lease(catalog, token_of([job]), lease_seconds=60):
+    with maintain_lease(catalog, token_of([job]), lease_seconds=60):
         assert free(catalog) == 1
-    with hold_lease(catalog, token_of([job]), lease_seconds=0.03):
+    with maintain_lease(catalog, token_of([job]), lease_seconds=0.03):
         time.sleep(0.1)
     found = read_job(catalog, job.id)
     assert (found.state, found.lease_token) == (JobState.QUEUED, None)
@@ -421,7 +428,7 @@ def test_a_lease_is_held_on_although_the_catalog_was_away(
     assert first is not None
     away = threading.Event()
     monkeypatch.setattr("shared.jobs.leases.extend_lease", _failing_once(away))
-    with hold_lease(catalog, token_of([job]), lease_seconds=0.15):
+    with maintain_lease(catalog, token_of([job]), lease_seconds=0.15):
         assert away.wait(5)
         _wait_for_another_lease(catalog, job.id, first)
 
@@ -545,8 +552,8 @@ def test_leases_know_no_clock_but_the_databases(
     expire_lease(catalog, *waiting)
     assert free(catalog) == 2  # and one 30 years behind keeps nothing
     with catalog.write() as session:
-        release(session.get_one(Job, waiting[0]), after_seconds=60)
-        release(session.get_one(Job, waiting[1]), after_seconds=-60)
+        release_job(session.get_one(Job, waiting[0]), after_seconds=60)
+        release_job(session.get_one(Job, waiting[1]), after_seconds=-60)
     assert ids(take(catalog)) == [waiting[1]]
 
 
@@ -578,7 +585,7 @@ def test_a_finished_job_can_not_be_cancelled(catalog: Catalog, map_id: UUID) -> 
     for state in (JobState.SUCCEEDED, JobState.FAILED, JobState.CANCELLED):
         (job_id,) = queue(catalog, map_id, state=state)
         with pytest.raises(Conflict, match=state) as refused, catalog.write() as session:
-            cancel(session.get_one(Job, job_id))
+            cancel_job(session.get_one(Job, job_id))
         assert refused.value.code == "job_finished"
         assert states(catalog, [job_id]) == [state]
 
@@ -589,7 +596,7 @@ def test_a_cancelled_job_is_over_at_once(catalog: Catalog, map_id: UUID) -> None
     jobs = take(catalog)
     with catalog.write() as session:
         for job_id in queued + running:
-            cancel(session.get_one(Job, job_id))
+            cancel_job(session.get_one(Job, job_id))
     assert end(catalog, jobs) == []
     for job_id in queued + running:
         job = read_job(catalog, job_id)
@@ -603,9 +610,9 @@ def test_success_and_failure_are_stored_with_their_figures(catalog: Catalog, map
     good, bad = queue(catalog, map_id, 2)
     jobs = take(catalog)
     with catalog.write() as session:
-        mine = {job.id: job for job in held(session, token_of(jobs), jobs)}
-        succeed(mine[good], {"row": 1})
-        fail(mine[bad], PROBLEM)
+        mine = {job.id: job for job in lock_leased_jobs(session, token_of(jobs), jobs)}
+        succeed_job(mine[good], {"row": 1})
+        fail_job(mine[bad], PROBLEM)
     done, failed = read_job(catalog, good), read_job(catalog, bad)
     assert (done.result, done.error) == ({"row": 1}, None)
     assert (done.progress_done, done.progress_failed) == (1, 0)
@@ -617,20 +624,20 @@ def test_a_released_job_counts_no_attempt_and_comes_again(catalog: Catalog, map_
     waiting = queue(catalog, map_id, 2)
     jobs = take(catalog)
     with catalog.write() as session:
-        one, two = held(session, token_of(jobs), jobs)
-        release(one)
-        release(two, after_seconds=3600)
+        one, two = lock_leased_jobs(session, token_of(jobs), jobs)
+        release_job(one)
+        release_job(two, after_seconds=3600)
     assert states(catalog, waiting) == [JobState.QUEUED, JobState.QUEUED]
     assert ids(take(catalog)) == waiting[:1]
     assert [read_job(catalog, job_id).attempts for job_id in waiting] == [0, 0]
 
 
 def test_a_released_model_change_stays_running(catalog: Catalog, map_id: UUID) -> None:
-    for kind in MODEL_CHANGES:
+    for kind in MODEL_CHANGE_JOBS:
         (job_id,) = queue(catalog, map_id, kind=kind)
         jobs = take(catalog)
         with catalog.write() as session:
-            release(held(session, token_of(jobs), jobs)[0])
+            release_job(lock_leased_jobs(session, token_of(jobs), jobs)[0])
         job = read_job(catalog, job_id)
         assert (job.state, job.lease_token) == (JobState.RUNNING, None)
         jobs = take(catalog)
@@ -654,15 +661,15 @@ def test_failed_and_cancelled_jobs_start_anew_when_retried(catalog: Catalog, map
         )
         photo_id, job_id = photo.id, job.id
     with catalog.write() as session:
-        retry(session, get_job(session, map_id, job_id, lock=True))
+        retry_job(session, get_job(session, map_id, job_id, lock=True))
     job = read_job(catalog, job_id)
     assert (job.state, job.attempts, job.alone, job.error) == (JobState.QUEUED, 0, False, None)
     assert (job.progress_failed, job.finished_at) == (0, None)
     with catalog.write() as session:
         assert session.get_one(Job, job_id).photo_id == photo_id
-        cancel(session.get_one(Job, job_id))
+        cancel_job(session.get_one(Job, job_id))
     with catalog.write() as session:
-        retry(session, get_job(session, map_id, job_id, lock=True))
+        retry_job(session, get_job(session, map_id, job_id, lock=True))
     assert ids(take(catalog)) == [job_id]
 
 
@@ -670,15 +677,15 @@ def test_only_failed_and_cancelled_jobs_can_be_retried(catalog: Catalog, map_id:
     for state in (JobState.QUEUED, JobState.RUNNING, JobState.SUCCEEDED):
         (job_id,) = queue(catalog, map_id, state=state)
         with pytest.raises(Conflict, match=state) as refused, catalog.write() as session:
-            retry(session, session.get_one(Job, job_id))
+            retry_job(session, session.get_one(Job, job_id))
         assert refused.value.code == "job_not_retryable"
 
 
 def test_a_model_change_is_started_anew_and_not_retried(catalog: Catalog, map_id: UUID) -> None:
-    for kind in (*MODEL_CHANGES, JobKind.REINDEX):
+    for kind in (*MODEL_CHANGE_JOBS, JobKind.REINDEX):
         (job_id,) = queue(catalog, map_id, kind=kind, state=JobState.FAILED)
         with pytest.raises(Conflict) as refused, catalog.write() as session:
-            retry(session, session.get_one(Job, job_id))
+            retry_job(session, session.get_one(Job, job_id))
         assert refused.value.code == "job_not_retryable"
 
 
@@ -689,7 +696,7 @@ def test_the_job_of_a_deleted_photo_can_not_be_retried(catalog: Catalog, map_id:
     delete(catalog, map_id, photo_id)
     assert states(catalog, [job_id]) == [JobState.CANCELLED]
     with pytest.raises(Conflict) as refused, catalog.write() as session:
-        retry(session, session.get_one(Job, job_id))
+        retry_job(session, session.get_one(Job, job_id))
     assert refused.value.code == "photo_deleted"
 
 
@@ -697,7 +704,7 @@ def test_a_requeued_job_has_lost_its_past(catalog: Catalog, map_id: UUID) -> Non
     (job_id,) = queue(catalog, map_id, attempts=2, alone=True)
     jobs = take(catalog)
     with catalog.write() as session:
-        requeue(session.get_one(Job, job_id))
+        requeue_job(session.get_one(Job, job_id))
     assert end(catalog, jobs) == []
     job = read_job(catalog, job_id)
     assert (job.state, job.attempts, job.alone) == (JobState.QUEUED, 0, False)
@@ -714,14 +721,14 @@ def test_a_second_model_change_is_refused_and_names_the_first(
         other = add_map(session, "other").id
         first = start_model_change(session, map_id, JobKind.FIT, {"seed": 0}).id
         start_model_change(session, other, JobKind.FIT, {"seed": 0})  # each map has its own
-    for kind in MODEL_CHANGES:
+    for kind in MODEL_CHANGE_JOBS:
         with pytest.raises(Conflict, match=str(first)) as refused, catalog.write() as session:
             start_model_change(session, map_id, kind, {})
         assert refused.value.code == "model_change_running"
         assert refused.value.extra == {"job_id": str(first)}
     with catalog.write() as session:
         cancel_model_change(session, get_job(session, map_id, first, lock=True))
-        assert unfinished_model_change(session, map_id) is None
+        assert get_unfinished_model_change(session, map_id) is None
         start_model_change(session, map_id, JobKind.IMPORT, {})
 
 
@@ -803,8 +810,8 @@ def _begin(catalog: Catalog, map_id: UUID) -> UUID:
         jobs = take(catalog, least_priority=Priority.MODEL_CHANGE)
     columns = ("extractor", "spec", "spec_fingerprint", "dimension", "model_id")
     with catalog.write() as session:
-        (mine,) = held(session, token_of(jobs), jobs)
-        begin_generation(session, mine, **{name: getattr(template, name) for name in columns})
+        (mine,) = lock_leased_jobs(session, token_of(jobs), jobs)
+        create_generation(session, mine, **{name: getattr(template, name) for name in columns})
         session.delete(session.get_one(Generation, template.id))
     return job_id
 
@@ -839,13 +846,13 @@ def test_a_job_of_another_map_is_not_found(catalog: Catalog, map_id: UUID) -> No
 
 
 def test_a_hint_sent_before_the_wait_is_not_lost() -> None:
-    hints = InProcessHints()
+    hints = InProcessWakeups()
     hints.send()
     assert hints.wait(30)
 
 
 def test_at_most_one_hint_is_outstanding() -> None:
-    hints = InProcessHints()
+    hints = InProcessWakeups()
     for _ in range(5):
         hints.send()
     assert hints.wait(30)
@@ -853,7 +860,7 @@ def test_at_most_one_hint_is_outstanding() -> None:
 
 
 def test_a_waiting_worker_wakes_with_the_hint() -> None:
-    hints = InProcessHints()
+    hints = InProcessWakeups()
     with ThreadPoolExecutor(1) as pool:
         waiting = pool.submit(hints.wait, 60)
         hints.send()
@@ -861,7 +868,7 @@ def test_a_waiting_worker_wakes_with_the_hint() -> None:
 
 
 def test_a_wait_without_a_hint_ends() -> None:
-    assert not InProcessHints().wait(0.01)
+    assert not InProcessWakeups().wait(0.01)
 
 
 def test_a_job_that_had_not_begun_is_not_blamed_for_the_fall(
@@ -871,8 +878,8 @@ def test_a_job_that_had_not_begun_is_not_blamed_for_the_fall(
         job_id = add_job(session, map_id).id
     for _ in range(5):
         with catalog.write() as session:
-            claim(session, worker="w", limit=1, lease_seconds=60, begun=False)
-            assert free_expired_leases(session, max_attempts=3, everyone=True) == 1
+            claim_jobs(session, worker="w", limit=1, lease_seconds=60, started=False)
+            assert reclaim_expired_leases(session, max_attempts=3, all_leases=True) == 1
     job = read_job(catalog, job_id)
     assert (job.state, job.attempts, job.alone) == (JobState.QUEUED, 0, False)
 
@@ -880,9 +887,9 @@ def test_a_job_that_had_not_begun_is_not_blamed_for_the_fall(
 def test_a_job_that_has_begun_may_be_blamed(catalog: Catalog, map_id: UUID) -> None:
     with catalog.write() as session:
         job_id = add_job(session, map_id).id
-        (job,) = claim(session, worker="w", limit=1, lease_seconds=60, begun=False)
+        (job,) = claim_jobs(session, worker="w", limit=1, lease_seconds=60, started=False)
         assert job.lease_token is not None
-        begin(session, job.lease_token, 1)
+        mark_started(session, job.lease_token, 1)
     with catalog.write() as session:
-        free_expired_leases(session, max_attempts=3, everyone=True)
+        reclaim_expired_leases(session, max_attempts=3, all_leases=True)
     assert read_job(catalog, job_id).attempts == 1

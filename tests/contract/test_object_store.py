@@ -20,7 +20,7 @@ import pytest
 
 from shared.errors import NotFound, StorageFull, Unavailable
 from shared.objects import FolderStore, ObjectStore, OwnedStore
-from shared.objects.folder import MARK
+from shared.objects.folder import OWNER_MARK
 from shared.objects.keys import trash_key
 from shared.objects.s3 import S3Store
 from tests.support.servers import S3Server, start_moto
@@ -415,7 +415,7 @@ class ObjectStoreContract:
         assert store.read_note(".placewise-test") == b"one"
         store.write_note(".placewise-test", b"three")
         assert store.read_note(".placewise-test") == b"three"
-        assert not [key for key in keys_of(store) if not key.startswith(MARK)]
+        assert not [key for key in keys_of(store) if not key.startswith(OWNER_MARK)]
         store.delete_note(".placewise-test")
         store.delete_note(".placewise-test")
         assert store.read_note(".placewise-test") is None

@@ -12,10 +12,10 @@ import torch
 from numpy.typing import NDArray
 from typer.testing import CliRunner
 
-from services.cli.main import tree
-from shared.vision.pca import Projection
+from services.cli.main import build_app
+from shared.vision.pca import PcaProjection
 from shared.vision.pca_file import decode_whitening
-from shared.vision.pca_fit import fit
+from shared.vision.pca_fit import fit_pca
 from tests.support.photos import photo_bytes
 
 PHOTOS = 9
@@ -39,7 +39,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def run(*arguments: object, code: int = 0) -> dict[str, Any]:
     command = [str(argument) for argument in arguments]
-    result = CliRunner().invoke(tree([command[0]]), [*command, "--json"])
+    result = CliRunner().invoke(build_app([command[0]]), [*command, "--json"])
     assert result.exit_code == code, result.output
     answer: dict[str, Any] = json.loads(result.stdout)
     return answer
@@ -62,11 +62,11 @@ def test_a_folders_whitening_shortens_the_rows_of_the_same_extractor(
 
     whole = run("describe", *photos, "--out", tmp_path / "whole.npy")
     rows = np.load(tmp_path / "whole.npy")
-    expected = fit(rows, KEPT)
+    expected = fit_pca(rows, KEPT)
     assert fitted["sha256"] == decode_whitening(file.read_bytes()).whitening.sha256
     shorter = run("describe", *photos, "--out", tmp_path / "short.npy", "--pca", file)
     found = np.load(tmp_path / "short.npy")
-    by_hand = Projection(expected, torch.device("cpu")).project(rows)
+    by_hand = PcaProjection(expected, torch.device("cpu")).project(rows)
     np.testing.assert_allclose(found, by_hand, atol=1e-3)
     assert shorter["spec"] == {
         **whole["spec"],
@@ -104,7 +104,7 @@ def test_a_file_of_rows_is_enough(tmp_path: Path) -> None:
     found = decode_whitening(file.read_bytes())
     assert found.spec is None
     assert (fitted["rows"], found.whitening.rows) == (39, 39)
-    expected = fit(np.delete(rows, 7, axis=0), KEPT)
+    expected = fit_pca(np.delete(rows, 7, axis=0), KEPT)
     np.testing.assert_allclose(found.whitening.directions, expected.directions, atol=1e-4)
     assert fitted["explained"] == pytest.approx(expected.explained)
 

@@ -10,9 +10,9 @@ from hypothesis import strategies as some
 from sqlalchemy import delete, select
 
 from services.search.photo_columns import PhotoColumns
-from services.search.select import select as select_rows
-from shared.catalog.metadata_search import MetadataFilter, filter_conditions, search_metadata
-from shared.catalog.photos import Photo, PhotoFacts, PhotoRole
+from services.search.select import build_row_mask as select_rows
+from shared.catalog.metadata_search import MetadataFilter, filter_conditions, search_photos
+from shared.catalog.photos import Photo, PhotoFilterValues, PhotoRole
 from shared.catalog.session import Catalog
 from shared.photo_filter import Box, Circle, PhotoFilter
 from tests.support.catalog_rows import add_map, add_photo
@@ -33,7 +33,9 @@ def map_id(catalog: Catalog) -> UUID:
         return add_map(session).id
 
 
-def store(catalog: Catalog, map_id: UUID, photos: list[PhotoFacts]) -> list[PhotoFacts]:
+def store(
+    catalog: Catalog, map_id: UUID, photos: list[PhotoFilterValues]
+) -> list[PhotoFilterValues]:
     """Exactly these photos lie in the catalog; what search reads of them."""
     with catalog.write() as session:
         session.execute(delete(Photo))
@@ -50,8 +52,8 @@ def store(catalog: Catalog, map_id: UUID, photos: list[PhotoFacts]) -> list[Phot
                 tags=photo.tags,
             )
     with catalog.read() as session:
-        found = session.execute(select(*PhotoFacts.COLUMNS).order_by(Photo.id))
-        return [PhotoFacts(*facts) for facts in found]
+        found = session.execute(select(*PhotoFilterValues.COLUMNS).order_by(Photo.id))
+        return [PhotoFilterValues(*facts) for facts in found]
 
 
 def in_sql(catalog: Catalog, wanted: PhotoFilter) -> set[UUID]:
@@ -59,7 +61,7 @@ def in_sql(catalog: Catalog, wanted: PhotoFilter) -> set[UUID]:
         return set(session.scalars(select(Photo.id).where(*filter_conditions(wanted))))
 
 
-def in_scan(photos: list[PhotoFacts], wanted: PhotoFilter) -> set[UUID]:
+def in_scan(photos: list[PhotoFilterValues], wanted: PhotoFilter) -> set[UUID]:
     columns = PhotoColumns.of(len(photos), enumerate(photos))
     return set(columns.photo_id[select_rows(columns, wanted, ())])
 
@@ -124,7 +126,7 @@ def test_filters_narrow_the_metadata_search_of_one_map_and_role(
         (None, {right, asking}),
     ):
         with catalog.read() as session:
-            page, total = search_metadata(
+            page, total = search_photos(
                 session, map_id, MetadataFilter(photos=about, role=role), 10, None
             )
         assert {photo.id for photo in page} == expected

@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 from urllib3.exceptions import ProtocolError
 
 from services.cli import storage
-from services.cli.server_checks import objects_check
+from services.cli.server_checks import check_object_store
 from shared.errors import Misconfigured, Unavailable
 from shared.objects import FolderStore, ObjectStore
 from shared.objects.open_store import open_store
@@ -285,15 +285,15 @@ def test_the_folder_is_the_store_unless_an_endpoint_is_set(
 
 
 def test_the_doctor_looks_at_the_bucket(s3: S3Server, bucket: Bucket) -> None:
-    assert bucket.name in objects_check(Settings(**s3.variables(bucket.name)))
+    assert bucket.name in check_object_store(Settings(**s3.variables(bucket.name)))
     assert not list(bucket.client.list_objects(bucket.name, recursive=True)), "it tidied up"
     with pytest.raises(Unavailable, match="create-bucket"):
-        objects_check(Settings(**s3.variables("never-made")))
+        check_object_store(Settings(**s3.variables("never-made")))
 
 
 def test_the_client_needs_its_settings(settings: Settings) -> None:
     with pytest.raises(Misconfigured, match="S3_ACCESS_KEY"):
-        Bucket.of(settings)
+        Bucket.from_settings(settings)
 
 
 USE = """

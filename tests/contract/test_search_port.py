@@ -31,17 +31,17 @@ from numpy.typing import NDArray
 
 from services.search import answer, gpu
 from services.search import worker as worker_module
-from services.search.load import Loader
+from services.search.load import ChunkLoader
 from services.search.loaded_chunk import StoredChunk
-from services.search.metrics import SearchMetrics
+from services.search.metrics import MeteredSearch
 from services.search.worker import SearchWorker
 from services.steward.compact import merge_slot
 from shared import read_retries
-from shared.catalog.chunks import Chunk, Descriptor, live_chunks
+from shared.catalog.chunks import Chunk, Descriptor, list_live_chunks
 from shared.catalog.generations import Generation, GenerationState
-from shared.catalog.maps import Map, bump_version, lock_map
-from shared.catalog.models import ensure_model
-from shared.catalog.photos import Photo, PhotoRole, mark_deleted
+from shared.catalog.maps import Map, increment_map_version, lock_map
+from shared.catalog.models import get_or_create_model
+from shared.catalog.photos import Photo, PhotoRole, mark_photo_deleted
 from shared.catalog.schema import migrate
 from shared.catalog.session import Catalog
 from shared.chunks import decode_rows, encode_rows, manifest_key, write_chunk
@@ -50,9 +50,9 @@ from shared.errors import Gone, InvalidRequest, Unavailable
 from shared.ids import new_id
 from shared.objects import FolderStore, ObjectStore
 from shared.photo_filter import Box, Circle, PhotoFilter
-from shared.search_protocol import Mode, SearchPort, SearchRequest, SearchResponse
+from shared.search_protocol import Mode, SearchBackend, SearchRequest, SearchResponse
 from shared.settings import Settings
-from shared.shards import WHOLE
+from shared.shards import SINGLE_SHARD
 from tests.support.codes import always_by_codes, always_by_int8, int8_on_demand
 from tests.support.search_tier import SearchTier
 
@@ -87,7 +87,7 @@ class SmallMap:
         with catalog.write() as session:
             session.add(Map(id=self.map_id, name=f"map-{self.map_id}", extractor="test"))
             session.flush()
-            model = ensure_model(session, "test", "0" * 64, "MIT", {})
+            model = get_or_create_model(session, "test", "0" * 64, "MIT", {})
             session.add(
                 Generation(
                     id=self.generation_id,
@@ -150,7 +150,7 @@ class SmallMap:
                 for row, photo_id in enumerate(photo_ids)
                 if row >= dead
             )
-            bump_version(session, self.map_id)
+            increment_map_version(session, self.map_id)
         self.rows |= dict(list(zip(photo_ids, rows, strict=True))[dead:])
         return photo_ids
 
@@ -175,13 +175,13 @@ class SmallMap:
             photo = session.get_one(Photo, photo_id)
             for name, value in columns.items():
                 setattr(photo, name, value)
-            photo.changed_version = bump_version(session, self.map_id)
+            photo.changed_version = increment_map_version(session, self.map_id)
 
     def delete(self, photo_id: UUID) -> None:
         with self.catalog.write() as session:
             lock_map(session, self.map_id)
             photo = session.get_one(Photo, photo_id)
-            mark_deleted(session, photo, bump_version(session, self.map_id))
+            mark_photo_deleted(session, photo, increment_map_version(session, self.map_id))
         del self.rows[photo_id]
 
     def merge(self, slot: int = 0) -> bool:
@@ -189,7 +189,7 @@ class SmallMap:
 
     def chunk_keys(self) -> list[str]:
         with self.catalog.read() as session:
-            return [chunk.object_key for chunk in live_chunks(session, self.generation_id)]
+            return [chunk.object_key for chunk in list_live_chunks(session, self.generation_id)]
 
     def reference(self, photo_id: UUID) -> Reference:
         with self.catalog.read() as session:
@@ -243,7 +243,7 @@ def assert_answers(response: SearchResponse, expected: list[tuple[UUID, float]])
     )
 
 
-OpenPort = Callable[..., SearchPort]
+OpenPort = Callable[..., SearchBackend]
 
 # How rows are scanned has nothing to do with the catalog.
 whatever_the_catalog = pytest.mark.parametrize("catalog", ["sqlite"], indirect=True)
@@ -692,7 +692,7 @@ def _damaged(whole: bytes, damage: str) -> bytes:
 class TestSearchWorker(SearchPortContract):
     @pytest.fixture
     def port(self, catalog: Catalog, store: FolderStore, settings: Settings) -> OpenPort:
-        def open_port(**changes: object) -> SearchPort:
+        def open_port(**changes: object) -> SearchBackend:
             return SearchWorker(catalog, store, settings.model_copy(update=changes))
 
         return open_port
@@ -711,10 +711,10 @@ class TestSearchWorker(SearchPortContract):
         whole = store.get(key)
         store.put(key, _damaged(whole, "flipped"))
         worker = SearchWorker(catalog, store, settings)
-        worker.follow()
+        worker.sync()
         assert worker.status().missing == (key,)
         store.put(key, whole)
-        worker.follow()
+        worker.sync()
         assert worker.status().missing == ()
         assert worker.status().rows == 5
 
@@ -739,8 +739,8 @@ class TestSearchWorker(SearchPortContract):
         monkeypatch.setattr(store, "open", counted)
         worker = SearchWorker(catalog, store, settings)
         for seed in (2, 3):
-            worker.follow()
-            worker.follow()
+            worker.sync()
+            worker.sync()
             places.add(unit_rows(seed, 5))
             request = places.request(places.query(unit_rows(seed, 1)[0]), k=20)
             assert worker.search(request).missing == (key,)
@@ -763,15 +763,15 @@ class TestSearchWorker(SearchPortContract):
         worker = SearchWorker(
             catalog, store, settings.model_copy(update={"search_memory_bytes": 0})
         )
-        worker.follow()
+        worker.sync()
         assert worker.status().rows == 10
         whole = store.get(key)
         os.truncate(store.path(key), 200)
         store.delete(kept)
-        worker.follow()
+        worker.sync()
         assert (worker.status().missing, worker.status().rows) == ((key,), 5)
         store.put(key, whole)
-        worker.follow()
+        worker.sync()
         assert (worker.status().missing, worker.status().rows) == ((), 10)
 
     def test_following_forgets_what_is_no_longer_searched(
@@ -780,11 +780,11 @@ class TestSearchWorker(SearchPortContract):
         places = SmallMap(catalog, store)
         places.add(unit_rows(1, 5))
         worker = SearchWorker(catalog, store, settings)
-        worker.follow()
+        worker.sync()
         assert worker.status().versions == {places.generation_id: places.version}
         with catalog.write() as session:
             session.get_one(Generation, places.generation_id).state = GenerationState.RETIRED
-        worker.follow()
+        worker.sync()
         assert worker.status().versions == {}
         assert worker.status().resident_bytes == 0
 
@@ -794,10 +794,10 @@ class TestSearchWorker(SearchPortContract):
         places = SmallMap(catalog, store)
         first = places.add(unit_rows(1, 5))
         worker = SearchWorker(catalog, store, settings)
-        worker.follow()
+        worker.sync()
         store.delete(places.reference(first[0])[0])
         places.add(unit_rows(2, 5))
-        worker.follow()
+        worker.sync()
         assert worker.status().missing == (), "a loaded chunk was read again"
         assert worker.status().rows == 10
 
@@ -830,7 +830,7 @@ class TestSearchWorkerByInt8(TestSearchWorker):
         places.add(unit_rows(1, 30))
         vector = unit_rows(2, 1)[0]
         first = port().search(places.request(places.query(vector)))
-        (path,) = settings.search_cache(WHOLE).rglob("*.int8")
+        (path,) = settings.search_cache_folder(SINGLE_SHARD).rglob("*.int8")
         whole = path.read_bytes()
         path.unlink()
         if damage != "gone":
@@ -843,8 +843,8 @@ class TestSearchWorkerByInt8(TestSearchWorker):
         self, places: SmallMap, port: OpenPort, settings: Settings
     ) -> None:
         places.add(unit_rows(1, 30))
-        settings.search_cache(WHOLE).parent.mkdir(parents=True, exist_ok=True)
-        settings.search_cache(WHOLE).write_text("no folder can be here")
+        settings.search_cache_folder(SINGLE_SHARD).parent.mkdir(parents=True, exist_ok=True)
+        settings.search_cache_folder(SINGLE_SHARD).write_text("no folder can be here")
         vector = unit_rows(2, 1)[0]
         response = port().search(places.request(places.query(vector)))
         assert_answers(response, places.brute_force(vector))
@@ -882,13 +882,13 @@ class TestSearchWorkerDeterministic(TestSearchWorker):
         self, places: SmallMap, port: OpenPort, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         go_on = threading.Event()
-        make = Loader.int8_codes
+        make = ChunkLoader.load_int8_codes
 
-        def slowly(self: Loader, object_key: str, stored: StoredChunk) -> Int8Codes:
+        def slowly(self: ChunkLoader, object_key: str, stored: StoredChunk) -> Int8Codes:
             assert go_on.wait(60)
             return make(self, object_key, stored)
 
-        monkeypatch.setattr(Loader, "int8_codes", slowly)
+        monkeypatch.setattr(ChunkLoader, "load_int8_codes", slowly)
         places.add(unit_rows(1, 30))
         vector = unit_rows(2, 1)[0]
         request = places.request(places.query(vector))
@@ -914,7 +914,7 @@ class TestSearchWorkerDeterministic(TestSearchWorker):
         request = places.request(places.query(vector))
         search = port()
         search.search(request.model_copy(update={"mode": Mode.AUTO}))
-        folder = settings.search_cache(WHOLE)
+        folder = settings.search_cache_folder(SINGLE_SHARD)
         shutil.rmtree(folder)
         folder.write_text("no folder can be here")
         with pytest.raises(Unavailable) as caught:
@@ -940,15 +940,15 @@ class TestSearchWorkerOnADevice(TestSearchWorker):
         monkeypatch: pytest.MonkeyPatch,
     ) -> OpenPort:
         always_by_int8(monkeypatch)
-        monkeypatch.setattr(answer, "worth_codes", lambda selected, k: selected > 0)
-        monkeypatch.setattr(gpu, "KINDS", (request.param,))
+        monkeypatch.setattr(answer, "sign_codes_pay_off", lambda selected, k: selected > 0)
+        monkeypatch.setattr(gpu, "ROW_FORMATS", (request.param,))
 
-        def open_port(**changes: object) -> SearchPort:
-            device = gpu.Device(torch.device("cpu"), lambda: 1e9, 0)
+        def open_port(**changes: object) -> SearchBackend:
+            device = gpu.GpuDevice(torch.device("cpu"), lambda: 1e9, 0)
             worker = SearchWorker(
                 catalog, store, settings.model_copy(update=changes), device=device
             )
-            worker.follow()
+            worker.sync()
             return worker
 
         return open_port
@@ -970,13 +970,13 @@ class TestSearchWorkerOnADevice(TestSearchWorker):
         places.add(unit_rows(1, 40))
         search = port()
         assert isinstance(search, SearchWorker)
-        told = SearchMetrics(search).text().decode()
+        told = MeteredSearch(search).render().decode()
         bytes_there = search.status().devices[0].resident_bytes
         assert f'placewise_search_device_resident_bytes{{device="cpu"}} {bytes_there:.1f}' in told
         assert 'placewise_search_device_failed{device="cpu"} 0.0' in told
 
 
-def _once_made(search: SearchPort, request: SearchRequest) -> SearchResponse:
+def _once_made(search: SearchBackend, request: SearchRequest) -> SearchResponse:
     for _ in range(1000):
         try:
             return search.search(request)
@@ -1006,7 +1006,7 @@ class TestSearchOverHttp(SearchPortContract):
     ) -> Iterator[OpenPort]:
         with contextlib.ExitStack() as running:
 
-            def open_port(**changes: object) -> SearchPort:
+            def open_port(**changes: object) -> SearchBackend:
                 # Whoever waits longer for a version waits longer for the shards, too.
                 wait = float(str(changes.get("search_wait_seconds", settings.search_wait_seconds)))
                 patience = {"search_timeout_seconds": max(10.0, 5 * wait)}
@@ -1022,13 +1022,13 @@ class TestSearchOverHttp(SearchPortContract):
     ) -> None:
         int8_on_demand(monkeypatch)
         go_on = threading.Event()
-        make = Loader.int8_codes
+        make = ChunkLoader.load_int8_codes
 
-        def slowly(self: Loader, object_key: str, stored: StoredChunk) -> Int8Codes:
+        def slowly(self: ChunkLoader, object_key: str, stored: StoredChunk) -> Int8Codes:
             assert go_on.wait(60)
             return make(self, object_key, stored)
 
-        monkeypatch.setattr(Loader, "int8_codes", slowly)
+        monkeypatch.setattr(ChunkLoader, "load_int8_codes", slowly)
         for slot in range(3):
             places.add(unit_rows(slot, 10), slot=slot)
         vector = unit_rows(9, 1)[0]
@@ -1092,7 +1092,7 @@ class AddDeleteMerge(RuleBasedStateMachine):
 
     @rule()
     def follow(self) -> None:
-        self.worker.follow()
+        self.worker.sync()
 
     @rule()
     def forget_everything(self) -> None:

@@ -16,8 +16,8 @@ from shared.catalog.installation import (
     Installation,
     adopt_store,
     check_before_new_catalog,
-    ensure_installation,
-    open_own_store,
+    get_or_create_installation,
+    open_installation_store,
 )
 from shared.catalog.maps import Map
 from shared.catalog.photos import Photo
@@ -25,7 +25,7 @@ from shared.catalog.session import Catalog
 from shared.errors import Misconfigured
 from shared.ids import new_id
 from shared.objects import ObjectStore, OwnedStore
-from shared.objects.folder import MARK, FolderStore
+from shared.objects.folder import OWNER_MARK, FolderStore
 from shared.objects.open_store import open_store
 from shared.objects.s3 import Bucket, S3Store
 from shared.objects.store_owner import read_owner
@@ -53,7 +53,7 @@ def started(s3: S3Server, tmp_path: Path) -> Callable[[Catalog, Bucket], ObjectS
 
     def start(catalog: Catalog, bucket: Bucket) -> ObjectStore:
         settings = Settings(placewise_home=tmp_path / "home", **s3.variables(bucket.name))
-        return open_own_store(catalog, settings, alone=False)
+        return open_installation_store(catalog, settings, exclusive=False)
 
     return start
 
@@ -75,9 +75,9 @@ def copied(source: Bucket, target: Bucket) -> None:
 
 def test_an_installation_has_one_id_for_ever(catalog: Catalog) -> None:
     with catalog.write() as session:
-        first = ensure_installation(session).id
+        first = get_or_create_installation(session).id
     with catalog.write() as session:
-        assert ensure_installation(session).id == first
+        assert get_or_create_installation(session).id == first
         assert len(session.scalars(select(Installation)).all()) == 1
 
 
@@ -85,7 +85,7 @@ def test_two_catalogs_have_two_ids(catalog: Catalog, other_catalog: Catalog) -> 
     ids = set()
     for one in (catalog, other_catalog):
         with one.write() as session:
-            ids.add(ensure_installation(session).id)
+            ids.add(get_or_create_installation(session).id)
     assert len(ids) == 2
 
 
@@ -95,8 +95,8 @@ def test_empty_bucket_is_taken_and_taken_again_at_the_next_start(
     started(catalog, bucket).put("originals/a", b"x")
     started(catalog, bucket)
     with catalog.read() as session:
-        owner = ensure_installation(session).id
-    assert S3Store(bucket).get(MARK).decode() == str(owner)
+        owner = get_or_create_installation(session).id
+    assert S3Store(bucket).get(OWNER_MARK).decode() == str(owner)
 
 
 def test_services_that_start_together_agree_on_the_bucket(
@@ -178,7 +178,9 @@ def test_catalog_with_objects_in_a_bucket_takes_no_folder(
 ) -> None:
     started(catalog, bucket)
     with pytest.raises(Misconfigured) as caught:
-        open_own_store(catalog, Settings(placewise_home=tmp_path / "home"), alone=False)
+        open_installation_store(
+            catalog, Settings(placewise_home=tmp_path / "home"), exclusive=False
+        )
     assert caught.value.code == "object_store_changed"
     assert bucket.name in caught.value.detail
 
@@ -216,13 +218,13 @@ def photo_of_before(catalog: Catalog, settings: Settings) -> OwnedStore:
 def test_store_of_another_catalog_is_refused_and_the_ways_out_are_named(
     used: Settings, catalog: Catalog, other_catalog: Catalog
 ) -> None:
-    open_own_store(catalog, used, alone=False).put("originals/a", b"x")
+    open_installation_store(catalog, used, exclusive=False).put("originals/a", b"x")
     with pytest.raises(Misconfigured) as caught:
-        open_own_store(other_catalog, used, alone=False)
+        open_installation_store(other_catalog, used, exclusive=False)
     assert caught.value.code in TAKEN
     for way in ("Restore the catalog", "placewise rebuild-catalog", "placewise storage adopt"):
         assert way in caught.value.detail
-    assert open_own_store(catalog, used, alone=False).get("originals/a") == b"x"
+    assert open_installation_store(catalog, used, exclusive=False).get("originals/a") == b"x"
 
 
 def test_store_without_a_mark_is_marked_where_the_catalog_knows_its_photos(
@@ -234,12 +236,12 @@ def test_store_without_a_mark_is_marked_where_the_catalog_knows_its_photos(
         store.delete(session.get_one(Photo, lost).object_key)  # one of them, by another fault
     assert read_owner(store) is None
     with pytest.raises(Misconfigured) as caught:
-        open_own_store(other_catalog, used, alone=False)
+        open_installation_store(other_catalog, used, exclusive=False)
     assert caught.value.code in TAKEN
     assert read_owner(store) is None
-    open_own_store(catalog, used, alone=False)
+    open_installation_store(catalog, used, exclusive=False)
     with catalog.write() as session:
-        assert read_owner(store) == str(ensure_installation(session).id)
+        assert read_owner(store) == str(get_or_create_installation(session).id)
 
 
 def _map_of(catalog: Catalog) -> UUID:
@@ -253,7 +255,7 @@ def test_store_of_strange_objects_is_refused_by_a_catalog_with_photos_of_its_own
     photo_of_before(catalog, Settings(placewise_home=tmp_path / "elsewhere"))
     open_store(used).put(f"originals/{new_id()}", b"of another one")
     with pytest.raises(Misconfigured) as caught:
-        open_own_store(catalog, used, alone=False)
+        open_installation_store(catalog, used, exclusive=False)
     assert caught.value.code in TAKEN
 
 
@@ -262,7 +264,7 @@ def test_empty_store_is_refused_by_a_catalog_with_photos(
 ) -> None:
     photo_of_before(catalog, Settings(placewise_home=tmp_path / "elsewhere"))
     with pytest.raises(Misconfigured, match="mounted") as caught:
-        open_own_store(catalog, used, alone=False)
+        open_installation_store(catalog, used, exclusive=False)
     assert caught.value.code == "object_store_changed"
 
 
@@ -274,7 +276,7 @@ def test_files_of_people_and_of_queries_do_not_keep_a_catalog_from_a_folder(
     store = open_store(settings)
     for key in ("imports/city/1.jpg", "originals/holiday.jpg", f"queries/{new_id()}"):
         store.put(key, b"theirs")
-    open_own_store(catalog, settings, alone=False)
+    open_installation_store(catalog, settings, exclusive=False)
 
 
 def test_two_catalogs_that_start_together_never_share_a_folder(
@@ -286,7 +288,7 @@ def test_two_catalogs_that_start_together_never_share_a_folder(
     def start(one: Catalog) -> None:
         barrier.wait()
         try:
-            open_own_store(one, settings, alone=False)
+            open_installation_store(one, settings, exclusive=False)
             outcomes.append("owner")
         except Misconfigured as error:
             outcomes.append(error.code)
@@ -304,7 +306,7 @@ def test_new_catalog_is_not_even_created_beside_a_used_store(
 ) -> None:
     new = Catalog(f"sqlite:///{tmp_path / 'new.sqlite'}")
     check_before_new_catalog(new, used)
-    open_own_store(catalog, used, alone=False)
+    open_installation_store(catalog, used, exclusive=False)
     with pytest.raises(Misconfigured) as caught:
         check_before_new_catalog(new, used)
     assert caught.value.code in TAKEN
@@ -317,9 +319,9 @@ def test_new_catalog_is_not_even_created_beside_a_used_store(
 def test_adopted_store_belongs_to_the_new_catalog_alone(
     used: Settings, catalog: Catalog, other_catalog: Catalog
 ) -> None:
-    store = open_own_store(catalog, used, alone=False)
+    store = open_installation_store(catalog, used, exclusive=False)
     adopt_store(other_catalog, store)
-    open_own_store(other_catalog, used, alone=False)
+    open_installation_store(other_catalog, used, exclusive=False)
     with pytest.raises(Misconfigured) as caught:
-        open_own_store(catalog, used, alone=False)
+        open_installation_store(catalog, used, exclusive=False)
     assert caught.value.code in TAKEN

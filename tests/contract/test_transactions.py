@@ -13,10 +13,10 @@ from sqlalchemy.exc import DBAPIError, IntegrityError, OperationalError
 from sqlalchemy.exc import TimeoutError as PoolTimeout
 from sqlalchemy.orm import Session
 
-from shared.catalog.away import as_unavailable
-from shared.catalog.connections import Limits, Pool
+from shared.catalog.away import to_unavailable
+from shared.catalog.connections import PoolConfig, TransactionTimeouts
 from shared.catalog.maps import Map, lock_map
-from shared.catalog.session import TRIES, Catalog
+from shared.catalog.session import MAX_TRANSACTION_ATTEMPTS, Catalog
 from tests.support.catalog_rows import add_map
 from tests.support.servers import PostgresServer
 
@@ -25,8 +25,8 @@ from tests.support.servers import PostgresServer
 def catalog(postgres: PostgresServer, migrated_postgres: str) -> Iterator[Catalog]:
     opened = Catalog(
         postgres.new_database(migrated_postgres),
-        Pool(name="placewise-test", size=2, overflow=1, wait_seconds=0.2),
-        Limits(statement_seconds=10, lock_seconds=5),
+        PoolConfig(name="placewise-test", size=2, overflow=1, wait_seconds=0.2),
+        TransactionTimeouts(statement_seconds=10, lock_seconds=5),
     )
     yield opened
     opened.close()
@@ -95,7 +95,7 @@ def test_units_that_never_get_through_are_given_up(catalog: Catalog) -> None:
 
     with pytest.raises(OperationalError):
         catalog.run(unit)
-    assert runs == TRIES
+    assert runs == MAX_TRANSACTION_ATTEMPTS
 
 
 @pytest.mark.parametrize("state", ["23505", "55P03", "57014", "53300"])
@@ -110,7 +110,7 @@ def test_every_other_error_is_raised_at_once(catalog: Catalog, state: str) -> No
     with pytest.raises(DBAPIError) as caught:
         catalog.run(unit)
     assert runs == 1
-    told = as_unavailable(caught.value)
+    told = to_unavailable(caught.value)
     assert (told and told.code) == {
         "23505": None,  # a bug, or the caller's business
         "55P03": "catalog_busy",
@@ -122,13 +122,15 @@ def test_every_other_error_is_raised_at_once(catalog: Catalog, state: str) -> No
 def test_violated_constraint_is_no_outage(catalog: Catalog, maps: list[UUID]) -> None:
     with pytest.raises(IntegrityError) as caught, catalog.write() as session:
         add_map(session, "a")
-    assert as_unavailable(caught.value) is None
+    assert to_unavailable(caught.value) is None
 
 
 def test_limits_hold_inside_the_transaction_and_leave_nothing_behind(catalog: Catalog) -> None:
     """Behind a PgBouncer, what a transaction leaves behind another service would meet."""
     names = ("statement_timeout", "lock_timeout", "idle_in_transaction_session_timeout")
-    with catalog.limited(Limits(statement_seconds=1.5, lock_seconds=0.5)).read() as session:
+    with catalog.with_timeouts(
+        TransactionTimeouts(statement_seconds=1.5, lock_seconds=0.5)
+    ).read() as session:
         inside = [session.scalar(text(f"SHOW {name}")) for name in names]
         assert session.scalar(text("SHOW application_name")) == "placewise-test"
         prepared = text("SELECT count(*) FROM pg_prepared_statements")
@@ -143,10 +145,10 @@ def test_limits_hold_inside_the_transaction_and_leave_nothing_behind(catalog: Ca
 def test_statement_that_takes_too_long_is_ended_and_the_connection_stays_good(
     catalog: Catalog,
 ) -> None:
-    quick = catalog.limited(Limits(statement_seconds=0.2))
+    quick = catalog.with_timeouts(TransactionTimeouts(statement_seconds=0.2))
     with pytest.raises(OperationalError) as caught, quick.read() as session:
         session.execute(text("SELECT pg_sleep(30)"))
-    told = as_unavailable(caught.value)
+    told = to_unavailable(caught.value)
     assert told is not None
     assert told.code == "catalog_busy"
     with quick.read() as session:
@@ -159,6 +161,6 @@ def test_no_free_connection_is_told_within_the_configured_wait(catalog: Catalog)
             session.scalar(select(1))
         with pytest.raises(PoolTimeout) as caught, catalog.read() as one_too_many:
             one_too_many.scalar(select(1))
-    told = as_unavailable(caught.value)
+    told = to_unavailable(caught.value)
     assert told is not None
     assert told.code == "catalog_busy"

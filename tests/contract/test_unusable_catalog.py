@@ -15,16 +15,16 @@ from sqlalchemy.exc import OperationalError
 from starlette.testclient import TestClient
 
 from services.gateway.app import create_app
-from services.gateway.context import Gateway
-from services.gateway.keys import NoKeys
+from services.gateway.context import GatewayContext
+from services.gateway.keys import LocalhostAuthenticator
 from services.search.worker import SearchWorker
-from shared.catalog.away import as_unavailable
-from shared.catalog.maps import ensure_default_map
+from shared.catalog.away import to_unavailable
+from shared.catalog.maps import get_or_create_default_map
 from shared.catalog.schema import migrate
 from shared.catalog.session import Catalog
 from shared.catalog.unusable import check_pages
 from shared.errors import Misconfigured, StorageFull
-from shared.jobs import InProcessHints
+from shared.jobs import InProcessWakeups
 from shared.objects import FolderStore
 from shared.settings import Settings
 from tests.support.problems import problem
@@ -129,9 +129,11 @@ def test_a_command_on_a_damaged_catalog_ends_with_a_sentence(file: Path, command
 @pytest.fixture
 def client(catalog: Catalog, store: FolderStore, settings: Settings) -> TestClient:
     with catalog.write() as session:
-        ensure_default_map(session, settings.extractor)
+        get_or_create_default_map(session, settings.extractor)
     search = SearchWorker(catalog, store, settings)
-    gateway = Gateway(catalog, store, InProcessHints(), search, settings, NoKeys())
+    gateway = GatewayContext(
+        catalog, store, InProcessWakeups(), search, settings, LocalhostAuthenticator()
+    )
     return TestClient(create_app(gateway), base_url="http://localhost")
 
 
@@ -169,7 +171,7 @@ def test_a_catalog_without_room_is_a_507(catalog: Catalog, client: TestClient) -
 def test_what_a_failing_disk_says_is_no_word_of_being_away() -> None:
     original = sqlite3.OperationalError("disk I/O error")
     original.sqlite_errorname = "SQLITE_IOERR_READ"
-    told = as_unavailable(OperationalError("SELECT 1", {}, original))
+    told = to_unavailable(OperationalError("SELECT 1", {}, original))
     assert told is not None
     assert (told.code, told.status) == ("catalog_io_error", 503)
     assert "dmesg" in told.detail
@@ -179,7 +181,7 @@ def test_postgresql_without_room_is_full_and_not_away() -> None:
     class DiskFull(Exception):
         sqlstate = "53100"
 
-    told = as_unavailable(OperationalError("INSERT", {}, DiskFull("no space left on device")))
+    told = to_unavailable(OperationalError("INSERT", {}, DiskFull("no space left on device")))
     assert isinstance(told, StorageFull)
 
 

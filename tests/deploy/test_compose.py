@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from services.http_server import GRACEFUL_SECONDS
+from services.http_server import SHUTDOWN_GRACE_SECONDS
 from shared.settings import Settings
 from tests.deploy.composition import (
     EMBEDDED,
@@ -225,7 +225,7 @@ def test_an_extractor_has_time_to_end_its_drain(everything: dict[str, Json]) -> 
         assert float(everything[name]["healthcheck"]["test"][-1]) > 10 * drain_seconds
         assert drain_seconds == Settings().drain_seconds
     for name in ("gateway", "search-0", "search-1"):
-        assert seconds(everything[name]["stop_grace_period"]) > 2 * GRACEFUL_SECONDS
+        assert seconds(everything[name]["stop_grace_period"]) > 2 * SHUTDOWN_GRACE_SECONDS
 
 
 def test_redis_forgets_nothing_by_itself(everything: dict[str, Json]) -> None:

@@ -12,9 +12,9 @@ import httpx2
 import pytest
 
 from shared.catalog.session import Catalog
-from shared.jobs.celery_app import DRAIN_TASK, make_celery
-from shared.jobs.celery_hints import CeleryHints
-from shared.jobs.hints import Lane
+from shared.jobs.celery_app import DRAIN_TASK, create_celery_app
+from shared.jobs.celery_hints import CeleryWakeups
+from shared.jobs.hints import WakeupQueue
 from shared.objects import FolderStore
 from shared.settings import Settings
 from tests.deploy.composition import SERVICES, make_env, services, variables
@@ -100,13 +100,13 @@ def test_flower_shows_what_a_drain_did_and_only_to_who_has_the_password(
     settings = Settings(
         redis_url=f"redis://:{values['REDIS_PASSWORD']}@127.0.0.1:{machine.port('redis')}/0"
     )
-    app = make_celery(settings)
-    hints = CeleryHints(app, settings)
+    app = create_celery_app(settings)
+    hints = CeleryWakeups(app, settings)
     try:
         until(lambda: flower.get("/workers", params={"json": "1"}).json()["data"])
         for number in range(PHOTOS, 2 * PHOTOS):
             upload(catalog_on_postgres, store, map_id, photo_bytes(number))
-        hints.send(Lane.BULK)
+        hints.send(WakeupQueue.BULK)
 
         # Drains of before Flower heard of the worker need not be there.
         def drains() -> list[dict[str, Any]]:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from services.extractor.worker import ExtractorWorker
 from shared.catalog.session import Catalog
-from shared.heartbeat import Heartbeat, silence_seconds
+from shared.heartbeat import Heartbeat, seconds_since_heartbeat
 from shared.objects import FolderStore
 from shared.settings import Settings
 
@@ -42,7 +42,7 @@ def test_an_extractor_beats_in_its_drains(
     worker = ExtractorWorker(catalog, store, settings, "extractor")
     worker.drain(threading.Event())
     worker.close()
-    assert silence_seconds(tmp_path / "heartbeat") < 60
+    assert seconds_since_heartbeat(tmp_path / "heartbeat") < 60
 
 
 def test_no_file_is_no_beat(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ import pytest
 import yaml
 from sqlalchemy import text, update
 
-from services.http_server import GRACEFUL_SECONDS
+from services.http_server import SHUTDOWN_GRACE_SECONDS
 from shared.catalog.session import Catalog
 from shared.jobs import Job, JobState
 from shared.jobs.table import EXTRACTOR_JOBS, STEWARD_JOBS, WaitingFor
@@ -90,7 +90,7 @@ def test_every_service_is_watched_and_has_time_to_end(build: str) -> None:
         if container(workload).get("ports"):
             assert "readinessProbe" in container(workload)
             _, waited = container(workload)["lifecycle"]["preStop"]["exec"]["command"]
-            assert grace > int(waited) + 2 * GRACEFUL_SECONDS
+            assert grace > int(waited) + 2 * SHUTDOWN_GRACE_SECONDS
     extractor = of_kind(build, "Deployment")["extractor"]["spec"]["template"]["spec"]
     (config,) = of_kind(build, "ConfigMap").values()
     drain_seconds = float(config["data"]["DRAIN_SECONDS"])

@@ -14,7 +14,7 @@ import pytest
 
 from shared.client import Client
 from shared.errors import Unauthorized
-from shared.home import address_file
+from shared.home import server_address_file
 from tests.support.photos import photo_bytes
 from tests.support.problems import problem
 from tests.support.server import ServerProcess, environment, run_command
@@ -160,7 +160,7 @@ def test_commands_of_the_same_user_need_no_key(server: ServerProcess, tmp_path: 
     ):
         ended = run_command(*command, env=env, cwd=tmp_path)
         assert ended.returncode == 0, ended.stdout + ended.stderr
-    assert stat.S_IMODE(address_file(server.home).stat().st_mode) == 0o600
+    assert stat.S_IMODE(server_address_file(server.home).stat().st_mode) == 0o600
 
 
 def test_commands_with_a_servers_address_need_its_key(
@@ -193,7 +193,7 @@ def test_a_restart_keeps_the_key_and_another_one_replaces_it(tmp_path: Path) -> 
             return answer.status_code == 200
 
         assert opens(first)
-        local = json.loads(address_file(server.home).read_text())["key"]
+        local = json.loads(server_address_file(server.home).read_text())["key"]
         assert opens(local)
         assert server.stop() == 0
         server.log_path.unlink()

@@ -11,7 +11,7 @@ import pytest
 
 from shared.datasets.city.plan import CityOptions, make_plan
 from shared.datasets.city.write import write_city
-from shared.home import address_file
+from shared.home import server_address_file
 from tests.support.server import ServerProcess, environment, run_command
 
 
@@ -36,7 +36,7 @@ def run(server: ServerProcess, folder: Path, *arguments: str | Path, code: int =
 def test_service_finds_what_the_extractor_finds(
     server: ServerProcess, city: Path, tmp_path: Path
 ) -> None:
-    said = json.loads(address_file(server.home).read_text())
+    said = json.loads(server_address_file(server.home).read_text())
     there = ["--server", said["url"], *(["--key", said["key"]] if "key" in said else [])]
     served = run(server, tmp_path, "--data", city, *there, "--out", tmp_path / "served")
     alone = run(

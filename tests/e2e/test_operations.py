@@ -11,7 +11,7 @@ from typing import Any
 import httpx2
 import pytest
 
-from shared.home import address_file
+from shared.home import server_address_file
 from tests.support.photos import photo_bytes
 from tests.support.problems import problem
 from tests.support.server import ServerProcess, environment, run_command
@@ -198,7 +198,7 @@ def test_a_folder_has_one_server(server: ServerProcess, tmp_path: Path) -> None:
     assert str(server.client.base_url).rstrip("/") in said
     assert str(server.home) in said
     assert got(server.client.get("/readyz")), "the first one goes on"
-    assert address_file(server.home).exists(), "and can still be found"
+    assert server_address_file(server.home).exists(), "and can still be found"
 
 
 def test_an_address_has_one_server(server: ServerProcess, tmp_path: Path) -> None:
@@ -235,7 +235,7 @@ def test_a_stopped_server_goes_on_where_it_was(tmp_path: Path) -> None:
             uploads = [server.upload(photo_bytes(n)).json() for n in range(2, 7)]
             server.process.send_signal(signal.SIGTERM)
         assert server.process.wait(timeout=30) == 0, server.log()
-        assert not address_file(server.home).exists()
+        assert not server_address_file(server.home).exists()
 
         server.start()
         for upload in uploads:

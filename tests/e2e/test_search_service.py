@@ -14,12 +14,12 @@ from uuid import UUID
 import httpx2
 import pytest
 
-from shared.catalog.chunks import descriptor_of
+from shared.catalog.chunks import find_descriptor
 from shared.catalog.generations import active_generation
 from shared.catalog.maps import get_map
-from shared.catalog.search_workers import RegisteredWorker
+from shared.catalog.search_workers import RegisteredSearchWorker
 from shared.catalog.session import Catalog
-from shared.search_http import HttpSearch
+from shared.search_http import HttpSearchClient
 from shared.search_protocol import SearchRequest, SearchResponse
 from tests.support.photos import photo_bytes
 from tests.support.processes import PLACEWISE, Process, start
@@ -48,14 +48,14 @@ def search_process(home: Path, log: Path, **settings: Any) -> Iterator[tuple[Pro
         process.wait()
 
 
-def ask(port: HttpSearch, home: Path, file_id: str) -> SearchResponse:
+def ask(port: HttpSearchClient, home: Path, file_id: str) -> SearchResponse:
     """The photos most similar to a stored one, asked of the shards without a gateway."""
     catalog = Catalog(f"sqlite:///{home / 'catalog.sqlite'}")
     with catalog.read() as session:
         map_ = get_map(session, "default")
         generation = active_generation(session, map_.id)
         assert generation is not None
-        found = descriptor_of(session, generation.id, UUID(file_id))
+        found = find_descriptor(session, generation.id, UUID(file_id))
         assert found is not None
         request = SearchRequest(
             map_id=map_.id,
@@ -72,7 +72,7 @@ def ask(port: HttpSearch, home: Path, file_id: str) -> SearchResponse:
 def names(home: Path) -> list[str]:
     catalog = Catalog(f"sqlite:///{home / 'catalog.sqlite'}")
     with catalog.read() as session:
-        found = [f"{w.shard}/{w.shards}" for w in session.query(RegisteredWorker)]
+        found = [f"{w.shard}/{w.shards}" for w in session.query(RegisteredSearchWorker)]
     catalog.close()
     return sorted(found)
 
@@ -84,7 +84,7 @@ def test_two_search_processes_answer_what_the_embedded_one_answers(
     with (
         search_process(server.home, tmp_path / "0.log", search_shard="0/2") as (first, first_url),
         search_process(server.home, tmp_path / "1.log", search_shard="1/2") as (_, second_url),
-        HttpSearch([first_url, second_url], 10.0) as port,
+        HttpSearchClient([first_url, second_url], 10.0) as port,
     ):
         answer = ask(port, server.home, file_ids[0])
         assert (len(answer.hits), answer.missing) == (PHOTOS, ())

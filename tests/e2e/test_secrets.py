@@ -11,7 +11,7 @@ import urllib3
 
 from shared.client import Client
 from shared.errors import PlacewiseError
-from shared.home import address_file
+from shared.home import server_address_file
 from tests.support.photos import photo_bytes
 from tests.support.server import ServerProcess
 from tests.support.servers import S3Server
@@ -37,7 +37,7 @@ def server(s3: S3Server, tmp_path_factory: pytest.TempPathFactory) -> Iterator[S
 def test_no_secret_is_logged(server: ServerProcess, s3: S3Server) -> None:
     url, call = str(server.client.base_url), server.client
     secrets = {"ADMIN_KEY": ADMIN, "S3_SECRET_KEY": s3.secret_key}
-    secrets["local key"] = json.loads(address_file(server.home).read_text())["key"]
+    secrets["local key"] = json.loads(server_address_file(server.home).read_text())["key"]
     wanted = {"name": "someone", "scopes": ["read", "write"]}
     made = call.post(f"{API}/keys", json=wanted).json()
     secrets["key"] = made["key"]

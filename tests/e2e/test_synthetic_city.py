@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from PIL import Image
 
-from shared.datasets.utm_names import fields_of_name, position_of_name
+from shared.datasets.utm_names import upload_fields_of_file_name, utm_position_of_file_name
 from tests.support.server import environment, run_command
 
 SMALL = ("--places", "12", "--queries", "10", "--size", "96x72")
@@ -71,8 +71,8 @@ def test_every_photo_has_a_name_of_the_convention_and_the_size_asked_for(out: Pa
     photos = list(out.rglob("*.jpg"))
     assert len(photos) == 48 + 10 + 48
     for path in photos:
-        assert position_of_name(path.name) is not None
-        fields = fields_of_name(path.name, None)
+        assert utm_position_of_file_name(path.name) is not None
+        fields = upload_fields_of_file_name(path.name, None)
         assert set(fields) == {"latitude", "longitude", "heading", "captured_at"}
         with Image.open(path) as image:
             assert image.size == (96, 72)
@@ -110,7 +110,10 @@ def test_gsv_xs_table_names_its_photos_by_place(out: Path) -> None:
     for row in rows:
         # As the field's own tools read it: the place stands before the `_` of the note.
         assert int(row["filename"].split("@")[-2].split("_")[0]) == int(row["place_id"])
-        assert position_of_name(row["filename"]) == (float(row["UTMx"]), float(row["UTMy"]))
+        assert utm_position_of_file_name(row["filename"]) == (
+            float(row["UTMx"]),
+            float(row["UTMy"]),
+        )
     assert min([row["place_id"] for row in rows].count(str(p)) for p in range(12)) >= 4
 
 

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from services.trainer import run
-from services.trainer.display import Quiet
+from services.trainer.display import NullDisplay
 from services.trainer.stop import StopRequest
 from tests.support.processes import INHERITED, PLACEWISE, start
 from tests.support.tiny_places import write_tiny_places
@@ -49,7 +49,7 @@ def test_an_interrupted_process_leaves_a_run_that_goes_on_exactly(
     # Two steps more, and all of them without an interruption.
     torch.set_num_threads(1)
     most = stopped + 2
-    resumed = run.resume(tmp_path / "run", {"max_steps": most}, Quiet(), StopRequest())
+    resumed = run.resume(tmp_path / "run", {"max_steps": most}, NullDisplay(), StopRequest())
     whole = train({**said, "run_name": "whole", "max_steps": most})
     assert [epoch["step"] for epoch in resumed["epochs"]] == [most]
     assert_same_weights(Path(whole["last"]), Path(resumed["last"]))

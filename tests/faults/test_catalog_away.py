@@ -17,21 +17,21 @@ from starlette.testclient import TestClient
 
 from services.extractor.worker import ExtractorWorker
 from services.gateway.app import create_app
-from services.gateway.context import Gateway
-from services.gateway.keys import NoKeys
-from services.parts import start_part
-from services.search.presence import Presence
+from services.gateway.context import GatewayContext
+from services.gateway.keys import LocalhostAuthenticator
+from services.parts import start_service_thread
+from services.search.presence import WorkerHeartbeat
 from services.search.worker import SearchWorker
-from services.steward.evaluate import Evaluator
-from services.steward.loop import Steward
-from shared.catalog.chunks import Descriptor, descriptor_of
-from shared.catalog.connections import Limits, Pool
+from services.steward.evaluate import EvaluationWorker
+from services.steward.loop import Scheduler
+from shared.catalog.chunks import Descriptor, find_descriptor
+from shared.catalog.connections import PoolConfig, TransactionTimeouts
 from shared.catalog.generations import active_generation
-from shared.catalog.maps import ensure_default_map, get_map, lock_map
+from shared.catalog.maps import get_map, get_or_create_default_map, lock_map
 from shared.catalog.photos import Photo
 from shared.catalog.schema import migrate
 from shared.catalog.session import Catalog
-from shared.jobs import InProcessHints
+from shared.jobs import InProcessWakeups
 from shared.objects import FolderStore
 from shared.search_protocol import SearchRequest
 from shared.settings import Settings
@@ -60,7 +60,9 @@ class House:
         settings = Settings().model_copy(
             update={"lease_seconds": 3.0, "device": "cpu", "decode_processes": 1}
         )
-        self.catalog = Catalog(url, Pool(size=4, overflow=4, wait_seconds=1.0, connect_seconds=2.0))
+        self.catalog = Catalog(
+            url, PoolConfig(size=4, overflow=4, wait_seconds=1.0, connect_seconds=2.0)
+        )
         migrate(self.catalog)
         with self.catalog.engine.begin() as connection:
             # The tests' servers keep commits in their own memory for a moment; one that is killed
@@ -70,25 +72,29 @@ class House:
             )
         self.catalog.close()  # connections that are opened from here on have it
         with self.catalog.write() as session:
-            ensure_default_map(session, settings.new_map_extractor)
-        store, hints = FolderStore(folder / "objects"), InProcessHints()
+            get_or_create_default_map(session, settings.new_map_extractor)
+        store, hints = FolderStore(folder / "objects"), InProcessWakeups()
         self.search = SearchWorker(self.catalog, store, settings)
         self._extractor = ExtractorWorker(self.catalog, store, settings, "extractor")
-        self.requests = self.catalog.limited(Limits(STATEMENT_SECONDS, lock_seconds=1.0))
-        gateway = Gateway(self.requests, store, hints, self.search, settings, NoKeys())
+        self.requests = self.catalog.with_timeouts(
+            TransactionTimeouts(STATEMENT_SECONDS, lock_seconds=1.0)
+        )
+        gateway = GatewayContext(
+            self.requests, store, hints, self.search, settings, LocalhostAuthenticator()
+        )
         self.client = TestClient(
             create_app(gateway), base_url="http://localhost", raise_server_exceptions=False
         )
-        evaluator = Evaluator(self.catalog, store, self.search, settings, "evaluator")
+        evaluator = EvaluationWorker(self.catalog, store, self.search, settings, "evaluator")
         self.died = threading.Event()
         self._stop = threading.Event()
         self._parts = [
-            start_part(name, part, self._stop, self.died.set)
+            start_service_thread(name, part, self._stop, self.died.set)
             for name, part in (
                 ("search", self.search.run),
-                ("presence", Presence(self.catalog, self.search, "search").run),
+                ("presence", WorkerHeartbeat(self.catalog, self.search, "search").run),
                 ("extractor", partial(self._extractor.run, hints=hints)),
-                ("steward", Steward(self.catalog, store, hints, settings).run),
+                ("steward", Scheduler(self.catalog, store, hints, settings).run),
                 ("evaluator", evaluator.run),
             )
         ]
@@ -123,7 +129,7 @@ class House:
             map_ = get_map(session, "default")
             generation = active_generation(session, map_.id)
             assert generation is not None
-            found = descriptor_of(session, generation.id, session.get_one(Photo, photo_id).id)
+            found = find_descriptor(session, generation.id, session.get_one(Photo, photo_id).id)
             assert found is not None
             return SearchRequest(
                 map_id=map_.id,
@@ -158,7 +164,7 @@ def test_catalog_killed_under_uploads_loses_nothing_that_was_acknowledged(
     first = house.upload(0).json()["file_id"]
     house.wait_for(1)
     request = house.request(first)
-    house.search.follow()
+    house.search.sync()
     acknowledged, refused, strange = {first}, threading.Event(), []
     stop = threading.Event()
 

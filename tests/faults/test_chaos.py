@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.chaos import run_chaos
-from benchmarks.chaos.faults import every_fault
+from benchmarks.chaos.faults import all_faults
 
 # The same kind as another one, on another process or connection: `placewise bench chaos` has them.
 ANOTHER_OF_ITS_KIND = {
@@ -25,8 +25,8 @@ ANOTHER_OF_ITS_KIND = {
 def test_whatever_dies_no_photo_is_lost_doubled_or_stuck_and_no_answer_is_wrong(
     tmp_path: Path,
 ) -> None:
-    faults = [fault for fault in every_fault() if fault.name not in ANOTHER_OF_ITS_KIND]
-    assert len(faults) == len(every_fault()) - len(ANOTHER_OF_ITS_KIND)
+    faults = [fault for fault in all_faults() if fault.name not in ANOTHER_OF_ITS_KIND]
+    assert len(faults) == len(all_faults()) - len(ANOTHER_OF_ITS_KIND)
     run = run_chaos(
         tmp_path, photos=150, fault_seconds=1.0, seed=20_261_121, faults=faults, executed=False
     )

@@ -12,7 +12,7 @@ from uuid import UUID
 import httpx2
 import psutil
 
-from benchmarks.chaos.audit import audit, unfinished
+from benchmarks.chaos.audit import check_invariants, count_unfinished_jobs
 from shared.catalog.session import Catalog
 from shared.objects import FolderStore
 from tests.support.photos import photo_bytes
@@ -84,8 +84,8 @@ def test_after_ten_kills_every_acknowledged_photo_is_searchable_exactly_once(
             hashlib.sha256(photo_bytes(number)).hexdigest(): UUID(file_id)
             for number, file_id in uploader.acknowledged.items()
         }
-        counts = audit(catalog, FolderStore(server.home / "objects"), expected)
-        assert counts.all_zero, counts
+        counts = check_invariants(catalog, FolderStore(server.home / "objects"), expected)
+        assert counts.none_found, counts
         catalog.close()
         assert_each_finds_itself(server, uploader.acknowledged)
 
@@ -121,7 +121,7 @@ def test_decoding_children_end_with_a_killed_server(tmp_path: Path) -> None:
 
 def wait_until_nothing_is_left_to_do(catalog: Catalog) -> None:
     deadline = time.monotonic() + 60
-    while left := unfinished(catalog):
+    while left := count_unfinished_jobs(catalog):
         assert time.monotonic() < deadline, f"{left} jobs are stuck"
         time.sleep(0.1)
 

@@ -46,7 +46,7 @@ class Filled:
 
     @property
     def store(self) -> OwnedStore:
-        return open_store(Settings(placewise_home=self.home, **self.settings), alone=False)
+        return open_store(Settings(placewise_home=self.home, **self.settings), exclusive=False)
 
     def originals(self) -> set[str]:
         return {info.key for info in self.store.list(ORIGINALS)}

@@ -10,7 +10,7 @@ from sqlalchemy import func, select
 from services.steward.model_changes import advance_model_changes
 from shared.catalog.photos import Photo
 from shared.catalog.searches import Search
-from shared.jobs import InProcessHints, Job
+from shared.jobs import InProcessWakeups, Job
 from tests.integration.gateway import Service
 
 ROUNDS = 60
@@ -83,7 +83,7 @@ def fit(service: Service, map_name: str, **wanted: int) -> None:
     started = service.json("POST", "/vocabularies", 202, params={"map": map_name}, json=wanted)
     for _ in range(ROUNDS):
         service.drain()
-        advance_model_changes(service.catalog, InProcessHints())
+        advance_model_changes(service.catalog, InProcessWakeups())
         job = service.json("GET", f"/jobs/{started['job_id']}", params={"map": map_name})
         if job["state"] == "succeeded":
             return

@@ -13,12 +13,12 @@ import torch
 from services.extractor import worker as worker_module
 from services.extractor.decoding import DecoderPool
 from services.extractor.worker import ExtractorWorker
-from shared.catalog.maps import ensure_default_map
+from shared.catalog.maps import get_or_create_default_map
 from shared.catalog.session import Catalog
 from shared.errors import PlacewiseError
 from shared.objects import FolderStore
 from shared.settings import Settings
-from shared.vision.decode import Decoded
+from shared.vision.decode import DecodedPhoto
 from shared.vision.preprocessing import Preprocessing
 from tests.integration.door import Door
 from tests.integration.gateway import Service
@@ -36,7 +36,7 @@ class LentDecoders:
 
     def decode(
         self, photos: Sequence[bytes], preprocessing: Preprocessing
-    ) -> list[Decoded | PlacewiseError]:
+    ) -> list[DecodedPhoto | PlacewiseError]:
         return self._pool.decode(photos, preprocessing)
 
     def close(self) -> None:
@@ -90,7 +90,7 @@ def service(
 ) -> Service:
     """The HTTP API on an empty catalog with the map `default`."""
     with catalog.write() as session:
-        ensure_default_map(session, settings.extractor)
+        get_or_create_default_map(session, settings.extractor)
     return Service(catalog, store, settings, make_worker)
 
 

@@ -8,13 +8,13 @@ import httpx2
 from starlette.testclient import TestClient
 
 from services.gateway.app import create_app
-from services.gateway.context import Gateway
-from services.gateway.keys import CatalogKeys
+from services.gateway.context import GatewayContext
+from services.gateway.keys import ApiKeyAuthenticator
 from services.search.worker import SearchWorker
-from shared.api_keys import hash_key
-from shared.catalog.maps import ensure_default_map
+from shared.api_keys import hash_api_key
+from shared.catalog.maps import get_or_create_default_map
 from shared.catalog.session import Catalog
-from shared.jobs import InProcessHints
+from shared.jobs import InProcessWakeups
 from shared.objects import FolderStore
 from shared.settings import Settings
 from tests.support.photos import photo_bytes
@@ -27,10 +27,10 @@ class Door:
 
     def __init__(self, catalog: Catalog, store: FolderStore, settings: Settings) -> None:
         with catalog.write() as session:
-            ensure_default_map(session, settings.extractor)
+            get_or_create_default_map(session, settings.extractor)
         search = SearchWorker(catalog, store, settings)
-        keys = CatalogKeys(catalog, hash_key(ADMIN))
-        gateway = Gateway(catalog, store, InProcessHints(), search, settings, keys)
+        keys = ApiKeyAuthenticator(catalog, hash_api_key(ADMIN))
+        gateway = GatewayContext(catalog, store, InProcessWakeups(), search, settings, keys)
         self.catalog, self.store = catalog, store
         self.app = create_app(gateway)
         self._client = TestClient(self.app, base_url="http://places.example")

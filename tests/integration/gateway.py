@@ -11,11 +11,11 @@ from starlette.testclient import TestClient
 
 from services.extractor.worker import ExtractorWorker
 from services.gateway.app import create_app
-from services.gateway.context import Gateway
-from services.gateway.keys import NoKeys
+from services.gateway.context import GatewayContext
+from services.gateway.keys import LocalhostAuthenticator
 from services.search.worker import SearchWorker
 from shared.catalog.session import Catalog
-from shared.jobs import InProcessHints
+from shared.jobs import InProcessWakeups
 from shared.objects import OwnedStore
 from shared.settings import Settings
 from tests.support.photos import photo_bytes
@@ -35,7 +35,9 @@ class Service:
     ) -> None:
         self.catalog, self.store, self.settings = catalog, store, settings
         self.search = SearchWorker(catalog, store, settings)
-        gateway = Gateway(catalog, store, InProcessHints(), self.search, settings, NoKeys())
+        gateway = GatewayContext(
+            catalog, store, InProcessWakeups(), self.search, settings, LocalhostAuthenticator()
+        )
         self._app = create_app(gateway)
         self._client = TestClient(self._app, base_url="http://localhost")
         self.make_worker = make_worker

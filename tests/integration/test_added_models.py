@@ -14,15 +14,15 @@ import torch
 from sqlalchemy import select, update
 
 from services.extractor import new_generation as new_generation_module
-from services.steward.collect import collect_brought, collect_orphans
+from services.steward.collect import collect_job_files, collect_orphans
 from services.steward.model_changes import advance_model_changes
 from shared.catalog.added_models import remove_model
 from shared.catalog.generations import Generation, active_generation
 from shared.catalog.maps import get_map
 from shared.catalog.models import Model
-from shared.jobs import InProcessHints, JobKind
+from shared.jobs import InProcessWakeups, JobKind
 from shared.objects.keys import CHECKPOINTS, MODELS
-from shared.vision.backbones.torchhub import weights_fingerprint
+from shared.vision.backbones.torchhub import module_fingerprint
 from tests.integration.gateway import Service
 from tests.integration.workplace import same
 from tests.support.catalog_rows import end_pauses, stored_rows
@@ -55,7 +55,7 @@ def ended(service: Service, answer: httpx2.Response, map_name: str = "default") 
     assert answer.status_code == 202, answer.text
     for _ in range(20):
         service.drain()
-        advance_model_changes(service.catalog, InProcessHints())
+        advance_model_changes(service.catalog, InProcessWakeups())
         job = service.json("GET", f"/jobs/{answer.json()['job_id']}", params={"map": map_name})
         if job["state"] not in ("queued", "running"):
             return job
@@ -116,7 +116,7 @@ def test_a_checkpoint_becomes_a_model_without_what_training_goes_on_with(service
         "already_there": False,
     }
     assert stored.startswith(f"{MODELS}{said['sha256']}/")
-    weights = weights_fingerprint(model)[1]
+    weights = module_fingerprint(model)[1]
     assert weights <= result["size_bytes"] < weights + 20_000 < len(data)
     assert (said["licence"], said["note"], said["maps"]) == ("CC BY 4.0", None, [])
     assert (said["image_size"], said["dimension"]) == (list(SIDES), 128)
@@ -216,7 +216,7 @@ def test_a_checkpoint_that_can_not_be_used_fails_with_the_reason_and_leaves_noth
     failed(service, started, code)
     assert not (tmp_path / "executed").exists()
     assert service.json("GET", "/models")["models"] == []
-    collect_brought(service.catalog, service.store, CHECKPOINTS, JobKind.ADD_MODEL)
+    collect_job_files(service.catalog, service.store, CHECKPOINTS, JobKind.ADD_MODEL)
     assert keys(service, CHECKPOINTS) == keys(service, MODELS) == []
     again = service("POST", f"/jobs/{started.json()['job_id']}/retry")
     assert "POST /api/v1/models" in problem(again, 409, "job_not_retryable")["detail"]
@@ -224,7 +224,7 @@ def test_a_checkpoint_that_can_not_be_used_fails_with_the_reason_and_leaves_noth
 
 def test_a_checkpoint_is_kept_until_it_was_looked_at(service: Service) -> None:
     started = send(service, some_checkpoint())
-    collect_brought(service.catalog, service.store, CHECKPOINTS, JobKind.ADD_MODEL)
+    collect_job_files(service.catalog, service.store, CHECKPOINTS, JobKind.ADD_MODEL)
     collect_orphans(service.catalog, service.store, 0)
     assert len(keys(service, CHECKPOINTS)) == 1
     done(service, started)
@@ -409,13 +409,15 @@ def test_a_model_that_is_removed_at_the_last_moment_begins_no_generation(
     walks: Service, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     before = active(walks).id
-    real = new_generation_module.begin_with_known
+    real = new_generation_module.start_generation_with_stored_vocabulary
 
     def remove_first(*arguments: Any) -> None:
         with walks.catalog.write() as session:
             remove_model(session, "walks", "test-tiny-avg")
         real(*arguments)
 
-    monkeypatch.setattr("services.extractor.take_vocabulary.begin_with_known", remove_first)
+    monkeypatch.setattr(
+        "services.extractor.take_vocabulary.start_generation_with_stored_vocabulary", remove_first
+    )
     failed(walks, switch(walks, extractor="gsv:walks"), "model_missing")
     assert active(walks).id == before

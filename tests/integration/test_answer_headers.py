@@ -8,12 +8,12 @@ import pytest
 from starlette.testclient import TestClient
 
 from services.gateway.app import create_app
-from services.gateway.context import Gateway
-from services.gateway.keys import NoKeys
+from services.gateway.context import GatewayContext
+from services.gateway.keys import LocalhostAuthenticator
 from services.search.worker import SearchWorker
-from shared.catalog.maps import ensure_default_map
+from shared.catalog.maps import get_or_create_default_map
 from shared.catalog.session import Catalog
-from shared.jobs import InProcessHints
+from shared.jobs import InProcessWakeups
 from shared.objects import FolderStore
 from shared.settings import Settings
 from tests.integration.door import Door
@@ -38,9 +38,9 @@ def catalog(sqlite_catalog: Catalog) -> Catalog:
 
 def client_of(catalog: Catalog, store: FolderStore, settings: Settings, search: Any) -> TestClient:
     with catalog.write() as session:
-        ensure_default_map(session, settings.extractor)
-    keys = NoKeys(settings.trusted_origins)
-    gateway = Gateway(catalog, store, InProcessHints(), search, settings, keys)
+        get_or_create_default_map(session, settings.extractor)
+    keys = LocalhostAuthenticator(settings.allowed_origins)
+    gateway = GatewayContext(catalog, store, InProcessWakeups(), search, settings, keys)
     return TestClient(create_app(gateway), base_url=HERE)
 
 

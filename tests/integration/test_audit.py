@@ -7,7 +7,7 @@ from uuid import UUID
 import pytest
 from sqlalchemy import delete, update
 
-from benchmarks.chaos.audit import Counts, audit
+from benchmarks.chaos.audit import InvariantViolations, check_invariants
 from shared.catalog.chunks import Chunk, Descriptor
 from shared.catalog.photos import Photo
 from shared.catalog.session import Catalog
@@ -32,7 +32,7 @@ def acknowledged(catalog: Catalog, store: FolderStore) -> Found:
     return {photo.sha256: photo.id for photo in photos}
 
 
-def changed(counts: Counts) -> dict[str, int]:
+def changed(counts: InvariantViolations) -> dict[str, int]:
     names = ("lost", "twice", "stuck", "failed", "torn")
     return {name: getattr(counts, name) for name in names if getattr(counts, name)}
 
@@ -40,8 +40,8 @@ def changed(counts: Counts) -> dict[str, int]:
 def test_nothing_is_counted_where_all_is_well(
     catalog: Catalog, store: FolderStore, acknowledged: Found
 ) -> None:
-    counts = audit(catalog, store, acknowledged)
-    assert counts.all_zero
+    counts = check_invariants(catalog, store, acknowledged)
+    assert counts.none_found
     assert not counts.details
 
 
@@ -54,7 +54,7 @@ def test_a_photo_without_its_row_bytes_or_descriptor_is_lost(
         store.delete(photo.object_key)
         session.execute(delete(Descriptor).where(Descriptor.photo_id.in_([first, third])))
         session.execute(delete(Photo).where(Photo.id == first))
-    counts = audit(catalog, store, acknowledged)
+    counts = check_invariants(catalog, store, acknowledged)
     assert changed(counts) == {"lost": 3}
     assert [
         str(photo_id) in detail
@@ -70,7 +70,7 @@ def test_bytes_that_are_stored_twice_are_counted(
         other = add_map(session, "another")
         photo = add_photo(session, other.id, sha256=sha256)
     store.put(photo.object_key, b"its bytes")
-    assert changed(audit(catalog, store, acknowledged)) == {"twice": 1}
+    assert changed(check_invariants(catalog, store, acknowledged)) == {"twice": 1}
 
 
 def test_unfinished_and_failed_jobs_are_counted(
@@ -81,7 +81,7 @@ def test_unfinished_and_failed_jobs_are_counted(
         add_job(session, map_id)
         add_job(session, map_id, state=JobState.RUNNING)
         add_job(session, map_id, state=JobState.FAILED, error={"code": "worker_fell"})
-    assert changed(audit(catalog, store, acknowledged)) == {"stuck": 2, "failed": 1}
+    assert changed(check_invariants(catalog, store, acknowledged)) == {"stuck": 2, "failed": 1}
 
 
 @pytest.mark.parametrize("damage", ["bytes", "no bytes", "no manifest", "another hash"])
@@ -98,4 +98,4 @@ def test_a_chunk_that_is_not_what_the_catalog_says_is_torn(
         store.delete(chunk.object_key)
     elif damage == "no manifest":
         store.delete(manifest_key(chunk.object_key))
-    assert changed(audit(catalog, store, acknowledged)) == {"torn": 1}
+    assert changed(check_invariants(catalog, store, acknowledged)) == {"torn": 1}

@@ -15,15 +15,15 @@ from sqlalchemy import select
 from services.extractor.worker import ExtractorWorker
 from shared.backup import copy_objects, make, rows
 from shared.backup.folder import BackupFolder, open_backup
-from shared.backup.make import make_backup
-from shared.backup.restore import Restored, restore_backup
-from shared.backup.rows import tables
+from shared.backup.make import create_backup
+from shared.backup.restore import RestoreResult, restore_backup
+from shared.backup.rows import backup_tables
 from shared.catalog.chunks import Chunk
-from shared.catalog.installation import ensure_installation
+from shared.catalog.installation import get_or_create_installation
 from shared.catalog.photos import Photo
 from shared.catalog.session import Catalog
 from shared.errors import Conflict, Misconfigured
-from shared.integrity.check import check
+from shared.integrity.check import verify_store
 from shared.jobs.table import Job, JobState
 from shared.objects import FolderStore
 from shared.settings import Settings
@@ -58,17 +58,17 @@ def other_store(tmp_path: Path) -> FolderStore:
 @pytest.fixture
 def backed_up(service: Service, tmp_path: Path) -> Callable[[], Any]:
     with service.catalog.write() as session:
-        installation_id = ensure_installation(session).id
+        installation_id = get_or_create_installation(session).id
 
     def back_up() -> Any:
-        return make_backup(
+        return create_backup(
             service.catalog, service.store, installation_id, tmp_path / "backup", IMPORTS
         )
 
     return back_up
 
 
-def restored(path: Path, catalog: Catalog, store: FolderStore) -> Restored:
+def restored(path: Path, catalog: Catalog, store: FolderStore) -> RestoreResult:
     folder, about = open_backup(path)
     return restore_backup(folder, about, catalog, lambda: store, IMPORTS)
 
@@ -98,7 +98,7 @@ def test_a_backup_goes_from_either_database_into_the_other_and_answers_the_same(
     done = restored(tmp_path / "backup", other_catalog, other_store)
     assert done.cancelled_jobs == 1
     with service.catalog.read() as here, other_catalog.read() as there:
-        for table in tables():
+        for table in backup_tables():
             if table.name in ("installation", "jobs"):
                 continue
             order = list(table.primary_key.columns)
@@ -111,7 +111,7 @@ def test_a_backup_goes_from_either_database_into_the_other_and_answers_the_same(
     for job_id in [*queued, *held]:
         job = read_job(other_catalog, UUID(job_id))
         assert job.lease_token is None
-    report = check(other_catalog, other_store, originals=True)
+    report = verify_store(other_catalog, other_store, originals=True)
     assert report.faults == []
     assert report.checked["chunk"] >= 1
 
@@ -127,12 +127,12 @@ def test_restored_catalog_has_the_id_of_its_store_or_else_of_the_backup(
 ) -> None:
     about = backed_up()
     with other_catalog.write() as session:
-        own = str(ensure_installation(session).id)
+        own = str(get_or_create_installation(session).id)
     folder, _ = open_backup(tmp_path / "backup")
     owner = own if is_marked else None  # as after a first start, which marks the store
     restore_backup(folder, about, other_catalog, lambda: other_store, IMPORTS, store_owner=owner)
     with other_catalog.write() as session:
-        restored_id = str(ensure_installation(session).id)
+        restored_id = str(get_or_create_installation(session).id)
     assert restored_id == (own if is_marked else about.installation_id)
 
 
@@ -145,9 +145,9 @@ def test_a_backup_taken_again_copies_only_what_is_new_and_forgets_what_is_gone(
 
     def noted(store: FolderStore, folder: BackupFolder, info: Any) -> int:
         taken.append(info.key)
-        return copy_objects.take(store, folder, info)
+        return copy_objects.back_up_object(store, folder, info)
 
-    monkeypatch.setattr("shared.backup.make.take", noted)
+    monkeypatch.setattr("shared.backup.make.back_up_object", noted)
     assert backed_up().objects
     assert taken == []
     with service.catalog.read() as session:
@@ -190,10 +190,10 @@ def test_what_comes_or_goes_while_a_backup_is_taken_is_in_it_or_not_named_by_it(
             service.store.delete(newest.object_key)
         return copy_rest(*arguments)
 
-    copy_all, copy_rest = make._copy_all, make._copy_rest
+    copy_all, copy_rest = make._copy_all, make._copy_missing
     monkeypatch.setattr("shared.backup.make.dump_rows", meanwhile)
     monkeypatch.setattr(make, "_copy_all", before)
-    monkeypatch.setattr(make, "_copy_rest", after)
+    monkeypatch.setattr(make, "_copy_missing", after)
     about = backed_up()
     assert len(rounds) == 2
     assert (about.missing, about.damaged) == ([], [])
@@ -225,7 +225,7 @@ def test_an_interrupted_backup_leaves_the_one_before_and_goes_on(
     before = backed_up()
     service.indexed(2)
     with monkeypatch.context() as patched:
-        patched.setattr(make, "_copy_rest", lambda *_: 1 / 0)
+        patched.setattr(make, "_copy_missing", lambda *_: 1 / 0)
         with pytest.raises(ZeroDivisionError):
             backed_up()
     with (tmp_path / "backup/objects.jsonl").open("a") as lines:
@@ -285,11 +285,11 @@ def test_a_folder_that_is_no_backup_or_anothers_is_left_alone(
     (tmp_path / "letters").mkdir()
     (tmp_path / "letters/to-mother.txt").write_text("Dear")
     with pytest.raises(Misconfigured) as caught:
-        make_backup(service.catalog, service.store, UUID(int=1), tmp_path / "letters", IMPORTS)
+        create_backup(service.catalog, service.store, UUID(int=1), tmp_path / "letters", IMPORTS)
     assert caught.value.code == "not_a_backup"
     backed_up()
     with pytest.raises(Misconfigured) as caught:
-        make_backup(service.catalog, service.store, UUID(int=1), tmp_path / "backup", IMPORTS)
+        create_backup(service.catalog, service.store, UUID(int=1), tmp_path / "backup", IMPORTS)
     assert caught.value.code == "other_installation"
     file = tmp_path / "backup/backup.json"
     file.write_text(json.dumps({**json.loads(file.read_text()), "format": 99}))

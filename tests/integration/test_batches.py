@@ -14,19 +14,19 @@ import pytest
 from sqlalchemy import func, select
 
 from services.extractor.worker import ExtractorWorker
-from services.gateway.batches import checked_prefix
+from services.gateway.batches import validate_prefix
 from services.steward.batches import bring_in as bring_in_module
 from services.steward.batches import worker as worker_module
 from services.steward.batches.worker import BatchWorker, resume_batches
-from services.steward.collect import collect_brought, collect_orphans
-from services.steward.delete_maps import delete_maps
-from shared.catalog.maps import ensure_default_map
+from services.steward.collect import collect_job_files, collect_orphans
+from services.steward.delete_maps import purge_deleted_maps
+from shared.catalog.maps import get_or_create_default_map
 from shared.catalog.photos import Photo
 from shared.catalog.session import Catalog
 from shared.errors import StorageFull, Unavailable, Unprocessable
 from shared.intake import incoming as incoming_module
 from shared.intake import store_photo as store_photo_module
-from shared.jobs import InProcessHints, Job, JobKind, JobState, free_expired_leases
+from shared.jobs import InProcessWakeups, Job, JobKind, JobState, reclaim_expired_leases
 from shared.jobs.batches import BatchItem
 from shared.objects import FolderStore, ObjectStore, OwnedStore
 from shared.objects.keys import ARCHIVES, TRASH
@@ -56,7 +56,7 @@ class Batches:
     def new_worker(self, **changed: Any) -> BatchWorker:
         """As after a restart, with other settings if need be."""
         settings = self.settings.model_copy(update=changed)
-        return BatchWorker(self.catalog, self.store, InProcessHints(), settings, "steward")
+        return BatchWorker(self.catalog, self.store, InProcessWakeups(), settings, "steward")
 
     def start(self, *files: tuple[str, bytes], **parts: Any) -> UUID:
         """`POST /upload/batch` with these files, and `archive` or `manifest`; its job."""
@@ -73,7 +73,7 @@ class Batches:
     def work(self, worker: BatchWorker | None = None) -> bool:
         """The next slice of a batch, without pauses."""
         end_pauses(self.catalog)
-        return (worker or self.worker).work_next(threading.Event())
+        return (worker or self.worker).run_next(threading.Event())
 
     def finish(self, job_id: UUID, worker: BatchWorker | None = None) -> dict[str, Any]:
         """Slices and drains until the batch has ended; the job as the API tells it."""
@@ -168,11 +168,11 @@ def test_a_prefix_may_be_written_as_an_address_in_the_servers_own_bucket(
     settings: Settings,
 ) -> None:
     own = settings.model_copy(update={"s3_endpoint": "http://s3:9000", "s3_bucket": "city"})
-    assert checked_prefix("s3://city/imports/monday", own) == "imports/monday/"
-    assert checked_prefix("imports/monday/", own) == "imports/monday/"
+    assert validate_prefix("s3://city/imports/monday", own) == "imports/monday/"
+    assert validate_prefix("imports/monday/", own) == "imports/monday/"
     for wrong in ("s3://other/imports/monday", "s3://city/originals", "s3://city", "s3://"):
         with pytest.raises(Unprocessable) as caught:
-            checked_prefix(wrong, own)
+            validate_prefix(wrong, own)
         assert caught.value.code == "invalid_field"
 
 
@@ -250,7 +250,7 @@ def test_an_archive_comes_in_with_its_table_and_goes(
     assert named.latitude == 45.0691
     assert batches.store.get(two.object_key) == photo_bytes(2)
     assert [item["line"] for item in batches.items(job_id)] == [None, 2, None]
-    collect_brought(batches.catalog, batches.store, ARCHIVES, JobKind.BATCH)
+    collect_job_files(batches.catalog, batches.store, ARCHIVES, JobKind.BATCH)
     assert batches.keys("archives/") == set()
 
 
@@ -356,7 +356,7 @@ def test_limits_of_a_batch_are_said_and_leave_nothing(
 ) -> None:
     small = settings.model_copy(update={"max_archive_size": 3000, "max_batch_photos": 2})
     with catalog.write() as session:
-        ensure_default_map(session, settings.extractor)
+        get_or_create_default_map(session, settings.extractor)
     service = Service(catalog, store, small, make_worker)
 
     def refused(**sent: Any) -> str:
@@ -408,7 +408,7 @@ def test_an_archive_that_makes_no_sense_fails_and_brings_in_nothing(
     assert batches.photos() == []
     answer = batches.service("POST", f"/jobs/{job_id}/retry")
     assert "Upload them again" in problem(answer, 409, "job_not_retryable")["detail"]
-    collect_brought(batches.catalog, batches.store, ARCHIVES, JobKind.BATCH)
+    collect_job_files(batches.catalog, batches.store, ARCHIVES, JobKind.BATCH)
     assert batches.keys("archives/") == set()
     assert not batches.work()
 
@@ -572,9 +572,9 @@ def test_an_upload_goes_before_the_photos_of_a_batch(batches: Batches) -> None:
 def test_batches_take_turns(batches: Batches, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(worker_module, "SLICE_SECONDS", 0.0)
     jobs = [batches.start(*files(*range(begin, begin + 3))) for begin in (0, 10)]
-    monkeypatch.setattr(worker_module, "TURN_SECONDS", 60.0)
+    monkeypatch.setattr(worker_module, "YIELD_SECONDS", 60.0)
     for _ in range(2):
-        assert batches.worker.work_next(threading.Event())
+        assert batches.worker.run_next(threading.Event())
     assert [batches.job(job_id)["state"] for job_id in jobs] == ["running", "running"]
 
 
@@ -592,7 +592,7 @@ def test_cancelling_ends_what_has_not_ended(batches: Batches) -> None:
     assert set(states) == {"succeeded", "cancelled"}
     assert queued_photos(batches.catalog) == 0
     assert not batches.work()
-    collect_brought(batches.catalog, batches.store, ARCHIVES, JobKind.BATCH)
+    collect_job_files(batches.catalog, batches.store, ARCHIVES, JobKind.BATCH)
     assert batches.keys("archives/") == set()
     problem(batches.service("POST", f"/jobs/{job_id}/cancel"), 409, "job_finished")
 
@@ -648,7 +648,7 @@ def test_a_map_that_is_deleted_takes_its_batch_along(batches: Batches) -> None:
     batches.work(batches.new_worker(batch_ahead_photos=3))
     batches.service.json("DELETE", "/maps/default")
     for _ in range(ROUNDS):
-        delete_maps(batches.catalog, batches.store)
+        purge_deleted_maps(batches.catalog, batches.store)
     assert batches.keys("originals/") | batches.keys("archives/") == set()
     with batches.catalog.read() as session:
         assert session.scalar(select(func.count()).select_from(BatchItem)) == 0
@@ -684,7 +684,7 @@ def restart(batches: Batches, job_id: UUID) -> BatchWorker:
     """Another steward, once the dead one's lease is over."""
     expire_lease(batches.catalog, job_id)
     with batches.catalog.write() as session:
-        assert free_expired_leases(session, max_attempts=3) == 1
+        assert reclaim_expired_leases(session, max_attempts=3) == 1
     return batches.new_worker()
 
 
@@ -740,17 +740,17 @@ def test_a_steward_killed_in_each_commit_leaves_each_photo_once(
     batches: Batches, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     job_id = batches.start(archive=zip_of(files(*range(5))))
-    real = store_photo_module.put_photo
+    real = store_photo_module.insert_photo
 
     def put_then_die(*arguments: Any) -> Any:
         real(*arguments)
         raise Killed
 
     for life in range(2):
-        monkeypatch.setattr(bring_in_module, "put_photo", put_then_die)
+        monkeypatch.setattr(bring_in_module, "insert_photo", put_then_die)
         with pytest.raises(Killed):
             batches.work()
-        monkeypatch.setattr(bring_in_module, "put_photo", real)
+        monkeypatch.setattr(bring_in_module, "insert_photo", real)
         assert batches.photos() == [], life
         batches.worker = restart(batches, job_id)
     assert len(batches.keys("originals/")) == 2, "orphans of the two lives"
@@ -780,14 +780,14 @@ def test_an_item_that_kills_its_stewards_is_given_up_and_the_others_come_in(
     batches: Batches, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     job_id = batches.start(archive=zip_of(files(*range(4))))
-    real = incoming_module.examine
+    real = incoming_module.validate_photo
 
     def die_of_one(store: ObjectStore, received: Any, *rest: Any, **said: Any) -> Any:
         if received.filename == "2.jpg":
             raise Killed
         return real(store, received, *rest, **said)
 
-    monkeypatch.setattr(bring_in_module, "examine", die_of_one)
+    monkeypatch.setattr(bring_in_module, "validate_photo", die_of_one)
     for _ in range(3):
         with pytest.raises(Killed):
             batches.work()
@@ -861,12 +861,12 @@ def test_an_archive_that_was_removed_fails_its_batch(batches: Batches) -> None:
 def test_bytes_that_wait_in_a_batch_are_no_orphans(batches: Batches) -> None:
     job_id = batches.start(*files(1, 2))
     archive_id = batches.start(archive=zip_of(files(3)))
-    collect_brought(batches.catalog, batches.store, ARCHIVES, JobKind.BATCH)
+    collect_job_files(batches.catalog, batches.store, ARCHIVES, JobKind.BATCH)
     collect_orphans(batches.catalog, batches.store, age_seconds=-60)
     assert counts(batches.finish(job_id)) == (2, 2, 0)
     assert counts(batches.finish(archive_id)) == (1, 1, 0)
     batches.store.put(f"archives/{UUID(int=7)}", b"of a gateway that was killed")
-    collect_brought(batches.catalog, batches.store, ARCHIVES, JobKind.BATCH)
+    collect_job_files(batches.catalog, batches.store, ARCHIVES, JobKind.BATCH)
     assert f"archives/{UUID(int=7)}" in batches.keys("archives/")
     collect_orphans(batches.catalog, batches.store, age_seconds=-60)
     assert batches.keys("archives/") == set()
@@ -894,7 +894,7 @@ def on_s3(
 ) -> Batches:
     """As `batches`, with the objects in a bucket. No photo is described: extractors have others."""
     with catalog.write() as session:
-        ensure_default_map(session, settings.extractor)
+        get_or_create_default_map(session, settings.extractor)
     store: OwnedStore = S3Store(s3.new_bucket())
     return Batches(Service(catalog, store, settings, make_worker), settings)
 
@@ -912,7 +912,7 @@ def test_every_source_is_brought_in_on_a_bucket_across_a_kill(
         job_id = on_s3.start(manifest=lines(*({"key": f"imports/{n}"} for n, _ in photos)))
     else:
         job_id = on_s3.start(archive=PACKED[source](photos))
-    real = incoming_module.examine
+    real = incoming_module.validate_photo
     left = [3]
 
     def die_at_the_third(*arguments: Any) -> Any:
@@ -921,7 +921,7 @@ def test_every_source_is_brought_in_on_a_bucket_across_a_kill(
             raise Killed
         return real(*arguments)
 
-    monkeypatch.setattr(bring_in_module, "examine", die_at_the_third)
+    monkeypatch.setattr(bring_in_module, "validate_photo", die_at_the_third)
     with pytest.raises(Killed):
         on_s3.work()
     on_s3.worker = restart(on_s3, job_id)

@@ -17,9 +17,9 @@ from services.steward.queue import resend_hints
 from shared.catalog.session import Catalog
 from shared.errors import Misconfigured
 from shared.jobs import Job, JobState
-from shared.jobs.celery_app import DRAIN_TASK, make_celery
-from shared.jobs.celery_hints import MOST_WAITING, CeleryHints
-from shared.jobs.hints import Lane
+from shared.jobs.celery_app import DRAIN_TASK, create_celery_app
+from shared.jobs.celery_hints import MAX_PENDING_WAKEUPS, CeleryWakeups
+from shared.jobs.hints import WakeupQueue
 from shared.objects import FolderStore
 from shared.settings import Settings
 from tests.support.catalog_rows import add_map, ask, upload
@@ -39,16 +39,16 @@ def own_redis() -> Iterator[RedisServer]:
 
 
 @pytest.fixture
-def hints(own_redis: RedisServer) -> Iterator[CeleryHints]:
+def hints(own_redis: RedisServer) -> Iterator[CeleryWakeups]:
     settings = Settings(redis_url=own_redis.url)
-    made = CeleryHints(make_celery(settings), settings)
+    made = CeleryWakeups(create_celery_app(settings), settings)
     yield made
     made.close()
 
 
-def waiting(server: RedisServer) -> dict[Lane, list[bytes]]:
+def waiting(server: RedisServer) -> dict[WakeupQueue, list[bytes]]:
     with Redis.from_url(server.url) as client:
-        return {lane: list(client.lrange(lane, 0, -1)) for lane in Lane}
+        return {lane: list(client.lrange(lane, 0, -1)) for lane in WakeupQueue}
 
 
 def until(condition) -> None:  # type: ignore[no-untyped-def]
@@ -59,13 +59,13 @@ def until(condition) -> None:  # type: ignore[no-untyped-def]
 
 
 def test_a_hint_is_json_that_names_no_job_in_the_lane_it_was_sent_on(
-    hints: CeleryHints, own_redis: RedisServer
+    hints: CeleryWakeups, own_redis: RedisServer
 ) -> None:
-    hints.send(Lane.QUERY)
-    until(lambda: waiting(own_redis)[Lane.QUERY])
+    hints.send(WakeupQueue.QUERY)
+    until(lambda: waiting(own_redis)[WakeupQueue.QUERY])
     found = waiting(own_redis)
-    assert (len(found[Lane.QUERY]), len(found[Lane.BULK])) == (1, 0)
-    message = json.loads(found[Lane.QUERY][0])
+    assert (len(found[WakeupQueue.QUERY]), len(found[WakeupQueue.BULK])) == (1, 0)
+    message = json.loads(found[WakeupQueue.QUERY][0])
     assert message["content-type"] == "application/json"
     assert message["headers"]["task"] == DRAIN_TASK
     arguments, named, _ = json.loads(base64.b64decode(message["body"]))
@@ -73,18 +73,18 @@ def test_a_hint_is_json_that_names_no_job_in_the_lane_it_was_sent_on(
 
 
 def test_a_lane_holds_few_hints_however_many_are_sent(
-    hints: CeleryHints, own_redis: RedisServer
+    hints: CeleryWakeups, own_redis: RedisServer
 ) -> None:
-    for _ in range(3 * MOST_WAITING):
+    for _ in range(3 * MAX_PENDING_WAKEUPS):
         hints.send()
         time.sleep(0.02)
-    until(lambda: len(waiting(own_redis)[Lane.BULK]) >= MOST_WAITING)
+    until(lambda: len(waiting(own_redis)[WakeupQueue.BULK]) >= MAX_PENDING_WAKEUPS)
     time.sleep(0.2)
-    assert len(waiting(own_redis)[Lane.BULK]) == MOST_WAITING
+    assert len(waiting(own_redis)[WakeupQueue.BULK]) == MAX_PENDING_WAKEUPS
 
 
 def test_without_redis_a_hint_neither_waits_nor_raises_and_the_next_one_arrives(
-    hints: CeleryHints, own_redis: RedisServer
+    hints: CeleryWakeups, own_redis: RedisServer
 ) -> None:
     assert own_redis.process is not None
     own_redis.process.kill()
@@ -96,14 +96,14 @@ def test_without_redis_a_hint_neither_waits_nor_raises_and_the_next_one_arrives(
 
     def arrived() -> bool:
         hints.send()
-        return bool(waiting(own_redis)[Lane.BULK])
+        return bool(waiting(own_redis)[WakeupQueue.BULK])
 
     until(arrived)
 
 
 def test_services_without_redis_say_what_to_set() -> None:
     with pytest.raises(Misconfigured, match="REDIS_URL") as caught:
-        make_celery(Settings())
+        create_celery_app(Settings())
     assert caught.value.code == "redis_missing"
 
 
@@ -160,7 +160,7 @@ def test_an_extractor_does_what_is_queued_whatever_happens_to_the_hints(
     tmp_path: Path,
     catalog_on_postgres: Catalog,
     map_id: UUID,
-    hints: CeleryHints,
+    hints: CeleryWakeups,
     own_redis: RedisServer,
     extractor: Extractor,
 ) -> None:
@@ -176,7 +176,7 @@ def test_an_extractor_does_what_is_queued_whatever_happens_to_the_hints(
 
     put(20)
     ask(catalog_on_postgres, store, map_id, photo_bytes(3))
-    for lane in Lane:
+    for lane in WakeupQueue:
         hints.send(lane)
         hints.send(lane)  # two of one are harmless
     until(lambda: done(catalog_on_postgres) == {JobState.SUCCEEDED: 41})

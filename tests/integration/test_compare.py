@@ -11,20 +11,20 @@ import pytest
 from sqlalchemy import select
 
 from services.extractor import stored_rows
-from services.extractor.compare import Comparisons, Prepared
+from services.extractor.compare import ComparisonRunner, PreparedComparison
 from services.extractor.worker import ExtractorWorker
 from services.steward.collect import (
     collect_ended_generations,
     collect_orphans,
     collect_queries,
 )
-from shared.catalog.chunks import rows_of
-from shared.catalog.maps import ensure_default_map
+from shared.catalog.chunks import find_descriptor_rows
+from shared.catalog.maps import get_or_create_default_map
 from shared.catalog.session import Catalog
 from shared.chunks import Row, read_row
-from shared.comparison import Compared
+from shared.comparison import CompareResult
 from shared.ids import new_id
-from shared.jobs import Job, JobKind, free_expired_leases
+from shared.jobs import Job, JobKind, reclaim_expired_leases
 from shared.objects import FolderStore, ObjectStore
 from shared.objects.keys import comparison_key, query_key
 from shared.settings import Settings
@@ -217,7 +217,7 @@ def test_comparisons_wait_in_the_queue_of_queries(
     make_worker: Callable[[], ExtractorWorker],
 ) -> None:
     with catalog.write() as session:
-        ensure_default_map(session, settings.extractor)
+        get_or_create_default_map(session, settings.extractor)
     few = settings.model_copy(update={"max_queued_queries": 1})
     service = Service(catalog, store, few, make_worker)
     query = service.indexed(0, 1)[0]
@@ -242,18 +242,18 @@ def test_cancelled_comparison_can_be_retried(service: Service) -> None:
 def test_comparison_of_a_worker_that_was_given_up_is_ended_by_the_next_one(
     service: Service, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    real = Comparisons._compare
+    real = ComparisonRunner._compare
     given_up: list[int] = []
 
-    def compare(self: Comparisons, prepared: Prepared) -> Compared:
+    def compare(self: ComparisonRunner, prepared: PreparedComparison) -> CompareResult:
         if not given_up:
             with service.catalog.write() as session:
-                given_up.append(free_expired_leases(session, 3, everyone=True))
+                given_up.append(reclaim_expired_leases(session, 3, all_leases=True))
         return real(self, prepared)
 
     query = service.indexed(0, 1, 2)[0]
     started = begun(service, f"/similarity/{query}")
-    monkeypatch.setattr(Comparisons, "_compare", compare)
+    monkeypatch.setattr(ComparisonRunner, "_compare", compare)
     assert service.worker.drain(threading.Event()).succeeded == 1
     assert given_up == [1]
     job = service.json("GET", f"/jobs/{started['job_id']}")
@@ -324,7 +324,7 @@ def test_candidate_whose_descriptor_is_damaged_is_compared_and_not_explained(
     before = plain(service, query)
     damaged = ids(before)[0]
     with service.catalog.read() as session:
-        found = rows_of(session, UUID(before["generation_id"]), [UUID(damaged)])
+        found = find_descriptor_rows(session, UUID(before["generation_id"]), [UUID(damaged)])
     ((at, ((number, _),)),) = found.items()
 
     def read(store: ObjectStore, key: str, row: int) -> Row:

@@ -21,15 +21,15 @@ from fastapi import FastAPI, Request
 from fastapi.responses import StreamingResponse
 
 from services import http_connections
-from services.call_log import Call, CallLog
+from services.call_log import RequestLogMiddleware, RequestRecord
 from services.http_connections import (
     ConnectionLimits,
     Connections,
     Reason,
     address_group,
 )
-from services.http_server import http_server, listening
-from shared.problems import CLIENT_GONE, install_problem_handlers
+from services.http_server import http_server, listen
+from shared.problems import CLIENT_GONE, install_exception_handlers
 from shared.settings import Settings
 
 LONG = 30.0
@@ -44,7 +44,7 @@ class Running:
     def __init__(self, port: int, connections: Connections) -> None:
         self.port = port
         self.connections = connections
-        self.calls: list[Call] = []
+        self.calls: list[RequestRecord] = []
         self.hold = threading.Event()
 
     def connect(self, source: str = "127.0.0.1") -> socket.socket:
@@ -65,12 +65,12 @@ class Running:
 @contextlib.contextmanager
 def serving(**limits: Any) -> Iterator[Running]:
     """`limits` beside LIMITS."""
-    with listening("127.0.0.1", 0) as listener:
+    with listen("127.0.0.1", 0) as listener:
         connections = Connections(replace(LIMITS, **limits))
         running = Running(listener.getsockname()[1], connections)
         app = FastAPI()
-        install_problem_handlers(app)
-        app.add_middleware(CallLog, on_end=running.calls.append)
+        install_exception_handlers(app)
+        app.add_middleware(RequestLogMiddleware, on_end=running.calls.append)
 
         @app.get("/whoami")
         async def whoami(request: Request) -> str:

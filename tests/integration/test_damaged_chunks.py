@@ -14,12 +14,12 @@ from sqlalchemy.exc import OperationalError
 from shared import read_retries
 from shared.catalog.chunks import Chunk
 from shared.catalog.searches import Search
-from shared.integrity.check import check
-from shared.integrity.repair import repair
-from shared.jobs import InProcessHints
+from shared.integrity.check import verify_store
+from shared.integrity.repair import repair_descriptors
+from shared.jobs import InProcessWakeups
 from shared.objects import FolderStore, ObjectStore
 from shared.objects.s3 import S3Store
-from shared.shards import WHOLE
+from shared.shards import SINGLE_SHARD
 from tests.integration.gateway import Service
 from tests.support.problems import problem
 from tests.support.servers import S3Server
@@ -37,9 +37,9 @@ def store(request: pytest.FixtureRequest, tmp_path: Path) -> ObjectStore:
 
 def restarted(service: Service) -> Service:
     """The service as on a new machine: nothing is loaded, and nothing of a bucket is cached."""
-    shutil.rmtree(service.settings.search_cache(WHOLE), ignore_errors=True)
+    shutil.rmtree(service.settings.search_cache_folder(SINGLE_SHARD), ignore_errors=True)
     again = Service(service.catalog, service.store, service.settings, service.make_worker)
-    again.search.follow()
+    again.search.sync()
     return again
 
 
@@ -84,10 +84,10 @@ def test_the_rest_is_answered_and_the_chunk_named_until_it_is_repaired(
     assert health["status"] == health["parts"]["search"]["status"] == "degraded"
     assert key in health["parts"]["search"]["detail"]
 
-    report = check(service.catalog, service.store, originals=False)
-    assert repair(service.catalog, InProcessHints(), report) == 1
+    report = verify_store(service.catalog, service.store, originals=False)
+    assert repair_descriptors(service.catalog, InProcessWakeups(), report) == 1
     service.drain()
-    service.search.follow()
+    service.search.sync()
     mended = similar(service, asked)
     assert mended["similar_images"] == whole["similar_images"]
     assert (mended["certificate"], mended["missing"]) == ("exhaustive", [])

@@ -16,9 +16,9 @@ from sqlalchemy import func, select, update
 
 from services.extractor.worker import ExtractorWorker
 from services.steward.collect import collect_direct_uploads, collect_orphans
-from services.steward.delete_maps import delete_maps
+from services.steward.delete_maps import purge_deleted_maps
 from shared.catalog.base import db_now_plus
-from shared.catalog.direct_uploads import DirectUpload
+from shared.catalog.direct_uploads import PresignedUpload
 from shared.catalog.photos import Photo
 from shared.catalog.session import Catalog
 from shared.intake.photo_header import read_photo_header
@@ -87,7 +87,7 @@ def photos(catalog: Catalog) -> int:
 
 def expire(catalog: Catalog, seconds_ago: float = 1) -> None:
     with catalog.write() as session:
-        session.execute(update(DirectUpload).values(expires_at=db_now_plus(-seconds_ago)))
+        session.execute(update(PresignedUpload).values(expires_at=db_now_plus(-seconds_ago)))
 
 
 @lenient
@@ -279,8 +279,8 @@ def test_what_was_not_completed_in_time_is_gone_and_collected(
     put(kept, photo_bytes(2))
     with catalog.write() as session:
         session.execute(
-            update(DirectUpload)
-            .where(DirectUpload.id == UUID(upload["upload_id"]))
+            update(PresignedUpload)
+            .where(PresignedUpload.id == UUID(upload["upload_id"]))
             .values(expires_at=db_now_plus(-1))
         )
     problem(complete(service, upload), 410, "upload_expired")
@@ -320,10 +320,10 @@ def test_a_deleted_maps_uploads_go_with_it(
     service.json("DELETE", "/maps/city")
     problem(complete(service, upload, params={"map": "city"}), 404, "map_not_found")
     for _ in range(5):
-        delete_maps(catalog, store)
+        purge_deleted_maps(catalog, store)
     assert keys(store) == set()
     with catalog.read() as session:
-        assert session.scalars(select(DirectUpload.id)).all() == []
+        assert session.scalars(select(PresignedUpload.id)).all() == []
 
 
 def test_presigning_can_be_repeated_under_a_key(service: Service, catalog: Catalog) -> None:
@@ -335,7 +335,7 @@ def test_presigning_can_be_repeated_under_a_key(service: Service, catalog: Catal
     assert [answer.status_code for answer in answers] == [201, 201]
     assert answers[0].json() == answers[1].json()
     with catalog.read() as session:
-        assert len(session.scalars(select(DirectUpload.id)).all()) == 1
+        assert len(session.scalars(select(PresignedUpload.id)).all()) == 1
 
 
 @pytest.mark.parametrize(
@@ -359,7 +359,7 @@ def test_what_can_not_be_understood_is_refused_before_anything_is_sent(
     file = {"filename": "a.jpg", "file_size": 10, "sha256": "0" * 64}
     field_refused(service("POST", "/uploads/presign", json={**file, **changed}), field)
     with catalog.read() as session:
-        assert session.scalars(select(DirectUpload.id)).all() == []
+        assert session.scalars(select(PresignedUpload.id)).all() == []
 
 
 @lenient

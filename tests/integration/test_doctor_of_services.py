@@ -11,15 +11,15 @@ import pytest
 from sqlalchemy import update
 
 from services.cli import server_checks
-from services.cli.server_checks import objects_check, postgres_check, redis_check
+from services.cli.server_checks import check_object_store, check_postgres, check_redis
 from services.cli.service_checks import (
-    gateway_check,
-    processes_check,
-    search_check,
-    steward_check,
+    check_gateway,
+    check_processes,
+    check_search,
+    check_steward,
 )
 from shared.catalog.base import db_now_plus
-from shared.catalog.live_processes import LiveProcess, living, signs_of_life
+from shared.catalog.live_processes import RegisteredProcess, list_processes, process_heartbeat
 from shared.catalog.session import Catalog
 from shared.errors import Misconfigured, PlacewiseError, Unavailable
 from shared.objects import FolderStore
@@ -50,83 +50,83 @@ def refused(check: Any, *arguments: Any) -> PlacewiseError:
 def test_postgres_tells_its_version_tables_and_clock(
     deployed: Catalog, postgres: PostgresServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert "tables up to date" in postgres_check(Settings())
-    monkeypatch.setattr(server_checks, "MOST_SKEW_SECONDS", -1.0)
-    assert refused(postgres_check, Settings()).code == "clocks_differ"
-    monkeypatch.setattr(server_checks, "LEAST_POSTGRES", 10**9)
-    assert refused(postgres_check, Settings()).code == "postgres_too_old"
-    monkeypatch.setattr(server_checks, "LEAST_POSTGRES", 0)
+    assert "tables up to date" in check_postgres(Settings())
+    monkeypatch.setattr(server_checks, "MAX_CLOCK_SKEW_SECONDS", -1.0)
+    assert refused(check_postgres, Settings()).code == "clocks_differ"
+    monkeypatch.setattr(server_checks, "MIN_POSTGRES_VERSION", 10**9)
+    assert refused(check_postgres, Settings()).code == "postgres_too_old"
+    monkeypatch.setattr(server_checks, "MIN_POSTGRES_VERSION", 0)
     monkeypatch.setenv("DATABASE_URL", postgres.new_database())
-    assert refused(postgres_check, Settings()).code == "schema_outdated"
+    assert refused(check_postgres, Settings()).code == "schema_outdated"
     monkeypatch.setenv("DATABASE_URL", "postgresql+psycopg://nobody:x@127.0.0.1:1/none")
-    assert refused(postgres_check, Settings()).code == "catalog_unavailable"
+    assert refused(check_postgres, Settings()).code == "catalog_unavailable"
 
 
 def test_redis_tells_its_version_and_has_to_keep_what_it_is_given(
     redis: RedisServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert refused(redis_check, Settings()).code == "redis_missing"
+    assert refused(check_redis, Settings()).code == "redis_missing"
     monkeypatch.setenv("REDIS_URL", redis.url)
-    assert "answers" in redis_check(Settings())
-    monkeypatch.setattr(server_checks, "LEAST_REDIS", (999, 0))
-    assert refused(redis_check, Settings()).code == "redis_too_old"
+    assert "answers" in check_redis(Settings())
+    monkeypatch.setattr(server_checks, "MIN_REDIS_VERSION", (999, 0))
+    assert refused(check_redis, Settings()).code == "redis_too_old"
     monkeypatch.setenv("REDIS_URL", "redis://127.0.0.1:1/0")
-    gone = refused(redis_check, Settings())
+    gone = refused(check_redis, Settings())
     assert isinstance(gone, Unavailable)
     assert "Start it" in gone.detail
 
 
 def test_objects_are_written_read_and_deleted(monkeypatch: pytest.MonkeyPatch) -> None:
-    said = objects_check(Settings())
+    said = check_object_store(Settings())
     assert "written, read, listed and deleted" in said
     store = FolderStore(Settings().placewise_home / "objects", alone=False)
     assert list(store.list("")) == []
     monkeypatch.setattr(FolderStore, "read_range", lambda *_: b"all of it")
-    assert refused(objects_check, Settings()).code == "object_store_unfit"
+    assert refused(check_object_store, Settings()).code == "object_store_unfit"
     assert list(store.list("")) == []
 
 
 def test_who_lives_is_known_and_who_was_killed_soon_is_not(deployed: Catalog) -> None:
     settings = Settings()
-    assert refused(processes_check, settings, "extractor").code == "nobody_there"
-    with signs_of_life(deployed, "extractor"):
+    assert refused(check_processes, settings, "extractor").code == "nobody_there"
+    with process_heartbeat(deployed, "extractor"):
         deadline = time.monotonic() + 30
         while True:
             with deployed.read() as session:
-                if living(session):
+                if list_processes(session):
                     break
             assert time.monotonic() < deadline, "it gave no sign"
             time.sleep(0.01)
-        assert processes_check(settings, "extractor").startswith("1 of release ")
+        assert check_processes(settings, "extractor").startswith("1 of release ")
         with deployed.write() as session:
-            session.execute(update(LiveProcess).values(seen_at=db_now_plus(-60)))
-        gone = refused(processes_check, settings, "extractor")
+            session.execute(update(RegisteredProcess).values(seen_at=db_now_plus(-60)))
+        gone = refused(check_processes, settings, "extractor")
         assert re.search(r"The last sign of one is \d+ s old", gone.detail)
     with deployed.read() as session:
-        assert living(session) == [], "it has signed off"
+        assert list_processes(session) == [], "it has signed off"
 
 
 def test_a_steward_that_lives_and_frees_no_lease_is_found_out(deployed: Catalog) -> None:
     with deployed.write() as session:
-        session.add(LiveProcess(role="steward", name="one", release="1"))
+        session.add(RegisteredProcess(role="steward", name="one", release="1"))
         add_job(session, add_map(session).id)
-    assert "no lease is overdue" in steward_check(Settings())
+    assert "no lease is overdue" in check_steward(Settings())
     job = take(deployed, 1)[0]
     set_columns(deployed, job.id, lease_until=db_now_plus(-60))
-    assert refused(steward_check, Settings()).code == "leases_overdue"
+    assert refused(check_steward, Settings()).code == "leases_overdue"
 
 
 def test_every_shard_has_to_be_answered_for(
     deployed: Catalog, store: FolderStore, settings: Settings, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert refused(search_check, settings).code == "search_missing"
+    assert refused(check_search, settings).code == "search_missing"
     first = SearchServer(deployed, store, settings, Shard(0, 2))
     second = SearchServer(deployed, store, settings, Shard(1, 2))
     try:
         monkeypatch.setenv("SEARCH_URLS", f"{first.url},{second.url}")
-        assert search_check(Settings()).startswith("2 shards, 2 workers, 0 rows")
+        assert check_search(Settings()).startswith("2 shards, 2 workers, 0 rows")
         second.stop()
-        ill = refused(search_check, Settings())
+        ill = refused(check_search, Settings())
         assert ill.code == "search_ill"
         assert "nobody answers for shard 1/2" in ill.detail
     finally:
@@ -135,7 +135,7 @@ def test_every_shard_has_to_be_answered_for(
 
 
 def test_a_gateway_that_is_not_there_is_named() -> None:
-    gone = refused(gateway_check, "http://127.0.0.1:1", None)
+    gone = refused(check_gateway, "http://127.0.0.1:1", None)
     assert isinstance(gone, Unavailable)
     assert not isinstance(gone, Misconfigured)
     assert "http://127.0.0.1:1 does not answer" in gone.detail

@@ -19,13 +19,13 @@ from shared.catalog.base import db_now
 from shared.catalog.chunks import Descriptor
 from shared.catalog.evaluations import Evaluation
 from shared.catalog.generations import Generation, GenerationState
-from shared.catalog.maps import bump_version, get_map, lock_map
+from shared.catalog.maps import get_map, increment_map_version, lock_map
 from shared.catalog.photos import Photo, PhotoRole
 from shared.catalog.searches import Search
 from shared.catalog.session import Catalog
 from shared.errors import Unavailable
-from shared.jobs import JobKind, JobState, free_expired_leases
-from shared.jobs.finish import cancel, fail, retry
+from shared.jobs import JobKind, JobState, reclaim_expired_leases
+from shared.jobs.finish import cancel_job, fail_job, retry_job
 from shared.jobs.table import get_job
 from shared.objects import FolderStore
 from shared.search_protocol import SearchRequest, SearchResponse, SearchStatus
@@ -225,7 +225,7 @@ def test_chunks_merged_and_removed_meanwhile_change_no_figure(town: Town) -> Non
     def merge() -> None:
         assert merge_slot(town.catalog, town.store, town.generation_id, 0)
         collect_superseded_chunks(town.catalog, town.store, grace_seconds=0)
-        town.search.follow()
+        town.search.sync()
 
     job_id = town.start()
     town.work(Watched(town.search, 4, merge))
@@ -240,7 +240,7 @@ def test_chunks_merged_and_removed_meanwhile_change_no_figure(town: Town) -> Non
 @pytest.fixture
 def look_always(monkeypatch: pytest.MonkeyPatch) -> None:
     """The evaluator looks at its job after every question."""
-    monkeypatch.setattr(asked_module, "REPORT_SECONDS", -1.0)
+    monkeypatch.setattr(asked_module, "PROGRESS_INTERVAL_SECONDS", -1.0)
 
 
 @pytest.mark.usefixtures("look_always")
@@ -250,7 +250,7 @@ def test_a_cancelled_evaluation_ends_soon_and_leaves_nothing(town: Town) -> None
 
     def cancel_it() -> None:
         with town.catalog.write() as session:
-            cancel(get_job(session, town.map_id, job_id, lock=True))
+            cancel_job(get_job(session, town.map_id, job_id, lock=True))
 
     search = Watched(town.search, 2, cancel_it)
     assert town.work(search)
@@ -267,13 +267,13 @@ def test_an_evaluation_cancelled_at_the_last_moment_leaves_nothing(town: Town) -
 
     def cancel_it() -> None:
         with town.catalog.write() as session:
-            cancel(get_job(session, town.map_id, job_id, lock=True))
+            cancel_job(get_job(session, town.map_id, job_id, lock=True))
 
     town.work(Watched(town.search, len(STREETS), cancel_it))
     assert read_job(town.catalog, job_id).state == JobState.CANCELLED
     assert (town.evaluations(), town.calibration()) == ([], None)
     with town.catalog.write() as session:
-        retry(session, get_job(session, town.map_id, job_id, lock=True))
+        retry_job(session, get_job(session, town.map_id, job_id, lock=True))
     assert town.work()
     assert len(town.evaluations()) == 1
 
@@ -308,7 +308,7 @@ def test_a_killed_evaluation_begins_anew(town: Town) -> None:
     assert not town.work(), "its lease is not over"
     expire_lease(town.catalog, job_id)
     with town.catalog.write() as session:
-        assert free_expired_leases(session, max_attempts=3) == 1
+        assert reclaim_expired_leases(session, max_attempts=3) == 1
     search = Watched(town.search, 0, kill)
     assert town.work(search)
     assert search.asked >= len(STREETS)
@@ -326,7 +326,7 @@ def test_an_evaluator_whose_lease_was_taken_over_commits_nothing(town: Town) -> 
     def take_over() -> None:
         expire_lease(town.catalog, job_id)
         with town.catalog.write() as session:
-            free_expired_leases(session, max_attempts=3)
+            reclaim_expired_leases(session, max_attempts=3)
         assert town.work()
 
     assert town.work(Watched(town.search, 3, take_over))
@@ -386,7 +386,7 @@ def test_a_damaged_map_is_not_measured_by_its_rest(town: Town, order: int) -> No
     assert keys[order] in job.error["detail"]
     assert town.evaluations() == []
     town.store.put(keys[order], whole)
-    town.search.follow()
+    town.search.sync()
     assert town.figures()["leave_one_out"]["R@1"] == 2 / 8
 
 
@@ -450,7 +450,7 @@ def test_an_automatic_evaluation_is_not_for_every_map_setting_or_moment(town: To
     with town.catalog.write() as session:
         lock_map(session, town.map_id)
         session.get_one(Photo, photo_ids[0]).role = PhotoRole.QUERY
-        bump_version(session, town.map_id)
+        increment_map_version(session, town.map_id)
     assert not automatic(town), "one of them has become a query"
     town.publish([(77, at(77))])
     with town.catalog.write() as session:
@@ -472,7 +472,7 @@ def test_an_evaluation_that_came_to_nothing_is_not_tried_again_before_the_next_c
     job = town.evaluation_jobs()[-1]
     with town.catalog.write() as session:
         mine = get_job(session, town.map_id, job.id, lock=True)
-        cancel(mine) if end == "is cancelled" else fail(mine, {"code": "out_of_luck"})
+        cancel_job(mine) if end == "is cancelled" else fail_job(mine, {"code": "out_of_luck"})
     for _ in range(3):
         evaluate_changed_maps(town.catalog, LEAST, word_weights=True)
     assert len(town.evaluation_jobs()) == done + 1

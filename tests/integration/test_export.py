@@ -10,7 +10,7 @@ from uuid import UUID
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.catalog.chunks import live_chunks, live_rows
+from shared.catalog.chunks import list_live_chunks, list_live_rows
 from shared.catalog.generations import Generation
 from shared.chunks import read_chunk
 from shared.ids import new_id
@@ -42,9 +42,9 @@ def test_each_row_is_the_descriptor_of_its_line(service: Service) -> None:
     stored: dict[UUID, NDArray[np.float32]] = {}
     with service.catalog.read() as session:
         [generation] = session.query(Generation).all()
-        for chunk in live_chunks(session, generation.id):
+        for chunk in list_live_chunks(session, generation.id):
             found = read_chunk(service.store, chunk.object_key, chunk.sha256)
-            stored |= {photo: found[row] for row, photo in live_rows(session, chunk.id)}
+            stored |= {photo: found[row] for row, photo in list_live_rows(session, chunk.id)}
     assert rows.dtype == np.float32
     assert len(rows) == len(table) == len(names) == len(stored) == 3
     for number, (row, line) in enumerate(zip(rows, table, strict=True)):

@@ -20,24 +20,24 @@ from sqlalchemy.exc import OperationalError
 
 from services.extractor import publish as publish_module
 from services.extractor import worker as worker_module
-from services.extractor.model_change import ModelChanges
-from services.extractor.target import find_target
+from services.extractor.model_change import ModelChangeRunner
+from services.extractor.target import resolve_generation
 from services.extractor.worker import ExtractorWorker
 from services.steward.collect import collect_orphans
-from services.steward.model_changes import fit_maps_that_wait
-from services.steward.queue import free_leases
-from shared.catalog.chunks import Chunk, Descriptor, live_chunks
+from services.steward.model_changes import auto_fit_vocabularies
+from services.steward.queue import release_expired_leases
+from shared.catalog.chunks import Chunk, Descriptor, list_live_chunks
 from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.maps import Map
-from shared.catalog.photos import Photo, mark_deleted
+from shared.catalog.photos import Photo, mark_photo_deleted
 from shared.chunks import decode_rows, manifest_key
-from shared.jobs import Job, JobKind, JobState, claim
-from shared.jobs.finish import requeue
+from shared.jobs import Job, JobKind, JobState, claim_jobs
+from shared.jobs.finish import requeue_job
 from shared.jobs.table import WaitingFor
 from shared.objects import FolderStore
 from shared.objects.keys import query_vector_key, thumbnail_key
 from shared.vision.backbones.tiny import TinyBackbone
-from shared.vision.decode import decode
+from shared.vision.decode import decode_photo
 from shared.vision.extractors import Extractor
 from shared.vision.preprocessing import get_preprocessing
 from shared.vision.resample import Pixels
@@ -69,7 +69,7 @@ Hook = Callable[[Callable[..., None]], None]
 
 
 def pixels_of(data: bytes) -> Pixels:
-    return decode(data, get_preprocessing("square32"), 10**9).pixels
+    return decode_photo(data, get_preprocessing("square32"), 10**9).pixels
 
 
 def once(do: Callable[[], None]) -> Callable[..., None]:
@@ -105,7 +105,7 @@ def test_each_photo_gets_its_one_row_and_the_right_one(averages: Workplace) -> N
         }
         assert averages.store.head(thumbnail_key(photo_id)) is not None
     with averages.catalog.read() as session:
-        chunks = live_chunks(session, averages.active().id)
+        chunks = list_live_chunks(session, averages.active().id)
         assert [chunk.rows for chunk in chunks] == [4, 4, 1]
         # The first generation, then three batches: each is something new to find.
         assert session.get_one(Map, averages.map_id).version == 4
@@ -316,9 +316,9 @@ def test_a_crash_between_chunk_and_commit_leaves_an_orphan_that_is_collected(
     orphans = averages.keys("chunks/")
     assert len(orphans) == 2  # rows and manifest
     assert averages.rows() == {}
-    assert free_leases(averages.catalog, 3) == 0  # the lease has to expire first
+    assert release_expired_leases(averages.catalog, 3) == 0  # the lease has to expire first
     expire_lease(averages.catalog, *(averages.job_of(p).id for p in photo_ids))
-    assert free_leases(averages.catalog, 3) == 2
+    assert release_expired_leases(averages.catalog, 3) == 2
     _drain(make_worker())
     assert set(averages.rows()) == set(photo_ids)
     live = averages.keys("")
@@ -357,9 +357,9 @@ def test_no_lease_is_held_on_when_the_catalog_went_away_in_a_drain(
     def claim_or_fail(*arguments: Any, **options: Any) -> list[Job]:
         if next(calls) == 2:  # a batch is done, the next one is taken and being decoded
             raise OperationalError("the catalog is away", None, Exception())
-        return claim(*arguments, **options)
+        return claim_jobs(*arguments, **options)
 
-    monkeypatch.setattr(worker_module, "claim", claim_or_fail)
+    monkeypatch.setattr(worker_module, "claim_jobs", claim_or_fail)
     with pytest.raises(OperationalError):
         averages.drain()
     gc.collect()
@@ -368,7 +368,7 @@ def test_no_lease_is_held_on_when_the_catalog_went_away_in_a_drain(
     monkeypatch.undo()
     assert len(averages.rows()) == 4
     expire_lease(averages.catalog, *(averages.job_of(p).id for p in photo_ids[4:]))
-    free_leases(averages.catalog, 3)
+    release_expired_leases(averages.catalog, 3)
     averages.drain()
     assert set(averages.rows()) == set(photo_ids)
 
@@ -388,7 +388,7 @@ def test_nothing_of_a_batch_is_committed_once_its_lease_was_taken_over(
     def take_over() -> None:
         jobs = [averages.job_of(photo_id).id for photo_id in photo_ids]
         expire_lease(averages.catalog, *jobs)
-        assert free_leases(averages.catalog, 3) == 3
+        assert release_expired_leases(averages.catalog, 3) == 3
         _drain(quick)
         seen.append(averages.keys("chunks/"))
 
@@ -411,7 +411,7 @@ def test_one_job_that_was_taken_over_is_a_dead_row_beside_the_others(
 
     def start_anew() -> None:
         with averages.catalog.write() as session:
-            requeue(session.get_one(Job, lost))
+            requeue_job(session.get_one(Job, lost))
 
     before_describing(once(start_anew))
     averages.drain()
@@ -438,7 +438,7 @@ def test_a_photo_deleted_while_it_is_described_is_not_in_the_generation(
     def vanish() -> None:
         averages.delete(photo_ids[1])
         with averages.catalog.write() as session:  # without ending its job
-            mark_deleted(session, session.get_one(Photo, photo_ids[2]), 1)
+            mark_photo_deleted(session, session.get_one(Photo, photo_ids[2]), 1)
 
     before_describing(once(vanish))
     assert averages.drain().succeeded == 1
@@ -451,7 +451,7 @@ def test_a_photo_deleted_before_it_is_read_costs_nothing(averages: Workplace) ->
     job_id = averages.job_of(photo_ids[0]).id
     averages.delete(photo_ids[0])
     with averages.catalog.write() as session:  # the worker had claimed it just before
-        requeue(session.get_one(Job, job_id))
+        requeue_job(session.get_one(Job, job_id))
     averages.drain()
     assert set(averages.rows()) == {photo_ids[1]}
     assert averages.job(job_id).state == JobState.CANCELLED
@@ -559,7 +559,7 @@ def test_nothing_is_described_beside_a_photo_that_is_tried_alone(
     def ask(_: NDArray[np.uint8]) -> None:
         if not asked:
             asked.append(averages.ask(photo_bytes(99)))
-            time.sleep(3 * worker_module.QUERY_LOOK_SECONDS)
+            time.sleep(3 * worker_module.QUERY_POLL_SECONDS)
             during.append(JobState(averages.job(asked[0]).state))
 
     before_describing(ask)
@@ -577,15 +577,15 @@ def test_a_query_goes_between_the_slices_of_a_fit(
     job_id = vlads.start(JobKind.FIT, clusters=8, sample=100, seed=1)
     asked: list[UUID] = []
     stages: list[tuple[str | None, JobState]] = []
-    real = ModelChanges.slice
+    real = ModelChangeRunner.run_step
 
-    def watch(self: ModelChanges, job: Job) -> None:
+    def watch(self: ModelChangeRunner, job: Job) -> None:
         if asked:
             stages.append((job.stage, JobState(vlads.job(asked[-1]).state)))
         asked.append(vlads.ask(photo_bytes(50 + len(asked))))
         real(self, job)
 
-    monkeypatch.setattr(ModelChanges, "slice", watch)
+    monkeypatch.setattr(ModelChangeRunner, "run_step", watch)
     vlads.drain()
     assert [stage for stage, _ in stages] == ["sample", "sample", "cluster"]
     assert {state for _, state in stages} == {JobState.SUCCEEDED}
@@ -610,13 +610,13 @@ def test_photos_wait_for_a_vocabulary_which_is_fitted_once_there_are_enough(
     assert refused.error is not None
     assert refused.error["code"] == "no_vocabulary"
 
-    fit_maps_that_wait(vlads.catalog, vlads.hints, 4)  # AUTO_FIT_PHOTOS
+    auto_fit_vocabularies(vlads.catalog, vlads.hints, 4)  # AUTO_FIT_PHOTOS
     assert not vlads.hints.wait(0)
     photo_ids += vlads.upload(4)
     vlads.drain()
-    fit_maps_that_wait(vlads.catalog, vlads.hints, 4)
+    auto_fit_vocabularies(vlads.catalog, vlads.hints, 4)
     assert vlads.hints.wait(0)
-    fit_maps_that_wait(vlads.catalog, vlads.hints, 4)  # once is enough
+    auto_fit_vocabularies(vlads.catalog, vlads.hints, 4)  # once is enough
     with vlads.catalog.read() as session:
         job_id = session.scalars(select(Job.id).where(Job.kind == JobKind.FIT)).one()
     fit = vlads.finish(job_id)
@@ -640,7 +640,7 @@ def test_no_vocabulary_is_fitted_by_itself_after_a_fit_was_cancelled(vlads: Work
     vlads.upload(1, 2)
     vlads.drain()
     vlads.cancel(vlads.start(JobKind.FIT, clusters=8, sample=100, seed=0))
-    fit_maps_that_wait(vlads.catalog, vlads.hints, 1)
+    auto_fit_vocabularies(vlads.catalog, vlads.hints, 1)
     with vlads.catalog.read() as session:
         assert session.scalar(select(func.count()).where(Job.kind == JobKind.FIT)) == 1
 
@@ -655,7 +655,7 @@ def test_a_photo_that_finds_no_vocabulary_while_one_is_made_is_not_left_waiting(
     late: list[UUID] = []
 
     def find_or_fit(*arguments: Any) -> Any:
-        found = find_target(*arguments)
+        found = resolve_generation(*arguments)
         if late and found is None and vlads.job_of(late[0]).worker == "worker-0":
             fit()
         return found
@@ -663,7 +663,7 @@ def test_a_photo_that_finds_no_vocabulary_while_one_is_made_is_not_left_waiting(
     fit = once(lambda: _fit_with(vlads, quick))
     _drain(slow)
     late += vlads.upload(3)
-    monkeypatch.setattr(worker_module, "find_target", find_or_fit)
+    monkeypatch.setattr(worker_module, "resolve_generation", find_or_fit)
     _drain(slow)  # sees no vocabulary; before it says so, the other worker has fitted one
     assert vlads.job_of(late[0]).state == JobState.SUCCEEDED
     assert set(vlads.rows()) >= set(late)

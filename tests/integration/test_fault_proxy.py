@@ -11,9 +11,9 @@ import httpx2
 import pytest
 from redis import Redis
 
-from benchmarks.fleet.doubler import Doubler
-from benchmarks.fleet.proxy import FaultProxy, Mode
-from shared.jobs.hints import Lane
+from benchmarks.fleet.doubler import MessageDuplicator
+from benchmarks.fleet.proxy import FaultProxy, ProxyMode
+from shared.jobs.hints import WakeupQueue
 from tests.support.servers import start_redis
 from tests.support.servers.daemon import free_ports
 
@@ -65,13 +65,13 @@ def test_everything_passes_before_and_after_a_fault(
     proxy: FaultProxy, client: httpx2.Client
 ) -> None:
     assert client.put("/", content=BODY).content == BODY
-    with proxy.misbehaving(Mode.REFUSED), pytest.raises(httpx2.TransportError):
+    with proxy.in_mode(ProxyMode.REFUSED), pytest.raises(httpx2.TransportError):
         client.get("/")
     assert client.put("/", content=BODY).content == BODY
 
 
 def test_a_cut_connection_ends_within_the_request(proxy: FaultProxy, client: httpx2.Client) -> None:
-    with proxy.misbehaving(Mode.CUT):
+    with proxy.in_mode(ProxyMode.CUT):
         with pytest.raises(httpx2.TransportError):
             client.put("/", content=BODY)
         with pytest.raises(httpx2.TransportError):
@@ -82,21 +82,21 @@ def test_a_connection_that_stands_is_cut_when_the_fault_begins(
     proxy: FaultProxy, client: httpx2.Client
 ) -> None:
     assert client.get("/").is_success
-    with proxy.misbehaving(Mode.REFUSED), contextlib.suppress(httpx2.TransportError):
+    with proxy.in_mode(ProxyMode.REFUSED), contextlib.suppress(httpx2.TransportError):
         pytest.fail(f"the connection still stood: {client.get('/')}")
 
 
 def test_a_slow_connection_brings_everything_in_the_end(
     proxy: FaultProxy, client: httpx2.Client
 ) -> None:
-    with proxy.misbehaving(Mode.SLOW):
+    with proxy.in_mode(ProxyMode.SLOW):
         assert client.put("/", content=BODY).content == BODY
 
 
 def test_a_full_store_refuses_writes_and_answers_reads(
     proxy: FaultProxy, client: httpx2.Client
 ) -> None:
-    with proxy.misbehaving(Mode.FULL):
+    with proxy.in_mode(ProxyMode.FULL):
         for _ in range(2):
             assert client.get("/").content == BODY
             assert client.put("/", content=BODY).status_code == 507
@@ -104,12 +104,12 @@ def test_a_full_store_refuses_writes_and_answers_reads(
 
 def test_every_message_is_there_twice() -> None:
     with start_redis(own=True) as server, Redis.from_url(server.url) as redis:
-        doubler = Doubler(server.url)
-        with doubler.at_work():
+        doubler = MessageDuplicator(server.url)
+        with doubler.duplicating():
             for number in range(10):
-                redis.lpush(Lane.BULK, f'{{"body": "{number}"}}')
-            while int(redis.llen(Lane.BULK)) < 20:
+                redis.lpush(WakeupQueue.BULK, f'{{"body": "{number}"}}')
+            while int(redis.llen(WakeupQueue.BULK)) < 20:
                 pass
             redis.lpush("another list", "x")
-        assert doubler.doubled == 10
+        assert doubler.duplicated_messages == 10
         assert redis.llen("another list") == 1

@@ -14,7 +14,7 @@ from sqlalchemy import func, select, update
 from services.extractor.worker import ExtractorWorker
 from services.gateway import model_changes, once
 from shared.catalog.base import db_now_plus
-from shared.catalog.idempotency import KeyedCall
+from shared.catalog.idempotency import IdempotencyRecord
 from shared.catalog.photos import Photo
 from shared.catalog.session import Catalog
 from shared.errors import Unavailable
@@ -40,7 +40,7 @@ def upload(service: Service, photo: bytes, key: str = "key-1", **options: Any) -
     return service("POST", "/upload", files=files, headers=headers, **options)
 
 
-def count(catalog: Catalog, table: type[Job] | type[Photo] | type[KeyedCall]) -> int:
+def count(catalog: Catalog, table: type[Job] | type[Photo] | type[IdempotencyRecord]) -> int:
     with catalog.read() as session:
         return session.scalar(select(func.count()).select_from(table)) or 0
 
@@ -114,7 +114,7 @@ def test_a_repeated_call_is_done_once_and_answered_the_same(
     jobs = count(catalog, Job)
     same(first, call(service, headers=keyed()))
     assert count(catalog, Job) == jobs
-    assert count(catalog, KeyedCall) == 1
+    assert count(catalog, IdempotencyRecord) == 1
 
 
 @pytest.mark.parametrize("what", ["cancel", "retry"])
@@ -131,7 +131,7 @@ def test_without_a_key_every_call_is_a_call(service: Service, catalog: Catalog) 
     service.indexed(1, latitude=45, longitude=7)
     jobs = {call_evaluation(service).json()["job_id"] for _ in range(2)}
     assert len(jobs) == 2
-    assert count(catalog, KeyedCall) == 0
+    assert count(catalog, IdempotencyRecord) == 0
 
 
 def test_an_upload_whose_answer_was_lost_gives_the_same_ids_and_stores_once(
@@ -216,7 +216,7 @@ def test_a_refusal_is_kept_and_leaves_nothing(service: Service, store: FolderSto
 
 def test_a_body_that_can_not_be_understood_keeps_no_key(service: Service, catalog: Catalog) -> None:
     field_refused(service("POST", "/maps", json={"name": "a/b"}, headers=keyed()), "name")
-    assert count(catalog, KeyedCall) == 0
+    assert count(catalog, IdempotencyRecord) == 0
     assert call_map(service, headers=keyed()).status_code == 201
 
 
@@ -229,9 +229,9 @@ def test_a_failure_of_ours_is_not_kept(
     with monkeypatch.context() as broken:
         broken.setattr("shared.intake.incoming.read_photo_header", away)
         problem(upload(service, photo_bytes(1)), 503, "object_store_unavailable")
-        broken.setattr(model_changes, "has_live", away)
+        broken.setattr(model_changes, "has_live_photo", away)
         problem(call_fit(service, headers=keyed("fit")), 503, "object_store_unavailable")
-    assert count(catalog, KeyedCall) == 0
+    assert count(catalog, IdempotencyRecord) == 0
     assert upload(service, photo_bytes(1)).status_code == 202
     assert call_fit(service, headers=keyed("fit")).status_code == 202
     assert (count(catalog, Photo), originals(store)) == (1, 1)
@@ -272,18 +272,18 @@ def test_a_gateway_that_was_slower_than_its_lease_has_no_effect_beside_another_o
     service.indexed(1, latitude=45, longitude=7)
     jobs = count(catalog, Job)
     second: list[httpx2.Response] = []
-    begin = once.Once.begin
+    begin = once.IdempotentRequest.claim_key
 
-    def slowly(self: once.Once, *arguments: Any) -> None:
+    def slowly(self: once.IdempotentRequest, *arguments: Any) -> None:
         begin(self, *arguments)
         if not second:
             with catalog.write() as session:
-                session.execute(update(KeyedCall).values(lease_until=db_now_plus(-1)))
+                session.execute(update(IdempotencyRecord).values(lease_until=db_now_plus(-1)))
             second.append(httpx2.Response(0))
             second[0] = call_evaluation(service, headers=keyed())
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(once.Once, "begin", slowly)
+        patch.setattr(once.IdempotentRequest, "claim_key", slowly)
         first = call_evaluation(service, headers=keyed())
     problem(first, 409, "idempotency_key_in_use")
     assert second[0].status_code == 202
@@ -295,14 +295,18 @@ def test_a_gateway_that_died_blocks_its_key_no_longer_than_its_lease(
     service: Service, catalog: Catalog, store: FolderStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What a killed process leaves: a claimed key, and nothing after it."""
-    monkeypatch.setattr(once.Once, "end", lambda self: None)
+    monkeypatch.setattr(once.IdempotentRequest, "release_key", lambda self: None)
     with monkeypatch.context() as dying:
-        dying.setattr(once.Once, "keep", lambda *_: (_ for _ in ()).throw(SystemError("killed")))
+        dying.setattr(
+            once.IdempotentRequest,
+            "store_response",
+            lambda *_: (_ for _ in ()).throw(SystemError("killed")),
+        )
         problem(upload(service, photo_bytes(1)), 500, "internal_error")
     assert count(catalog, Photo) == 0
     problem(upload(service, photo_bytes(1)), 409, "idempotency_key_in_use")
     with catalog.write() as session:
-        session.execute(update(KeyedCall).values(lease_until=db_now_plus(-1)))
+        session.execute(update(IdempotencyRecord).values(lease_until=db_now_plus(-1)))
     first = upload(service, photo_bytes(1))
     assert first.status_code == 202
     same(first, upload(service, photo_bytes(1)))
@@ -350,7 +354,7 @@ def test_a_key_that_is_none_is_refused_by_name(
     field_refused(service("POST", "/maps", json={"name": "x"}, headers=headers), "Idempotency-Key")
     files = {"file": ("photo.jpg", photo_bytes(1))}
     field_refused(service("POST", "/upload", files=files, headers=headers), "Idempotency-Key")
-    assert (count(catalog, KeyedCall), originals(store)) == (0, 0)
+    assert (count(catalog, IdempotencyRecord), originals(store)) == (0, 0)
 
 
 def test_the_longest_key_is_one(service: Service) -> None:
@@ -362,7 +366,7 @@ def test_an_expired_key_is_free(service: Service, catalog: Catalog) -> None:
     service.indexed(1, latitude=45, longitude=7)
     first = call_evaluation(service, headers=keyed())
     with catalog.write() as session:
-        session.execute(update(KeyedCall).values(expires_at=db_now_plus(-1)))
+        session.execute(update(IdempotencyRecord).values(expires_at=db_now_plus(-1)))
     again = call_evaluation(service, headers=keyed())
     assert again.status_code == 202
     assert again.json()["job_id"] != first.json()["job_id"]

@@ -10,7 +10,7 @@ import pytest
 from sqlalchemy.exc import OperationalError
 
 from services.gateway import job_watch
-from services.gateway.job_watch import Change, JobWatch, Mark
+from services.gateway.job_watch import Change, JobNotifier, Mark
 from shared.catalog.schema import migrate
 from shared.catalog.session import Catalog
 from shared.ids import new_id
@@ -36,14 +36,14 @@ def jobs(catalog: Catalog) -> list[UUID]:
 
 async def started(*waits: asyncio.Task[None]) -> None:
     """Returns when they have looked at least once."""
-    await asyncio.sleep(5 * job_watch.LOOK_SECONDS)
+    await asyncio.sleep(5 * job_watch.NOTIFIER_POLL_SECONDS)
     assert not any(wait.done() for wait in waits)
 
 
 def test_each_waits_until_its_own_job_has_ended(catalog: Catalog, jobs: list[UUID]) -> None:
     async def scenario() -> None:
-        watch = JobWatch(catalog)
-        waits = [asyncio.create_task(watch.wait_for_end(job, LONG)) for job in jobs]
+        watch = JobNotifier(catalog)
+        waits = [asyncio.create_task(watch.wait_until_finished(job, LONG)) for job in jobs]
         await started(*waits)
         for job, wait in zip(jobs, waits, strict=True):
             assert not wait.done()
@@ -54,23 +54,23 @@ def test_each_waits_until_its_own_job_has_ended(catalog: Catalog, jobs: list[UUI
 
 
 def test_job_that_is_gone_is_not_waited_for(catalog: Catalog) -> None:
-    asyncio.run(JobWatch(catalog).wait_for_end(new_id(), LONG))
+    asyncio.run(JobNotifier(catalog).wait_until_finished(new_id(), LONG))
 
 
 def test_waiting_ends_when_the_time_is_up(catalog: Catalog, jobs: list[UUID]) -> None:
-    asyncio.run(JobWatch(catalog).wait_for_end(jobs[0], 0.05))
+    asyncio.run(JobNotifier(catalog).wait_until_finished(jobs[0], 0.05))
 
 
 def test_stopping_server_lets_nobody_wait_for_long(
     catalog: Catalog, jobs: list[UUID], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(job_watch, "LAST_SECONDS", 0.0)
+    monkeypatch.setattr(job_watch, "SHUTDOWN_WAIT_SECONDS", 0.0)
 
     async def scenario() -> None:
-        watch = JobWatch(catalog)
-        wait = asyncio.create_task(watch.wait_for_end(jobs[0], 10 * LONG))
+        watch = JobNotifier(catalog)
+        wait = asyncio.create_task(watch.wait_until_finished(jobs[0], 10 * LONG))
         await started(wait)
-        watch.end_soon()
+        watch.begin_shutdown()
         await asyncio.wait_for(wait, LONG)
 
     asyncio.run(scenario())
@@ -93,8 +93,10 @@ def test_all_that_wait_share_one_look(
     count_looks(monkeypatch, looks)
 
     async def scenario() -> None:
-        watch = JobWatch(catalog)
-        waits = [asyncio.create_task(watch.wait_for_end(jobs[n % 3], LONG)) for n in range(60)]
+        watch = JobNotifier(catalog)
+        waits = [
+            asyncio.create_task(watch.wait_until_finished(jobs[n % 3], LONG)) for n in range(60)
+        ]
         await started(*waits)
         before = len(looks)
         assert before <= 6, "one look serves all sixty"
@@ -103,7 +105,7 @@ def test_all_that_wait_share_one_look(
             set_columns(catalog, job, state=JobState.SUCCEEDED)
         await asyncio.wait_for(asyncio.gather(*waits), LONG)
         after = len(looks)
-        await asyncio.sleep(5 * job_watch.LOOK_SECONDS)
+        await asyncio.sleep(5 * job_watch.NOTIFIER_POLL_SECONDS)
         assert len(looks) == after, "nobody waits, nobody looks"
 
     asyncio.run(scenario())
@@ -125,7 +127,7 @@ def test_all_event_streams_share_one_look_and_wake_at_their_jobs_change(
     monkeypatch.setattr(job_watch, "CHANGE_LOOK_SECONDS", 0.1)
 
     async def scenario() -> None:
-        watch = JobWatch(catalog)
+        watch = JobNotifier(catalog)
         seen = await asyncio.gather(*(watch.wait_for_change(job, (), LONG) for job in jobs))
         marks = {change.job.id: change.mark for change in seen if change}
         looks.clear()
@@ -144,7 +146,7 @@ def test_all_event_streams_share_one_look_and_wake_at_their_jobs_change(
             assert change.job.progress_done == 7
         assert read == [{jobs[1]}]
         assert not any(wait.done() for wait in waits[0::3])
-        watch.end_soon()
+        watch.begin_shutdown()
         ended = await asyncio.wait_for(asyncio.gather(*waits[0::3]), LONG)
         assert set(ended) == {None}, "a server that stops ends its streams"
         assert await watch.wait_for_change(jobs[0], (), LONG) is None
@@ -159,7 +161,7 @@ def test_who_waits_for_a_change_is_told_when_the_catalog_is_away_and_when_time_i
         raise OperationalError("select", {}, Exception("away"))
 
     async def wait(seconds: float) -> Change | None:
-        return await JobWatch(catalog).wait_for_change(jobs[0], (), seconds)
+        return await JobNotifier(catalog).wait_for_change(jobs[0], (), seconds)
 
     with pytest.raises(TimeoutError):
         asyncio.run(wait(0.001))
@@ -170,8 +172,10 @@ def test_who_waits_for_a_change_is_told_when_the_catalog_is_away_and_when_time_i
 
 def test_who_goes_away_takes_no_others_answer_along(catalog: Catalog, jobs: list[UUID]) -> None:
     async def scenario() -> None:
-        watch = JobWatch(catalog)
-        goes, stays = (asyncio.create_task(watch.wait_for_end(jobs[0], LONG)) for _ in range(2))
+        watch = JobNotifier(catalog)
+        goes, stays = (
+            asyncio.create_task(watch.wait_until_finished(jobs[0], LONG)) for _ in range(2)
+        )
         await started(goes, stays)
         goes.cancel()
         set_columns(catalog, jobs[0], state=JobState.SUCCEEDED)

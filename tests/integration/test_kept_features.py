@@ -11,7 +11,7 @@ from services.steward.collect import (
     collect_ended_generations,
     collect_orphans,
 )
-from services.steward.delete_maps import delete_maps
+from services.steward.delete_maps import purge_deleted_maps
 from shared.catalog.generations import active_generation
 from shared.catalog.maps import get_map
 from shared.ids import new_id
@@ -95,7 +95,7 @@ def test_kept_features_go_with_their_generation_and_with_their_map(service: Serv
     compared(service, query, "words")
     assert kept(service) == keys(service, others, "words")
     service.json("DELETE", "/maps/words")
-    delete_maps(service.catalog, service.store)
+    purge_deleted_maps(service.catalog, service.store)
     assert kept(service) == set()
 
 

@@ -10,8 +10,8 @@ import pytest
 from sqlalchemy import select, update
 from starlette.datastructures import Headers
 
-from services.gateway.keys import CatalogKeys
-from shared.api_keys import hash_key
+from services.gateway.keys import ApiKeyAuthenticator
+from shared.api_keys import hash_api_key
 from shared.catalog.keys import ApiKey
 from shared.catalog.photos import Photo
 from shared.objects import FolderStore
@@ -27,7 +27,7 @@ def test_a_key_is_shown_once_and_kept_as_a_hash(door: Door) -> None:
     assert door(ADMIN, "GET", "/keys").json() == [made]
     with door.catalog.read() as session:
         row = session.scalars(select(ApiKey)).one()
-    assert row.sha256 == hash_key(key)
+    assert row.sha256 == hash_api_key(key)
     assert key not in str(vars(row))
 
 
@@ -94,9 +94,9 @@ def test_the_last_use_is_noted_once_a_minute(door: Door) -> None:
     door(made["key"], "GET", "/jobs")
     assert used() == first
     # Another gateway, which has not seen the key yet, leaves a fresh note as it is.
-    keys = CatalogKeys(door.catalog)
-    caller = asyncio.run(keys.check(Headers({"authorization": f"Bearer {made['key']}"})))
-    asyncio.run(keys.note_use(caller))
+    keys = ApiKeyAuthenticator(door.catalog)
+    caller = asyncio.run(keys.authenticate(Headers({"authorization": f"Bearer {made['key']}"})))
+    asyncio.run(keys.record_use(caller))
     assert used() == first
 
 

@@ -8,13 +8,13 @@ from uuid import UUID
 import pytest
 from sqlalchemy import select
 
-from services.extractor.fit_vocabulary import FitVocabulary
-from services.steward.compact import compact
-from services.steward.model_changes import fit_maps_that_wait
-from shared.catalog.maps import bump_version, lock_map
+from services.extractor.fit_vocabulary import VocabularyFitJob
+from services.steward.compact import merge_small_chunks
+from services.steward.model_changes import auto_fit_vocabularies
+from shared.catalog.maps import increment_map_version, lock_map
 from shared.catalog.photos import Photo, PhotoRole
 from shared.jobs import Job, JobKind, JobState
-from shared.objects.keys import work_key
+from shared.objects.keys import job_work_key
 from shared.vision.extractors import Extractor
 from tests.integration.gateway import Service
 from tests.integration.workplace import FIT, Workplace
@@ -28,7 +28,7 @@ def become(workplace: Workplace, role: PhotoRole, *photo_ids: UUID) -> None:
         for photo_id in photo_ids:
             photo = session.get_one(Photo, photo_id)
             photo.role = role
-            photo.changed_version = bump_version(session, workplace.map_id)
+            photo.changed_version = increment_map_version(session, workplace.map_id)
 
 
 def test_a_query_keeps_its_descriptor_through_merging_and_a_model_change(vlads: Workplace) -> None:
@@ -41,7 +41,7 @@ def test_a_query_keeps_its_descriptor_through_merging_and_a_model_change(vlads: 
     vlads.drain()
     assert vlads.searchable() == 4
     before = vlads.rows()
-    assert compact(vlads.catalog, vlads.store, compact_chunks=2) == 1
+    assert merge_small_chunks(vlads.catalog, vlads.store, compact_chunks=2) == 1
     assert {photo_id: row.tolist() for photo_id, row in vlads.rows().items()} == {
         photo_id: row.tolist() for photo_id, row in before.items()
     }
@@ -58,13 +58,13 @@ def test_a_vocabulary_is_learnt_from_database_photos_alone(
     photo_ids = vlads.upload(*range(8))
     become(vlads, PhotoRole.QUERY, *photo_ids[::2])
     seen: list[str] = []
-    real = FitVocabulary._sample
+    real = VocabularyFitJob._sample
 
-    def sample(self: FitVocabulary, job: Job, extractor: Extractor) -> None:
-        seen[:] = json.loads(vlads.store.get(work_key(job.id, "plan.json")))
+    def sample(self: VocabularyFitJob, job: Job, extractor: Extractor) -> None:
+        seen[:] = json.loads(vlads.store.get(job_work_key(job.id, "plan.json")))
         real(self, job, extractor)
 
-    monkeypatch.setattr(FitVocabulary, "_sample", sample)
+    monkeypatch.setattr(VocabularyFitJob, "_sample", sample)
     vlads.fit()
     assert {UUID(photo_id) for photo_id in seen} == set(photo_ids[1::2])
     assert vlads.vocabulary(vlads.active().vocabulary_id).provenance["photos"] == 4
@@ -79,7 +79,7 @@ def test_waiting_queries_do_not_make_a_map_fit_a_vocabulary(vlads: Workplace) ->
     vlads.drain()
 
     def fits() -> list[str]:
-        fit_maps_that_wait(vlads.catalog, vlads.hints, auto_fit_photos=3)
+        auto_fit_vocabularies(vlads.catalog, vlads.hints, auto_fit_photos=3)
         with vlads.catalog.read() as session:
             return list(session.scalars(select(Job.state).where(Job.kind == JobKind.FIT)))
 

@@ -14,30 +14,30 @@ import numpy as np
 import pytest
 from sqlalchemy import func, select
 
-from services.extractor.loaded import LoadedModels
+from services.extractor.loaded import ModelRegistry
 from services.extractor.publish import publish
-from services.extractor.renew import renew_outdated_generations
+from services.extractor.renew import reindex_outdated_generations
 from services.gateway import upload as upload_module
 from services.steward import delete_maps as delete_maps_module
 from services.steward.collect import collect_orphans
-from services.steward.compact import compact
-from services.steward.delete_maps import delete_maps
-from services.steward.evaluate import Evaluator
+from services.steward.compact import merge_small_chunks
+from services.steward.delete_maps import purge_deleted_maps
+from services.steward.evaluate import EvaluationWorker
 from services.steward.model_changes import advance_model_changes
 from shared.catalog.base import Base, db_now_plus
 from shared.catalog.chunks import Chunk, Descriptor
-from shared.catalog.direct_uploads import DirectUpload
-from shared.catalog.figures import keep_figures
+from shared.catalog.direct_uploads import PresignedUpload
+from shared.catalog.figures import cache_map_statistics
 from shared.catalog.generations import Generation
 from shared.catalog.installation import Installation
 from shared.catalog.maps import Map
 from shared.catalog.models import Model
 from shared.catalog.photos import Photo
 from shared.catalog.schema_compatibility import SchemaCompatibility
-from shared.catalog.search_workers import RegisteredWorker
+from shared.catalog.search_workers import RegisteredSearchWorker
 from shared.catalog.session import Catalog
 from shared.intake.store_photo import store_photo
-from shared.jobs import InProcessHints, Job, JobKind, JobState
+from shared.jobs import InProcessWakeups, Job, JobKind, JobState
 from shared.jobs.batches import BatchItem
 from shared.objects import FolderStore
 from shared.objects.keys import JOURNAL, TRASH
@@ -56,7 +56,8 @@ class Away(Exception):
 
 
 OF_NO_MAP = {
-    kind.__tablename__ for kind in (Installation, Model, RegisteredWorker, SchemaCompatibility)
+    kind.__tablename__
+    for kind in (Installation, Model, RegisteredSearchWorker, SchemaCompatibility)
 }
 
 
@@ -85,7 +86,7 @@ def id_of(service: Service, name: str) -> UUID:
 def remove_all(catalog: Catalog, store: FolderStore) -> None:
     """The steward's rounds until no deleted map is left."""
     for _ in range(ROUNDS):
-        delete_maps(catalog, store)
+        purge_deleted_maps(catalog, store)
         with catalog.read() as session:
             if not session.scalars(select(Map.id).where(Map.deleted_at.is_not(None))).all():
                 return
@@ -111,14 +112,16 @@ def live_in(service: Service, name: str) -> None:
     service.ask(near_copy(2), name)
     service.drain()
     service.json("POST", "/evaluations", 202, params=params)
-    evaluator = Evaluator(service.catalog, service.store, service.search, settings, "evaluator")
-    assert evaluator.evaluate_next(threading.Event())
+    evaluator = EvaluationWorker(
+        service.catalog, service.store, service.search, settings, "evaluator"
+    )
+    assert evaluator.run_next(threading.Event())
     service.json("POST", "/vocabularies", 202, params=params, json={"clusters": 3, "seed": 5})
     finish_changes(service)
     service.json("POST", "/generations", 202, params=params, json={"pca": 1})
     finish_changes(service)
     with service.catalog.write() as session:
-        keep_figures(session, id_of(service, name))
+        cache_map_statistics(session, id_of(service, name))
     buffer = io.BytesIO()
     np.save(buffer, np.ones((4, 99), np.float32))
     files = {"file": ("centres.npy", buffer.getvalue())}
@@ -129,7 +132,7 @@ def live_in(service: Service, name: str) -> None:
     service.json("POST", "/upload/batch", 202, params=params, files=files)
     with service.catalog.write() as session:  # which takes a bucket otherwise
         session.add(
-            DirectUpload(
+            PresignedUpload(
                 map_id=id_of(service, name),
                 filename="sent.jpg",
                 size_bytes=1,
@@ -143,7 +146,7 @@ def live_in(service: Service, name: str) -> None:
 def finish_changes(service: Service) -> None:
     for _ in range(8):
         service.drain()
-        advance_model_changes(service.catalog, InProcessHints())
+        advance_model_changes(service.catalog, InProcessWakeups())
 
 
 # --- what people see -------------------------------------------------------------------------
@@ -350,9 +353,9 @@ def test_a_photo_that_slips_in_at_the_last_moment_is_removed_by_the_next_round(
             store.put(add_photo(session, map_id).object_key, b"late")
 
     with monkeypatch.context() as patched:
-        patched.setattr(delete_maps_module, "_vocabularies", slip_in)
+        patched.setattr(delete_maps_module, "_purge_vocabulary_objects", slip_in)
         with pytest.raises(Exception, match=r"(?i)foreign key"):
-            delete_maps(catalog, store)
+            purge_deleted_maps(catalog, store)
     remove_all(catalog, store)
     assert (rows(catalog)["photos"], rows(catalog)["maps"]) == (0, 1)
     assert objects(store) == set()
@@ -370,9 +373,9 @@ def test_a_job_that_slips_in_is_cancelled_before_anything_is_removed(
     def away(*_: Any) -> bool:
         raise Away
 
-    monkeypatch.setattr(delete_maps_module, "_chunks", away)
+    monkeypatch.setattr(delete_maps_module, "_purge_chunks", away)
     with pytest.raises(Away):
-        delete_maps(catalog, store)
+        purge_deleted_maps(catalog, store)
     assert read_job(catalog, job.id).state == JobState.CANCELLED
 
 
@@ -416,7 +419,7 @@ def test_removal_that_was_killed_anywhere_goes_on(
         with monkeypatch.context() as patched:
             patched.setattr(FolderStore, "delete", delete)
             try:
-                delete_maps(catalog, store)
+                purge_deleted_maps(catalog, store)
             except Away:
                 _check_remembered(catalog, store)
                 continue
@@ -443,7 +446,7 @@ def _check_remembered(catalog: Catalog, store: FolderStore) -> None:
 def test_a_map_of_more_rows_than_one_transaction_takes_goes_as_well(
     service: Service, catalog: Catalog, store: FolderStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(delete_maps_module, "AT_ONCE", 10)  # and one chunk at once
+    monkeypatch.setattr(delete_maps_module, "ROWS_PER_TRANSACTION", 10)  # and one chunk at once
     service.json("POST", "/maps", 201, json={"name": "gone"})
     before = rows(catalog)
     for number in range(3):
@@ -478,13 +481,13 @@ def test_what_is_being_removed_is_neither_merged_nor_renewed_nor_held_in_memory(
     with catalog.write() as session:
         for generation in session.scalars(select(Generation)):
             generation.spec_fingerprint = "made by another release"
-    service.search.follow()
+    service.search.sync()
     assert service.search.status().rows == 2
     service.json("DELETE", "/maps/gone")
-    service.search.follow()
+    service.search.sync()
     assert service.search.status().resident_bytes == 0
-    assert compact(catalog, store, compact_chunks=2) == 0
-    assert renew_outdated_generations(catalog, LoadedModels(store, settings, none_added)) == 0
+    assert merge_small_chunks(catalog, store, compact_chunks=2) == 0
+    assert reindex_outdated_generations(catalog, ModelRegistry(store, settings, none_added)) == 0
     with catalog.read() as session:
         kinds = set(session.scalars(select(Job.kind)))
     assert kinds == {JobKind.INDEX}

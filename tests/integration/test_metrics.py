@@ -15,20 +15,20 @@ from prometheus_client import CollectorRegistry
 
 from services.extractor.metrics import ExtractorMetrics
 from services.gateway.app import create_app
-from services.gateway.context import Gateway
-from services.gateway.keys import NoKeys
+from services.gateway.context import GatewayContext
+from services.gateway.keys import LocalhostAuthenticator
 from services.gateway.queue_look import count_jobs
-from services.search.metrics import SearchMetrics
+from services.search.metrics import MeteredSearch
 from services.search.worker import SearchWorker
-from services.steward.loop import Steward
+from services.steward.loop import Scheduler
 from services.steward.metrics import StewardMetrics
 from shared.catalog.session import Catalog
 from shared.errors import Misconfigured
-from shared.jobs import InProcessHints, JobState
+from shared.jobs import InProcessWakeups, JobState
 from shared.jobs.table import JobKind, WaitingFor
 from shared.objects import FolderStore
 from shared.settings import Settings
-from shared.telemetry.metrics_server import serving_metrics
+from shared.telemetry.metrics_server import serve_metrics
 from tests.integration.gateway import Service
 from tests.integration.workplace import Workplace
 from tests.support.catalog_rows import add_job, add_map, expire_lease, take
@@ -46,8 +46,18 @@ def whole(catalog: Catalog, store: FolderStore, settings: Settings) -> Collector
     """The registry of all services together, as the embedded Placewise has it."""
     registry = CollectorRegistry()
     search = SearchWorker(catalog, store, settings)
-    counted = SearchMetrics(search, registry)
-    create_app(Gateway(catalog, store, InProcessHints(), counted, settings, NoKeys(), registry))
+    counted = MeteredSearch(search, registry)
+    create_app(
+        GatewayContext(
+            catalog,
+            store,
+            InProcessWakeups(),
+            counted,
+            settings,
+            LocalhostAuthenticator(),
+            registry,
+        )
+    )
     ExtractorMetrics(registry)
     StewardMetrics(registry)
     return registry
@@ -171,17 +181,17 @@ def test_a_steward_counts_its_rounds_and_what_it_mends(
     catalog: Catalog, store: FolderStore, settings: Settings
 ) -> None:
     registry = CollectorRegistry()
-    steward = Steward(catalog, store, InProcessHints(), settings, StewardMetrics(registry))
+    steward = Scheduler(catalog, store, InProcessWakeups(), settings, StewardMetrics(registry))
     with catalog.write() as session:
         map_id = add_map(session).id
         add_job(session, map_id)
         add_job(session, map_id)
     expire_lease(catalog, take(catalog, 1)[0].id)
-    duties = {duty.name: duty for duty in steward.duties}
+    duties = {duty.name: duty for duty in steward.tasks}
     for name in ("free leases", "resend hints", "collect"):
-        steward._do(duties[name])
-    duties["compact"].do = lambda: 1 / 0
-    steward._do(duties["compact"])
+        steward._run_task(duties[name])
+    duties["compact"].run = lambda: 1 / 0
+    steward._run_task(duties["compact"])
     value = registry.get_sample_value
     assert value("placewise_steward_leases_expired_total") == 1
     assert value("placewise_steward_hints_resent_total") == 1
@@ -195,12 +205,12 @@ def test_a_steward_counts_its_rounds_and_what_it_mends(
 def test_figures_are_answered_on_a_port_of_their_own(
     whole: CollectorRegistry, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with serving_metrics(Settings(), whole) as none:
+    with serve_metrics(Settings(), whole) as none:
         assert none is None
     monkeypatch.setenv("METRICS_PORT", "0")
-    with serving_metrics(Settings(), whole) as port:
+    with serve_metrics(Settings(), whole) as port:
         with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=10) as answer:
             assert b"placewise_gateway_catalog_up 1.0" in answer.read()
         monkeypatch.setenv("METRICS_PORT", str(port))
-        with pytest.raises(Misconfigured, match="METRICS_PORT"), serving_metrics(Settings(), whole):
+        with pytest.raises(Misconfigured, match="METRICS_PORT"), serve_metrics(Settings(), whole):
             pass

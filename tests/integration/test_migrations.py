@@ -14,7 +14,7 @@ from sqlalchemy import MetaData, Table, func, select, text
 
 from shared.catalog import schema
 from shared.catalog.base import db_now
-from shared.catalog.connections import Limits, Pool
+from shared.catalog.connections import PoolConfig, TransactionTimeouts
 from shared.catalog.photos import Photo
 from shared.catalog.schema import check_schema, migrate, wait_for_schema
 from shared.catalog.session import Catalog
@@ -26,7 +26,7 @@ from tests.support.servers import PostgresServer
 
 @pytest.fixture
 def catalog(postgres: PostgresServer) -> Iterator[Catalog]:
-    opened = Catalog(postgres.new_database(), Pool(), Limits(5, 3))
+    opened = Catalog(postgres.new_database(), PoolConfig(), TransactionTimeouts(5, 3))
     yield opened
     opened.close()
 
@@ -110,9 +110,9 @@ def test_migration_gives_way_to_a_lock_and_is_tried_again(catalog: Catalog) -> N
 
 def test_lock_that_is_never_free_ends_the_migration(catalog: Catalog) -> None:
     with catalog.engine.begin() as connection:
-        connection.exec_driver_sql(f"SELECT pg_advisory_xact_lock({schema.ADVISORY_LOCK})")
+        connection.exec_driver_sql(f"SELECT pg_advisory_xact_lock({schema.ADVISORY_LOCK_ID})")
         with pytest.raises(Unavailable, match="Another migration"):
-            migrate(catalog, patience_seconds=0.2)
+            migrate(catalog, timeout_seconds=0.2)
 
 
 def test_broken_off_index_is_built_anew(catalog: Catalog) -> None:
@@ -157,7 +157,7 @@ def test_schema_of_a_later_release_is_fine_until_it_is_no_longer_understood(
 
 
 def test_catalog_that_is_away_is_waited_for(catalog: Catalog) -> None:
-    nowhere = Catalog("postgresql+psycopg://nobody@127.0.0.1:1/none", Pool(connect_seconds=2))
+    nowhere = Catalog("postgresql+psycopg://nobody@127.0.0.1:1/none", PoolConfig(connect_seconds=2))
     with pytest.raises(Unavailable) as caught:
         wait_for_schema(nowhere, 0.1)
     assert caught.value.code == "catalog_unavailable"

@@ -17,16 +17,16 @@ from numpy.typing import NDArray
 from sqlalchemy import select
 
 from services.extractor import slices
-from services.extractor.fit_vocabulary import FitVocabulary
-from services.extractor.model_change import ModelChanges
+from services.extractor.fit_vocabulary import VocabularyFitJob
+from services.extractor.model_change import ModelChangeRunner
 from services.extractor.worker import ExtractorWorker
-from services.steward.collect import collect_work
+from services.steward.collect import collect_model_change_files
 from shared.catalog.generations import GenerationState
 from shared.catalog.maps import Map
 from shared.catalog.photos import Photo
 from shared.errors import Conflict
 from shared.jobs import Job, JobKind, JobState
-from shared.jobs.finish import cancel, requeue, retry
+from shared.jobs.finish import cancel_job, requeue_job, retry_job
 from shared.jobs.table import WaitingFor
 from shared.objects.keys import new_vocabulary_key
 from shared.vision.extractors import Extractor
@@ -81,7 +81,7 @@ def photo_ids(workplace: Workplace) -> list[UUID]:
 def do_one_step_a_slice(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each look at the clock is a slice later than the one before."""
     looks = itertools.count()
-    clock = SimpleNamespace(monotonic=lambda: next(looks) * slices.SLICE_SECONDS)
+    clock = SimpleNamespace(monotonic=lambda: next(looks) * slices.STEP_SECONDS)
     monkeypatch.setattr(slices, "time", clock)
 
 
@@ -92,15 +92,15 @@ def do_slices(
 ) -> None:
     """Drain until after the slice of a job (as it was claimed) for which `until` is true."""
     stop = threading.Event()
-    real = ModelChanges.slice
+    real = ModelChangeRunner.run_step
 
-    def slice_and_stop(self: ModelChanges, job: Job) -> None:
+    def slice_and_stop(self: ModelChangeRunner, job: Job) -> None:
         real(self, job)
         if until(job):
             stop.set()
 
     with monkeypatch.context() as patched:
-        patched.setattr(ModelChanges, "slice", slice_and_stop)
+        patched.setattr(ModelChangeRunner, "run_step", slice_and_stop)
         worker.drain(stop)
 
 
@@ -136,7 +136,7 @@ def test_a_fit_replaces_the_generation_while_the_old_one_answers(fitted: Workpla
         "photos": PHOTOS,
         "failed": 0,
     }
-    assert job.progress_done == job.progress_total == 2 * PHOTOS + slices.FIT_UNITS
+    assert job.progress_done == job.progress_total == 2 * PHOTOS + slices.FIT_PROGRESS_UNITS
     assert _version(fitted) > version
 
     vocabulary = fitted.vocabulary(new.vocabulary_id)
@@ -230,9 +230,11 @@ def test_a_fit_is_the_same_for_its_seed_and_whoever_does_its_slices(
         assert len(progress) < 120
     assert len(progress) > 20  # plan, two of the sample, 4 seeds, and the passes over one batch
     done, totals = zip(*progress, strict=True)
-    assert set(totals) == {5 + slices.FIT_UNITS + PHOTOS}, "what there is to do does not change"
+    assert set(totals) == {5 + slices.FIT_PROGRESS_UNITS + PHOTOS}, (
+        "what there is to do does not change"
+    )
     assert list(done) == sorted(set(done)), "each slice is seen"
-    assert (done[2], done[-1]) == (5, 5 + slices.FIT_UNITS)
+    assert (done[2], done[-1]) == (5, 5 + slices.FIT_PROGRESS_UNITS)
     again = torn.finish(job_id)
     assert again.progress_done == totals[0]
 
@@ -262,7 +264,7 @@ def test_a_slice_that_crashes_is_tried_again_and_then_fails_the_fit(
         raise RuntimeError("out of memory")
 
     job_id = fitted.start(JobKind.FIT, **FIT)
-    monkeypatch.setattr(FitVocabulary, "_cluster", crash)
+    monkeypatch.setattr(VocabularyFitJob, "_cluster", crash)
     fitted.drain()
     job = fitted.job(job_id)
     assert (job.state, job.stage) == (JobState.FAILED, "cluster")
@@ -387,7 +389,7 @@ def test_a_photo_that_failed_in_a_generation_is_described_when_it_is_queued_agai
     with fitted.catalog.write() as session:
         job = session.get_one(Job, job_id)
         # Uploading the same bytes again queues the job as it is; POST /jobs/{id}/retry asks.
-        retry(session, job) if later_changes else requeue(job)
+        retry_job(session, job) if later_changes else requeue_job(job)
     fitted.drain()
     assert fitted.job(job_id).state == JobState.SUCCEEDED
     assert bad in fitted.rows()
@@ -398,7 +400,7 @@ def test_a_reindex_job_that_someone_cancelled_is_made_anew(fitted: Workplace) ->
     fitted.advance()
     first = fitted.reindex_jobs(new)[0]
     with fitted.catalog.write() as session:
-        cancel(session.get_one(Job, first.id))
+        cancel_job(session.get_one(Job, first.id))
     assert fitted.finish(job_id).state == JobState.SUCCEEDED
     assert set(fitted.rows(new)) == set(photo_ids(fitted))
 
@@ -414,13 +416,13 @@ def test_a_fit_can_be_cancelled_in_each_stage(
 ) -> None:
     do_one_step_a_slice(monkeypatch)
     old = fitted.active().id
-    real = ModelChanges.slice
+    real = ModelChangeRunner.run_step
     for stage in (None, "sample", "cluster"):
         job_id = fitted.start(JobKind.FIT, **{**FIT, "seed": 1})
         stop = threading.Event()
 
         def cancel_there(
-            self: ModelChanges,
+            self: ModelChangeRunner,
             job: Job,
             *,
             stage: str | None = stage,
@@ -434,13 +436,13 @@ def test_a_fit_can_be_cancelled_in_each_stage(
                 real(self, job)
 
         with monkeypatch.context() as patched:
-            patched.setattr(ModelChanges, "slice", cancel_there)
+            patched.setattr(ModelChangeRunner, "run_step", cancel_there)
             fitted.worker.drain(stop)
         assert fitted.job(job_id).state == JobState.CANCELLED
         assert fitted.building() is None
         assert fitted.drain().claimed == 0
         assert (fitted.active().id, fitted.searchable()) == (old, PHOTOS)
-        collect_work(fitted.catalog, fitted.store)
+        collect_model_change_files(fitted.catalog, fitted.store)
         assert fitted.keys("work/") == set()
     assert fitted.fit(seed=1).state == JobState.SUCCEEDED
     assert fitted.active().id != old

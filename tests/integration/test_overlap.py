@@ -11,7 +11,7 @@ import pytest
 
 from services.extractor.publish import publish
 from services.extractor.worker import ExtractorWorker
-from services.steward.queue import free_leases
+from services.steward.queue import release_expired_leases
 from shared.jobs import JobState
 from shared.objects import FolderStore
 from shared.vision.extractors import Extractor
@@ -99,7 +99,7 @@ def test_batch_that_waits_to_be_published_keeps_its_lease(
     gate.await_seen("describe 4", "describe 4")
     until = time.monotonic() + 2 * lease_seconds
     while time.monotonic() < until:
-        assert free_leases(averages.catalog, 3) == 0
+        assert release_expired_leases(averages.catalog, 3) == 0
         time.sleep(0.1)
     gate.open.set()
     draining.join()
@@ -148,7 +148,7 @@ def test_stopping_worker_publishes_what_it_has_described(averages: Workplace, ga
     gate.open.set()
     draining.join()
     (result,) = results
-    assert (result.claimed, result.succeeded, result.more) == (12, 8, True)
+    assert (result.claimed, result.succeeded, result.interrupted) == (12, 8, True)
     assert set(averages.rows()) == set(photo_ids[:8])
     left = [averages.job_of(photo_id) for photo_id in photo_ids[8:]]
     assert all(job.state == JobState.QUEUED and job.lease_token is None for job in left)

@@ -14,12 +14,12 @@ import pytest
 import torch
 
 from services.extractor import fit_pca, slices, stored_rows
-from services.extractor.loaded import LoadedModels
-from services.extractor.model_change import ModelChanges
-from services.extractor.renew import renew_outdated_generations
+from services.extractor.loaded import ModelRegistry
+from services.extractor.model_change import ModelChangeRunner
+from services.extractor.renew import reindex_outdated_generations
 from services.extractor.worker import ExtractorWorker
 from services.steward.collect import collect_orphans, collect_whitenings
-from services.steward.delete_maps import delete_maps
+from services.steward.delete_maps import purge_deleted_maps
 from shared.catalog.generations import Generation
 from shared.catalog.maps import Map, mark_map_deleted
 from shared.catalog.photos import Photo, PhotoRole
@@ -30,9 +30,9 @@ from shared.jobs import Job, JobKind, JobState
 from shared.jobs.table import WaitingFor
 from shared.objects.keys import WHITENINGS, WORK, query_vector_key
 from shared.vision import extractors
-from shared.vision.pca import Projection, Whitening
+from shared.vision.pca import PcaProjection, PcaWhitening
 from shared.vision.pca_file import decode_whitening
-from shared.vision.pca_fit import fit
+from shared.vision.pca_fit import fit_pca as fit_whitening
 from shared.vision.vocabulary import decode_centres
 from tests.integration.conftest import LentDecoders
 from tests.integration.workplace import Workplace, expected_row, same
@@ -68,13 +68,13 @@ def reduce(workplace: Workplace, pca: int = KEPT) -> Job:
     return job
 
 
-def by_hand(rows: dict[UUID, Rows]) -> Whitening:
+def by_hand(rows: dict[UUID, Rows]) -> PcaWhitening:
     """What a fit on all of these rows comes to."""
-    return fit(np.stack([rows[photo_id] for photo_id in sorted(rows)]), KEPT)
+    return fit_whitening(np.stack([rows[photo_id] for photo_id in sorted(rows)]), KEPT)
 
 
-def projected(whitening: Whitening, row: Rows) -> Rows:
-    found: Rows = Projection(whitening, CPU).project(row[np.newaxis])[0]
+def projected(whitening: PcaWhitening, row: Rows) -> Rows:
+    found: Rows = PcaProjection(whitening, CPU).project(row[np.newaxis])[0]
     return found
 
 
@@ -146,7 +146,7 @@ def test_stored_rows_are_whitened_without_a_photo(
         "rows": PHOTOS,
         "explained": pytest.approx(expected.explained),
     }
-    assert job.progress_done == job.progress_total == 2 * PHOTOS + slices.FIT_UNITS
+    assert job.progress_done == job.progress_total == 2 * PHOTOS + slices.FIT_PROGRESS_UNITS
     (stored,) = whitenings(workplace)
     file = decode_whitening(workplace.store.get(stored.object_key))
     assert file.whitening.sha256 == stored.sha256 == expected.sha256
@@ -188,24 +188,24 @@ def test_a_fit_is_the_same_whoever_does_its_slices(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     looks = itertools.count()
-    clock = SimpleNamespace(monotonic=lambda: next(looks) * slices.SLICE_SECONDS)
+    clock = SimpleNamespace(monotonic=lambda: next(looks) * slices.STEP_SECONDS)
     monkeypatch.setattr(slices, "time", clock)
-    monkeypatch.setattr(fit_pca, "READ_BYTES", 4 * 16 * 5)  # five rows at once
+    monkeypatch.setattr(fit_pca, "READ_BATCH_BYTES", 4 * 16 * 5)  # five rows at once
     monkeypatch.setattr(
         fit_pca, "block_width", lambda count, dimension: 6
     )  # so: three blocks of columns
-    real = ModelChanges.slice
+    real = ModelChangeRunner.run_step
     job_id = described.start(JobKind.PCA, pca=KEPT)
     stages, progress = [], []
     while described.job(job_id).waiting_for != WaitingFor.DESCRIPTORS:
         stop = threading.Event()
 
-        def slice_and_stop(self: ModelChanges, job: Job, stop: threading.Event = stop) -> None:
+        def slice_and_stop(self: ModelChangeRunner, job: Job, stop: threading.Event = stop) -> None:
             real(self, job)
             stop.set()
 
         with monkeypatch.context() as patched:
-            patched.setattr(ModelChanges, "slice", slice_and_stop)
+            patched.setattr(ModelChangeRunner, "run_step", slice_and_stop)
             make_worker().drain(stop)  # one that knows nothing
         job = described.job(job_id)
         stages.append(job.stage)
@@ -238,7 +238,7 @@ def test_a_photo_whose_row_is_damaged_is_described_anew(
         half: Rows = (found / 2).astype(np.float32)
         return half
 
-    monkeypatch.setattr(fit_pca, "stored_rows", lambda *_: before)  # the fit is not meant
+    monkeypatch.setattr(fit_pca, "read_stored_rows", lambda *_: before)  # the fit is not meant
     monkeypatch.setattr(stored_rows, "read_row", read)
     reduce(described)
     for photo_id, row in described.rows().items():
@@ -250,14 +250,14 @@ def test_a_photo_whose_projected_row_is_not_finite_fails_alone(
 ) -> None:
     before = described.rows()
     refused = sorted(before)[3]
-    real = Projection.project
+    real = PcaProjection.project
 
-    def project(self: Projection, rows: Rows) -> Rows:
+    def project(self: PcaProjection, rows: Rows) -> Rows:
         found = real(self, rows)
         found[(rows == before[refused]).all(axis=1)] = np.nan
         return found
 
-    monkeypatch.setattr(Projection, "project", project)
+    monkeypatch.setattr(PcaProjection, "project", project)
     reduce(described)
     assert described.rows().keys() == before.keys() - {refused}
     with described.catalog.read() as session:
@@ -271,10 +271,10 @@ def test_photos_are_described_where_the_rows_that_answer_were_made_otherwise(
     """An upgrade: the rows are projected ones, by a former decoder. The whitening stays."""
     before, old = reduced.rows(), reduced.active()
     monkeypatch.setattr(extractors, "DECODER", "another release")
-    models = LoadedModels(
+    models = ModelRegistry(
         reduced.store, reduced.settings.model_copy(update={"device": "cpu"}), none_added
     )
-    assert renew_outdated_generations(reduced.catalog, models) == 1
+    assert reindex_outdated_generations(reduced.catalog, models) == 1
     with reduced.catalog.read() as session:
         job_id = session.query(Job).filter_by(kind=JobKind.SWITCH).one().id
     assert reduced.finish(job_id).state == JobState.SUCCEEDED
@@ -382,7 +382,7 @@ def test_a_whitening_goes_when_its_generations_have_ended(reduced: Workplace) ->
 def test_a_deleted_map_leaves_no_whitening(reduced: Workplace) -> None:
     with reduced.catalog.write() as session:
         mark_map_deleted(session, session.get_one(Map, reduced.map_id))
-    delete_maps(reduced.catalog, reduced.store)
+    purge_deleted_maps(reduced.catalog, reduced.store)
     assert whitenings(reduced) == []
     assert reduced.keys(WHITENINGS) | {k for k in reduced.keys(WORK) if "plan" not in k} <= (
         reduced.keys(WORK)

@@ -10,7 +10,7 @@ import pytest
 
 from services.steward.model_changes import advance_model_changes
 from shared.catalog.vocabularies import Vocabulary
-from shared.jobs import InProcessHints
+from shared.jobs import InProcessWakeups
 from shared.vision.vocabulary_file import decode_vocabulary
 from tests.integration.gateway import Service
 from tests.support.problems import field_refused, problem
@@ -40,7 +40,7 @@ def done(service: Service, answer: httpx2.Response) -> Any:
     assert answer.status_code == 202, answer.text
     for _ in range(20):
         service.drain()
-        advance_model_changes(service.catalog, InProcessHints())
+        advance_model_changes(service.catalog, InProcessWakeups())
         job = get(service, f"/jobs/{answer.json()['job_id']}")
         if job["state"] not in ("queued", "running"):
             assert job["state"] == "succeeded", job

@@ -9,13 +9,13 @@ from uuid import UUID
 import pytest
 import torch
 
-from services.extractor.loaded import LoadedModels
-from services.extractor.renew import renew_outdated_generations
+from services.extractor.loaded import ModelRegistry
+from services.extractor.renew import reindex_outdated_generations
 from services.extractor.worker import ExtractorWorker
 from shared.catalog.generations import Generation
 from shared.jobs import JobKind, JobState
-from shared.recipes import get_recipe
-from shared.vision.decode import decode
+from shared.recipes import get_extractor_config
+from shared.vision.decode import decode_photo
 from shared.vision.extractors import Extractor
 from shared.vision.precision import Precision
 from tests.integration.workplace import Workplace, same
@@ -39,9 +39,9 @@ def make_set(
 
 
 def row(precision: Precision, number: int) -> Any:
-    recipe = get_recipe("test-tiny-avg", allow_test_extractors=True)
+    recipe = get_extractor_config("test-tiny-avg", allow_test_extractors=True)
     made = Extractor(recipe, torch.device("cpu"), precision=precision)
-    pixels = decode(photo_bytes(number), made.preprocessing, 10**9).pixels
+    pixels = decode_photo(photo_bytes(number), made.preprocessing, 10**9).pixels
     return made.describe([pixels], None)[0]
 
 
@@ -114,8 +114,8 @@ def test_another_setting_alone_describes_nothing_anew(
 ) -> None:
     averages.upload(1)
     averages.drain()
-    models: LoadedModels = make_set("bfloat16")._models
-    assert renew_outdated_generations(averages.catalog, models) == 0
+    models: ModelRegistry = make_set("bfloat16")._models
+    assert reindex_outdated_generations(averages.catalog, models) == 0
 
 
 def test_photos_wait_where_the_generations_precision_is_not_known(averages: Workplace) -> None:

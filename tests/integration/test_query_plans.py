@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from benchmarks.catalog.calls import READS_EVERYTHING, call_everything
+from benchmarks.catalog.calls import KNOWN_FULL_SCANS, run_all_calls
 from benchmarks.catalog.explain import Explainer
-from benchmarks.catalog.fill import fill
-from shared.catalog.connections import Limits, Pool
+from benchmarks.catalog.fill import fill_catalog
+from shared.catalog.connections import PoolConfig, TransactionTimeouts
 from shared.catalog.session import Catalog
 from tests.support.servers import PostgresServer
 
@@ -18,22 +18,24 @@ PHOTOS = 60_000
 def test_no_statement_reads_a_whole_map(
     postgres: PostgresServer, migrated_postgres: str, tmp_path: Path
 ) -> None:
-    catalog = Catalog(postgres.new_database(migrated_postgres), Pool(), Limits(250, 250))
+    catalog = Catalog(
+        postgres.new_database(migrated_postgres), PoolConfig(), TransactionTimeouts(250, 250)
+    )
     try:
-        filled = fill(catalog, PHOTOS)
+        filled = fill_catalog(catalog, PHOTOS)
         explainer = Explainer(catalog, small=True)
-        calls = list(call_everything(catalog, filled, explainer, tmp_path))
+        calls = list(run_all_calls(catalog, filled, explainer, tmp_path))
     finally:
         catalog.close()
     assert {e.call for e in explainer.found} >= set(calls) - {
         "steward: fit maps that wait",
         "steward: evaluate changed maps",
     }, "every call asks something"
-    assert set(READS_EVERYTHING) <= set(calls), "an exception that is none any more"
+    assert set(KNOWN_FULL_SCANS) <= set(calls), "an exception that is none any more"
     faulty = {
         f"{e.call}: {e.faults()} {e.scans} {e.sql}"
         for e in explainer.found
-        if e.faults() and e.call not in READS_EVERYTHING
+        if e.faults() and e.call not in KNOWN_FULL_SCANS
     }
     assert not faulty, "\n".join(sorted(faulty))
 
@@ -41,13 +43,15 @@ def test_no_statement_reads_a_whole_map(
 def test_missing_index_is_noticed(
     postgres: PostgresServer, migrated_postgres: str, tmp_path: Path
 ) -> None:
-    catalog = Catalog(postgres.new_database(migrated_postgres), Pool(), Limits(250, 250))
+    catalog = Catalog(
+        postgres.new_database(migrated_postgres), PoolConfig(), TransactionTimeouts(250, 250)
+    )
     try:
-        filled = fill(catalog, PHOTOS)
+        filled = fill_catalog(catalog, PHOTOS)
         with catalog.engine.begin() as connection:
             connection.exec_driver_sql("DROP INDEX ix_photos_tags")
         explainer = Explainer(catalog, small=True)
-        for _ in call_everything(catalog, filled, explainer, tmp_path):
+        for _ in run_all_calls(catalog, filled, explainer, tmp_path):
             pass
     finally:
         catalog.close()

@@ -20,8 +20,8 @@ from shared.catalog.photos import Photo
 from shared.catalog.session import Catalog
 from shared.intake import incoming as incoming_module
 from shared.intake import photo_quota
-from shared.intake.incoming import Incoming
-from shared.jobs import InProcessHints
+from shared.intake.incoming import ValidatedPhoto
+from shared.jobs import InProcessWakeups
 from shared.objects import FolderStore
 from shared.settings import Settings
 from tests.integration.door import ADMIN, Door
@@ -117,7 +117,7 @@ def test_without_its_redis_a_gateway_answers_all_calls_and_says_so_once(
     caplog: pytest.LogCaptureFixture,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(quotas_module, "AWAY_SECONDS", 0.0)
+    monkeypatch.setattr(quotas_module, "REDIS_RETRY_SECONDS", 0.0)
     with start_redis(own=True) as redis, caplog.at_level(logging.WARNING):
         door = Door(catalog, store, settings.model_copy(update={"redis_url": SecretStr(redis.url)}))
         key = door.key("read", requests_per_minute=1)["key"]
@@ -134,7 +134,7 @@ def test_without_its_redis_a_gateway_answers_all_calls_and_says_so_once(
 def test_a_key_stores_so_many_photos_and_a_deleted_one_makes_room(
     door: Door, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(photo_quota, "FULL_LOOK_SECONDS", 0.0)
+    monkeypatch.setattr(photo_quota, "FULL_RECOUNT_SECONDS", 0.0)
     key = door.key("write", max_photos=2)["key"]
     for _ in range(3):  # the same bytes again, and none at all, are no further photos
         assert door.put(key, 1).status_code in (200, 202)
@@ -151,13 +151,13 @@ def test_parallel_uploads_store_exactly_as_many_photos_as_the_key_may(
 ) -> None:
     most, uploads = 3, 8
     all_received = Barrier(uploads)
-    real = incoming_module.examine
+    real = incoming_module.validate_photo
 
-    def examine_together(*said: Any) -> Incoming:
+    def examine_together(*said: Any) -> ValidatedPhoto:
         all_received.wait(60)
         return real(*said)
 
-    monkeypatch.setattr(upload_module, "examine", examine_together)
+    monkeypatch.setattr(upload_module, "validate_photo", examine_together)
     door.app.openapi()  # a route is worked out at its first call, which no two threads may do
     key = door.key("write", max_photos=most)["key"]
     with ThreadPoolExecutor(uploads) as pool:
@@ -178,7 +178,7 @@ def test_photos_of_a_batch_count_too(
     archive = zip_of({f"{number}.jpg": photo_bytes(number) for number in range(4)})
     started = door(key, "POST", "/upload/batch", files={"archive": ("photos.zip", archive)})
     assert started.status_code == 202, started.text
-    BatchWorker(catalog, store, InProcessHints(), settings, "steward").work_next(Event())
+    BatchWorker(catalog, store, InProcessWakeups(), settings, "steward").run_next(Event())
     items = door(ADMIN, "GET", f"/jobs/{started.json()['job_id']}/items").json()["items"]
     assert [item["state"] for item in items] == ["running", "running", "failed", "failed"]
     assert items[2]["error"]["code"] == "photo_quota_reached"

@@ -12,21 +12,21 @@ from sqlalchemy import delete, func, insert, select
 
 from services.steward import journal
 from services.steward.collect import CollectionHeld, collect_deleted_photos, collect_orphans
-from services.steward.compact import compact
-from services.steward.delete_maps import delete_maps
+from services.steward.compact import merge_small_chunks
+from services.steward.delete_maps import purge_deleted_maps
 from services.steward.model_changes import advance_model_changes
 from shared.catalog.base import Base
 from shared.catalog.chunks import Chunk, Descriptor
 from shared.catalog.generations import Generation
-from shared.catalog.installation import Installation, ensure_installation
-from shared.catalog.maps import ensure_default_map
+from shared.catalog.installation import Installation, get_or_create_installation
+from shared.catalog.maps import get_or_create_default_map
 from shared.catalog.photos import Photo
 from shared.catalog.schema_compatibility import SchemaCompatibility
 from shared.catalog.session import Catalog
 from shared.chunks import manifest_key
 from shared.errors import Conflict, StorageFull
-from shared.integrity.check import check
-from shared.jobs import InProcessHints
+from shared.integrity.check import verify_store
+from shared.jobs import InProcessWakeups
 from shared.jobs.table import Job
 from shared.journal.lag import catalog_lag
 from shared.journal.outbox import write_journal
@@ -72,7 +72,7 @@ def photo(service: Service, file_id: str, map_name: str = "default") -> Any:
 
 
 def answers(service: Service, file_id: str, map_name: str = "default") -> Any:
-    service.search.follow()
+    service.search.sync()
     found = service.json("POST", f"/similarity/{file_id}", params={"map": map_name})
     return found["similar_images"]
 
@@ -89,7 +89,7 @@ def two_maps(service: Service) -> dict[str, str]:
     service.json("POST", "/vocabularies", 202, params={"map": "halls"}, json={"clusters": 4})
     for _ in range(20):
         service.drain()
-        advance_model_changes(service.catalog, InProcessHints())
+        advance_model_changes(service.catalog, InProcessWakeups())
     service.json("DELETE", f"/uploads/{gone}")
     return dict.fromkeys((first, second, query), "default") | dict.fromkeys(halls, "halls")
 
@@ -105,14 +105,14 @@ def test_every_photo_is_searchable_again_with_all_that_was_said_of_it(
     service.json("DELETE", "/maps/gone")
     write_journal(service.catalog, store)
     with service.catalog.write() as session:
-        installation_id = ensure_installation(session).id
+        installation_id = get_or_create_installation(session).id
     said = {file_id: photo(service, file_id, name) for file_id, name in left.items()}
     before = {file_id: answers(service, file_id, name) for file_id, name in left.items()}
     assert all(before.values())
 
     lose_catalog(service.catalog)
     with service.catalog.write() as session:
-        ensure_default_map(session, settings.extractor)  # as a first start has left it
+        get_or_create_default_map(session, settings.extractor)  # as a first start has left it
     service, taken = rebuilt(service)
     assert (taken.maps, taken.photos, taken.queued_photos) == (2, 6, 0)
     assert taken.descriptors == 6
@@ -122,7 +122,7 @@ def test_every_photo_is_searchable_again_with_all_that_was_said_of_it(
     with service.catalog.read() as session:
         assert session.scalars(select(Installation.id)).one() == installation_id
         assert session.scalar(select(func.count()).select_from(Photo)) == 6
-    assert check(service.catalog, store, originals=True).faults == []
+    assert verify_store(service.catalog, store, originals=True).faults == []
     assert catalog_lag(service.catalog, store) is None
     assert [m["name"] for m in service.json("GET", "/maps")] == ["default", "halls"]
     # It goes on: new photos come into the same generations, and the journal too.
@@ -130,7 +130,7 @@ def test_every_photo_is_searchable_again_with_all_that_was_said_of_it(
     assert answers(service, new, "halls")
     assert write_journal(service.catalog, store).lines > 0
     assert collect_orphans(service.catalog, store, -1.0) > 0  # the deleted photo's and map's
-    assert check(service.catalog, store, originals=True).faults == []
+    assert verify_store(service.catalog, store, originals=True).faults == []
 
 
 def test_a_rebuild_that_was_killed_goes_on_and_a_full_catalog_is_refused(
@@ -162,7 +162,7 @@ def test_a_rebuild_that_was_killed_goes_on_and_a_full_catalog_is_refused(
     with service.catalog.read() as session:
         for table, rows in ((Photo, 3), (Descriptor, 3), (Chunk, 1), (Job, 0)):
             assert session.scalar(select(func.count()).select_from(table)) == rows, table
-    assert check(service.catalog, store, originals=True).faults == []
+    assert verify_store(service.catalog, store, originals=True).faults == []
     with pytest.raises(Conflict, match="photos") as caught:
         begin_rebuild(service.catalog, store)
     assert caught.value.code == "catalog_not_empty"
@@ -198,7 +198,9 @@ def test_merged_chunks_give_each_photo_one_row(
     service: Service, store: FolderStore, settings: Settings
 ) -> None:
     file_ids = [service.indexed(number)[0] for number in (1, 2, 3)]
-    assert compact(service.catalog, store, compact_chunks=2) == 1  # the three lie there still
+    assert (
+        merge_small_chunks(service.catalog, store, compact_chunks=2) == 1
+    )  # the three lie there still
     file_ids += service.indexed(4)
     write_journal(service.catalog, store)
     lose_catalog(service.catalog)
@@ -206,7 +208,7 @@ def test_merged_chunks_give_each_photo_one_row(
     assert (taken.chunks, taken.descriptors) == (2, 4)
     with service.catalog.read() as session:
         assert set(session.scalars(select(Descriptor.photo_id))) == set(map(UUID, file_ids))
-    assert check(service.catalog, store, originals=True).faults == []
+    assert verify_store(service.catalog, store, originals=True).faults == []
 
 
 def test_uploads_of_the_last_seconds_come_back_though_the_journal_does_not_name_them(
@@ -315,7 +317,7 @@ def test_an_older_catalog_collects_nothing_and_takes_in_what_came_later(
     assert [one["image_id"] for one in answers(service, first)] == [later]
     assert photo(service, elsewhere, "later")["searchable"]
     assert service("GET", f"/uploads/{second}").status_code == 404
-    assert check(service.catalog, store, originals=True).faults == []
+    assert verify_store(service.catalog, store, originals=True).faults == []
     assert take_in(service.catalog, store, settings, unnamed_age_seconds=3600) == TakenIn()
 
 
@@ -334,7 +336,7 @@ def test_bytes_go_once_the_journal_tells_of_the_deletion(
 
     def round_() -> int:
         collect_deleted_photos(service.catalog, store, 0)
-        delete_maps(service.catalog, store)
+        purge_deleted_maps(service.catalog, store)
         return len(list(store.list(ORIGINALS)))
 
     with monkeypatch.context() as patched:

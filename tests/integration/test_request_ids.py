@@ -16,11 +16,11 @@ from sqlalchemy import select
 from services.steward.batches.worker import BatchWorker
 from shared.catalog.chunks import Chunk
 from shared.errors import Misconfigured
-from shared.jobs import InProcessHints
+from shared.jobs import InProcessWakeups
 from shared.jobs.batches import BatchItem
 from shared.jobs.table import Job, JobKind
 from shared.settings import Settings
-from shared.telemetry.traces import set_up_traces
+from shared.telemetry.traces import configure_tracing
 from tests.integration.gateway import Service
 from tests.support.archives import zip_of
 from tests.support.photos import photo_bytes
@@ -70,9 +70,9 @@ def test_photos_of_a_batch_carry_the_id_of_its_call(service: Service) -> None:
         headers={"X-Request-ID": ID},
     )
     worker = BatchWorker(
-        service.catalog, service.store, InProcessHints(), Settings(), "steward-test"
+        service.catalog, service.store, InProcessWakeups(), Settings(), "steward-test"
     )
-    assert worker.work_next(threading.Event())
+    assert worker.run_next(threading.Event())
     with service.catalog.read() as session:
         assert len(session.scalars(select(BatchItem)).all()) == 2
         made = session.execute(select(Job.kind, Job.request_id)).all()
@@ -94,7 +94,7 @@ def test_a_trace_leads_from_the_call_to_the_transaction_that_makes_it_searchable
 ) -> None:
     spans = InMemorySpanExporter()
     caller = "00-0af7651916cd43dd8448eb211c80319c-b7ad6b7169203331-01"
-    with set_up_traces(Settings(), "test", spans):
+    with configure_tracing(Settings(), "test", spans):
         answer = service(
             "POST",
             "/upload",
@@ -129,7 +129,7 @@ def test_traces_without_their_packages_are_refused(monkeypatch: pytest.MonkeyPat
     monkeypatch.setitem(sys.modules, "opentelemetry", None)
     monkeypatch.delitem(sys.modules, "shared.telemetry.opentelemetry_tracer", raising=False)
     with pytest.raises(Misconfigured, match="extra `otel`") as caught:
-        set_up_traces(Settings(), "gateway")
+        configure_tracing(Settings(), "gateway")
     assert caught.value.code == "otel_missing"
 
 

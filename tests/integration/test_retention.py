@@ -10,7 +10,7 @@ import pytest
 from sqlalchemy import select, update
 
 from services.steward import retention as retention_module
-from services.steward.retention import forget_old_jobs, forget_old_searches
+from services.steward.retention import delete_old_jobs, delete_old_searches
 from shared.catalog.base import db_now_plus
 from shared.catalog.maps import get_map
 from shared.catalog.searches import Search
@@ -57,13 +57,13 @@ def test_jobs_that_ended_long_ago_go_and_others_stay(service: Service, catalog: 
             session, map_id, JobKind.FIT, state=JobState.FAILED, finished_at=db_now_plus(0)
         ).id
     age_jobs(catalog, DAYS - 0.01)
-    forget_old_jobs(catalog, DAYS)
+    delete_old_jobs(catalog, DAYS)
     assert jobs(catalog) == {done, asked, str(failed_fit)}
     age_jobs(catalog, DAYS + 0.01)
     recent = service.upload(photo_bytes(2))["job_id"]
     service.drain()
     waiting = service.upload(photo_bytes(3))["job_id"]
-    forget_old_jobs(catalog, DAYS)
+    delete_old_jobs(catalog, DAYS)
     assert jobs(catalog) == {recent, waiting}
     problem(service("GET", f"/jobs/{done}"), 404, "job_not_found")
 
@@ -72,7 +72,7 @@ def test_a_described_photo_needs_its_job_no_more(service: Service, catalog: Cata
     first = service.upload(photo_bytes(1))
     service.drain()
     age_jobs(catalog, DAYS + 1)
-    forget_old_jobs(catalog, DAYS)
+    delete_old_jobs(catalog, DAYS)
     assert jobs(catalog) == set()
     status, again = upload_again(service, photo_bytes(1))
     assert (status, again["file_id"], again["job_id"]) == (200, first["file_id"], None)
@@ -93,7 +93,7 @@ def test_a_photo_that_was_not_described_keeps_its_job_and_can_be_queued_again(
         service.json("POST", f"/jobs/{first['job_id']}/cancel")
     service.drain()
     age_jobs(catalog, 10 * DAYS)
-    forget_old_jobs(catalog, DAYS)
+    delete_old_jobs(catalog, DAYS)
     assert service.json("GET", f"/jobs/{first['job_id']}")["state"] == end
     status, again = upload_again(service, data)
     assert (status, again["job_id"], again["status"]) == (202, first["job_id"], "queued")
@@ -108,7 +108,7 @@ def test_an_old_failure_that_was_tried_again_is_not_old(service: Service, catalo
     service.json("POST", f"/jobs/{job_id}/cancel")
     age_jobs(catalog, 10 * DAYS)
     service.json("POST", f"/jobs/{job_id}/retry")
-    forget_old_jobs(catalog, DAYS)
+    delete_old_jobs(catalog, DAYS)
     assert service.json("GET", f"/jobs/{job_id}")["state"] == "queued"
 
 
@@ -120,7 +120,7 @@ def test_searches_go_when_their_days_are_over(service: Service, catalog: Catalog
     with catalog.write() as session:
         session.get_one(Search, UUID(old)).searched_at = datetime.now(UTC) - timedelta(days=91)
         session.get_one(Search, UUID(recent)).searched_at = datetime.now(UTC) - timedelta(days=89)
-    forget_old_searches(catalog, 90)
+    delete_old_searches(catalog, 90)
     found = service.json("GET", "/searches")["searches"]
     assert [search["search_id"] for search in found] == [recent]
     assert service.json("GET", "/database/stats")["total_searches"] == 1
@@ -129,7 +129,7 @@ def test_searches_go_when_their_days_are_over(service: Service, catalog: Catalog
 def test_more_than_one_transaction_takes_goes_in_several(
     service: Service, catalog: Catalog, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(retention_module, "AT_ONCE", 2)
+    monkeypatch.setattr(retention_module, "RETENTION_ROWS_PER_TRANSACTION", 2)
     with catalog.write() as session:
         map_id = get_map(session, "default").id
         for _ in range(5):
@@ -142,6 +142,6 @@ def test_more_than_one_transaction_takes_goes_in_several(
             )
     left = []
     for _ in range(3):
-        forget_old_jobs(catalog, 1)
+        delete_old_jobs(catalog, 1)
         left.append(len(jobs(catalog)))
     assert left == [3, 1, 0]

@@ -14,8 +14,8 @@ from fastapi import Request
 from services.extractor.worker import ExtractorWorker
 from services.gateway import room as room_module
 from services.gateway.keys import Caller
-from services.gateway.room import MOST_RETRY_SECONDS, Kind, Room
-from shared.api_keys import EVERYTHING
+from services.gateway.room import MAX_RETRY_SECONDS, AdmissionControl, UploadKind
+from shared.api_keys import ALL_SCOPES
 from shared.catalog.base import db_now_plus
 from shared.catalog.maps import get_map
 from shared.catalog.session import Catalog
@@ -23,7 +23,7 @@ from shared.errors import TooManyRequests
 from shared.ids import new_id
 from shared.jobs import Job, JobKind, JobState
 from shared.jobs.table import Priority
-from shared.jobs.waiting import RATE_SECONDS, look_at_queue
+from shared.jobs.waiting import THROUGHPUT_WINDOW_SECONDS, measure_queue_depth
 from shared.objects import FolderStore
 from shared.settings import Settings
 from tests.integration.gateway import Service
@@ -54,13 +54,13 @@ def make_service(
 
 @pytest.fixture
 def always_look(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(room_module, "LOOK_SECONDS", 0.0)
-    monkeypatch.setattr(room_module, "LOOK_SHARE", 0.0)
+    monkeypatch.setattr(room_module, "ADMISSION_POLL_SECONDS", 0.0)
+    monkeypatch.setattr(room_module, "POLL_COST_DIVISOR", 0.0)
 
 
 @pytest.fixture
 def never_look_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(room_module, "LOOK_SECONDS", 3600.0)
+    monkeypatch.setattr(room_module, "ADMISSION_POLL_SECONDS", 3600.0)
 
 
 def upload(service: Service, number: int, map_name: str = "default") -> httpx2.Response:
@@ -70,7 +70,7 @@ def upload(service: Service, number: int, map_name: str = "default") -> httpx2.R
 
 def queue_full(answer: httpx2.Response) -> dict[str, Any]:
     body = problem(answer, 429, "queue_full")
-    assert 1 <= int(answer.headers["retry-after"]) <= MOST_RETRY_SECONDS
+    assert 1 <= int(answer.headers["retry-after"]) <= MAX_RETRY_SECONDS
     assert body["retry_after_seconds"] == int(answer.headers["retry-after"])
     return body
 
@@ -162,8 +162,8 @@ def test_what_waits_for_something_else_or_was_not_asked_for_is_no_queue(catalog:
             add_job(session, one, state=state)
         add_job(session, one, state=JobState.RUNNING, lease_token=one, lease_until=db_now_plus(60))
     with catalog.read() as session:
-        seen = look_at_queue(session, 100)
-    assert dict(seen.of_maps) == {"one": 1, "other": 2}
+        seen = measure_queue_depth(session, 100)
+    assert dict(seen.jobs_by_map) == {"one": 1, "other": 2}
     assert (seen.jobs, seen.queries) == (3, 2)
 
 
@@ -174,7 +174,7 @@ def test_a_look_counts_no_more_than_it_needs(catalog: Catalog) -> None:
             add_job(session, map_id)
             add_job(session, map_id, JobKind.DESCRIBE)
     with catalog.read() as session:
-        seen = look_at_queue(session, 4)
+        seen = measure_queue_depth(session, 4)
     assert (seen.jobs, seen.queries) == (4, 4)
 
 
@@ -184,7 +184,7 @@ def test_a_look_sees_how_fast_photos_are_finished(catalog: Catalog) -> None:
         for seconds, kind in (
             *((5, JobKind.INDEX),) * 20,
             *((5, JobKind.DESCRIBE),) * 10,
-            (RATE_SECONDS + 5, JobKind.INDEX),
+            (THROUGHPUT_WINDOW_SECONDS + 5, JobKind.INDEX),
             (5, JobKind.EVALUATE),
         ):
             add_job(
@@ -195,7 +195,9 @@ def test_a_look_sees_how_fast_photos_are_finished(catalog: Catalog) -> None:
                 finished_at=db_now_plus(-seconds),
             )
     with catalog.read() as session:
-        assert look_at_queue(session, 100).finished_per_second == 30 / RATE_SECONDS
+        assert (
+            measure_queue_depth(session, 100).finished_per_second == 30 / THROUGHPUT_WINDOW_SECONDS
+        )
 
 
 def test_a_look_is_taken_once_for_many_calls(
@@ -205,10 +207,10 @@ def test_a_look_is_taken_once_for_many_calls(
 
     def counted(session: Any, most: int) -> Any:
         looks.append(most)
-        return look_at_queue(session, most)
+        return measure_queue_depth(session, most)
 
-    monkeypatch.setattr(room_module, "look_at_queue", counted)
-    monkeypatch.setattr(room_module, "LOOK_SECONDS", 3600.0)
+    monkeypatch.setattr(room_module, "measure_queue_depth", counted)
+    monkeypatch.setattr(room_module, "ADMISSION_POLL_SECONDS", 3600.0)
     service = make_service()
     for number in range(5):
         assert upload(service, number).status_code == 202
@@ -222,13 +224,13 @@ def test_a_look_is_taken_once_for_many_calls(
         (1000, 10.0, 10),  # 100 too many for nine tenths
         (1500, 10.0, 60),  # 600 too many
         (1000, 1000.0, 1),
-        (1000, 0.0, MOST_RETRY_SECONDS),  # nothing is finished: no one knows
+        (1000, 0.0, MAX_RETRY_SECONDS),  # nothing is finished: no one knows
     ],
 )
 def test_the_time_to_come_again_follows_from_the_queue_and_its_speed(
     waiting: int, per_second: float, seconds: int
 ) -> None:
-    error = room_module._queue_full("jobs", waiting, 1000, per_second)
+    error = room_module._queue_full_error("jobs", waiting, 1000, per_second)
     assert error.extra["retry_after_seconds"] == seconds
 
 
@@ -276,57 +278,59 @@ def test_the_disk_of_the_originals_counts_too_and_no_disk_where_nothing_lies(
     photos = settings.placewise_home.parent / "photos"
     photos.mkdir()
     elsewhere = settings.model_copy(update={"upload_dir": photos})
-    assert Room(catalog, elsewhere).disk.free_bytes() == 5
-    assert Room(catalog, settings).disk.free_bytes() == 9
+    assert AdmissionControl(catalog, elsewhere).disk.free_bytes() == 5
+    assert AdmissionControl(catalog, settings).disk.free_bytes() == 9
     asked.clear()
     away = settings.model_copy(update={"s3_endpoint": "s3:1", "database_url": "postgresql://db"})
-    assert Room(catalog, away).disk.free_bytes() is None
+    assert AdmissionControl(catalog, away).disk.free_bytes() is None
     assert asked == []
 
 
 def test_one_gateway_receives_so_many_files_at_once(catalog: Catalog, settings: Settings) -> None:
-    room = Room(catalog, settings.model_copy(update={"max_concurrent_uploads": 2}))
+    room = AdmissionControl(catalog, settings.model_copy(update={"max_concurrent_uploads": 2}))
     ours = call_of(new_id(), "192.0.2.1")
-    with room.receiving(Kind.UPLOAD, ours), room.receiving(Kind.UPLOAD, ours):
-        with pytest.raises(TooManyRequests) as caught, room.receiving(Kind.UPLOAD, ours):
+    with room.admit_upload(UploadKind.UPLOAD, ours), room.admit_upload(UploadKind.UPLOAD, ours):
+        with pytest.raises(TooManyRequests) as caught, room.admit_upload(UploadKind.UPLOAD, ours):
             raise AssertionError("it was let in")
         assert caught.value.code == "too_many_uploads"
-        with room.receiving(Kind.QUERY, ours):
-            assert room.being_received(Kind.QUERY) == 1
-    with pytest.raises(ZeroDivisionError), room.receiving(Kind.UPLOAD, ours):
+        with room.admit_upload(UploadKind.QUERY, ours):
+            assert room.active_uploads(UploadKind.QUERY) == 1
+    with pytest.raises(ZeroDivisionError), room.admit_upload(UploadKind.UPLOAD, ours):
         raise ZeroDivisionError
-    assert room.being_received(Kind.UPLOAD) == 0
+    assert room.active_uploads(UploadKind.UPLOAD) == 0
 
 
 def call_of(key_id: UUID | None, address: str) -> Request:
-    caller = Caller("whoever", EVERYTHING, key_id)
+    caller = Caller("whoever", ALL_SCOPES, key_id)
     return Request({"type": "http", "client": (address, 1), "state": {"caller": caller}})
 
 
 def test_one_key_and_one_address_leave_places_to_others(
     catalog: Catalog, settings: Settings
 ) -> None:
-    room = Room(catalog, settings.model_copy(update={"max_concurrent_uploads_per_caller": 2}))
+    room = AdmissionControl(
+        catalog, settings.model_copy(update={"max_concurrent_uploads_per_caller": 2})
+    )
     key, other_key = new_id(), new_id()
     with (
-        room.receiving(Kind.UPLOAD, call_of(key, "2001:db8::1")),
-        room.receiving(Kind.UPLOAD, call_of(key, "192.0.2.1")),
+        room.admit_upload(UploadKind.UPLOAD, call_of(key, "2001:db8::1")),
+        room.admit_upload(UploadKind.UPLOAD, call_of(key, "192.0.2.1")),
     ):
         with (
             pytest.raises(TooManyRequests, match="of this key"),
-            room.receiving(Kind.UPLOAD, call_of(key, "192.0.2.9")),
+            room.admit_upload(UploadKind.UPLOAD, call_of(key, "192.0.2.9")),
         ):
             raise AssertionError("one key was let in three times")
         with (
-            room.receiving(Kind.UPLOAD, call_of(other_key, "2001:db8::2")),
+            room.admit_upload(UploadKind.UPLOAD, call_of(other_key, "2001:db8::2")),
             pytest.raises(TooManyRequests, match="of this address"),
-            room.receiving(Kind.UPLOAD, call_of(None, "2001:db8::ffff")),
+            room.admit_upload(UploadKind.UPLOAD, call_of(None, "2001:db8::ffff")),
         ):
             raise AssertionError("one /64 was let in three times")
-        with room.receiving(Kind.UPLOAD, call_of(None, "192.0.2.9")):
-            assert room.being_received(Kind.UPLOAD) == 3
-    with room.receiving(Kind.UPLOAD, call_of(key, "192.0.2.1")):
-        assert room.being_received(Kind.UPLOAD) == 1, "places are given back"
+        with room.admit_upload(UploadKind.UPLOAD, call_of(None, "192.0.2.9")):
+            assert room.active_uploads(UploadKind.UPLOAD) == 3
+    with room.admit_upload(UploadKind.UPLOAD, call_of(key, "192.0.2.1")):
+        assert room.active_uploads(UploadKind.UPLOAD) == 1, "places are given back"
 
 
 def test_an_event_stream_too_many_is_refused_and_one_that_ended_makes_room(

@@ -14,18 +14,18 @@ import pytest
 from starlette.testclient import TestClient
 
 from services.gateway.app import create_app
-from services.gateway.context import Gateway
-from services.gateway.keys import NoKeys
+from services.gateway.context import GatewayContext
+from services.gateway.keys import LocalhostAuthenticator
 from services.search import app as search_app
-from services.steward.located import Located
-from services.steward.measure import Measure
+from services.steward.located import GeotaggedPhoto
+from services.steward.measure import MapEvaluation
 from shared.catalog.chunks import Chunk, Descriptor
 from shared.catalog.generations import Generation
 from shared.catalog.session import Catalog
 from shared.chunks import decode_rows, encode_rows
 from shared.errors import Unavailable
-from shared.estimate.places import Spot
-from shared.jobs import InProcessHints
+from shared.estimate.places import PhotoLocation
+from shared.jobs import InProcessWakeups
 from shared.objects import FolderStore
 from shared.photo_filter import PhotoFilter
 from shared.search_protocol import SearchRequest, SearchResponse
@@ -304,7 +304,9 @@ def test_the_gateways_health_names_shards_without_workers_and_stays_ready(
     settings: Settings,
 ) -> None:
     tier = tier_of(1, 2)
-    gateway = Gateway(catalog, store, InProcessHints(), tier.port, settings, NoKeys())
+    gateway = GatewayContext(
+        catalog, store, InProcessWakeups(), tier.port, settings, LocalhostAuthenticator()
+    )
     with TestClient(create_app(gateway), base_url="http://localhost") as client:
         assert client.get("/api/v1/health").json()["parts"]["search"] == {
             "status": "healthy",
@@ -331,12 +333,12 @@ def test_a_map_is_not_measured_while_a_shard_is_missing(
     tier = tier_of(1, 1)
     with catalog.read() as session:
         generation = session.get_one(Generation, places.generation_id)
-    measure = Measure(catalog, tier.port, generation, 25.0, lambda: None)
-    sample = [Located(next(iter(places.rows)), Spot(None, None, "hall"), None)]
-    measure.run(sample)
+    measure = MapEvaluation(catalog, tier.port, generation, 25.0, lambda: None)
+    sample = [GeotaggedPhoto(next(iter(places.rows)), PhotoLocation(None, None, "hall"), None)]
+    measure.evaluate(sample)
     tier.servers[1][0].stop()
     with pytest.raises(Unavailable) as caught:
-        measure.run(sample)
+        measure.evaluate(sample)
     assert caught.value.code == "search_incomplete"
 
 
@@ -359,7 +361,7 @@ def test_a_worker_is_ready_once_it_has_loaded_what_answers(
 
     status, body = ready()
     assert (status, body["reasons"]) == (503, ["the catalog was not read yet"])
-    server.worker.follow()
+    server.worker.sync()
     status, body = ready()
     assert (status, body["status"], body["reasons"]) == (200, "ready", [])
     (lag,) = body["lags"].values()
@@ -367,7 +369,7 @@ def test_a_worker_is_ready_once_it_has_loaded_what_answers(
     assert 0 <= lag["seconds"] < 5
 
     with monkeypatch.context() as patched:
-        patched.setattr(search_app, "READY_LAG_SECONDS", 0.0)
+        patched.setattr(search_app, "MAX_READY_LAG_SECONDS", 0.0)
         status, body = ready()
         assert status == 503
         assert re.search("is 0 versions behind, level .* s ago", body["reasons"][0])
@@ -378,7 +380,7 @@ def test_a_worker_is_ready_once_it_has_loaded_what_answers(
     server.stop()
     server.start()
     server.wait_until_started()
-    server.worker.follow()
+    server.worker.sync()
     status, body = ready()
     assert (status, body["status"], body["missing"]) == (200, "degraded", [key])
     assert httpx2.get(f"{server.url}/livez").status_code == 200

@@ -13,17 +13,17 @@ from uuid import UUID
 import pytest
 from sqlalchemy import select, update
 
-from services.search.presence import Presence
+from services.search.presence import WorkerHeartbeat
 from services.search.worker import SearchWorker
 from services.steward import mend_generations as mend_generations_module
 from services.steward import search_workers
 from services.steward.mend_generations import mend_generations
-from services.steward.search_workers import SLOW_SECONDS, remove_dead_workers
+from services.steward.search_workers import SLOW_LOAD_SECONDS, remove_dead_search_workers
 from shared import read_retries
 from shared.catalog.base import db_now, db_now_plus
 from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.maps import Map
-from shared.catalog.search_workers import DEAD_SECONDS, RegisteredWorker
+from shared.catalog.search_workers import SEARCH_WORKER_TIMEOUT_SECONDS, RegisteredSearchWorker
 from shared.catalog.session import Catalog
 from shared.chunks import encode_rows
 from shared.jobs import JobState
@@ -60,11 +60,11 @@ class Registered:
     """A search worker with its entry, which works when it is told to."""
 
     worker: SearchWorker
-    presence: Presence
+    presence: WorkerHeartbeat
 
     def catch_up(self) -> None:
-        self.worker.follow()
-        self.presence.tell()
+        self.worker.sync()
+        self.presence.send_if_due()
 
 
 Register = Callable[..., Registered]
@@ -76,8 +76,8 @@ def register(catalog: Catalog, store: FolderStore, settings: Settings) -> Regist
 
     def make(name: str, shard: str = "0/1", store: FolderStore = store) -> Registered:
         worker = SearchWorker(catalog, store, settings, Shard.parse(shard))
-        made = Registered(worker, Presence(catalog, worker, name))
-        made.presence.tell()
+        made = Registered(worker, WorkerHeartbeat(catalog, worker, name))
+        made.presence.send_if_due()
         return made
 
     return make
@@ -101,17 +101,19 @@ def complete(workplace: Workplace) -> tuple[UUID, UUID]:
     return job_id, generation_id
 
 
-def entries(catalog: Catalog) -> list[RegisteredWorker]:
+def entries(catalog: Catalog) -> list[RegisteredSearchWorker]:
     with catalog.read() as session:
-        return list(session.scalars(select(RegisteredWorker).order_by(RegisteredWorker.name)))
+        return list(
+            session.scalars(select(RegisteredSearchWorker).order_by(RegisteredSearchWorker.name))
+        )
 
 
 def age(catalog: Catalog, name: str, seconds: float) -> None:
     """The worker was last heard of so long ago."""
     with catalog.write() as session:
         session.execute(
-            update(RegisteredWorker)
-            .where(RegisteredWorker.name == name)
+            update(RegisteredSearchWorker)
+            .where(RegisteredSearchWorker.name == name)
             .values(seen_at=db_now_plus(-seconds))
             .execution_options(synchronize_session=False)
         )
@@ -152,13 +154,13 @@ def test_a_generation_is_switched_in_once_the_slow_worker_has_loaded_it_too(
 
     job_id, new_id = complete(fitted)
     quick.catch_up()
-    loading = threading.Thread(target=slow.worker.follow)
+    loading = threading.Thread(target=slow.worker.sync)
     loading.start()
     try:
         assert slow_store.reached.wait(WAIT_SECONDS), "it does not load what is built"
         fitted.delete(next(iter(found(quick, fitted, old))))  # a change that both have to see
         for _ in range(3):
-            slow.presence.tell()
+            slow.presence.send_if_due()
             fitted.advance()
             job = fitted.job(job_id)
             assert (job.waiting_for, job.stage) == (WaitingFor.SEARCH, "load")
@@ -171,7 +173,7 @@ def test_a_generation_is_switched_in_once_the_slow_worker_has_loaded_it_too(
         loading.join()
     fitted.advance()
     assert fitted.active().id == old.id, "it has loaded, and has not said so yet"
-    slow.presence.tell()
+    slow.presence.send_if_due()
     fitted.advance()
     job = fitted.job(job_id)
     assert (job.state, job.waiting_for, job.awaited) == (JobState.SUCCEEDED, None, None)
@@ -188,10 +190,10 @@ def test_a_worker_that_dies_is_not_waited_for_for_ever(
     living.catch_up()
     fitted.advance()
     assert fitted.job(job_id).waiting_for == WaitingFor.SEARCH
-    age(catalog, "dying", DEAD_SECONDS - 2)
+    age(catalog, "dying", SEARCH_WORKER_TIMEOUT_SECONDS - 2)
     fitted.advance()
     assert fitted.job(job_id).waiting_for == WaitingFor.SEARCH, "it may only have paused"
-    age(catalog, "dying", DEAD_SECONDS + 1)
+    age(catalog, "dying", SEARCH_WORKER_TIMEOUT_SECONDS + 1)
     fitted.advance()
     assert fitted.active().id == new_id
     assert dying.worker.status().versions == {}
@@ -206,7 +208,7 @@ def test_a_worker_that_lives_and_does_not_load_is_named_and_waited_for(
     assert fitted.job(job_id).awaited is None, "not yet: loading takes its time"
     with catalog.write() as session:
         session.get_one(Generation, new_id).complete_at = session.scalar(
-            select(db_now_plus(-SLOW_SECONDS - 1))
+            select(db_now_plus(-SLOW_LOAD_SECONDS - 1))
         )
     with caplog.at_level(logging.WARNING):
         for _ in range(3):
@@ -256,7 +258,7 @@ def test_a_damaged_chunk_of_what_is_built_is_described_again_and_then_switched_i
     fitted.advance()
     assert fitted.job(job_id).waiting_for == WaitingFor.SEARCH
 
-    monkeypatch.setattr(search_workers, "SLOW_SECONDS", 0.0)
+    monkeypatch.setattr(search_workers, "SLOW_LOAD_SECONDS", 0.0)
     mend_generations(fitted.catalog, fitted.store)
     fitted.advance()
     assert fitted.job(job_id).waiting_for == WaitingFor.DESCRIPTORS
@@ -279,7 +281,7 @@ def test_a_chunk_that_only_its_worker_can_not_read_is_kept(
     fitted.store.put(key, whole[:-1])
     worker.catch_up()
     fitted.store.put(key, whole)
-    monkeypatch.setattr(search_workers, "SLOW_SECONDS", 0.0)
+    monkeypatch.setattr(search_workers, "SLOW_LOAD_SECONDS", 0.0)
     mend_generations(fitted.catalog, fitted.store)
     fitted.advance()
     assert fitted.job(job_id).waiting_for == WaitingFor.SEARCH
@@ -289,7 +291,7 @@ def test_a_model_change_whose_chunks_are_damaged_again_and_again_fails(
     fitted: Workplace, register: Register, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(mend_generations_module, "MAX_MENDED_CHUNKS", 0)
-    monkeypatch.setattr(search_workers, "SLOW_SECONDS", 0.0)
+    monkeypatch.setattr(search_workers, "SLOW_LOAD_SECONDS", 0.0)
     worker, old = register("worker"), fitted.active()
     job_id, new_id = complete(fitted)
     key = next(k for k in fitted.keys(f"chunks/{new_id}/") if k.endswith(".npy"))
@@ -351,7 +353,7 @@ def test_a_worker_tells_that_it_lives_and_what_it_has_loaded(
 def test_a_running_worker_keeps_its_entry_fresh_and_removes_it_in_the_end(
     register: Register, catalog: Catalog, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("services.search.presence.LOOK_SECONDS", 0.01)
+    monkeypatch.setattr("services.search.presence.CHANGE_POLL_SECONDS", 0.01)
     monkeypatch.setattr("services.search.presence.HEARTBEAT_SECONDS", 0.02)
     worker = register("worker")
     stop = threading.Event()
@@ -361,7 +363,7 @@ def test_a_running_worker_keeps_its_entry_fresh_and_removes_it_in_the_end(
     try:
         _wait_until(lambda: _seconds_ago(catalog) < 50)
         with catalog.write() as session:  # by a steward that could not hear of it
-            session.delete(session.get_one(RegisteredWorker, worker.presence.id))
+            session.delete(session.get_one(RegisteredSearchWorker, worker.presence.id))
         _wait_until(lambda: bool(entries(catalog)))
     finally:
         stop.set()
@@ -371,7 +373,7 @@ def test_a_running_worker_keeps_its_entry_fresh_and_removes_it_in_the_end(
 
 def _seconds_ago(catalog: Catalog) -> float:
     with catalog.read() as session:
-        seen, now = session.execute(select(RegisteredWorker.seen_at, db_now())).one()
+        seen, now = session.execute(select(RegisteredSearchWorker.seen_at, db_now())).one()
         return float((now - seen).total_seconds())
 
 
@@ -385,7 +387,7 @@ def _wait_until(true: Callable[[], bool]) -> None:
 def test_the_steward_forgets_workers_that_are_dead(register: Register, catalog: Catalog) -> None:
     register("living")
     register("dead")
-    age(catalog, "living", DEAD_SECONDS - 5)
-    age(catalog, "dead", DEAD_SECONDS + 1)
-    remove_dead_workers(catalog)
+    age(catalog, "living", SEARCH_WORKER_TIMEOUT_SECONDS - 5)
+    age(catalog, "dead", SEARCH_WORKER_TIMEOUT_SECONDS + 1)
+    remove_dead_search_workers(catalog)
     assert [entry.name for entry in entries(catalog)] == ["living"]

@@ -18,44 +18,44 @@ from services.steward import collect as collect_module
 from services.steward import compact as compact_module
 from services.steward.collect import (
     CollectionHeld,
-    collect,
     collect_deleted_photos,
     collect_ended_generations,
+    collect_garbage,
+    collect_model_change_files,
     collect_orphans,
     collect_queries,
     collect_superseded_chunks,
-    collect_work,
     empty_expired_trash,
 )
-from services.steward.compact import compact, merge_slot
-from services.steward.loop import Duty, Steward
+from services.steward.compact import merge_slot, merge_small_chunks
+from services.steward.loop import PeriodicTask, Scheduler
 from services.steward.metrics import StewardMetrics
 from services.steward.queue import resend_hints
 from shared.catalog.base import db_now_plus
-from shared.catalog.chunks import Chunk, Descriptor, count_searchable, live_chunks
-from shared.catalog.direct_uploads import DirectUpload
+from shared.catalog.chunks import Chunk, Descriptor, count_searchable, list_live_chunks
+from shared.catalog.direct_uploads import PresignedUpload
 from shared.catalog.generations import Generation, GenerationState
-from shared.catalog.idempotency import CallMade, KeyedCall, claim_key
-from shared.catalog.installation import REBUILDING, ensure_installation
+from shared.catalog.idempotency import IdempotencyRecord, RequestIdentity, claim_idempotency_key
+from shared.catalog.installation import REBUILDING, get_or_create_installation
 from shared.catalog.maps import Map
 from shared.catalog.photos import Photo, get_photo
 from shared.catalog.session import Catalog
 from shared.catalog.vocabularies import Vocabulary, VocabularyOrigin
 from shared.chunks import read_chunk, write_chunk
 from shared.ids import new_id
-from shared.jobs import InProcessHints, Job, JobKind, JobState
+from shared.jobs import InProcessWakeups, Job, JobKind, JobState
 from shared.objects import FolderStore
 from shared.objects.collection_hold import Hold, HoldReason, read_hold, write_hold
 from shared.objects.keys import (
     TRASH,
     incoming_key,
+    job_work_key,
     key_before_trash,
     new_original_key,
     new_vocabulary_key,
     query_key,
     query_vector_key,
     thumbnail_key,
-    work_key,
 )
 from shared.objects.trash import TrashSize, restore_trash
 from shared.read_retries import ReadRetries
@@ -107,7 +107,7 @@ class House:
     def live(self) -> list[tuple[int, int]]:
         """(slot, rows) of the live chunks."""
         with self.catalog.read() as session:
-            return [(c.slot, c.rows) for c in live_chunks(session, self.generation_id)]
+            return [(c.slot, c.rows) for c in list_live_chunks(session, self.generation_id)]
 
     def check_rows(self, expected: list[UUID]) -> None:
         """The generation holds these photos, each with its own descriptor, and no others."""
@@ -117,7 +117,7 @@ class House:
         with self.catalog.read() as session:
             assert count_searchable(session, self.generation_id) == len(expected)
             pointed_at = set(session.scalars(select(Descriptor.chunk_id)))
-            assert pointed_at <= {c.id for c in live_chunks(session, self.generation_id)}
+            assert pointed_at <= {c.id for c in list_live_chunks(session, self.generation_id)}
 
     def version(self) -> int:
         with self.catalog.read() as session:
@@ -154,11 +154,13 @@ def house(catalog: Catalog, store: FolderStore) -> House:
 def test_small_chunks_of_a_slot_become_one(house: House) -> None:
     photo_ids = sum_of(house.chunks(2, 3, 1))
     version = house.version()
-    assert compact(house.catalog, house.store, compact_chunks=3) == 1
+    assert merge_small_chunks(house.catalog, house.store, compact_chunks=3) == 1
     assert house.live() == [(0, 6)]
     house.check_rows(photo_ids)
     assert house.version() == version + 1  # search workers look again
-    assert compact(house.catalog, house.store, compact_chunks=3) == 0  # nothing is left to do
+    assert (
+        merge_small_chunks(house.catalog, house.store, compact_chunks=3) == 0
+    )  # nothing is left to do
 
 
 def sum_of(parts: list[list[UUID]]) -> list[UUID]:
@@ -167,7 +169,7 @@ def sum_of(parts: list[list[UUID]]) -> list[UUID]:
 
 def test_few_chunks_of_an_open_slot_are_left(house: House) -> None:
     house.chunks(2, 3)
-    assert compact(house.catalog, house.store, compact_chunks=3) == 0
+    assert merge_small_chunks(house.catalog, house.store, compact_chunks=3) == 0
     assert house.live() == [(0, 2), (0, 3)]
 
 
@@ -175,12 +177,12 @@ def test_merging_stays_inside_a_slot_and_never_exceeds_its_rows(house: House) ->
     photo_ids = sum_of(house.chunks(3, 4, 3, 5, 5, 9, 1, slot_rows=10))
     assert house.live() == [(0, 3), (0, 4), (0, 3), (1, 5), (1, 5), (2, 9), (2, 1)]
     # The full slots alone: the open one (2) is no worse than it may be.
-    assert compact(house.catalog, house.store, MANY) == 2
+    assert merge_small_chunks(house.catalog, house.store, MANY) == 2
     assert house.live() == [(0, 10), (1, 10), (2, 9), (2, 1)]
     with house.catalog.read() as session:
-        sealed = [chunk.sealed for chunk in live_chunks(session, house.generation_id)]
+        sealed = [chunk.sealed for chunk in list_live_chunks(session, house.generation_id)]
     assert sealed == [True, True, False, False]
-    assert compact(house.catalog, house.store, compact_chunks=2) == 1
+    assert merge_small_chunks(house.catalog, house.store, compact_chunks=2) == 1
     assert house.live() == [(0, 10), (1, 10), (2, 10)]
     house.check_rows(photo_ids)
 
@@ -188,9 +190,9 @@ def test_merging_stays_inside_a_slot_and_never_exceeds_its_rows(house: House) ->
 def test_rows_of_deleted_photos_are_dropped(house: House) -> None:
     first, second = house.chunks(5, 5)
     house.delete(first[0], first[4])
-    assert compact(house.catalog, house.store, MANY) == 0  # a fifth is not worth it
+    assert merge_small_chunks(house.catalog, house.store, MANY) == 0  # a fifth is not worth it
     house.delete(second[2])
-    assert compact(house.catalog, house.store, MANY) == 1
+    assert merge_small_chunks(house.catalog, house.store, MANY) == 1
     assert house.live() == [(0, 7)]
     house.check_rows([*first[1:4], *second[:2], *second[3:]])
 
@@ -198,10 +200,10 @@ def test_rows_of_deleted_photos_are_dropped(house: House) -> None:
 def test_a_slot_of_deleted_photos_is_left_without_a_chunk(house: House) -> None:
     (photo_ids,) = house.chunks(3)
     house.delete(*photo_ids)
-    assert compact(house.catalog, house.store, MANY) == 1
+    assert merge_small_chunks(house.catalog, house.store, MANY) == 1
     assert house.live() == []
     house.check_rows([])
-    assert compact(house.catalog, house.store, MANY) == 0
+    assert merge_small_chunks(house.catalog, house.store, MANY) == 0
 
 
 def test_rows_that_no_photo_ever_had_are_dropped(house: House) -> None:
@@ -209,7 +211,7 @@ def test_rows_that_no_photo_ever_had_are_dropped(house: House) -> None:
     with house.catalog.write() as session:  # two jobs of the batch were taken over
         for photo_id in photo_ids[:2]:
             session.delete(session.get_one(Descriptor, (house.generation_id, photo_id)))
-    assert compact(house.catalog, house.store, MANY) == 1
+    assert merge_small_chunks(house.catalog, house.store, MANY) == 1
     assert house.live() == [(0, 2)]
     house.check_rows(photo_ids[2:])
 
@@ -224,7 +226,7 @@ def test_merging_twice_at_once_merges_once(house: House, monkeypatch: pytest.Mon
         return read_chunk(*arguments)
 
     with house.catalog.read() as session:
-        first_keys = {live_chunks(session, house.generation_id)[0].object_key}
+        first_keys = {list_live_chunks(session, house.generation_id)[0].object_key}
     monkeypatch.setattr(compact_module, "read_chunk", read_together)
     with ThreadPoolExecutor(2) as pool:
         merges = [
@@ -302,10 +304,10 @@ def test_a_chunk_that_arrives_while_merging_is_not_lost(
 def test_a_corrupt_chunk_stays_and_others_are_merged(house: House) -> None:
     photo_ids = sum_of(house.chunks(5, 5, 3, 3, slot_rows=10))
     with house.catalog.read() as session:
-        broken = live_chunks(session, house.generation_id)[0].object_key
+        broken = list_live_chunks(session, house.generation_id)[0].object_key
     whole = house.store.get(broken)
     house.store.put(broken, whole[:-1] + bytes([whole[-1] ^ 1]))
-    assert compact(house.catalog, house.store, compact_chunks=2) == 1
+    assert merge_small_chunks(house.catalog, house.store, compact_chunks=2) == 1
     assert house.live() == [(0, 5), (0, 5), (1, 6)]
     house.store.put(broken, whole)
     house.check_rows(photo_ids)
@@ -316,21 +318,21 @@ def test_a_corrupt_chunk_is_not_read_with_every_round_of_merging(
 ) -> None:
     house.chunks(1, 1)
     with house.catalog.read() as session:
-        broken = live_chunks(session, house.generation_id)[0].object_key
+        broken = list_live_chunks(session, house.generation_id)[0].object_key
     whole = house.store.get(broken)
     house.store.put(broken, whole[:-1])
     retries = ReadRetries()
-    assert compact(house.catalog, house.store, 2, retries) == 0
+    assert merge_small_chunks(house.catalog, house.store, 2, retries) == 0
     house.store.put(broken, whole)
-    assert compact(house.catalog, house.store, 2, retries) == 0, "its pause is not over"
+    assert merge_small_chunks(house.catalog, house.store, 2, retries) == 0, "its pause is not over"
     monkeypatch.setattr("shared.read_retries.time.monotonic", lambda: float("inf"))
-    assert compact(house.catalog, house.store, 2, retries) == 1
+    assert merge_small_chunks(house.catalog, house.store, 2, retries) == 1
 
 
 def test_generations_that_no_longer_answer_are_not_merged(house: House) -> None:
     house.chunks(1, 1, 1)
     house.change(Generation, house.generation_id, state=GenerationState.RETIRED)
-    assert compact(house.catalog, house.store, compact_chunks=2) == 0
+    assert merge_small_chunks(house.catalog, house.store, compact_chunks=2) == 0
 
 
 # --- superseded chunks and ended generations -------------------------------------------------
@@ -468,10 +470,10 @@ def test_what_a_model_change_kept_goes_when_it_needs_it_no_more(house: House) ->
         new_id(),  # no one knows it
     ]
     for job_id in needed + over:
-        house.store.put(work_key(job_id, "plan.json"), b"[]")
+        house.store.put(job_work_key(job_id, "plan.json"), b"[]")
     house.store.put("work/stray.txt", b"?")
-    collect_work(house.catalog, house.store)
-    assert house.objects("work/") == {work_key(job_id, "plan.json") for job_id in needed}
+    collect_model_change_files(house.catalog, house.store)
+    assert house.objects("work/") == {job_work_key(job_id, "plan.json") for job_id in needed}
 
 
 # --- orphans ---------------------------------------------------------------------------------
@@ -572,12 +574,12 @@ def test_collection_of_more_than_a_share_is_held_before_anything_is_moved(
         house.store.put(key, b"orphan")
     house.age(orphans, 2 * DAY_SECONDS)
     metrics = StewardMetrics(CollectorRegistry())
-    steward = Steward(house.catalog, house.store, InProcessHints(), settings, metrics)
-    (duty,) = [duty for duty in steward.duties if duty.name == "collect orphans"]
+    steward = Scheduler(house.catalog, house.store, InProcessWakeups(), settings, metrics)
+    (duty,) = [duty for duty in steward.tasks if duty.name == "collect orphans"]
     share = settings.collect_max_share
     assert share * len(live | orphans) < 4
 
-    duty.do()
+    duty.run()
     assert house.objects() == live | orphans
     assert house.objects("trash/") == set()
     assert metrics.collection_held._value.get() == 1
@@ -593,7 +595,7 @@ def test_collection_of_more_than_a_share_is_held_before_anything_is_moved(
     assert house.objects() == live
     assert len(house.objects("trash/")) == 4
     assert read_hold(house.store) is None
-    duty.do()
+    duty.run()
     assert metrics.collection_held._value.get() == 0
     assert metrics.trash_bytes._value.get() == 24
 
@@ -620,12 +622,12 @@ def test_single_orphan_is_held_where_the_catalog_is_behind_or_adopted_the_store(
     house.store.put(orphan := new_original_key(), b"orphan")
     house.age({orphan}, 2 * DAY_SECONDS)
     with house.catalog.write() as session:
-        ensure_installation(session).journal_sequence = REBUILDING
+        get_or_create_installation(session).journal_sequence = REBUILDING
     with pytest.raises(CollectionHeld) as caught:
         collect_orphans(house.catalog, house.store, DAY_SECONDS)
     assert caught.value.hold.reason == HoldReason.CATALOG_BEHIND
     with house.catalog.write() as session:
-        ensure_installation(session).journal_sequence = 0
+        get_or_create_installation(session).journal_sequence = 0
     write_hold(house.store, Hold(HoldReason.ADOPTED, 1, 6, 1))
     assert collect_orphans(house.catalog, house.store, 3 * DAY_SECONDS) == 0  # it is too young
     with pytest.raises(CollectionHeld) as caught:
@@ -682,7 +684,7 @@ def test_stray_files_stop_no_collection_and_go_with_the_orphans(house: House) ->
 def test_more_orphans_than_one_look_takes_all_go(
     house: House, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(collect_module, "AT_ONCE", 3)
+    monkeypatch.setattr(collect_module, "ROWS_PER_TRANSACTION", 3)
     live = _live_objects(house)
     for _ in range(8):
         house.store.put(new_original_key(), b"orphan")
@@ -709,7 +711,7 @@ def test_collecting_twice_at_once_harms_nothing(house: House, settings: Settings
 
     def both() -> None:
         together.wait(timeout=30)
-        collect(house.catalog, house.store, now)
+        collect_garbage(house.catalog, house.store, now)
 
     with ThreadPoolExecutor(2) as pool:
         for done in [pool.submit(both) for _ in range(2)]:
@@ -721,7 +723,7 @@ def test_collecting_twice_at_once_harms_nothing(house: House, settings: Settings
 
 
 def test_a_duty_that_raises_does_not_stop_the_others(house: House, settings: Settings) -> None:
-    steward = Steward(house.catalog, house.store, InProcessHints(), settings)
+    steward = Scheduler(house.catalog, house.store, InProcessWakeups(), settings)
     done: list[str] = []
     stop = threading.Event()
 
@@ -734,7 +736,7 @@ def test_a_duty_that_raises_does_not_stop_the_others(house: House, settings: Set
         if done.count("fail") > 1:
             stop.set()
 
-    steward.duties = [Duty("fail", 0.0, fail), Duty("work", 0.0, work)]
+    steward.tasks = [PeriodicTask("fail", 0.0, fail), PeriodicTask("work", 0.0, work)]
     steward.run(stop)
     assert done == ["fail", "work", "fail", "work"]  # and it is tried again
 
@@ -743,7 +745,7 @@ def test_each_duty_is_done_by_the_loop(
     house: House, settings: Settings, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """One round does everything once: each duty leaves its trace."""
-    hints = InProcessHints()
+    hints = InProcessWakeups()
     soon = settings.model_copy(
         update={"compact_chunks": 2, "orphan_age_seconds": 0.0, "auto_fit_photos": 1}
     )
@@ -760,9 +762,9 @@ def test_each_duty_is_done_by_the_loop(
     house.store.put(new_original_key(), b"orphan")
     house.age(house.objects("originals/"), 60)
     with house.catalog.write() as session:
-        made = CallMade("someone", "key", "POST /api/v1/maps", "0" * 64)
-        claim_key(session, made, lease_seconds=1, life_seconds=-1)
-        forgotten = DirectUpload(
+        made = RequestIdentity("someone", "key", "POST /api/v1/maps", "0" * 64)
+        claim_idempotency_key(session, made, lease_seconds=1, life_seconds=-1)
+        forgotten = PresignedUpload(
             map_id=house.map_id,
             filename="a.jpg",
             size_bytes=1,
@@ -772,9 +774,9 @@ def test_each_duty_is_done_by_the_loop(
         session.add(forgotten)
         session.flush()
     house.store.put(incoming_key(forgotten.id), b"never completed")
-    steward = Steward(house.catalog, house.store, hints, soon)
+    steward = Scheduler(house.catalog, house.store, hints, soon)
     stop = threading.Event()
-    steward.duties.append(Duty("stop", 0.0, stop.set))
+    steward.tasks.append(PeriodicTask("stop", 0.0, stop.set))
     steward.run(stop)
     assert house.live() == [(0, 2)]
     assert house.objects("originals/") == set()
@@ -782,15 +784,15 @@ def test_each_duty_is_done_by_the_loop(
     assert hints.wait(0)
     house.check_rows(kept)
     with house.catalog.read() as session:
-        assert session.scalars(select(KeyedCall.id)).all() == []
-        assert session.scalars(select(DirectUpload.id)).all() == []
+        assert session.scalars(select(IdempotencyRecord.id)).all() == []
+        assert session.scalars(select(PresignedUpload.id)).all() == []
         assert session.get_one(Job, lost).state == JobState.QUEUED
         fit = session.scalars(select(Job).where(Job.kind == JobKind.FIT)).one()
         assert fit.map_id == other
 
 
 def test_a_lost_hint_is_sent_again_while_there_is_work(house: House) -> None:
-    hints = InProcessHints()
+    hints = InProcessWakeups()
     resend_hints(house.catalog, hints)
     assert not hints.wait(0)
     add_one_job(house, JobKind.INDEX, waiting_for="vocabulary")

@@ -12,10 +12,10 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
-from services.cli.main import tree
+from services.cli.main import build_app
 from services.trainer import run
-from services.trainer.configuration import make_arguments, read_yaml
-from services.trainer.display import Quiet
+from services.trainer.configuration import build_arguments, load_yaml
+from services.trainer.display import NullDisplay
 from services.trainer.stop import RunStopped, StopRequest
 from shared.errors import Conflict, InvalidRequest, NotFound, PlacewiseError, Unprocessable
 from shared.vision.place_models.checkpoint import load_checkpoint
@@ -38,7 +38,7 @@ def _one_thread() -> Iterator[None]:
     torch.set_num_threads(threads)
 
 
-class StopAfter(Quiet):
+class StopAfter(NullDisplay):
     """Asks for the end once `what` has been heard of `times` times."""
 
     def __init__(self, stop: StopRequest, what: str, times: int) -> None:
@@ -70,7 +70,7 @@ def test_a_run_leaves_its_summary_configuration_and_checkpoints(whole: tuple[Pat
     assert report["monitor"] == f"{name}/R1"
     assert report["images"] == 2 * 6 * 3
     assert 0 <= report["share_waiting_for_data"] <= 1
-    assert make_arguments(read_yaml(folder / "config.yaml")).cities == (CITY,)
+    assert build_arguments(load_yaml(folder / "config.yaml")).cities == (CITY,)
     assert list((folder / "csv").rglob("metrics.csv"))
     assert list((folder / "tensorboard").glob("events*"))
 
@@ -131,8 +131,8 @@ def test_a_run_that_was_stopped_goes_on_as_if_it_had_not_been(
     (name,) = report["sets"]
     display = StopAfter(stop, name if what == "places" else what, times)
     with pytest.raises(RunStopped):
-        run.run(make_arguments(told(places, tmp_path)), display, stop)
-    resumed = run.resume(tmp_path / "run", {}, Quiet(), StopRequest())
+        run.run(build_arguments(told(places, tmp_path)), display, stop)
+    resumed = run.resume(tmp_path / "run", {}, NullDisplay(), StopRequest())
     assert [epoch["figures"] for epoch in resumed["epochs"]] == [
         epoch["figures"] for epoch in report["epochs"]
     ]
@@ -144,7 +144,7 @@ def test_a_run_that_was_stopped_goes_on_as_if_it_had_not_been(
 def test_a_finished_run_learns_longer(whole: tuple[Path, Json], tmp_path: Path) -> None:
     folder, _ = whole
     copy = Path(shutil.copytree(folder, tmp_path / "run"))
-    report = run.resume(copy, {"max_epochs": 3, "logger": "none"}, Quiet(), StopRequest())
+    report = run.resume(copy, {"max_epochs": 3, "logger": "none"}, NullDisplay(), StopRequest())
     assert [epoch["number"] for epoch in report["epochs"]] == [0, 1, 2]
 
 
@@ -154,18 +154,18 @@ def test_a_resumed_run_can_not_become_another(
     folder, _ = whole
     copy = Path(shutil.copytree(folder, tmp_path / "run"))
     with pytest.raises(Conflict, match="batch_size"):
-        run.resume(copy, {"batch_size": 3}, Quiet(), StopRequest())
+        run.resume(copy, {"batch_size": 3}, NullDisplay(), StopRequest())
     more = write_tiny_places(tmp_path / "more", places=7)
     with pytest.raises(Conflict, match="are not those"):
-        run.resume(copy, {"data_root": str(more)}, Quiet(), StopRequest())
+        run.resume(copy, {"data_root": str(more)}, NullDisplay(), StopRequest())
     with pytest.raises(NotFound, match="there is no"):
-        run.resume(tmp_path, {}, Quiet(), StopRequest())
+        run.resume(tmp_path, {}, NullDisplay(), StopRequest())
 
 
 def test_frozen_layers_keep_their_weights_and_the_others_learn(
     places: Path, tmp_path: Path
 ) -> None:
-    display = Quiet()
+    display = NullDisplay()
     said = told(places, tmp_path, layers_to_freeze=0, max_steps=2)
     report = train(said, display)
     begun = train(told(places, tmp_path, layers_to_freeze=0, lr=1e-30, max_steps=1, run_name="0"))
@@ -181,7 +181,7 @@ def test_a_photo_that_does_not_decode_is_named_and_counted(places: Path, tmp_pat
     mine = Path(shutil.copytree(places, tmp_path / "places"))
     broken = sorted((mine / "gsv_xs" / "train" / CITY).iterdir())[0]
     broken.write_bytes(broken.read_bytes()[:100])
-    display = Quiet()
+    display = NullDisplay()
     said = told(mine, tmp_path, random_sample_from_each_place=False, max_epochs=1)
     report = train(said, display)
     assert list(report["bad_photos"]) == [str(broken)]
@@ -258,7 +258,7 @@ def test_the_grid_command_makes_every_run_names_the_failed_one_and_ranks_the_oth
     )  # fmt: skip
     out = tmp_path / "grid"
     command = ["grid", str(file), "--out", str(out)]
-    dry = CliRunner().invoke(tree(["grid"]), [*command, "--dry-run", "--json"])
+    dry = CliRunner().invoke(build_app(["grid"]), [*command, "--dry-run", "--json"])
     assert dry.exit_code == 0, dry.output
     assert [(row["run"], row["state"]) for row in json.loads(dry.stdout)] == [
         ("AVG", "waiting"),
@@ -266,7 +266,7 @@ def test_the_grid_command_makes_every_run_names_the_failed_one_and_ranks_the_oth
         ("wrong", "waiting"),
     ]
     assert not out.exists()
-    answer = CliRunner().invoke(tree(["grid"]), [*command, "--json"])
+    answer = CliRunner().invoke(build_app(["grid"]), [*command, "--json"])
     assert answer.exit_code == 1, answer.output
     states = {each["run"]["name"]: each["state"] for each in json.loads(answer.stdout)}
     assert states == {"AVG": "finished", "GeM": "finished", "wrong": "failed"}

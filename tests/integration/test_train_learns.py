@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from benchmarks.train.learning import gain_of
+from benchmarks.train.learning import measure_gain
 from services.trainer import run
-from services.trainer.configuration import make_arguments
-from services.trainer.device import choose_device
-from services.trainer.display import Quiet
+from services.trainer.configuration import build_arguments
+from services.trainer.device import resolve_device
+from services.trainer.display import NullDisplay
 from services.trainer.make_model import make_model
 from services.trainer.random_state import seed_everything
 from services.trainer.stop import StopRequest
@@ -26,7 +26,7 @@ def test_a_short_run_clearly_beats_the_untrained_network_on_held_out_places(
 ) -> None:
     city = tmp_path / "city"
     write_city(make_plan(CityOptions(250, 2, 300, 0, 0, 0.0, 96, 72)), city)
-    arguments = make_arguments(
+    arguments = build_arguments(
         {
             "data_root": city,
             "default_root_dir": str(tmp_path),
@@ -52,12 +52,12 @@ def test_a_short_run_clearly_beats_the_untrained_network_on_held_out_places(
             "logger": "none",
         }
     )
-    report = run.run(arguments, Quiet(), StopRequest())
+    report = run.run(arguments, NullDisplay(), StopRequest())
     seed_everything(arguments.seed)
-    untrained = make_model(arguments, Quiet(), resuming=False)
+    untrained = make_model(arguments, NullDisplay(), resuming=False)
     trained = load_checkpoint(Path(report["best"]["path"])).model
-    device, asked = choose_device(arguments), open_evaluation_set(city)
-    gain = gain_of(untrained, trained, asked, SIDE, device, k=5)
+    device, asked = resolve_device(arguments), open_evaluation_set(city)
+    gain = measure_gain(untrained, trained, asked, SIDE, device, k=5)
     assert gain.queries == 300
     # The whole 95 % interval lies above nothing gained.
     assert gain.low > 0, gain.as_json()

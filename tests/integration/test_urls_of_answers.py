@@ -10,7 +10,7 @@ from typing import Any
 import httpx2
 
 from services.steward.model_changes import advance_model_changes
-from shared.jobs import InProcessHints
+from shared.jobs import InProcessWakeups
 from tests.integration.gateway import API, Service
 from tests.support.photos import photo_bytes
 
@@ -80,7 +80,7 @@ class Followed:
     def until_it_ends(self, started: dict[str, Any]) -> None:
         for _ in range(60):
             self.service.drain()
-            advance_model_changes(self.service.catalog, InProcessHints())
+            advance_model_changes(self.service.catalog, InProcessWakeups())
             job = self.service.json("GET", started["status_url"].removeprefix(API))
             if job["state"] not in ("queued", "running"):
                 assert job["state"] == "succeeded", job

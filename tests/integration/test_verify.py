@@ -12,19 +12,19 @@ from shared.catalog.base import Base
 from shared.catalog.chunks import Chunk, Descriptor
 from shared.catalog.photos import Photo
 from shared.chunks import manifest_key
-from shared.integrity.check import check
-from shared.integrity.repair import repair
-from shared.integrity.report import Report
-from shared.jobs import InProcessHints
+from shared.integrity.check import verify_store
+from shared.integrity.repair import repair_descriptors
+from shared.integrity.report import IntegrityReport
+from shared.jobs import InProcessWakeups
 from tests.integration.gateway import Service
 from tests.integration.workplace import Workplace
 
 
-def looked(service: Service, *, originals: bool = False) -> Report:
-    return check(service.catalog, service.store, originals=originals)
+def looked(service: Service, *, originals: bool = False) -> IntegrityReport:
+    return verify_store(service.catalog, service.store, originals=originals)
 
 
-def faults(report: Report) -> set[tuple[str, str]]:
+def faults(report: IntegrityReport) -> set[tuple[str, str]]:
     return {(str(fault.wrong), fault.what) for fault in report.faults}
 
 
@@ -34,8 +34,8 @@ def chunk_keys(service: Service) -> list[str]:
         return list(session.scalars(wanted))
 
 
-def mend(service: Service, report: Report) -> int:
-    return repair(service.catalog, InProcessHints(), report)
+def mend(service: Service, report: IntegrityReport) -> int:
+    return repair_descriptors(service.catalog, InProcessWakeups(), report)
 
 
 def test_a_whole_store_has_no_faults(service: Service) -> None:
@@ -133,14 +133,14 @@ def test_a_generation_that_is_being_built_gets_its_lost_rows_again(vlads: Workpl
         chunk = session.scalars(select(Chunk).where(Chunk.generation_id == building)).first()
     assert chunk is not None
     vlads.store.delete(chunk.object_key)
-    report = check(vlads.catalog, vlads.store, originals=False)
+    report = verify_store(vlads.catalog, vlads.store, originals=False)
     assert faults(report) == {("missing", "chunk")}
-    assert repair(vlads.catalog, InProcessHints(), report) > 0
+    assert repair_descriptors(vlads.catalog, InProcessWakeups(), report) > 0
     assert vlads.finish(job_id).state == "succeeded"
     with vlads.catalog.read() as session:
         rows = select(func.count()).select_from(Descriptor)
         assert session.scalar(rows.where(Descriptor.generation_id == building)) == 10
-    assert check(vlads.catalog, vlads.store, originals=True).faults == []
+    assert verify_store(vlads.catalog, vlads.store, originals=True).faults == []
 
 
 def test_a_changed_vocabulary_is_found(vlads: Workplace) -> None:
@@ -148,11 +148,11 @@ def test_a_changed_vocabulary_is_found(vlads: Workplace) -> None:
     vlads.fit()
     (key,) = vlads.keys("vocabularies/")
     vlads.store.put(key, vlads.store.get(key)[:-4] + b"\0\0\0\0")
-    found = check(vlads.catalog, vlads.store, originals=False)
+    found = verify_store(vlads.catalog, vlads.store, originals=False)
     assert faults(found) == {("damaged", "vocabulary")}
 
 
 def test_every_table_that_names_objects_is_looked_at() -> None:
-    """A new one has to be added to `named_objects`, or backups would miss its objects unseen."""
+    """A new one has to be added to `list_referenced_objects`, or backups would miss its objects unseen."""
     naming = {table.name for table in Base.metadata.sorted_tables if "object_key" in table.columns}
     assert naming == {"batch_items", "chunks", "models", "photos", "vocabularies", "whitenings"}

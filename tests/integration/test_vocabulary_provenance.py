@@ -12,11 +12,11 @@ import pytest
 from shared.catalog.vocabularies import Vocabulary
 from shared.jobs import JobKind, JobState
 from shared.objects.keys import new_vocabulary_key
-from shared.recipes import get_recipe
+from shared.recipes import get_extractor_config
 from shared.vision import preprocessing
 from shared.vision.extractors import Extractor, choose_device
-from shared.vision.provenance import Provenance, of_features
-from shared.vision.vocabulary import check_centres, decode_centres, encode_centres
+from shared.vision.provenance import Provenance, feature_provenance
+from shared.vision.vocabulary import decode_centres, encode_centres, parse_centres
 from shared.vision.vocabulary_file import VocabularyFile
 from tests.integration.workplace import FIT, Workplace
 
@@ -24,13 +24,13 @@ WIDTH = 16  # of the tiny backbone's local features
 
 
 def tiny_features() -> Provenance:
-    recipe = get_recipe("test-tiny-vlad", allow_test_extractors=True)
-    return of_features(Extractor(recipe, choose_device("cpu")))
+    recipe = get_extractor_config("test-tiny-vlad", allow_test_extractors=True)
+    return feature_provenance(Extractor(recipe, choose_device("cpu")))
 
 
 def vocabulary_file(**provenance: Any) -> bytes:
     """Five centres in a file, learnt with the tiny features unless told otherwise."""
-    centres = check_centres(np.random.default_rng(3).standard_normal((5, WIDTH)).astype(np.float32))
+    centres = parse_centres(np.random.default_rng(3).standard_normal((5, WIDTH)).astype(np.float32))
     said = {**tiny_features(), "photos": 40, "sha256": centres.sha256, **provenance}
     return VocabularyFile(centres, said).encode()
 
@@ -83,7 +83,7 @@ def test_an_imported_vocabulary_keeps_what_its_file_says(vlads: Workplace) -> No
 
 def test_a_file_of_bare_centres_is_marked_as_of_unknown_origin(vlads: Workplace) -> None:
     vlads.upload(1)
-    centres = check_centres(np.eye(3, WIDTH, dtype=np.float32))
+    centres = parse_centres(np.eye(3, WIDTH, dtype=np.float32))
     job = vlads.finish(import_file(vlads, encode_centres(centres), "c_centers.npy"))
     assert job.state == JobState.SUCCEEDED
     assert active_vocabulary(vlads).provenance == {
@@ -127,7 +127,7 @@ def test_after_another_version_of_the_preprocessing_only_what_may_fit_is_switche
     vlads: Workplace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     vlads.upload(*range(6))
-    bare = encode_centres(check_centres(np.eye(3, WIDTH, dtype=np.float32)))
+    bare = encode_centres(parse_centres(np.eye(3, WIDTH, dtype=np.float32)))
     assert vlads.finish(import_file(vlads, bare, "bare.npy")).state == JobState.SUCCEEDED
     unknown = vlads.active().vocabulary_id
     assert vlads.fit().state == JobState.SUCCEEDED

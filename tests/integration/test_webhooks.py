@@ -21,17 +21,17 @@ from services.steward.batches.worker import BatchWorker
 from services.steward.webhooks import send as send_module
 from services.steward.webhooks.deliver import (
     MAX_IN_FLIGHT,
-    PAUSES_SECONDS,
-    WebhookSender,
-    pause_seconds,
+    RETRY_DELAYS_SECONDS,
+    WebhookDispatcher,
+    retry_delay_seconds,
 )
 from shared.catalog.base import db_now
 from shared.catalog.session import Catalog
-from shared.catalog.webhooks import Delivery, EventKind, Webhook, announce
-from shared.jobs import InProcessHints, Job, JobState
+from shared.catalog.webhooks import Delivery, EventKind, Webhook, enqueue_event
+from shared.jobs import InProcessWakeups, Job, JobState
 from shared.objects import FolderStore
 from shared.settings import Settings
-from shared.webhook_address import Target, parse_target
+from shared.webhook_address import WebhookTarget, parse_webhook_url
 from tests.integration.door import ADMIN, Door
 from tests.integration.workplace import Workplace
 from tests.support.archives import zip_of
@@ -65,7 +65,7 @@ class Told:
         make_worker: Callable[[], ExtractorWorker],
     ) -> None:
         self.door, self.receiver, self._make_worker = door, receiver, make_worker
-        self.sender = WebhookSender(door.catalog, settings)
+        self.sender = WebhookDispatcher(door.catalog, settings)
         self.webhook = self.add("job.succeeded", "job.failed")
 
     def add(self, *events: str) -> dict[str, Any]:
@@ -75,10 +75,10 @@ class Told:
         answer: dict[str, Any] = made.json()
         return answer
 
-    def send(self, sender: WebhookSender | None = None) -> int:
+    def send(self, sender: WebhookDispatcher | None = None) -> int:
         """Attempt what is due; how many deliveries that were."""
         one = sender or self.sender
-        return sum(asyncio.run(one.send_due(webhook)) for webhook in one.due_webhooks())
+        return sum(asyncio.run(one.deliver_due(webhook)) for webhook in one.due_webhooks())
 
     def trust(self, folder: Path, name: str) -> ssl.SSLContext:
         """For a server of that name, whose certificate our sender takes for a good one."""
@@ -91,7 +91,7 @@ class Told:
     def announce(self, event: EventKind) -> None:
         """An event that nothing but webhooks hears of."""
         with self.door.catalog.write() as session:
-            announce(session, event, {})
+            enqueue_event(session, event, {})
 
     def photo(self, number: int = 1) -> dict[str, Any]:
         """One that was put in and described."""
@@ -177,7 +177,7 @@ def test_what_was_not_heard_is_told_again_later_under_the_same_id(told: Told) ->
 def test_pauses_grow_for_three_days_and_then_it_is_given_up(told: Told) -> None:
     told.photo()
     told.receiver.status = 503
-    for _ in range(len(PAUSES_SECONDS)):
+    for _ in range(len(RETRY_DELAYS_SECONDS)):
         assert told.send() == 1
         assert told.log()[0]["state"] == "pending"
         told.come_due()
@@ -185,14 +185,14 @@ def test_pauses_grow_for_three_days_and_then_it_is_given_up(told: Told) -> None:
     assert told.log()[0]["state"] == "failed"
     told.come_due()
     assert told.send() == 0
-    pauses = [pause_seconds(attempts) for attempts in range(1, len(PAUSES_SECONDS) + 1)]
+    pauses = [retry_delay_seconds(attempts) for attempts in range(1, len(RETRY_DELAYS_SECONDS) + 1)]
     assert pauses == sorted(pauses, key=lambda pause: pause or 0)
     assert 2 * 86_400 < sum(pause or 0 for pause in pauses) < 5 * 86_400
 
 
 def test_a_try_whose_steward_died_is_made_again(told: Told) -> None:
     told.photo()
-    _, claimed = told.sender._claim(UUID(told.webhook["id"]))  # and then it dies
+    _, claimed = told.sender._claim_due(UUID(told.webhook["id"]))  # and then it dies
     assert len(claimed) == 1
     assert told.send() == 0, "another steward leaves it alone for a while"
     told.come_due()
@@ -217,11 +217,11 @@ def test_a_name_that_has_become_private_since_is_not_called(
 ) -> None:
     # As DNS rebinding does it: public when the webhook was made, loopback when it is called.
     told.photo()
-    strict = WebhookSender(
+    strict = WebhookDispatcher(
         told.door.catalog, Settings().model_copy(update={"webhook_private_addresses": False})
     )
     monkeypatch.setattr(
-        send_module, "parse_target", lambda url, allow_private: _target_of(told.receiver.url)
+        send_module, "parse_webhook_url", lambda url, allow_private: _target_of(told.receiver.url)
     )
     assert told.send(strict) == 1
     assert told.receiver.messages == []
@@ -230,8 +230,8 @@ def test_a_name_that_has_become_private_since_is_not_called(
     assert "no public address" in delivery["last_error"]
 
 
-def _target_of(url: str) -> Target:
-    return parse_target(url.replace("127.0.0.1", "localhost"), allow_private=True)
+def _target_of(url: str) -> WebhookTarget:
+    return parse_webhook_url(url.replace("127.0.0.1", "localhost"), allow_private=True)
 
 
 def test_the_connection_goes_to_the_address_that_was_checked(
@@ -411,12 +411,12 @@ def test_a_failed_job_and_a_finished_batch_are_told_of(told: Told, settings: Set
         ADMIN, "POST", "/upload/batch", files={"archive": ("photos.zip", archive)}
     ).json()
     store = told.door.store
-    worker = BatchWorker(told.door.catalog, store, InProcessHints(), settings, "steward")
-    worker.work_next(threading.Event())
+    worker = BatchWorker(told.door.catalog, store, InProcessWakeups(), settings, "steward")
+    worker.run_next(threading.Event())
     told._make_worker().drain(threading.Event())
     with told.door.catalog.write() as session:
         session.execute(update(Job).values(run_after=None))
-    worker.work_next(threading.Event())
+    worker.run_next(threading.Event())
     (delivery,) = told.log(batches)
     assert delivery["event"] == "batch.finished"
     while told.send():

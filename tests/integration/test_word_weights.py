@@ -18,7 +18,7 @@ from services.steward import teach as teach_module
 from services.steward.auto_evaluate import evaluate_changed_maps
 from services.steward.collect import collect_superseded_chunks
 from services.steward.compact import merge_slot
-from services.steward.evaluate import Evaluator
+from services.steward.evaluate import EvaluationWorker
 from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.maps import get_map
 from shared.catalog.session import Catalog
@@ -27,7 +27,7 @@ from shared.ids import new_id
 from shared.jobs import Job, JobKind, JobState, Priority
 from shared.objects import ObjectStore
 from shared.settings import Settings
-from shared.word_weights.record import Outcome, WordWeights, stored_word_weights
+from shared.word_weights.record import Outcome, WordWeights, parse_word_weights
 from tests.integration.gateway import Service
 from tests.support.catalog_rows import add_chunk, add_generation, add_photo, read_job
 from tests.support.problems import problem
@@ -72,8 +72,8 @@ class City:
 
     def work(self) -> bool:
         search = SearchWorker(self.catalog, self.store, Settings())
-        evaluator = Evaluator(self.catalog, self.store, search, Settings(), "evaluator")
-        return evaluator.evaluate_next(threading.Event())
+        evaluator = EvaluationWorker(self.catalog, self.store, search, Settings(), "evaluator")
+        return evaluator.run_next(threading.Event())
 
     def start(self, **params: Any) -> UUID:
         wanted = {"sample": TRIED, "seed": 0, "generation_id": str(self.generation_id)}
@@ -101,7 +101,7 @@ class City:
 
     def record(self) -> WordWeights | None:
         with self.catalog.read() as session:
-            return stored_word_weights(session.get_one(Generation, self.generation_id).word_weights)
+            return parse_word_weights(session.get_one(Generation, self.generation_id).word_weights)
 
     def set_generation(self, **columns: Any) -> None:
         with self.catalog.write() as session:
@@ -210,7 +210,7 @@ def test_the_same_seed_learns_the_same_however_little_memory_there_is(
     first, again, other = (city.learn(seed=seed, sample=FEW) for seed in (0, 0, 1))
     assert first == again
     assert first.weights != other.weights
-    monkeypatch.setattr(teach_module, "LESSON_BYTES", 10 * WORDS * WIDTH * 4)
+    monkeypatch.setattr(teach_module, "ROW_BATCH_BYTES", 10 * WORDS * WIDTH * 4)
     small = city.learn(sample=FEW)
     assert small.near_pairs == first.near_pairs
     assert min(small.weights[:2]) > 2 * max(small.weights[2:])
@@ -265,7 +265,7 @@ def _refused(city: City) -> str:
 
 @pytest.fixture
 def small_samples(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(auto_evaluate, "SAMPLE_PHOTOS", TRIED)
+    monkeypatch.setattr(auto_evaluate, "AUTO_SAMPLE_PHOTOS", TRIED)
 
 
 def queued(city: City, word_weights: bool = True) -> str | None:

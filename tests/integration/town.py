@@ -17,7 +17,7 @@ import numpy as np
 from sqlalchemy import select
 
 from services.search.worker import SearchWorker
-from services.steward.evaluate import Evaluator
+from services.steward.evaluate import EvaluationWorker
 from shared.catalog.evaluations import Evaluation
 from shared.catalog.generations import Generation
 from shared.catalog.maps import DEFAULT_MAP
@@ -25,7 +25,7 @@ from shared.catalog.session import Catalog
 from shared.ids import new_id
 from shared.jobs import Job, JobKind, Priority
 from shared.objects import FolderStore
-from shared.search_protocol import SearchPort, SearchRequest, SearchResponse, SearchStatus
+from shared.search_protocol import SearchBackend, SearchRequest, SearchResponse, SearchStatus
 from shared.settings import Settings
 from tests.support.catalog_rows import add_chunk, add_generation, add_map, add_photo, read_job
 
@@ -66,12 +66,16 @@ class Town:
             session.add(job)
         return job.id
 
-    def evaluator(self, search: SearchPort | None = None) -> Evaluator:
-        return Evaluator(self.catalog, self.store, search or self.search, Settings(), "evaluator")
+    def evaluator(self, search: SearchBackend | None = None) -> EvaluationWorker:
+        return EvaluationWorker(
+            self.catalog, self.store, search or self.search, Settings(), "evaluator"
+        )
 
-    def work(self, search: SearchPort | None = None, stop: threading.Event | None = None) -> bool:
+    def work(
+        self, search: SearchBackend | None = None, stop: threading.Event | None = None
+    ) -> bool:
         """Do the next evaluation; False when there was none."""
-        return self.evaluator(search).evaluate_next(stop or threading.Event())
+        return self.evaluator(search).run_next(stop or threading.Event())
 
     def figures(self, **params: Any) -> dict[str, Any]:
         """What an evaluation of now comes to."""
@@ -112,7 +116,7 @@ class Town:
 class Watched:
     """A search port that has something done before its n-th search (counted from 1)."""
 
-    port: SearchPort
+    port: SearchBackend
     at: int
     do: Callable[[], object]
     asked: int = 0

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from sqlalchemy import select
 
-from services.extractor.drain_result import DrainResult
+from services.extractor.drain_result import DrainStats
 from services.extractor.worker import ExtractorWorker
 from services.steward.model_changes import advance_model_changes
 from shared.catalog.chunks import count_searchable
@@ -22,16 +22,16 @@ from shared.catalog.photos import Photo
 from shared.catalog.session import Catalog
 from shared.catalog.vocabularies import Vocabulary
 from shared.chunks import Rows
-from shared.jobs import InProcessHints, Job, JobKind, JobState, free_expired_leases
+from shared.jobs import InProcessWakeups, Job, JobKind, JobState, reclaim_expired_leases
 from shared.jobs.model_changes import cancel_model_change, start_model_change
-from shared.jobs.table import UNFINISHED, get_job
+from shared.jobs.table import UNFINISHED_STATES, get_job
 from shared.objects import FolderStore
 from shared.objects.keys import TRASH
-from shared.recipes import get_recipe
+from shared.recipes import get_extractor_config
 from shared.settings import Settings
-from shared.vision.decode import decode
+from shared.vision.decode import decode_photo
 from shared.vision.extractors import Extractor
-from shared.vision.vocabulary import Centres
+from shared.vision.vocabulary import ClusterCentres
 from tests.support.catalog_rows import ask, delete, read_job, set_columns, stored_rows, upload
 from tests.support.photos import photo_bytes
 
@@ -47,7 +47,7 @@ class Workplace:
     settings: Settings
     map_id: UUID
     make_worker: Callable[[], ExtractorWorker]
-    hints: InProcessHints = field(default_factory=InProcessHints)
+    hints: InProcessWakeups = field(default_factory=InProcessWakeups)
     _worker: ExtractorWorker | None = None
 
     # --- what clients do ---
@@ -84,7 +84,7 @@ class Workplace:
             self._worker = self.make_worker()
         return self._worker
 
-    def drain(self) -> DrainResult:
+    def drain(self) -> DrainStats:
         return self.worker.drain(threading.Event())
 
     def advance(self) -> None:
@@ -98,7 +98,7 @@ class Workplace:
             self.advance()
             each_round()
             job = read_job(self.catalog, job_id)
-            if job.state not in UNFINISHED:
+            if job.state not in UNFINISHED_STATES:
                 return job
         raise AssertionError(f"the job did not end: {job.state}, {job.stage}, {job.waiting_for}")
 
@@ -119,14 +119,14 @@ class Workplace:
         for job_id in jobs:
             set_columns(self.catalog, job_id, lease_until=None)
         with self.catalog.write() as session:
-            free_expired_leases(session, self.settings.max_attempts, everyone=True)
+            reclaim_expired_leases(session, self.settings.max_attempts, all_leases=True)
 
     # --- what can be seen ---
 
     def await_end(self, job_id: UUID) -> JobState:
         """The state in which the job ends, while another thread works on it."""
         deadline = time.monotonic() + WAIT_SECONDS
-        while (job := self.job(job_id)).state in UNFINISHED:
+        while (job := self.job(job_id)).state in UNFINISHED_STATES:
             assert time.monotonic() < deadline, f"the job did not end: {job.state}, {job.stage}"
             time.sleep(0.01)
         return JobState(job.state)
@@ -184,10 +184,12 @@ class Workplace:
         }
 
 
-def expected_row(extractor: str, data: bytes, centres: Centres | None = None) -> Rows:
+def expected_row(extractor: str, data: bytes, centres: ClusterCentres | None = None) -> Rows:
     """What the extractor makes of the photo, without any of the services."""
-    made = Extractor(get_recipe(extractor, allow_test_extractors=True), torch.device("cpu"))
-    pixels = decode(data, made.preprocessing, 10**9).pixels
+    made = Extractor(
+        get_extractor_config(extractor, allow_test_extractors=True), torch.device("cpu")
+    )
+    pixels = decode_photo(data, made.preprocessing, 10**9).pixels
     row: Rows = made.describe([pixels], centres)[0]
     return row
 

@@ -15,17 +15,17 @@ from sqlalchemy import select, update
 from sqlalchemy.orm import Session
 
 from shared.catalog.base import db_now, db_now_plus
-from shared.catalog.chunks import Chunk, Descriptor, take_slot
+from shared.catalog.chunks import Chunk, Descriptor, allocate_slot
 from shared.catalog.generations import Generation, GenerationState, lock_generation
-from shared.catalog.maps import Map, bump_version, lock_map
-from shared.catalog.models import ensure_model
-from shared.catalog.photos import Photo, get_photo, mark_deleted
+from shared.catalog.maps import Map, increment_map_version, lock_map
+from shared.catalog.models import get_or_create_model
+from shared.catalog.photos import Photo, get_photo, mark_photo_deleted
 from shared.catalog.session import Catalog
 from shared.chunks import Rows, read_chunk, write_chunk
 from shared.ids import new_id
-from shared.jobs import Job, JobKind, JobState, Priority, claim
-from shared.jobs.finish import cancel
-from shared.jobs.table import MODEL_CHANGES, UNFINISHED
+from shared.jobs import Job, JobKind, JobState, Priority, claim_jobs
+from shared.jobs.finish import cancel_job
+from shared.jobs.table import MODEL_CHANGE_JOBS, UNFINISHED_STATES
 from shared.objects import ObjectStore
 from shared.objects.keys import new_original_key, query_key
 
@@ -37,7 +37,7 @@ PRIORITIES = {
     JobKind.COMPARE: Priority.QUERY,
     JobKind.EVALUATE: Priority.EVALUATION,
     JobKind.WORD_WEIGHTS: Priority.EVALUATION,
-    **dict.fromkeys(MODEL_CHANGES, Priority.MODEL_CHANGE),
+    **dict.fromkeys(MODEL_CHANGE_JOBS, Priority.MODEL_CHANGE),
 }
 
 
@@ -113,11 +113,11 @@ def delete(catalog: Catalog, map_id: UUID, photo_id: UUID) -> None:
     with catalog.write() as session:
         lock_map(session, map_id)
         photo = get_photo(session, map_id, photo_id)
-        mark_deleted(session, photo, bump_version(session, map_id))
+        mark_photo_deleted(session, photo, increment_map_version(session, map_id))
         for job in session.scalars(
-            select(Job).where(Job.photo_id == photo_id, Job.state.in_(UNFINISHED))
+            select(Job).where(Job.photo_id == photo_id, Job.state.in_(UNFINISHED_STATES))
         ):
-            cancel(job)
+            cancel_job(job)
 
 
 def add_generation(
@@ -127,7 +127,7 @@ def add_generation(
     **columns: Any,
 ) -> Generation:
     """A generation of rows with 4 numbers."""
-    model = ensure_model(session, "test-rows", "0" * 64, "MIT", {})
+    model = get_or_create_model(session, "test-rows", "0" * 64, "MIT", {})
     generation = Generation(
         **{
             "id": new_id(),
@@ -171,7 +171,7 @@ def add_chunk(
             Chunk(
                 id=chunk_id,
                 generation_id=generation_id,
-                slot=take_slot(generation, len(photo_ids), slot_rows),
+                slot=allocate_slot(generation, len(photo_ids), slot_rows),
                 object_key=written.object_key,
                 rows=written.rows,
                 size_bytes=written.size_bytes,
@@ -185,7 +185,7 @@ def add_chunk(
                     generation_id=generation_id, photo_id=photo_id, chunk_id=chunk_id, row=row
                 )
             )
-        bump_version(session, generation.map_id)
+        increment_map_version(session, generation.map_id)
     return chunk_id
 
 
@@ -256,10 +256,10 @@ def take(
 ) -> list[Job]:
     """Claim in a transaction of its own."""
     with catalog.write() as session:
-        return claim(
+        return claim_jobs(
             session,
             worker=worker,
             limit=limit,
             lease_seconds=lease_seconds,
-            least_priority=least_priority,
+            min_priority=least_priority,
         )

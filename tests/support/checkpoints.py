@@ -11,17 +11,17 @@ import torch
 
 from shared.chunks import Rows
 from shared.vision.backbones.base import normalise_pixels
-from shared.vision.decode import decode
+from shared.vision.decode import decode_photo
 from shared.vision.place_models.checkpoint import checkpoint_state
-from shared.vision.place_models.config import ModelConfig
-from shared.vision.place_models.model import PlaceModel, build_model
+from shared.vision.place_models.config import VprModelConfig
+from shared.vision.place_models.model import VprModel, build_vpr_model
 from shared.vision.preprocessing import get_preprocessing
 
 SIDES = (48, 64)  # pixels
 MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
 
-def untrained(seed: int = 0, **config: Any) -> PlaceModel:
+def untrained(seed: int = 0, **config: Any) -> VprModel:
     """A cropped ResNet-18 with random weights: 128 dimensions, photos of SIDES."""
     said: dict[str, Any] = {
         "backbone_arch": "resnet18",
@@ -33,10 +33,10 @@ def untrained(seed: int = 0, **config: Any) -> PlaceModel:
     }
     with torch.random.fork_rng():
         torch.manual_seed(seed)
-        return build_model(ModelConfig(**said))
+        return build_vpr_model(VprModelConfig(**said))
 
 
-def checkpoint_of(model: PlaceModel, **about: Any) -> bytes:
+def checkpoint_of(model: VprModel, **about: Any) -> bytes:
     """A Lightning checkpoint of the model: beside the weights, what a run goes on with."""
     moments = {name: torch.zeros_like(tensor) for name, tensor in model.state_dict().items()}
     state = {
@@ -61,11 +61,11 @@ def write_checkpoint(path: Path, seed: int = 0) -> Path:
     return path
 
 
-def own_output(model: PlaceModel, photo: bytes) -> Rows:
+def own_output(model: VprModel, photo: bytes) -> Rows:
     """What the model itself makes of a photo that is brought to its size."""
     height, width = model.config.image_size
     preprocessing = get_preprocessing(f"resize{height}x{width}")
-    pixels = decode(photo, preprocessing, 10**9).pixels.copy()
+    pixels = decode_photo(photo, preprocessing, 10**9).pixels.copy()
     with torch.inference_mode():
         batch = normalise_pixels(torch.from_numpy(pixels)[None], MEAN, STD)
         row: Rows = model(batch)[0].numpy()

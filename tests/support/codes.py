@@ -9,15 +9,15 @@ from services.search import answer, follow
 
 def always_by_codes(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every search of more than nothing goes through the codes, whatever its size."""
-    monkeypatch.setattr(follow, "CODED_FROM_BYTES", 0)
+    monkeypatch.setattr(follow, "MIN_CODED_BYTES", 0)
     monkeypatch.setattr(follow, "CODED_DIMENSION", 1)
-    monkeypatch.setattr(answer, "worth_codes", lambda selected, k: selected > 0)
+    monkeypatch.setattr(answer, "sign_codes_pay_off", lambda selected, k: selected > 0)
 
 
 def always_by_int8(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every search of more than nothing goes through int8 codes, as that of middle dimensions."""
-    monkeypatch.setattr(follow, "CODED_FROM_BYTES", 0)
-    monkeypatch.setattr(answer, "worth_int8", lambda selected, k, dimension: selected > 0)
+    monkeypatch.setattr(follow, "MIN_CODED_BYTES", 0)
+    monkeypatch.setattr(answer, "int8_codes_pay_off", lambda selected, k, dimension: selected > 0)
 
 
 def int8_on_demand(monkeypatch: pytest.MonkeyPatch) -> None:

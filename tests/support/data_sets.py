@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from shared.datasets.utm_names import PhotoName
+from shared.datasets.utm_names import UtmFileName
 
 
 def utm_name(east: float, north: float, note: str = "", heading: float | None = None) -> str:
     """A file name at a place in UTM zone 32T, metres."""
-    return PhotoName(east, north, 32, "T", note=note, heading=heading).file_name()
+    return UtmFileName(east, north, 32, "T", note=note, heading=heading).file_name()
 
 
 def write_photo(path: Path, number: int = 0) -> Path:

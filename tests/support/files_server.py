@@ -29,7 +29,7 @@ class FilesServer:
     break_after: list[int] = field(default_factory=list)
     """Bytes after which the next answers break off, each once."""
     stall_after: int | None = None
-    """Bytes after which an answer stands still until `go_on` is set."""
+    """Bytes after which an answer stands still until `checkpoint_and_release` is set."""
     go_on: threading.Event = field(default_factory=threading.Event)
     ranges: bool = True
     """Whether it has strong ETags and sends parts."""

@@ -15,9 +15,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from shared.recipes import get_recipe
+from shared.recipes import get_extractor_config
 from shared.vision.extractors import Extractor
-from shared.vision.fit_photos import fit_photos
+from shared.vision.fit_photos import fit_vocabulary
 from tests.support.points import clustered_points
 
 WIDTH = 384
@@ -66,7 +66,7 @@ def forget_peak_memory() -> None:
 
 def main(photos: int) -> None:
     torch.set_num_threads(1)
-    recipe = get_recipe("anyloc-vits14", allow_test_extractors=False)
+    recipe = get_extractor_config("anyloc-vits14", allow_test_extractors=False)
     extractor = Extractor(recipe, torch.device("cpu"), backbone=ManyPatches())
     blank = np.zeros((8, 8, 3), np.uint8)
 
@@ -75,7 +75,7 @@ def main(photos: int) -> None:
             yield [blank] * min(BATCH_PHOTOS, photos - begin)
 
     before = memory_bytes("VmRSS")
-    fitted = fit_photos(extractor, batches(), photos, clusters=CLUSTERS, seed=0)
+    fitted = fit_vocabulary(extractor, batches(), photos, clusters=CLUSTERS, seed=0)
     print(
         json.dumps(
             {

@@ -5,7 +5,7 @@ from __future__ import annotations
 from datetime import datetime
 from uuid import UUID
 
-from shared.catalog.photos import PhotoFacts, PhotoRole
+from shared.catalog.photos import PhotoFilterValues, PhotoRole
 
 
 def facts_of(
@@ -17,6 +17,8 @@ def facts_of(
     captured_at: datetime | None = None,
     place: str | None = None,
     tags: tuple[str, ...] = (),
-) -> PhotoFacts:
+) -> PhotoFilterValues:
     """A live photo of which only what is said is known."""
-    return PhotoFacts(photo_id, role, None, latitude, longitude, captured_at, place, list(tags))
+    return PhotoFilterValues(
+        photo_id, role, None, latitude, longitude, captured_at, place, list(tags)
+    )

@@ -9,8 +9,8 @@ from uuid import UUID
 
 from hypothesis import strategies as some
 
-from shared.catalog.photos import PhotoFacts, PhotoRole
-from shared.geodesy import without_dust
+from shared.catalog.photos import PhotoFilterValues, PhotoRole
+from shared.geodesy import flush_to_zero
 from shared.photo_filter import Box, Circle, PhotoFilter
 
 RADIUS_M = 6_371_008.8
@@ -42,11 +42,11 @@ points = some.tuples(latitudes, longitudes)
 
 
 @some.composite
-def photo_facts(draw: some.DrawFn, photo_id: UUID) -> PhotoFacts:
+def photo_facts(draw: some.DrawFn, photo_id: UUID) -> PhotoFilterValues:
     latitude, longitude = draw(some.tuples(some.none(), some.none()) | points)
     if latitude is not None and longitude is not None:  # as the catalog keeps them
-        latitude, longitude = without_dust(latitude), without_dust(longitude)
-    return PhotoFacts(
+        latitude, longitude = flush_to_zero(latitude), flush_to_zero(longitude)
+    return PhotoFilterValues(
         photo_id=photo_id,
         role=draw(some.sampled_from(PhotoRole)),
         deleted_at=None,
@@ -59,7 +59,7 @@ def photo_facts(draw: some.DrawFn, photo_id: UUID) -> PhotoFacts:
 
 
 @some.composite
-def circles(draw: some.DrawFn, photos: list[PhotoFacts]) -> Circle:
+def circles(draw: some.DrawFn, photos: list[PhotoFilterValues]) -> Circle:
     """Around a photo or anywhere; of no size, of the whole Earth, or up to just a photo."""
     spots = [(p.latitude, p.longitude) for p in photos if p.latitude is not None]
     centre = some.sampled_from(spots) if spots else points
@@ -77,7 +77,7 @@ def circles(draw: some.DrawFn, photos: list[PhotoFacts]) -> Circle:
 
 
 @some.composite
-def boxes(draw: some.DrawFn, photos: list[PhotoFacts]) -> Box:
+def boxes(draw: some.DrawFn, photos: list[PhotoFilterValues]) -> Box:
     """Anywhere, also across the antimeridian, with corners on photos, and of no size."""
     spots = [(p.latitude, p.longitude) for p in photos if p.latitude is not None]
     corner = (some.sampled_from(spots) | points) if spots else points
@@ -90,7 +90,7 @@ def boxes(draw: some.DrawFn, photos: list[PhotoFacts]) -> Box:
 
 
 @some.composite
-def photo_filters(draw: some.DrawFn, photos: list[PhotoFacts]) -> PhotoFilter:
+def photo_filters(draw: some.DrawFn, photos: list[PhotoFilterValues]) -> PhotoFilter:
     """Each condition in one of four, so that most filters let some of the photos pass."""
 
     def sometimes(condition: some.SearchStrategy[object]) -> object:
@@ -110,7 +110,7 @@ def photo_filters(draw: some.DrawFn, photos: list[PhotoFacts]) -> PhotoFilter:
     )
 
 
-def passes(photo: PhotoFacts, wanted: PhotoFilter) -> bool | None:
+def passes(photo: PhotoFilterValues, wanted: PhotoFilter) -> bool | None:
     """Whether the filter lets the photo pass; None on the very edge of its circle."""
     certain = [
         wanted.box is None or _is_inside(photo, wanted.box),
@@ -127,7 +127,7 @@ def passes(photo: PhotoFacts, wanted: PhotoFilter) -> bool | None:
     return True if wanted.near is None else _is_within(photo, wanted.near)
 
 
-def _is_within(photo: PhotoFacts, circle: Circle) -> bool | None:
+def _is_within(photo: PhotoFilterValues, circle: Circle) -> bool | None:
     if photo.latitude is None or photo.longitude is None:
         return False
     if (photo.latitude, photo.longitude) == (circle.latitude, circle.longitude):
@@ -143,7 +143,7 @@ def _is_within(photo: PhotoFacts, circle: Circle) -> bool | None:
     return None if abs(away - circle.radius_m) <= UNDECIDED_M else away < circle.radius_m
 
 
-def _is_inside(photo: PhotoFacts, box: Box) -> bool:
+def _is_inside(photo: PhotoFilterValues, box: Box) -> bool:
     """By angles round the pole, in exact fractions."""
     if photo.latitude is None or photo.longitude is None:
         return False

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch.nn.functional import normalize
 
-from shared.vision.kmeans import Pass, Seeding
+from shared.vision.kmeans import KMeansPass, KMeansPlusPlus
 
 
 def unit_points(seed: int, count: int, width: int) -> torch.Tensor:
@@ -28,13 +28,13 @@ def clustered_points(seed: int, count: int, width: int, clusters: int) -> torch.
 
 def full_kmeans(points: torch.Tensor, clusters: int, seed: int) -> torch.Tensor:
     """(clusters, width) centres by k-means++ and up to 100 of Lloyd's passes over all points."""
-    seeding = Seeding(points, seed)
+    seeding = KMeansPlusPlus(points, seed)
     while len(seeding.chosen) < clusters:
         seeding.next()
     centres = seeding.centres()
     for _ in range(100):
-        one = Pass.begin(centres)
-        one.see(points, centres)
+        one = KMeansPass.begin(centres)
+        one.accumulate(points, centres)
         before, centres = centres, one.end(centres)
         if float(((centres - before) ** 2).sum()) <= 1e-4:
             break

@@ -11,13 +11,13 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from services.search import answer as answer_module
-from services.search.answer import DECIMALS, Answer, Question
+from services.search.answer import SCORE_DECIMALS, SearchOptions, SearchResult
 from services.search.loaded_chunk import LoadedChunk
 from services.search.photo_columns import PhotoColumns
 from services.search.snapshot import Snapshot
-from services.search.together import Glances
+from services.search.together import QueryBatcher
 from shared.codes.int8 import int8_codes
-from shared.codes.signs import sign_codes
+from shared.codes.signs import encode_signs
 from shared.ids import new_id
 from tests.support.photo_facts import facts_of
 
@@ -39,7 +39,7 @@ def snapshot_of(rows: Rows, pieces: int = 3, by: str = "signs") -> Snapshot:
             f"chunks/{a}.npy",
             rows[a:b],
             PhotoColumns.of(b - a, [(row - a, facts_of(photo(row))) for row in range(a, b)]),
-            codes=sign_codes(rows[a:b]) if by == "signs" else None,
+            codes=encode_signs(rows[a:b]) if by == "signs" else None,
             int8=int8_codes(rows[a:b]) if by == "int8" else None,
         )
         for a, b in pairwise(bounds.tolist())
@@ -52,7 +52,7 @@ def brute_force(
 ) -> list[tuple[UUID, float]]:
     exact = query.astype(np.float64)
     exact /= np.linalg.norm(exact)
-    scores = np.round([row.astype(np.float64) @ exact for row in rows], DECIMALS)
+    scores = np.round([row.astype(np.float64) @ exact for row in rows], SCORE_DECIMALS)
     scored = [
         (-min(1.0, score), photo(number))
         for number, score in enumerate(scores.tolist())
@@ -61,12 +61,14 @@ def brute_force(
     return [(photo_id, -score) for score, photo_id in sorted(scored)[:k]]
 
 
-def answer(snapshot: Snapshot, query: Rows, asked: NDArray[np.bool_], question: Question) -> Answer:
+def answer(
+    snapshot: Snapshot, query: Rows, asked: NDArray[np.bool_], question: SearchOptions
+) -> SearchResult:
     """Of a query that comes alone."""
-    return answer_module.answer(snapshot, query, asked, question, Glances())
+    return answer_module.execute_query(snapshot, query, asked, question, QueryBatcher())
 
 
-def hits_of(found: Answer) -> list[tuple[UUID, float]]:
+def hits_of(found: SearchResult) -> list[tuple[UUID, float]]:
     return [(hit.photo_id, hit.score) for hit in found.hits]
 
 

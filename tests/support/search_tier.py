@@ -12,12 +12,12 @@ from typing import Self
 import uvicorn
 
 from services.http_connections import ConnectionLimits, Connections
-from services.http_server import http_server, listening, url_of
-from services.search.app import create_app
+from services.http_server import http_server, listen, reachable_url
+from services.search.app import create_search_app
 from services.search.worker import SearchWorker
 from shared.catalog.session import Catalog
 from shared.objects import ObjectStore
-from shared.search_http import HttpSearch
+from shared.search_http import HttpSearchClient
 from shared.settings import Settings
 from shared.shards import Shard
 
@@ -43,11 +43,11 @@ class SearchServer:
         """A new worker, which has to load everything anew."""
         self.worker = SearchWorker(*self._of)
         held = contextlib.ExitStack()
-        listener = held.enter_context(listening("127.0.0.1", self._port))
+        listener = held.enter_context(listen("127.0.0.1", self._port))
         self._port = listener.getsockname()[1]
-        self.url = url_of("127.0.0.1", self._port)
+        self.url = reachable_url("127.0.0.1", self._port)
         limits = ConnectionLimits.of(self._of[2])
-        server = http_server(create_app(self.worker), Connections(limits))
+        server = http_server(create_search_app(self.worker), Connections(limits))
         thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
         thread.start()
         self._running = server, thread, held
@@ -91,7 +91,7 @@ class SearchTier:
         for server in self._all():
             server.wait_until_started()
         urls = [server.url for server in self._all()]
-        self.port = HttpSearch(urls, settings.search_timeout_seconds)
+        self.port = HttpSearchClient(urls, settings.search_timeout_seconds)
 
     def __enter__(self) -> Self:
         self.port.__enter__()
@@ -115,4 +115,4 @@ class SearchTier:
     def follow(self) -> None:
         """Every worker brings itself up to date."""
         for server in self._all():
-            server.worker.follow()
+            server.worker.sync()

@@ -16,7 +16,7 @@ from typing import Any, Self
 import httpx2
 import psutil
 
-from shared.home import address_file
+from shared.home import server_address_file
 from tests.support.processes import INHERITED, PLACEWISE, Process, start
 
 SERVICES_KEY = "the-admin-key-of-the-tests"  # separate services want one, on loopback too
@@ -93,7 +93,7 @@ class ServerProcess:
 
     def start(self, *options: str) -> None:
         """Start and wait until it answers; `options` are those of `placewise serve`."""
-        address_file(self.home).unlink(missing_ok=True)
+        server_address_file(self.home).unlink(missing_ok=True)
         with self.log_path.open("ab") as log:
             self._process = start(
                 [PLACEWISE, "serve", *options],
@@ -133,7 +133,7 @@ class ServerProcess:
 
     def _announced(self) -> dict[str, str] | None:
         try:
-            said: dict[str, str] = json.loads(address_file(self.home).read_text())
+            said: dict[str, str] = json.loads(server_address_file(self.home).read_text())
         except (FileNotFoundError, ValueError):
             return None
         return said

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 import torch
 
-from shared.vision.decode import decode
+from shared.vision.decode import decode_photo
 from shared.vision.extractors import Extractor
 from shared.vision.preprocessing import get_preprocessing
 from tests.support.photos import photo_bytes
@@ -17,7 +17,7 @@ def make_too_heavy(monkeypatch: pytest.MonkeyPatch, number: int) -> None:
     """From now on each pass with `photo_bytes(number)`, preprocessed by `square32`, runs out of
     memory."""
     real = Extractor.features
-    heavy = decode(photo_bytes(number), get_preprocessing("square32"), 10**9).pixels
+    heavy = decode_photo(photo_bytes(number), get_preprocessing("square32"), 10**9).pixels
 
     def features(made: Extractor, pixels: Any) -> torch.Tensor:
         if any((one == heavy).all() for one in pixels):

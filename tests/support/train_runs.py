@@ -8,8 +8,8 @@ from typing import Any
 import torch
 
 from services.trainer import run
-from services.trainer.configuration import make_arguments
-from services.trainer.display import Quiet
+from services.trainer.configuration import build_arguments
+from services.trainer.display import NullDisplay
 from services.trainer.stop import StopRequest
 
 Json = dict[str, Any]
@@ -41,8 +41,8 @@ def told(places: Path, out: Path, **others: Any) -> Json:
     }
 
 
-def train(said: Json, display: Quiet | None = None) -> Json:
-    return run.run(make_arguments(said), display or Quiet(), StopRequest())
+def train(said: Json, display: NullDisplay | None = None) -> Json:
+    return run.run(build_arguments(said), display or NullDisplay(), StopRequest())
 
 
 def weights(path: Path) -> dict[str, torch.Tensor]:

@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from services.cli.anyloc_database import AnylocRow, read_rows
-from services.cli.anyloc_folder import AnylocFolder, read_folder
+from services.cli.anyloc_database import AnylocRow, read_anyloc_rows
+from services.cli.anyloc_folder import AnylocFolder, read_anyloc_folder
 from shared.errors import InvalidRequest
 from tests.support.anyloc import AnylocHouse
 
@@ -24,12 +24,12 @@ def house(tmp_path: Path) -> Iterator[AnylocHouse]:
 
 def one_row(house: AnylocHouse, **columns: Any) -> AnylocRow:
     house.add("a.jpg", b"photo", **columns)
-    [row] = read_rows(house.database)
+    [row] = read_anyloc_rows(house.database)
     return row
 
 
 def read(house: AnylocHouse, **options: Any) -> AnylocFolder:
-    return read_folder(house.root, options.get("database"), options.get("uploads"))
+    return read_anyloc_folder(house.root, options.get("database"), options.get("uploads"))
 
 
 def state_of(folder: Path) -> dict[Path, tuple[bytes, int]]:
@@ -105,9 +105,9 @@ def test_odd_values_cost_no_row(house: AnylocHouse) -> None:
     house.add("2.jpg", b"2", original_filename=b"blob.jpg", tags=b"\xff\xfe")
     house.add("3.jpg", b"3", original_filename="nul\0.jpg", image_id=None)
     house.connection.execute("UPDATE images SET tags = CAST(x'c328' AS TEXT) WHERE tags IS NULL")
-    names = [row.name for row in read_rows(house.database)]
+    names = [row.name for row in read_anyloc_rows(house.database)]
     assert names == ["", "blob.jpg", "nul.jpg"]
-    assert "" not in read_rows(house.database)[2].metadata
+    assert "" not in read_anyloc_rows(house.database)[2].metadata
     assert [photo.name for photo in read(house).photos] == ["1.jpg", "blob.jpg", "nul.jpg"]
 
 
@@ -115,7 +115,7 @@ def test_rows_in_the_write_ahead_log_are_read_and_nothing_is_written(house: Anyl
     house.add("a.jpg", b"photo")
     assert (house.models / "similarity.db-wal").stat().st_size > 0
     before = state_of(house.root)
-    assert len(read_rows(house.database)) == 1
+    assert len(read_anyloc_rows(house.database)) == 1
     assert state_of(house.root) == before
 
 
@@ -125,7 +125,7 @@ def test_a_folder_that_can_only_be_read_is_enough(house: AnylocHouse) -> None:
     house.models.chmod(0o500)
     try:
         before = state_of(house.root)
-        assert len(read_rows(house.database)) == 1
+        assert len(read_anyloc_rows(house.database)) == 1
         assert state_of(house.root) == before
     finally:
         house.models.chmod(0o700)
@@ -140,7 +140,7 @@ def test_a_database_that_can_not_be_read_is_named(house: AnylocHouse, broken: st
     damaged = {"text": b"This is no database." * 100, "empty": b"", "cut off": whole[:40_000]}
     house.database.write_bytes(damaged[broken])
     with pytest.raises(InvalidRequest) as caught:
-        read_rows(house.database)
+        read_anyloc_rows(house.database)
     assert caught.value.code == "bad_anyloc_database"
     assert str(house.database) in caught.value.detail
 
@@ -237,6 +237,6 @@ def test_a_database_and_photos_elsewhere_can_be_named(house: AnylocHouse, tmp_pa
 def test_a_folder_without_a_database_is_refused(tmp_path: Path) -> None:
     (tmp_path / "uploads").mkdir()
     with pytest.raises(InvalidRequest) as caught:
-        read_folder(tmp_path, None, None)
+        read_anyloc_folder(tmp_path, None, None)
     assert caught.value.code == "no_anyloc_database"
     assert "placewise index" in caught.value.detail

@@ -15,16 +15,16 @@ from typing import Any
 
 import pytest
 
-from services.steward.archives import Limits, Member, open_archive
+from services.steward.archives import ArchiveLimits, ArchiveMember, open_archive
 from services.steward.archives.member import MemberKind
-from services.steward.archives.ranged import open_ranged
+from services.steward.archives.ranged import open_buffered
 from services.steward.archives.zip_archive import ZipArchive
-from shared.archive_formats import ArchiveFormat, sniff_archive
+from shared.archive_formats import ArchiveFormat, detect_archive_format
 from shared.errors import Gone, PlacewiseError
 from shared.objects import FolderStore
 from tests.support.archives import PACKED, tar_of, tar_with, zip_of
 
-LIMITS = Limits(members=100, unpacked_bytes=50_000_000)
+LIMITS = ArchiveLimits(members=100, unpacked_bytes=50_000_000)
 KEY = "archives/a"
 MEMBERS = {
     "a.jpg": os.urandom(700_000),
@@ -35,20 +35,22 @@ MEMBERS = {
 every_kind = pytest.mark.parametrize("packed", PACKED.values(), ids=PACKED.keys())
 
 
-def contents(store: FolderStore, archive: bytes, limits: Limits = LIMITS) -> dict[str, bytes]:
+def contents(
+    store: FolderStore, archive: bytes, limits: ArchiveLimits = LIMITS
+) -> dict[str, bytes]:
     store.put(KEY, archive)
     opened = open_archive(store, KEY, limits)
     members = list(opened.members())
     return {member.name: b"".join(opened.read(member)) for member in members}
 
 
-def refused(store: FolderStore, archive: bytes, limits: Limits = LIMITS) -> PlacewiseError:
+def refused(store: FolderStore, archive: bytes, limits: ArchiveLimits = LIMITS) -> PlacewiseError:
     with pytest.raises(PlacewiseError) as caught:
         contents(store, archive, limits)
     return caught.value
 
 
-def listed(store: FolderStore, archive: bytes) -> list[Member]:
+def listed(store: FolderStore, archive: bytes) -> list[ArchiveMember]:
     store.put(KEY, archive)
     return list(open_archive(store, KEY, LIMITS).members())
 
@@ -88,7 +90,7 @@ def test_each_member_is_found_again_by_its_place_alone(
     ids=["zip", "empty zip", "tar", "gnu tar", "gzip", "text", "nothing", "zeros", "xz"],
 )
 def test_an_archive_is_told_by_its_content(archive: bytes, found: ArchiveFormat | None) -> None:
-    assert sniff_archive(archive[:512]) == found
+    assert detect_archive_format(archive[:512]) == found
 
 
 def test_what_is_gone_or_no_archive_is_said_to_be_that(store: FolderStore) -> None:
@@ -122,17 +124,17 @@ def test_more_members_than_allowed_are_refused(
     store: FolderStore, packed: Callable[[Any], bytes]
 ) -> None:
     archive = packed({f"{number}.jpg": b"x" for number in range(11)})
-    error = refused(store, archive, Limits(10, 10**6))
+    error = refused(store, archive, ArchiveLimits(10, 10**6))
     assert error.code == "too_many_photos"
     assert "MAX_BATCH_PHOTOS" in error.detail
-    assert len(contents(store, archive, Limits(11, 10**6))) == 11
+    assert len(contents(store, archive, ArchiveLimits(11, 10**6))) == 11
 
 
 @pytest.mark.parametrize("kind", ["zip", "tar.gz"])
 def test_a_bomb_is_refused_by_what_it_declares(store: FolderStore, kind: str) -> None:
     bomb = PACKED[kind]({f"{number}.jpg": bytes(3_000_000) for number in range(4)})
     assert len(bomb) < 100_000
-    assert refused(store, bomb, Limits(100, 10_000_000)).code == "batch_too_large"
+    assert refused(store, bomb, ArchiveLimits(100, 10_000_000)).code == "batch_too_large"
 
 
 @every_kind
@@ -172,7 +174,7 @@ def test_a_zip_that_unpacks_itself_is_read_behind_its_program(store: FolderStore
     shifted = program + zip_of(MEMBERS)
     # It begins with the program, so only an archive that is known to be one is read like this.
     store.put(KEY, shifted)
-    opened = ZipArchive(open_ranged(store, KEY, len(shifted)), len(shifted), LIMITS)
+    opened = ZipArchive(open_buffered(store, KEY, len(shifted)), len(shifted), LIMITS)
     assert {m.name: b"".join(opened.read(m)) for m in opened.members()} == MEMBERS
 
 
@@ -189,10 +191,10 @@ def test_a_zip64_directory_is_read(store: FolderStore) -> None:
     """65,536 members is more than the old directory can count."""
     many = zip_of([(f"{number}", b"") for number in range(65_536)], zipfile.ZIP_STORED)
     store.put(KEY, many)
-    opened = open_archive(store, KEY, Limits(70_000, 10**6))
+    opened = open_archive(store, KEY, ArchiveLimits(70_000, 10**6))
     assert sum(1 for _ in opened.members()) == 65_536
     with pytest.raises(PlacewiseError) as caught:
-        list(open_archive(store, KEY, Limits(65_535, 10**6)).members())
+        list(open_archive(store, KEY, ArchiveLimits(65_535, 10**6)).members())
     assert caught.value.code == "too_many_photos"
 
 

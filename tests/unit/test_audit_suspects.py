@@ -7,18 +7,24 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from shared.datasets.audit import Suspect, find_suspects
+from shared.datasets.audit import SuspectLabel, find_suspect_labels
 from shared.datasets.ground_truth import find_positives
 from shared.datasets.rules import parse_rule
-from shared.datasets.shots import EvaluationSet, Shot
+from shared.datasets.shots import DatasetPhoto, EvaluationSet
 from shared.errors import InvalidRequest
 
 
-def at(metres: float, name: str, heading: float | None = None, frame: int | None = None) -> Shot:
-    return Shot(Path(name), name, easting=metres, northing=0.0, heading=heading, frame=frame)
+def at(
+    metres: float, name: str, heading: float | None = None, frame: int | None = None
+) -> DatasetPhoto:
+    return DatasetPhoto(
+        Path(name), name, easting=metres, northing=0.0, heading=heading, frame=frame
+    )
 
 
-def evaluation(rule: str, database: list[Shot], queries: list[Shot]) -> EvaluationSet:
+def evaluation(
+    rule: str, database: list[DatasetPhoto], queries: list[DatasetPhoto]
+) -> EvaluationSet:
     positives = tuple(find_positives(parse_rule(rule), queries, database))
     return EvaluationSet(
         "street", Path(), tuple(database), tuple(queries), positives, rule, "placewise"
@@ -34,7 +40,7 @@ def asked(
     """All queries stand at 0 m; the suspects' queries and first matches."""
     street = evaluation("radius 25 m", DATABASE, [at(0, f"q{n}") for n in range(len(ranked))])
     given = None if scores is None else np.array(scores, np.float32)[:, None]
-    found = find_suspects(street, np.array(ranked, np.int64)[:, None], given, **options)
+    found = find_suspect_labels(street, np.array(ranked, np.int64)[:, None], given, **options)
     return [(one.query, one.database_name) for one in found]
 
 
@@ -53,18 +59,20 @@ def test_match_in_place_that_looks_another_way_is_a_suspect() -> None:
     street = evaluation(
         "heading 25 m 40 deg", [at(5, "back", heading=190)], [at(0, "query", heading=20)]
     )
-    (suspect,) = find_suspects(street, np.array([[0]]))
-    assert suspect == Suspect(0, 0, "query", "back", None, 5.0, 170.0)
+    (suspect,) = find_suspect_labels(street, np.array([[0]]))
+    assert suspect == SuspectLabel(0, 0, "query", "back", None, 5.0, 170.0)
 
 
 def test_frames_just_outside_the_rule_are_suspects() -> None:
     database = [at(0, f"f{frame}", frame=frame) for frame in (12, 18, 19)]
     queries = [at(0, "q", frame=10)] * 3
-    found = find_suspects(evaluation("frames 2", database, queries), np.array([[0], [1], [2]]))
+    found = find_suspect_labels(
+        evaluation("frames 2", database, queries), np.array([[0], [1], [2]])
+    )
     assert [one.database_name for one in found] == ["f18"]
 
 
 def test_predictions_of_other_queries_are_refused() -> None:
     with pytest.raises(InvalidRequest) as caught:
-        find_suspects(evaluation("radius", DATABASE, [at(0, "q")]), np.array([[0], [1]]))
+        find_suspect_labels(evaluation("radius", DATABASE, [at(0, "q")]), np.array([[0], [1]]))
     assert caught.value.code == "predictions_of_other_queries"

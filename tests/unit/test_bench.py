@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from benchmarks.report import Report, Spread
+from benchmarks.report import LatencySummary, Report
 from services.cli.bench import app
 
 runner = CliRunner()
@@ -64,5 +64,5 @@ def test_numbers_that_are_none_are_refused(workers: str) -> None:
 
 
 def test_spread_is_of_the_slowest_too() -> None:
-    found = Spread.of([float(number) for number in range(100, 0, -1)])
+    found = LatencySummary.of([float(number) for number in range(100, 0, -1)])
     assert (found.median, found.p95, found.worst) == (50.5, 96.0, 100.0)

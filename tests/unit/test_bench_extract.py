@@ -33,8 +33,8 @@ def test_vlad_in_loops_is_the_vlad_of_the_formula() -> None:
 def test_reference_makes_the_same_descriptors_by_the_whole_network(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(extract, "MATRIX", {"cpu": 64})
-    monkeypatch.setattr(extract, "LEARNT_FROM", 1)
+    monkeypatch.setattr(extract, "MATRIX_SIZE", {"cpu": 64})
+    monkeypatch.setattr(extract, "FIT_PHOTOS", 1)
     report = extract.measure(
         Progress(disable=True),
         extractor="anyloc-vits14:layer=1",
@@ -57,7 +57,7 @@ def test_reference_makes_the_same_descriptors_by_the_whole_network(
 def test_other_extractors_are_measured_without_a_reference(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(extract, "MATRIX", {"cpu": 64})
+    monkeypatch.setattr(extract, "MATRIX_SIZE", {"cpu": 64})
     report = extract.measure(
         Progress(disable=True),
         extractor="test-tiny-vlad",

@@ -15,19 +15,19 @@ from typer.testing import CliRunner
 
 from benchmarks.report import Report
 from benchmarks.search import measure
-from benchmarks.search.comparison import MATCHED, tell
+from benchmarks.search.comparison import MATCHED_CASE, report_comparison
 from benchmarks.search.growth import measure_growth
-from benchmarks.search.load import Answered, Outcome, count_wrong
-from benchmarks.search.memory import touched
-from benchmarks.search.methods import Asked, Ours
-from benchmarks.search.oracle import Oracle, Ranking, same, same_photos
-from benchmarks.search.places import BLOCKS, City
-from benchmarks.search.turns import compare, load
-from benchmarks.search.world import World, enough_memory, new_world
+from benchmarks.search.load import LoadOutcome, SearchObservation, count_wrong_answers
+from benchmarks.search.memory import count_bytes_read
+from benchmarks.search.methods import BenchmarkQuery, PlacewiseSearch
+from benchmarks.search.oracle import BruteForce, Ranking, same_photos, same_ranking
+from benchmarks.search.places import BLOCKS, SyntheticCity
+from benchmarks.search.turns import compare_methods, load_worker
+from benchmarks.search.world import SyntheticMap, create_synthetic_map, required_memory_bytes
 from services.cli.bench import app
 from services.search import follow
 from shared.chunks import Rows
-from shared.search_protocol import Hit, SearchResponse
+from shared.search_protocol import SearchHit, SearchResponse
 
 IDS = [UUID(int=number + 1) for number in range(6)]
 
@@ -39,9 +39,11 @@ def rows_of(seed: int, count: int, dimension: int = 64) -> Rows:
 
 
 @contextlib.contextmanager
-def world_of(home: Path, city: City, photos: int, chunk_rows: int) -> Iterator[World]:
-    budget = enough_memory(photos, city.dimension)
-    with new_world(home, city.dimension, search_memory_budget=budget) as world:
+def world_of(
+    home: Path, city: SyntheticCity, photos: int, chunk_rows: int
+) -> Iterator[SyntheticMap]:
+    budget = required_memory_bytes(photos, city.dimension)
+    with create_synthetic_map(home, city.dimension, search_memory_budget=budget) as world:
         for rows in city.chunks(photos, chunk_rows):
             world.add(rows)
         yield world
@@ -49,7 +51,7 @@ def world_of(home: Path, city: City, photos: int, chunk_rows: int) -> Iterator[W
 
 def response_of(ranking: Ranking, version: int = 1) -> SearchResponse:
     return SearchResponse(
-        hits=tuple(Hit(photo_id=photo_id, score=score) for photo_id, score in ranking),
+        hits=tuple(SearchHit(photo_id=photo_id, score=score) for photo_id, score in ranking),
         certificate="exhaustive",
         rows_scanned=6,
         rows_reranked=6,
@@ -58,7 +60,7 @@ def response_of(ranking: Ranking, version: int = 1) -> SearchResponse:
 
 
 def test_descriptors_have_the_structure_of_vlad() -> None:
-    city = City(7168, seed=3)
+    city = SyntheticCity(7168, seed=3)
     rows = np.concatenate(list(city.chunks(1300, 500)))
     assert rows.shape == (1300, 7168)
     np.testing.assert_allclose(np.linalg.norm(rows, axis=1), 1, atol=1e-6)
@@ -73,12 +75,12 @@ def test_descriptors_have_the_structure_of_vlad() -> None:
     best = -np.sort(-(city.revisits(1300, 30) @ rows.T), axis=1)
     assert 0.5 < np.median(best[:, 0]) < 0.7
     assert 0.3 < np.median(best[:, 9]) < 0.55
-    best = -np.sort(-(city.elsewhere(20) @ rows.T), axis=1)
+    best = -np.sort(-(city.out_of_map_rows(20) @ rows.T), axis=1)
     assert best[:, 9].max() < 0.25
 
 
 def test_places_of_a_walk_are_shown_by_one_three_or_thirty_photos() -> None:
-    city = City(7168, seed=3)
+    city = SyntheticCity(7168, seed=3)
     for walk, count in enumerate((1, 3, 30)):
         looks = city.walk(walk).looks
         alike = np.einsum("nkd,nkd->n", looks[1:], looks[:-1]) / looks[0].size
@@ -88,16 +90,16 @@ def test_places_of_a_walk_are_shown_by_one_three_or_thirty_photos() -> None:
 
 
 def test_the_same_seed_makes_the_same_city_whatever_the_chunks() -> None:
-    one = np.concatenate(list(City(512, 1).chunks(600, 100)))
-    other = np.concatenate(list(City(512, 1).chunks(600, 1000)))
+    one = np.concatenate(list(SyntheticCity(512, 1).chunks(600, 100)))
+    other = np.concatenate(list(SyntheticCity(512, 1).chunks(600, 1000)))
     np.testing.assert_array_equal(one, other)
-    assert not np.array_equal(one, np.concatenate(list(City(512, 2).chunks(600, 1000))))
+    assert not np.array_equal(one, np.concatenate(list(SyntheticCity(512, 2).chunks(600, 1000))))
 
 
 def test_brute_force_orders_equal_photos_by_their_ids_and_knows_who_is_there() -> None:
     rows = rows_of(1, 6)
     rows[4] = rows[1]
-    oracle = Oracle.of((rows[:4], rows[4:]), IDS, rows[1:2] * np.float32(3))
+    oracle = BruteForce.of((rows[:4], rows[4:]), IDS, rows[1:2] * np.float32(3))
     best = oracle.best(0, 2)
     assert [photo_id for photo_id, _ in best] == [IDS[1], IDS[4]]
     assert best[0][1] == pytest.approx(1, abs=1e-6)
@@ -109,7 +111,7 @@ def test_brute_force_orders_equal_photos_by_their_ids_and_knows_who_is_there() -
 
 def test_another_order_another_photo_another_score_and_a_missing_one_are_no_right_answers() -> None:
     truth = [(IDS[0], 0.9), (IDS[1], 0.8)]
-    assert same([(IDS[0], 0.9 + 1e-12), (IDS[1], 0.8)], truth)
+    assert same_ranking([(IDS[0], 0.9 + 1e-12), (IDS[1], 0.8)], truth)
     for found in (
         [(IDS[1], 0.8), (IDS[0], 0.9)],
         [(IDS[0], 0.9), (IDS[2], 0.8)],
@@ -118,26 +120,26 @@ def test_another_order_another_photo_another_score_and_a_missing_one_are_no_righ
         [*truth, (IDS[2], 0.1)],
         [],
     ):
-        assert not same(found, truth)
+        assert not same_ranking(found, truth)
     assert same_photos([(IDS[0], 0.91), (IDS[1], 0.81)], truth)
     assert not same_photos([(IDS[1], 0.81), (IDS[0], 0.91)], truth)
 
 
 def test_answers_under_load_are_held_against_the_version_that_they_name() -> None:
-    oracle = Oracle.of([rows_of(1, 6)], IDS, rows_of(2, 1))
+    oracle = BruteForce.of([rows_of(1, 6)], IDS, rows_of(2, 1))
     everyone, without = np.ones(5, bool), np.ones(6, bool)
     best = oracle.best(0, 1)[0][0]
     without[IDS.index(best)] = False
     assert best != IDS[5], "the photo that is added is to be another one"
-    outcome = Outcome(versions=[1, 4], live=[everyone, without])
+    outcome = LoadOutcome(versions=[1, 4], live=[everyone, without])
     before, after = (
         oracle.best(0, 2, live=np.append(everyone, False)),
         oracle.best(0, 2, live=without),
     )
 
     def wrong(ranking: Ranking, version: int, least: int = 1) -> int:
-        outcome.answered = [Answered(0, 2, least, response_of(ranking, version), 0.1)]
-        return count_wrong(outcome, oracle)
+        outcome.answered = [SearchObservation(0, 2, least, response_of(ranking, version), 0.1)]
+        return count_wrong_answers(outcome, oracle)
 
     assert wrong(before, 1) == wrong(before, 3) == wrong(after, 4) == wrong(after, 9) == 0
     assert wrong(before, 4) == 1, "the deleted photo is answered"
@@ -148,13 +150,13 @@ def test_answers_under_load_are_held_against_the_version_that_they_name() -> Non
 def test_a_search_by_codes_touches_all_first_bits_and_the_rows_that_it_compares(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(follow, "CODED_FROM_BYTES", 0)
-    city = City(7168, 1)
+    monkeypatch.setattr(follow, "MIN_CODED_BYTES", 0)
+    city = SyntheticCity(7168, 1)
     with world_of(tmp_path, city, 400, 200) as world:
         queries = city.revisits(400, 1)
-        ours = Ours(world, load(world), queries)
-        with touched() as count:
-            ours.search(Asked(0, 3))
+        ours = PlacewiseSearch(world, load_worker(world), queries)
+        with count_bytes_read() as count:
+            ours.search(BenchmarkQuery(0, 3))
         assert ours.certificates == {"statistical"}
         codes, row = 7168 // 8, 4 * 7168
         assert count.size_bytes >= 400 * codes + 3 * row
@@ -163,8 +165,8 @@ def test_a_search_by_codes_touches_all_first_bits_and_the_rows_that_it_compares(
 
 
 def test_memory_is_enough_for_codes_and_not_for_the_rows_of_a_coded_map() -> None:
-    assert enough_memory(10_000, 98_304) == 10_000 * 12_288
-    assert enough_memory(1000, 512) >= 1000 * 4 * 512
+    assert required_memory_bytes(10_000, 98_304) == 10_000 * 12_288
+    assert required_memory_bytes(1000, 512) >= 1000 * 4 * 512
 
 
 def test_whole_run_finds_no_wrong_answer_and_measures_everything(tmp_path: Path) -> None:
@@ -195,20 +197,20 @@ def test_whole_run_finds_no_wrong_answer_and_measures_everything(tmp_path: Path)
 def test_a_wrong_answer_of_ours_is_a_missed_figure(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    right = Ours.search
+    right = PlacewiseSearch.search
 
-    def last_two_change_places(self: Ours, asked: Asked) -> Ranking:
+    def last_two_change_places(self: PlacewiseSearch, asked: BenchmarkQuery) -> Ranking:
         found = list(right(self, asked))
         return [*found[:-2], *reversed(found[-2:])]
 
-    monkeypatch.setattr(Ours, "search", last_two_change_places)
-    city = City(512, 1)
+    monkeypatch.setattr(PlacewiseSearch, "search", last_two_change_places)
+    city = SyntheticCity(512, 1)
     with world_of(tmp_path, city, 60, 60) as world, Progress(disable=True) as progress:
-        compared = compare(world, city, 2, progress)
+        compared = compare_methods(world, city, 2, progress)
     report = Report("anything")
-    tell(report, compared)
+    report_comparison(report, compared)
     assert report.missed
-    assert compared.row(MATCHED, Ours.name).differ == 2
+    assert compared.row(MATCHED_CASE, PlacewiseSearch.name).differ == 2
 
 
 def test_command_asks_for_what_its_options_say(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from services.search import answer as answer_module
-from services.search.answer import Question, lacks_int8, worth_int8
+from services.search.answer import SearchOptions, int8_codes_pay_off, needs_int8_codes
 from shared.ids import new_id
 from shared.search_protocol import Mode
 from tests.support.search_rows import (
@@ -30,14 +30,14 @@ DIMENSION = 512
 
 @pytest.fixture(autouse=True)
 def by_int8(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(answer_module, "worth_int8", lambda selected, k, dimension: True)
+    monkeypatch.setattr(answer_module, "int8_codes_pay_off", lambda selected, k, dimension: True)
 
 
 @settings(max_examples=60, deadline=None)
 @given(case=cases(DIMENSION), mode=st.sampled_from([Mode.AUTO, Mode.DETERMINISTIC]))
 def test_answers_equal_brute_force_with_order_and_ties(case: Case, mode: Mode) -> None:
     snapshot = snapshot_of(case.rows, case.pieces, "int8")
-    found = answer(snapshot, case.query, case.asked, Question(case.k, case.min_score, mode))
+    found = answer(snapshot, case.query, case.asked, SearchOptions(case.k, case.min_score, mode))
     assert hits_of(found) == case.expected
     if case.asked.any():
         assert found.certificate == "bound"
@@ -52,7 +52,7 @@ def test_rows_of_any_length_are_searched(dimension: int) -> None:
     everything = np.ones(30, bool)
     snapshot = snapshot_of(rows, by="int8")
     for query in rows[:2]:
-        found = answer(snapshot, query, everything, Question(7, mode=Mode.DETERMINISTIC))
+        found = answer(snapshot, query, everything, SearchOptions(7, mode=Mode.DETERMINISTIC))
         assert hits_of(found) == brute_force(rows, query, 7, everything)
         assert found.certificate == "bound"
 
@@ -60,7 +60,7 @@ def test_rows_of_any_length_are_searched(dimension: int) -> None:
 def test_most_rows_are_never_read_when_the_place_is_in_the_map() -> None:
     rows = places(1, 3000, DIMENSION)
     query = rows[77] + np.float32(0.02) * places(9, 1, DIMENSION)[0]
-    found = answer(snapshot_of(rows, by="int8"), query, np.ones(3000, bool), Question(1))
+    found = answer(snapshot_of(rows, by="int8"), query, np.ones(3000, bool), SearchOptions(1))
     assert found.hits[0].photo_id == photo(77)
     assert found.rows_scanned == 3000
     assert found.rows_reranked < 30
@@ -71,11 +71,13 @@ def test_query_of_any_length_gives_the_same_answer() -> None:
     everything = np.ones(100, bool)
     snapshot = snapshot_of(rows, by="int8")
     scales = (1.0, 64.0, 1e-30, 1e15)
-    found = [answer(snapshot, rows[5] * np.float32(s), everything, Question(5)) for s in scales]
+    found = [
+        answer(snapshot, rows[5] * np.float32(s), everything, SearchOptions(5)) for s in scales
+    ]
     for one in found:
         assert [hit.photo_id for hit in one.hits] == [hit.photo_id for hit in found[0].hits]
         assert one.certificate == "bound"
-    nothing = answer(snapshot, np.zeros(DIMENSION, np.float32), everything, Question(5))
+    nothing = answer(snapshot, np.zeros(DIMENSION, np.float32), everything, SearchOptions(5))
     assert nothing.hits == ()
 
 
@@ -83,18 +85,20 @@ def test_rows_further_apart_than_a_look_are_all_looked_at(monkeypatch: pytest.Mo
     """Pieces of the scan end anywhere in the chunks."""
     from services.search import bounded
 
-    monkeypatch.setattr(bounded, "LOOK_BYTES", 7 * DIMENSION)
+    monkeypatch.setattr(bounded, "BUDGET_CHECK_BYTES", 7 * DIMENSION)
     rows = places(4, 100, DIMENSION)
     everything = np.ones(100, bool)
     for number in (0, 6, 7, 50, 99):
-        found = answer(snapshot_of(rows, by="int8"), rows[number], everything, Question(5))
+        found = answer(snapshot_of(rows, by="int8"), rows[number], everything, SearchOptions(5))
         assert hits_of(found) == brute_force(rows, rows[number], 5, everything)
 
 
 def test_dense_mode_compares_every_row() -> None:
     rows = places(4, 150, DIMENSION)
     everything = np.ones(150, bool)
-    found = answer(snapshot_of(rows, by="int8"), rows[0], everything, Question(9, mode=Mode.DENSE))
+    found = answer(
+        snapshot_of(rows, by="int8"), rows[0], everything, SearchOptions(9, mode=Mode.DENSE)
+    )
     assert found.certificate == "exhaustive"
     assert hits_of(found) == brute_force(rows, rows[0], 9, everything)
 
@@ -105,7 +109,7 @@ def test_what_is_left_to_chance_is_not_asked_where_nothing_may_be() -> None:
     everything = np.ones(400, bool)
     snapshot = snapshot_of(rows, by="signs")
     for mode, certificate in ((Mode.AUTO, "statistical"), (Mode.DETERMINISTIC, "exhaustive")):
-        found = answer(snapshot, rows[0], everything, Question(3, mode=mode))
+        found = answer(snapshot, rows[0], everything, SearchOptions(3, mode=mode))
         assert found.certificate == certificate
         assert hits_of(found) == brute_force(rows, rows[0], 3, everything)
     both = replace(
@@ -117,10 +121,10 @@ def test_what_is_left_to_chance_is_not_asked_where_nothing_may_be() -> None:
             )
         ),
     )
-    found = answer(both, rows[0], everything, Question(3, mode=Mode.DETERMINISTIC))
+    found = answer(both, rows[0], everything, SearchOptions(3, mode=Mode.DETERMINISTIC))
     assert found.certificate == "bound"
     assert hits_of(found) == brute_force(rows, rows[0], 3, everything)
-    found = answer(both, rows[0], everything, Question(3))
+    found = answer(both, rows[0], everything, SearchOptions(3))
     assert found.certificate == "statistical", "a glance at the signs reads less"
 
 
@@ -138,7 +142,7 @@ def test_int8_codes_are_used_where_they_are_less_to_read(
     monkeypatch: pytest.MonkeyPatch, selected: int, k: int, dimension: int, worth: bool
 ) -> None:
     monkeypatch.undo()
-    assert worth_int8(selected, k, dimension) == worth
+    assert int8_codes_pay_off(selected, k, dimension) == worth
 
 
 def test_small_maps_need_no_codes_to_leave_nothing_to_chance(
@@ -147,10 +151,10 @@ def test_small_maps_need_no_codes_to_leave_nothing_to_chance(
     monkeypatch.undo()
     rows = places(5, 400)
     few = snapshot_of(rows, by="none")
-    assert not lacks_int8(few, np.ones(400, bool), 3)
+    assert not needs_int8_codes(few, np.ones(400, bool), 3)
     many = replace(few, generation_id=new_id(), chunks=few.chunks * 6)
-    assert lacks_int8(many, np.ones(2400, bool), 3)
-    assert not lacks_int8(many, np.arange(2400) < 5, 3)
+    assert needs_int8_codes(many, np.ones(2400, bool), 3)
+    assert not needs_int8_codes(many, np.arange(2400) < 5, 3)
 
 
 @pytest.mark.parametrize("most_rows", [0, 1, 5, 12])
@@ -158,7 +162,7 @@ def test_search_that_gives_up_says_so_and_of_how_many_hits_it_is_certain(most_ro
     rows = places(8, 400, DIMENSION)
     everything = np.ones(400, bool)
     query = rows[3] + np.float32(0.5) * places(19, 1, DIMENSION)[0]
-    question = Question(20, most_rows=most_rows)
+    question = SearchOptions(20, most_rows=most_rows)
     found = answer(snapshot_of(rows, by="int8"), query, everything, question)
     assert found.certificate == "none"
     assert found.rows_reranked <= most_rows
@@ -169,7 +173,7 @@ def test_search_that_gives_up_says_so_and_of_how_many_hits_it_is_certain(most_ro
 
 def test_search_that_runs_out_of_time_says_so() -> None:
     rows = places(8, 400, DIMENSION)
-    question = Question(20, most_seconds=1e-9)
+    question = SearchOptions(20, most_seconds=1e-9)
     found = answer(snapshot_of(rows, by="int8"), rows[3], np.ones(400, bool), question)
     assert found.certificate == "none"
     assert found.certified_k <= len(found.hits) < 20
@@ -177,7 +181,7 @@ def test_search_that_runs_out_of_time_says_so() -> None:
 
 def test_nothing_that_matters_left_out_is_no_giving_up() -> None:
     rows = places(8, 400, DIMENSION)
-    question = Question(1, 0.999, most_rows=400)
+    question = SearchOptions(1, 0.999, most_rows=400)
     found = answer(snapshot_of(rows, by="int8"), rows[3], np.ones(400, bool), question)
     assert found.certificate == "bound"
     assert [hit.photo_id for hit in found.hits] == [photo(3)]

@@ -12,12 +12,12 @@ from hypothesis import given, settings
 
 from services.search import answer as answer_module
 from services.search import cascade, kernels
-from services.search.answer import Answer, Question
-from services.search.cascade import glance
+from services.search.answer import SearchOptions, SearchResult
+from services.search.cascade import scan_first_level
 from services.search.loaded_chunk import LoadedChunk
 from services.search.snapshot import Snapshot
-from services.search.together import Glances
-from shared.codes.signs import sign_codes
+from services.search.together import QueryBatcher
+from shared.codes.signs import encode_signs
 from shared.ids import new_id
 from shared.search_protocol import Mode
 from tests.support.search_rows import (
@@ -37,14 +37,14 @@ DIMENSION = 7168
 
 @pytest.fixture(autouse=True)
 def by_codes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(answer_module, "worth_codes", lambda selected, k: True)
+    monkeypatch.setattr(answer_module, "sign_codes_pay_off", lambda selected, k: True)
 
 
 @settings(max_examples=40, deadline=None)
 @given(case=cases(DIMENSION))
 def test_answers_equal_brute_force_with_order_and_ties(case: Case) -> None:
     snapshot = snapshot_of(case.rows, case.pieces)
-    found = answer(snapshot, case.query, case.asked, Question(case.k, case.min_score))
+    found = answer(snapshot, case.query, case.asked, SearchOptions(case.k, case.min_score))
     assert hits_of(found) == case.expected
     if case.asked.any():
         assert found.certificate == "statistical"
@@ -59,7 +59,7 @@ def test_rows_of_any_length_are_searched(dimension: int) -> None:
     rows = places(3, 60, dimension)
     everything = np.ones(60, bool)
     for query in rows[:3]:
-        found = answer(snapshot_of(rows), query, everything, Question(7))
+        found = answer(snapshot_of(rows), query, everything, SearchOptions(7))
         assert hits_of(found) == brute_force(rows, query, 7, everything)
         assert found.certificate == "statistical"
 
@@ -67,7 +67,7 @@ def test_rows_of_any_length_are_searched(dimension: int) -> None:
 def test_most_rows_are_never_read_when_the_place_is_in_the_map() -> None:
     rows = places(1, 2000)
     query = rows[77] + np.float32(0.002) * places(9, 1)[0]
-    found = answer(snapshot_of(rows), query, np.ones(2000, bool), Question(1))
+    found = answer(snapshot_of(rows), query, np.ones(2000, bool), SearchOptions(1))
     assert found.hits[0].photo_id == photo(77)
     assert found.rows_scanned == 2000
     assert found.rows_reranked < 50
@@ -77,16 +77,18 @@ def test_query_of_any_length_gives_the_same_answer() -> None:
     rows = places(2, 100)
     everything = np.ones(100, bool)
     snapshot = snapshot_of(rows)
-    found = [answer(snapshot, rows[5] * np.float32(s), everything, Question(5)) for s in (1, 64)]
+    found = [
+        answer(snapshot, rows[5] * np.float32(s), everything, SearchOptions(5)) for s in (1, 64)
+    ]
     assert hits_of(found[0]) == hits_of(found[1])
-    nothing = answer(snapshot, np.zeros(DIMENSION, np.float32), everything, Question(5))
+    nothing = answer(snapshot, np.zeros(DIMENSION, np.float32), everything, SearchOptions(5))
     assert nothing.hits == ()
 
 
 def test_dense_mode_compares_every_row() -> None:
     rows = places(4, 150)
     everything = np.ones(150, bool)
-    question = Question(9, mode=Mode.DENSE)
+    question = SearchOptions(9, mode=Mode.DENSE)
     found = answer(snapshot_of(rows), rows[0], everything, question)
     assert found.certificate == "exhaustive"
     assert found.max_z is None
@@ -98,8 +100,8 @@ def test_few_rows_are_compared_without_codes(monkeypatch: pytest.MonkeyPatch) ->
     rows = places(4, 300)
     asked = np.zeros(300, bool)
     asked[:50] = True
-    assert answer(snapshot_of(rows), rows[0], asked, Question(3)).certificate == "exhaustive"
-    everything = answer(snapshot_of(rows), rows[0], ~np.zeros(300, bool), Question(3))
+    assert answer(snapshot_of(rows), rows[0], asked, SearchOptions(3)).certificate == "exhaustive"
+    everything = answer(snapshot_of(rows), rows[0], ~np.zeros(300, bool), SearchOptions(3))
     assert everything.certificate == "statistical"
 
 
@@ -109,11 +111,11 @@ def test_codes_that_lie_are_found_out_and_every_row_is_compared() -> None:
     (chunk,) = snapshot.chunks
     assert chunk.codes is not None
     wrong = LoadedChunk(
-        chunk.chunk_id, chunk.object_key, chunk.rows, chunk.photos, sign_codes(rows[::-1].copy())
+        chunk.chunk_id, chunk.object_key, chunk.rows, chunk.photos, encode_signs(rows[::-1].copy())
     )
     lying = Snapshot(new_id(), new_id(), 1, (wrong,))
     everything = np.ones(200, bool)
-    found = answer(lying, rows[3], everything, Question(10))
+    found = answer(lying, rows[3], everything, SearchOptions(10))
     assert found.certificate == "exhaustive"
     assert hits_of(found) == brute_force(rows, rows[3], 10, everything)
 
@@ -123,7 +125,7 @@ def test_search_that_gives_up_says_so_and_of_how_many_hits_it_is_certain(most_ro
     rows = places(8, 400)
     everything = np.ones(400, bool)
     query = rows[3] + np.float32(0.5) * places(19, 1)[0]
-    found = answer(snapshot_of(rows), query, everything, Question(20, most_rows=most_rows))
+    found = answer(snapshot_of(rows), query, everything, SearchOptions(20, most_rows=most_rows))
     assert found.certificate == "none"
     assert found.rows_reranked <= most_rows
     exact = brute_force(rows, query, 20, everything)
@@ -133,7 +135,9 @@ def test_search_that_gives_up_says_so_and_of_how_many_hits_it_is_certain(most_ro
 
 def test_search_that_runs_out_of_time_says_so() -> None:
     rows = places(8, 400)
-    found = answer(snapshot_of(rows), rows[3], np.ones(400, bool), Question(20, most_seconds=1e-9))
+    found = answer(
+        snapshot_of(rows), rows[3], np.ones(400, bool), SearchOptions(20, most_seconds=1e-9)
+    )
     assert found.certificate == "none"
     assert found.certified_k <= len(found.hits) < 20
 
@@ -141,7 +145,7 @@ def test_search_that_runs_out_of_time_says_so() -> None:
 def test_nothing_that_matters_left_out_is_no_giving_up() -> None:
     rows = places(8, 400)
     found = answer(
-        snapshot_of(rows), rows[3], np.ones(400, bool), Question(1, 0.999, most_rows=400)
+        snapshot_of(rows), rows[3], np.ones(400, bool), SearchOptions(1, 0.999, most_rows=400)
     )
     assert found.certificate == "statistical"
     assert [hit.photo_id for hit in found.hits] == [photo(3)]
@@ -156,34 +160,34 @@ def test_queries_that_come_together_get_the_answers_that_they_get_alone(
     rng = np.random.default_rng(1)
     queries = [rows[row] + np.float32(0.3) * places(row, 1)[0] for row in range(24)]
     asked = [rng.random(500) < rng.choice([1.0, 0.3]) for _ in queries]
-    questions = [Question(int(rng.choice([1, 5, 30]))) for _ in queries]
+    questions = [SearchOptions(int(rng.choice([1, 5, 30]))) for _ in queries]
     alone = [answer(snapshot, *one) for one in zip(queries, asked, questions, strict=True)]
-    glances = Glances()
+    glances = QueryBatcher()
 
     def first_waits(*arguments: Any) -> Any:
-        if glances.rounds == 1:
-            wait_until(lambda: glances.waiting == 23, 30, lambda: None, "23 other queries")
-        return glance(*arguments)
+        if glances.batches_run == 1:
+            wait_until(lambda: glances.queue_length == 23, 30, lambda: None, "23 other queries")
+        return scan_first_level(*arguments)
 
-    monkeypatch.setattr(cascade, "glance", first_waits)
+    monkeypatch.setattr(cascade, "scan_first_level", first_waits)
 
-    def ask(number: int) -> Answer:
-        return answer_module.answer(
+    def ask(number: int) -> SearchResult:
+        return answer_module.execute_query(
             snapshot, queries[number], asked[number], questions[number], glances
         )
 
     with ThreadPoolExecutor(len(queries)) as threads:
         together = list(threads.map(ask, range(len(queries))))
     assert together == alone
-    assert glances.queries == 24
-    assert glances.rounds == 2, "the first goes alone, and all others in one round after it"
+    assert glances.queries_run == 24
+    assert glances.batches_run == 2, "the first goes alone, and all others in one round after it"
 
 
 def test_after_warming_up_nothing_is_left_to_compile() -> None:
-    cascade.warm_up()
+    cascade.compile_kernels()
     loops = [one for one in vars(kernels).values() if hasattr(one, "signatures")]
     before = {loop.py_func.__name__: len(loop.signatures) for loop in loops}
     assert before["distances"] == 1
     rows = places(3, 400, 98_304)
-    answer(snapshot_of(rows), rows[0], np.ones(400, bool), Question(300))
+    answer(snapshot_of(rows), rows[0], np.ones(400, bool), SearchOptions(300))
     assert {loop.py_func.__name__: len(loop.signatures) for loop in loops} == before

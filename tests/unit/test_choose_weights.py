@@ -6,17 +6,17 @@ from typing import Any
 
 import pytest
 
-from services.gateway.choose_weights import choose_weights
+from services.gateway.choose_weights import select_ranking_weights
 from shared.catalog.generations import Generation
 from shared.estimate.calibration import Calibration
 from shared.ids import new_id
-from shared.search_protocol import Hit
+from shared.search_protocol import SearchHit
 from shared.settings import Settings
-from shared.word_weights.pairs import TaughtBy
+from shared.word_weights.pairs import PairSource
 from shared.word_weights.record import Outcome, WordWeights
 
-PLAIN = Hit(photo_id=new_id(), score=0.5)
-WEIGHTED = Hit(photo_id=new_id(), score=0.5, weighted_score=0.7)
+PLAIN = SearchHit(photo_id=new_id(), score=0.5)
+WEIGHTED = SearchHit(photo_id=new_id(), score=0.5, weighted_score=0.7)
 
 
 def calibration(threshold: float) -> Calibration:
@@ -36,7 +36,7 @@ def generation(outcome: Outcome | None) -> Generation:
         record = WordWeights(
             outcome=outcome,
             reason="",
-            taught_by=TaughtBy.COORDINATES,
+            taught_by=PairSource.COORDINATES,
             near_pairs=100,
             far_pairs=100,
             seed=0,
@@ -64,12 +64,12 @@ def test_answers_say_whether_weights_rank_and_are_judged_accordingly(
     outcome: Outcome | None,
     wanted: bool,
     setting: bool,
-    first: Hit | None,
+    first: SearchHit | None,
     state: str,
     threshold: float,
 ) -> None:
     settings = Settings(_env_file=None).model_copy(update={"word_weights": setting})
-    chosen = choose_weights(generation(outcome), wanted, settings)
+    chosen = select_ranking_weights(generation(outcome), wanted, settings)
     hits = [first] if first else []
     assert chosen.values == ((1.0, 0.0) if outcome == Outcome.KEPT and wanted and setting else ())
     assert chosen.state(hits) == state

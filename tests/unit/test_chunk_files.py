@@ -16,13 +16,13 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 import shared.codes.stored
-from services.search.load import Loader, hold, parts_of, remove_others
+from services.search.load import ChunkLoader, hold_in_memory, memory_parts, remove_stale_folders
 from services.search.loaded_chunk import LoadedChunk, StoredChunk
-from services.search.memory import Memory, held
+from services.search.memory import MemoryBudget, allocate_parts
 from services.search.photo_columns import PhotoColumns
 from shared.catalog.chunks import Chunk
 from shared.chunks import CODED_BYTES, codes_key, delete_chunk, write_chunk
-from shared.codes.signs import sign_codes
+from shared.codes.signs import encode_signs
 from shared.errors import Unavailable
 from shared.ids import new_id
 from shared.objects import FolderStore
@@ -84,10 +84,10 @@ def written(store: FolderStore, rows: Rows) -> Chunk:
 
 def test_rows_are_those_that_were_written(store: FolderStore, folder: Path) -> None:
     rows = unit_rows(5)
-    stored = Loader(store, folder).rows(written(store, rows))
+    stored = ChunkLoader(store, folder).load_rows(written(store, rows))
     np.testing.assert_array_equal(stored.rows, rows)
     assert not stored.rows.flags.writeable
-    stored.file.read_ahead(5000, 100_000)
+    stored.file.prefetch(5000, 100_000)
 
 
 def test_rows_stay_readable_when_the_object_and_its_copy_are_deleted(
@@ -95,10 +95,10 @@ def test_rows_stay_readable_when_the_object_and_its_copy_are_deleted(
 ) -> None:
     rows = unit_rows(5)
     chunk = written(store, rows)
-    loader = Loader(store, folder)
-    stored = loader.rows(chunk)
+    loader = ChunkLoader(store, folder)
+    stored = loader.load_rows(chunk)
     delete_chunk(store, chunk.object_key)
-    loader.keep_only([])
+    loader.evict_except([])
     np.testing.assert_array_equal(stored.rows, rows)
 
 
@@ -109,21 +109,21 @@ def test_damaged_chunk_is_refused_by_its_hash_and_served_once_it_is_repaired(
     chunk = written(store, unit_rows(5))
     whole = store.get(chunk.object_key)
     store.put(chunk.object_key, damage(whole))
-    loader = Loader(store, folder)
+    loader = ChunkLoader(store, folder)
     with pytest.raises(Unavailable) as caught:
-        loader.rows(chunk)
+        loader.load_rows(chunk)
     assert caught.value.code == "chunk_corrupt"
     assert chunk.object_key in caught.value.detail
     assert not list(folder.glob("*"))
     store.put(chunk.object_key, whole)
-    assert len(loader.rows(chunk).rows) == 5
+    assert len(loader.load_rows(chunk).rows) == 5
 
 
 def test_objects_of_a_bucket_are_fetched_once(tmp_path: Path, folder: Path) -> None:
     store = Bucket(tmp_path / "objects")
     chunk = written(store, unit_rows(5))
     for _ in range(3):
-        Loader(store, folder).rows(chunk)
+        ChunkLoader(store, folder).load_rows(chunk)
     assert store.opened == 1
 
 
@@ -136,33 +136,33 @@ def test_a_damaged_copy_in_the_cache_is_fetched_again(
     chunk = written(bucket, rows)
     (folder / f"{chunk.sha256}.npy").parent.mkdir(parents=True)
     (folder / f"{chunk.sha256}.npy").write_bytes(damage)
-    assert np.array_equal(Loader(bucket, folder).rows(chunk).rows, rows)
-    assert np.array_equal(Loader(bucket, folder).rows(chunk).rows, rows)
+    assert np.array_equal(ChunkLoader(bucket, folder).load_rows(chunk).rows, rows)
+    assert np.array_equal(ChunkLoader(bucket, folder).load_rows(chunk).rows, rows)
     assert bucket.opened == 1
 
 
 def test_files_of_a_folder_are_not_copied(tmp_path: Path, folder: Path) -> None:
     store = FolderStore(tmp_path / "objects")
-    Loader(store, folder).rows(written(store, unit_rows(5)))
+    ChunkLoader(store, folder).load_rows(written(store, unit_rows(5)))
     assert not folder.exists()
 
 
 def test_only_the_files_of_chunks_that_are_searched_are_kept(tmp_path: Path, folder: Path) -> None:
     store = Bucket(tmp_path / "objects")
-    loader = Loader(store, folder)
-    kept, dropped = (loader.rows(written(store, unit_rows(n))) for n in (3, 4))
+    loader = ChunkLoader(store, folder)
+    kept, dropped = (loader.load_rows(written(store, unit_rows(n))) for n in (3, 4))
     (folder / "old.partial").touch()
     long_ago = time.time() - 7200
     os.utime(folder / "old.partial", (long_ago, long_ago))
     (folder / "new.partial").touch()
-    loader.keep_only([loaded(kept)])
+    loader.evict_except([loaded(kept)])
     assert {path.name for path in folder.iterdir()} == {f"{kept.sha256}.npy", "new.partial"}
     assert len(dropped.rows) == 4
     other = folder.with_name(str(new_id()))
     other.mkdir()
     mine = new_id()
     folder.rename(folder.with_name(str(mine)))
-    remove_others(folder.parent, [mine])
+    remove_stale_folders(folder.parent, [mine])
     assert [path.name for path in folder.parent.iterdir()] == [str(mine)]
 
 
@@ -190,9 +190,9 @@ def test_codes_that_lie_beside_a_chunk_are_not_made_again(
     rows = unit_rows(MANY)
     chunk = written(store, rows)
     monkeypatch.delattr(shared.codes.stored, "sign_codes")
-    loader = Loader(store, folder)
-    codes = loader.codes(chunk.object_key, loader.rows(chunk))
-    for level, expected in zip(codes.levels, sign_codes(rows).levels, strict=True):
+    loader = ChunkLoader(store, folder)
+    codes = loader.load_sign_codes(chunk.object_key, loader.load_rows(chunk))
+    for level, expected in zip(codes.levels, encode_signs(rows).levels, strict=True):
         np.testing.assert_array_equal(level, expected)
 
 
@@ -202,9 +202,9 @@ def test_codes_that_are_missing_are_made_once(
     rows = unit_rows(6)
     chunk = written(store, rows)
     for _ in range(2):
-        loader = Loader(store, folder)
-        codes = loader.codes(chunk.object_key, loader.rows(chunk))
-        np.testing.assert_array_equal(codes.levels[0], sign_codes(rows).levels[0])
+        loader = ChunkLoader(store, folder)
+        codes = loader.load_sign_codes(chunk.object_key, loader.load_rows(chunk))
+        np.testing.assert_array_equal(codes.levels[0], encode_signs(rows).levels[0])
         monkeypatch.delattr(shared.codes.stored, "sign_codes", raising=False)
 
 
@@ -217,15 +217,15 @@ def test_damaged_codes_are_made_again_and_the_chunk_is_served(
     key = codes_key(chunk.object_key)
     whole = store.get(key)
     if where == "kept here":
-        loader = Loader(store, folder)
-        loader.codes(chunk.object_key, loader.rows(chunk))
+        loader = ChunkLoader(store, folder)
+        loader.load_sign_codes(chunk.object_key, loader.load_rows(chunk))
         (kept,) = folder.glob("*.codes")
         kept.write_bytes(whole[:-1] + b"?")
     else:
         store.put(key, whole[:-1] + b"?")
-    loader = Loader(store, folder)
-    codes = loader.codes(chunk.object_key, loader.rows(chunk))
-    np.testing.assert_array_equal(codes.levels[-1], sign_codes(rows).levels[-1])
+    loader = ChunkLoader(store, folder)
+    codes = loader.load_sign_codes(chunk.object_key, loader.load_rows(chunk))
+    np.testing.assert_array_equal(codes.levels[-1], encode_signs(rows).levels[-1])
 
 
 def test_parts_are_held_in_memory_or_mapped_and_hold_the_same(
@@ -233,22 +233,22 @@ def test_parts_are_held_in_memory_or_mapped_and_hold_the_same(
 ) -> None:
     rows = unit_rows(6)
     chunk = written(store, rows)
-    loader = Loader(store, folder)
-    stored = loader.rows(chunk)
-    codes = loader.codes(chunk.object_key, stored)
+    loader = ChunkLoader(store, folder)
+    stored = loader.load_rows(chunk)
+    codes = loader.load_sign_codes(chunk.object_key, stored)
     stored = StoredChunk(stored.file, stored.rows, stored.sha256, codes)
     one = loaded(stored)
-    assert parts_of([one, one]) == [("codes 0", 2 * 6 * 896), ("rows", 2 * 6 * 4 * DIMENSION)]
+    assert memory_parts([one, one]) == [("codes 0", 2 * 6 * 896), ("rows", 2 * 6 * 4 * DIMENSION)]
     for parts in (0, 1, 2, 1, 0):
-        one = hold(one, parts)
+        one = hold_in_memory(one, parts)
         assert one.codes is not None
         assert (one.codes.levels[0] is codes.levels[0]) == (parts < 1)
         assert (one.rows is stored.rows) == (parts < 2)
         np.testing.assert_array_equal(one.rows, rows)
         np.testing.assert_array_equal(one.codes.levels[0], codes.levels[0])
-        one.read_ahead(5)
-    again = hold(hold(one, 2), 2)
-    assert hold(again, 2).rows is again.rows, "what is in memory is not copied again"
+        one.prefetch_row(5)
+    again = hold_in_memory(hold_in_memory(one, 2), 2)
+    assert hold_in_memory(again, 2).rows is again.rows, "what is in memory is not copied again"
 
 
 @given(
@@ -258,7 +258,7 @@ def test_parts_are_held_in_memory_or_mapped_and_hold_the_same(
 def test_no_more_than_the_budget_is_held_and_what_would_fit_is(
     wanted: dict[UUID, list[int]], budget: int
 ) -> None:
-    counts = held(wanted, budget)
+    counts = allocate_parts(wanted, budget)
     left = budget - sum(sum(wanted[key][:count]) for key, count in counts.items())
     assert left >= 0
     for key, count in counts.items():
@@ -267,14 +267,14 @@ def test_no_more_than_the_budget_is_held_and_what_would_fit_is(
 
 def test_first_parts_of_all_go_before_the_second_part_of_any() -> None:
     first, second = new_id(), new_id()
-    assert held({first: [10, 50], second: [10, 5]}, 60) == {first: 1, second: 2}
-    assert held({first: [10, 40], second: [10, 5]}, 60) == {first: 2, second: 1}
+    assert allocate_parts({first: [10, 50], second: [10, 5]}, 60) == {first: 1, second: 2}
+    assert allocate_parts({first: [10, 40], second: [10, 5]}, 60) == {first: 2, second: 1}
 
 
 def test_what_a_forgotten_generation_held_is_free_for_others() -> None:
-    memory = Memory(100)
+    memory = MemoryBudget(100)
     first, second = new_id(), new_id()
-    assert memory.parts_held(first, [60, 30]) == 2
-    assert memory.parts_held(second, [60]) == 0
-    memory.forget(first)
-    assert memory.parts_held(second, [60]) == 1
+    assert memory.allocate(first, [60, 30]) == 2
+    assert memory.allocate(second, [60]) == 0
+    memory.release_generation(first)
+    assert memory.allocate(second, [60]) == 1

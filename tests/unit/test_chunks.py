@@ -16,9 +16,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from shared.chunks import (
-    HEADER_BYTES,
+    HEADER_READ_BYTES,
     WrittenChunk,
-    are_whole,
     chunk_key,
     decode_rows,
     delete_chunk,
@@ -26,6 +25,7 @@ from shared.chunks import (
     manifest_key,
     read_chunk,
     read_row,
+    rows_are_valid,
     write_chunk,
 )
 from shared.errors import NotFound, Unavailable
@@ -215,7 +215,7 @@ def test_one_row_is_read_without_the_others(tmp_path: Path) -> None:
     for row in (0, 17, 39):
         store.bytes_read = 0
         np.testing.assert_array_equal(read_row(store, chunk.object_key, row), rows[row])
-        assert store.bytes_read == HEADER_BYTES + rows[row].nbytes
+        assert store.bytes_read == HEADER_READ_BYTES + rows[row].nbytes
     with pytest.raises(IndexError):
         read_row(store, chunk.object_key, 40)
 
@@ -236,4 +236,4 @@ def test_row_is_whole_with_the_length_of_a_descriptor_and_damaged_with_any_other
     direction = np.full(4, 0.5)
     lengths = [1, 0, 1.0009, 0.9991, 1.0011, 0.5, np.nan, np.inf]
     rows = np.stack([direction * length for length in lengths]).astype(np.float32)
-    assert are_whole(rows).tolist() == [True, True, True, True, False, False, False, False]
+    assert rows_are_valid(rows).tolist() == [True, True, True, True, False, False, False, False]

@@ -8,7 +8,7 @@ import pytest
 
 from shared.datasets.city import write
 from shared.datasets.city.plan import CityOptions, make_plan
-from shared.datasets.city.training_files import TrainLayout, laid_out
+from shared.datasets.city.training_files import TrainingLayoutName, with_training_layout
 from shared.datasets.sets import open_training_set
 from shared.errors import Conflict
 
@@ -28,28 +28,28 @@ def test_bytes_do_not_depend_on_how_many_processes_draw(
 ) -> None:
     drawn: list[int] = []
     write.write_city(PLAN, tmp_path / "alone", drawn.append)
-    assert drawn == [len(PLAN.shots)]
-    monkeypatch.setattr(write, "SHOTS_PER_TASK", 7)
+    assert drawn == [len(PLAN.photos)]
+    monkeypatch.setattr(write, "PHOTOS_PER_TASK", 7)
     monkeypatch.setattr("os.cpu_count", lambda: 2)
     drawn.clear()
     write.write_city(PLAN, tmp_path / "shared", drawn.append)
     assert len(drawn) == 3
-    assert sum(drawn) == len(PLAN.shots) == 8 + 4 + 8
+    assert sum(drawn) == len(PLAN.photos) == 8 + 4 + 8
     assert contents(tmp_path / "alone") == contents(tmp_path / "shared")
 
 
 def test_same_photos_can_be_laid_out_as_either_training_set(tmp_path: Path) -> None:
     opened = {}
-    for layout in TrainLayout:
-        write.write_city(laid_out(PLAN, layout), tmp_path / layout)
+    for layout in TrainingLayoutName:
+        write.write_city(with_training_layout(PLAN, layout), tmp_path / layout)
         opened[layout] = open_training_set(tmp_path / layout)
-    xs, original = opened[TrainLayout.GSV_XS], opened[TrainLayout.GSV_CITIES]
+    xs, original = opened[TrainingLayoutName.GSV_XS], opened[TrainingLayoutName.GSV_CITIES]
     assert (xs.layout, original.layout) == ("gsv_xs", "GSV-Cities")
     assert [p.place_id for p in xs.places] == [p.place_id for p in original.places] == [0, 1]
     for one, other in zip(xs.places, original.places, strict=True):
         assert [p.read_bytes() for p in one.photos] == [p.read_bytes() for p in other.photos]
-    assert contents(tmp_path / TrainLayout.GSV_XS / "queries") == contents(
-        tmp_path / TrainLayout.GSV_CITIES / "queries"
+    assert contents(tmp_path / TrainingLayoutName.GSV_XS / "queries") == contents(
+        tmp_path / TrainingLayoutName.GSV_CITIES / "queries"
     )
 
 
@@ -62,5 +62,5 @@ def test_folder_that_holds_anything_is_refused(tmp_path: Path) -> None:
 
 
 def test_empty_folder_may_be_written_into(tmp_path: Path) -> None:
-    write.check_empty(tmp_path)
-    write.check_empty(tmp_path / "not there yet")
+    write.check_output_empty(tmp_path)
+    write.check_output_empty(tmp_path / "not there yet")

@@ -9,14 +9,14 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from shared.datasets.city.camera import Camera, cast
-from shared.datasets.city.canvas import FINE, View
+from shared.datasets.city.camera import Camera, cast_rays
+from shared.datasets.city.canvas import SUPERSAMPLING, RenderBuffers
 from shared.datasets.city.catalogue import Catalogue, make_catalogue
-from shared.datasets.city.plan import CityOptions, Plan, Shot, make_plan
-from shared.datasets.city.render import Painter
+from shared.datasets.city.plan import CityOptions, CityPlan, PlannedPhoto, make_plan
+from shared.datasets.city.render import QuarterRenderer
 from shared.datasets.city.sessions import NIGHT, SESSIONS, SUMMER
 from shared.datasets.city.streets import Quarter
-from shared.datasets.city.texture_memory import TextureMemory
+from shared.datasets.city.texture_memory import TextureCache
 
 OPTIONS = CityOptions(
     places=60, views=4, queries=80, seed=3, catalogue_seed=1, out_of_map=0.25, width=96, height=72
@@ -24,7 +24,7 @@ OPTIONS = CityOptions(
 
 
 @pytest.fixture(scope="module")
-def plan() -> Plan:
+def plan() -> CityPlan:
     return make_plan(OPTIONS)
 
 
@@ -34,12 +34,12 @@ def catalogue() -> Catalogue:
 
 
 @pytest.fixture(scope="module")
-def painter(plan: Plan, catalogue: Catalogue) -> Painter:
-    return Painter(plan.quarters["map"], catalogue, TextureMemory())
+def painter(plan: CityPlan, catalogue: Catalogue) -> QuarterRenderer:
+    return QuarterRenderer(plan.quarters["map"], catalogue, TextureCache())
 
 
-def of_role(plan: Plan, role: str) -> list[Shot]:
-    return [shot for shot in plan.shots if shot.role == role]
+def of_role(plan: CityPlan, role: str) -> list[PlannedPhoto]:
+    return [shot for shot in plan.photos if shot.role == role]
 
 
 def facing(quarter: Quarter, side: int, distance: float) -> Camera:
@@ -76,7 +76,7 @@ def test_a_step_aside_moves_near_points_more_than_far_ones() -> None:
 def test_ray_meets_a_facade_where_the_point_projects() -> None:
     camera = Camera(3.0, -4.0, yaw=25.0, fov=80.0, width=320)
     start, direction = np.array([[-20.0, 9.0]]), np.array([[0.96, 0.28]])
-    hits = cast(camera, camera.slopes(1), start, direction, np.array([60.0]))
+    hits = cast_rays(camera, camera.slopes(1), start, direction, np.array([60.0]))
     seen = np.isfinite(hits.depth)
     assert seen.sum() > 200
     points = start + hits.along[seen, None] * direction
@@ -88,7 +88,7 @@ def test_ray_meets_a_facade_where_the_point_projects() -> None:
 def test_facade_is_not_seen_from_behind() -> None:
     camera = Camera(0.0, 0.0, yaw=0.0, fov=60.0)
     start, direction = np.array([[10.0, 9.0]]), np.array([[-1.0, 0.0]])
-    hits = cast(camera, camera.slopes(1), start, direction, np.array([20.0]))
+    hits = cast_rays(camera, camera.slopes(1), start, direction, np.array([20.0]))
     assert not np.isfinite(hits.depth).any()
 
 
@@ -96,18 +96,18 @@ def test_nearest_facade_hides_the_others() -> None:
     camera = Camera(0.0, 0.0, yaw=0.0, fov=60.0)
     starts = np.array([[-30.0, 20.0], [-5.0, 9.0]])
     directions = np.array([[1.0, 0.0], [1.0, 0.0]])
-    hits = cast(camera, camera.slopes(1), starts, directions, np.array([60.0, 10.0]))
+    hits = cast_rays(camera, camera.slopes(1), starts, directions, np.array([60.0, 10.0]))
     assert hits.plane[160] == 1
     assert hits.depth[160] == pytest.approx(9.0)
     assert hits.plane[0] == 0  # beside the short one
 
 
 def test_drawn_facade_moves_by_the_pinhole_formula_and_keeps_its_size(
-    plan: Plan, painter: Painter
+    plan: CityPlan, painter: QuarterRenderer
 ) -> None:
     side, distance, pixels = 12, 9.0, 16
     camera = facing(plan.quarters["map"], side, distance)
-    step = pixels / FINE * distance / camera.focal
+    step = pixels / SUPERSAMPLING * distance / camera.focal
     before = facade_of(painter.view(camera, SUMMER), distance)
     after = facade_of(painter.view(moved_right(camera, step), SUMMER), distance)
     both = (before[pixels:] > 0) & (after[:-pixels] > 0)
@@ -118,13 +118,17 @@ def test_drawn_facade_moves_by_the_pinhole_formula_and_keeps_its_size(
     assert same[both].mean() > unmoved.mean() + 0.2
 
 
-def facade_of(view: View, distance: float) -> np.ndarray[tuple[int, int], np.dtype[np.uint32]]:
+def facade_of(
+    view: RenderBuffers, distance: float
+) -> np.ndarray[tuple[int, int], np.dtype[np.uint32]]:
     """The canvas where the facade at that depth shows; 0 where trees and cars stand before it."""
     at_wall = np.abs(view.depth - distance) < 0.01
-    return np.where(np.kron(at_wall, np.ones((FINE, FINE), bool)), view.canvas, 0)
+    return np.where(np.kron(at_wall, np.ones((SUPERSAMPLING, SUPERSAMPLING), bool)), view.canvas, 0)
 
 
-def test_session_changes_the_light_and_not_the_geometry(plan: Plan, painter: Painter) -> None:
+def test_session_changes_the_light_and_not_the_geometry(
+    plan: CityPlan, painter: QuarterRenderer
+) -> None:
     camera = of_role(plan, "database")[7].camera
     # The same day's vehicles and leaves, in the light of the night.
     night = replace(NIGHT, name="summer", foliage="summer")
@@ -134,7 +138,7 @@ def test_session_changes_the_light_and_not_the_geometry(plan: Plan, painter: Pai
 
 
 def test_vehicles_are_others_on_another_day_and_houses_are_not(
-    plan: Plan, painter: Painter
+    plan: CityPlan, painter: QuarterRenderer
 ) -> None:
     shots = of_role(plan, "database")[::8]
     other_day = replace(SUMMER, name="another summer day")
@@ -146,7 +150,7 @@ def test_vehicles_are_others_on_another_day_and_houses_are_not(
     assert np.mean(changed) < 0.35
 
 
-def test_neighbouring_places_share_houses(plan: Plan) -> None:
+def test_neighbouring_places_share_houses(plan: CityPlan) -> None:
     quarter = plan.quarters["map"]
     database = [s for s in of_role(plan, "database") if s.number % OPTIONS.views == 0]
     houses = {shot.place: houses_seen(quarter, shot.camera) for shot in database}
@@ -159,7 +163,7 @@ def test_neighbouring_places_share_houses(plan: Plan) -> None:
     assert all(houses[a] != houses[b] for a, b in neighbours)
 
 
-def test_who_looks_the_other_way_sees_none_of_the_houses(plan: Plan) -> None:
+def test_who_looks_the_other_way_sees_none_of_the_houses(plan: CityPlan) -> None:
     quarter = plan.quarters["map"]
     seen = {
         s.place: houses_seen(quarter, s.camera, 25)
@@ -173,7 +177,7 @@ def test_who_looks_the_other_way_sees_none_of_the_houses(plan: Plan) -> None:
 
 
 def houses_seen(quarter: Quarter, camera: Camera, within_m: float = 60.0) -> set[tuple[int, int]]:
-    hits = cast(
+    hits = cast_rays(
         camera,
         camera.slopes(1),
         quarter.side_starts,
@@ -187,8 +191,8 @@ def houses_seen(quarter: Quarter, camera: Camera, within_m: float = 60.0) -> set
     }
 
 
-def test_no_camera_stands_in_a_house(plan: Plan) -> None:
-    for shot in plan.shots:
+def test_no_camera_stands_in_a_house(plan: CityPlan) -> None:
+    for shot in plan.photos:
         quarter = plan.quarters[shot.quarter]
         away = quarter.side_starts - shot.camera.position
         across = away[:, 0] * quarter.side_directions[:, 1]

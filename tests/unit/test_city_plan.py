@@ -7,9 +7,9 @@ from collections import Counter, defaultdict
 import numpy as np
 import pytest
 
-from shared.datasets.city.plan import CityOptions, Plan, Shot, make_plan
-from shared.datasets.recall import true_positives
-from shared.datasets.utm_names import fields_of_name, position_of_name
+from shared.datasets.city.plan import CityOptions, CityPlan, PlannedPhoto, make_plan
+from shared.datasets.recall import positives_within
+from shared.datasets.utm_names import upload_fields_of_file_name, utm_position_of_file_name
 
 OPTIONS = CityOptions(
     places=150, views=4, queries=120, seed=5, catalogue_seed=0, out_of_map=0.2, width=64, height=64
@@ -17,26 +17,26 @@ OPTIONS = CityOptions(
 
 
 @pytest.fixture(scope="module")
-def plan() -> Plan:
+def plan() -> CityPlan:
     return make_plan(OPTIONS)
 
 
-def of_role(plan: Plan, role: str) -> list[Shot]:
-    return [shot for shot in plan.shots if shot.role == role]
+def of_role(plan: CityPlan, role: str) -> list[PlannedPhoto]:
+    return [shot for shot in plan.photos if shot.role == role]
 
 
-def positions(shots: list[Shot]) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
+def positions(shots: list[PlannedPhoto]) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
     return np.array([(shot.camera.x, shot.camera.y) for shot in shots])
 
 
-def test_each_place_has_its_views_and_the_queries_are_as_many_as_asked(plan: Plan) -> None:
+def test_each_place_has_its_views_and_the_queries_are_as_many_as_asked(plan: CityPlan) -> None:
     views = Counter(shot.place for shot in of_role(plan, "database"))
     assert set(views) == set(range(150))
     assert set(views.values()) == {4}
     assert len(of_role(plan, "query")) == 120
 
 
-def test_out_of_map_queries_are_the_share_that_was_asked_for(plan: Plan) -> None:
+def test_out_of_map_queries_are_the_share_that_was_asked_for(plan: CityPlan) -> None:
     kinds = Counter(shot.kind for shot in of_role(plan, "query"))
     assert kinds == {"in_map": 88, "other_way": 8, "out_of_map": 24}
 
@@ -49,11 +49,11 @@ def test_share_out_of_map_may_be_anything_from_none_to_all(share: float, expecte
 
 
 def test_queries_on_the_map_have_positives_and_those_outside_are_200_metres_away(
-    plan: Plan,
+    plan: CityPlan,
 ) -> None:
     database, queries = of_role(plan, "database"), of_role(plan, "query")
-    found = true_positives(positions(queries), positions(database))
-    far = true_positives(positions(queries), positions(database), within_m=200.0)
+    found = positives_within(positions(queries), positions(database))
+    far = positives_within(positions(queries), positions(database), within_m=200.0)
     for shot, near, within_200_m in zip(queries, found, far, strict=True):
         if shot.kind == "out_of_map":
             assert not len(within_200_m)
@@ -62,14 +62,14 @@ def test_queries_on_the_map_have_positives_and_those_outside_are_200_metres_away
 
 
 def test_nothing_to_learn_from_lies_within_200_metres_of_a_query_or_the_database(
-    plan: Plan,
+    plan: CityPlan,
 ) -> None:
     asked = positions(of_role(plan, "database") + of_role(plan, "query"))
-    found = true_positives(positions(of_role(plan, "train")), asked, within_m=200.0)
+    found = positives_within(positions(of_role(plan, "train")), asked, within_m=200.0)
     assert not any(len(row) for row in found)
 
 
-def test_places_of_a_street_lie_15_to_25_metres_apart(plan: Plan) -> None:
+def test_places_of_a_street_lie_15_to_25_metres_apart(plan: CityPlan) -> None:
     middles = defaultdict(list)
     for shot in of_role(plan, "database"):
         middles[shot.place].append(shot.camera.position)
@@ -80,7 +80,7 @@ def test_places_of_a_street_lie_15_to_25_metres_apart(plan: Plan) -> None:
     assert within_a_street.min() > 13
 
 
-def test_queries_are_of_other_days_than_the_database(plan: Plan) -> None:
+def test_queries_are_of_other_days_than_the_database(plan: CityPlan) -> None:
     database = {shot.session.name for shot in of_role(plan, "database")}
     queries = {shot.session.name for shot in of_role(plan, "query")}
     assert len(database) == 2
@@ -88,7 +88,7 @@ def test_queries_are_of_other_days_than_the_database(plan: Plan) -> None:
     assert not database & queries
 
 
-def test_each_place_to_learn_from_has_four_sessions(plan: Plan) -> None:
+def test_each_place_to_learn_from_has_four_sessions(plan: CityPlan) -> None:
     sessions = defaultdict(set)
     for shot in of_role(plan, "train"):
         sessions[shot.place].add(shot.session.name)
@@ -96,19 +96,19 @@ def test_each_place_to_learn_from_has_four_sessions(plan: Plan) -> None:
     assert all(len(names) >= 4 for names in sessions.values())
 
 
-def test_name_says_where_and_when_the_camera_stood(plan: Plan) -> None:
-    names = [shot.name for shot in plan.shots]
+def test_name_says_where_and_when_the_camera_stood(plan: CityPlan) -> None:
+    names = [shot.name for shot in plan.photos]
     assert len(set(names)) == len(names)
-    for shot in plan.shots[::17]:
-        assert position_of_name(shot.name) == (shot.camera.x, shot.camera.y)
-        fields = fields_of_name(shot.name, None)
+    for shot in plan.photos[::17]:
+        assert utm_position_of_file_name(shot.name) == (shot.camera.x, shot.camera.y)
+        fields = upload_fields_of_file_name(shot.name, None)
         assert float(fields["heading"]) == pytest.approx(shot.camera.yaw, abs=0.006)
         assert fields["captured_at"].startswith(shot.session.starts_at.date().isoformat())
 
 
-def test_same_arguments_give_the_same_plan_and_another_seed_another(plan: Plan) -> None:
+def test_same_arguments_give_the_same_plan_and_another_seed_another(plan: CityPlan) -> None:
     again = make_plan(OPTIONS)
-    assert [shot.name for shot in again.shots] == [shot.name for shot in plan.shots]
-    assert again.shots == plan.shots
+    assert [shot.name for shot in again.photos] == [shot.name for shot in plan.photos]
+    assert again.photos == plan.photos
     other = make_plan(CityOptions(150, 4, 120, 6, 0, 0.2, 64, 64))
-    assert not {shot.name for shot in other.shots} & {shot.name for shot in plan.shots}
+    assert not {shot.name for shot in other.photos} & {shot.name for shot in plan.photos}

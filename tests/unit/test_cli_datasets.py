@@ -40,7 +40,7 @@ def test_ladder_is_shown_with_the_line_that_it_is_not_comparable(
             }
         ]
 
-    monkeypatch.setattr("services.cli.datasets.synth.climb", climbed)
+    monkeypatch.setattr("services.cli.datasets.synth.evaluate_baselines", climbed)
     arguments = ["synth", str(tmp_path / "out"), "--places", "1", "--queries", "2"]
     result = CliRunner().invoke(app, [*arguments, "--size", "64x64"])
     assert result.exit_code == 0, result.output

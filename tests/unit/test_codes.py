@@ -11,9 +11,9 @@ import pytest
 from numpy.typing import NDArray
 
 from services.search.cascade import hamming_deviation
-from shared.codes.rotation import rotation
-from shared.codes.signs import WORD, SignCodes, level_words, pack_signs, sign_codes
-from shared.codes.stored import decode_codes, encode_codes
+from shared.codes.rotation import get_rotation
+from shared.codes.signs import WORD_BITS, SignCodes, encode_signs, level_words, pack_signs
+from shared.codes.stored import decode_sign_codes, encode_sign_codes
 
 ANYLOC = 98_304
 
@@ -47,7 +47,7 @@ def adversarial(kind: str, count: int, rng: np.random.Generator) -> Rows:
 )
 def test_rotation_keeps_every_product_and_pads_little(dimension: int, padded: int) -> None:
     rows = np.random.default_rng(dimension).standard_normal((5, dimension)).astype(np.float32)
-    turn = rotation(dimension)
+    turn = get_rotation(dimension)
     assert turn.padded == padded
     rotated = turn.rotate(rows)
     assert rotated.shape == (5, padded)
@@ -55,7 +55,7 @@ def test_rotation_keeps_every_product_and_pads_little(dimension: int, padded: in
 
 
 def test_rotation_is_orthonormal() -> None:
-    turn = rotation(448)
+    turn = get_rotation(448)
     matrix = turn.rotate(np.eye(448, dtype=np.float32)).astype(np.float64)
     np.testing.assert_allclose(matrix @ matrix.T, np.eye(448), atol=1e-6)
     assert np.abs(matrix).max() < 6 / math.sqrt(448), "a number stays stronger than the others"
@@ -63,7 +63,7 @@ def test_rotation_is_orthonormal() -> None:
 
 def test_rotation_is_the_same_everywhere_and_always() -> None:
     """Codes lie beside chunks for years: another rotation would make them meaningless."""
-    rotated = rotation(192).rotate(np.ones((1, 192), np.float32))[0]
+    rotated = get_rotation(192).rotate(np.ones((1, 192), np.float32))[0]
     expected = [-11 / 72, -57 / 72, 6 / 72, 8 / 72]
     assert rotated[:4].tolist() == pytest.approx(expected, abs=1e-6)
 
@@ -76,7 +76,7 @@ def test_rows_of_another_length_or_type_are_no_rows_of_the_rotation() -> None:
     ]
     for rows in strange:
         with pytest.raises(ValueError, match=r"\(n, 64\) float32"):
-            rotation(64).rotate(rows)
+            get_rotation(64).rotate(rows)
 
 
 @pytest.mark.parametrize(
@@ -93,7 +93,7 @@ def test_rows_of_another_length_or_type_are_no_rows_of_the_rotation() -> None:
 def test_estimates_err_as_the_theory_says_whatever_the_rows(kind: str) -> None:
     rng = np.random.default_rng(7)
     rows, queries = adversarial(kind, 160, rng), adversarial(kind, 120, rng)
-    turn = rotation(ANYLOC)
+    turn = get_rotation(ANYLOC)
     cosines = queries.astype(np.float64) @ rows.T.astype(np.float64)
     apart = np.abs(cosines) < 0.9
     turned, asked = turn.rotate(rows), turn.rotate(queries)
@@ -116,7 +116,7 @@ def test_duplicates_are_estimated_no_worse() -> None:
     rng = np.random.default_rng(3)
     place = rng.standard_normal(ANYLOC)
     rows = normalised(place + 0.05 * rng.standard_normal((60, ANYLOC)))
-    turned = rotation(ANYLOC).rotate(rows)
+    turned = get_rotation(ANYLOC).rotate(rows)
     signs = np.sign(turned)
     cosines = rows.astype(np.float64) @ rows.T.astype(np.float64)
     same = signs @ signs.T / ANYLOC
@@ -127,11 +127,11 @@ def test_duplicates_are_estimated_no_worse() -> None:
 def test_bits_are_the_signs_of_the_rotated_row_level_by_level() -> None:
     rows = normalised(np.random.default_rng(5).standard_normal((70, 8192)))
     rows[3] = 0
-    codes = sign_codes(rows)
-    turned = rotation(8192).rotate(rows)
+    codes = encode_signs(rows)
+    turned = get_rotation(8192).rotate(rows)
     words = np.concatenate(codes.levels, axis=1)
     for row, bit in ((0, 0), (0, 63), (1, 64), (69, 8191), (5, 4096)):
-        word, place = divmod(bit, WORD)
+        word, place = divmod(bit, WORD_BITS)
         assert (int(words[row, word]) >> place) & 1 == (turned[row, bit] >= 0)
     np.testing.assert_array_equal(words, pack_signs(turned))
     assert codes.norms[3] == 0
@@ -144,7 +144,7 @@ def test_bits_are_the_signs_of_the_rotated_row_level_by_level() -> None:
 )
 def test_levels_add_up_to_the_whole_code(padded: int, words: tuple[int, ...]) -> None:
     assert level_words(padded) == words
-    assert WORD * sum(words) == padded
+    assert WORD_BITS * sum(words) == padded
 
 
 @pytest.fixture(scope="module")
@@ -159,36 +159,36 @@ def same(a: SignCodes, b: SignCodes) -> bool:
 
 
 def test_stored_codes_are_those_that_were_made(rows: Rows) -> None:
-    data = encode_codes(rows, "ab" * 32)
-    back = decode_codes(data, rows=9, dimension=8192, chunk_sha256="ab" * 32)
-    assert same(back, sign_codes(rows))
+    data = encode_sign_codes(rows, "ab" * 32)
+    back = decode_sign_codes(data, rows=9, dimension=8192, chunk_sha256="ab" * 32)
+    assert same(back, encode_signs(rows))
     for level in back.levels:
         assert level.ctypes.data % 8 == 0
-    empty = encode_codes(rows[:0], "ab" * 32)
-    assert len(decode_codes(empty, rows=0, dimension=8192, chunk_sha256="ab" * 32)) == 0
+    empty = encode_sign_codes(rows[:0], "ab" * 32)
+    assert len(decode_sign_codes(empty, rows=0, dimension=8192, chunk_sha256="ab" * 32)) == 0
 
 
 @pytest.mark.parametrize(
     "change", [{"rows": 8}, {"dimension": 8193}, {"chunk_sha256": "cd" * 32}], ids=str
 )
 def test_codes_of_other_rows_are_refused(rows: Rows, change: dict[str, object]) -> None:
-    data = encode_codes(rows, "ab" * 32)
+    data = encode_sign_codes(rows, "ab" * 32)
     expected: dict[str, object] = {"rows": 9, "dimension": 8192, "chunk_sha256": "ab" * 32}
     with pytest.raises(ValueError, match="other rows"):
-        decode_codes(data, **(expected | change))  # type: ignore[arg-type]
+        decode_sign_codes(data, **(expected | change))  # type: ignore[arg-type]
 
 
 def test_damaged_codes_are_refused(rows: Rows) -> None:
-    whole = encode_codes(rows, "ab" * 32)
+    whole = encode_sign_codes(rows, "ab" * 32)
     damaged = bytearray(whole)
     damaged[-1] ^= 1
     for data in (bytes(damaged), whole[:-9], whole[:100], b"", b"{}\n", b"[1]\n", b"\x00" * 200):
         with pytest.raises(ValueError):
-            decode_codes(data, rows=9, dimension=8192, chunk_sha256="ab" * 32)
+            decode_sign_codes(data, rows=9, dimension=8192, chunk_sha256="ab" * 32)
 
 
 def test_codes_made_otherwise_are_refused(rows: Rows) -> None:
-    whole = encode_codes(rows, "ab" * 32)
+    whole = encode_sign_codes(rows, "ab" * 32)
     older = whole.replace(b'"seed": 2', b'"seed": 1', 1)
     with pytest.raises(ValueError, match="seed"):
-        decode_codes(older, rows=9, dimension=8192, chunk_sha256="ab" * 32)
+        decode_sign_codes(older, rows=9, dimension=8192, chunk_sha256="ab" * 32)

@@ -6,25 +6,25 @@ import math
 
 import pytest
 
-from services.cli.compare_extractors import Entry, read_entries
+from services.cli.compare_extractors import ComparisonEntry, parse_entries
 from services.trainer.evaluation.pareto import pareto_front
 from shared.errors import InvalidRequest
 
 
 def test_commas_separate_extractors_and_their_options() -> None:
-    read = read_entries("a,b:layer=9,facet=key+pca512, c+fit,runs/last.ckpt+pca64")
+    read = parse_entries("a,b:layer=9,facet=key+pca512, c+fit,runs/last.ckpt+pca64")
     assert read == [
-        Entry("a", "a"),
-        Entry("b:layer=9,facet=key+pca512", "b:layer=9,facet=key", pca=512),
-        Entry("c+fit", "c", fit=True),
-        Entry("runs/last.ckpt+pca64", "runs/last.ckpt", pca=64),
+        ComparisonEntry("a", "a"),
+        ComparisonEntry("b:layer=9,facet=key+pca512", "b:layer=9,facet=key", pca=512),
+        ComparisonEntry("c+fit", "c", fit=True),
+        ComparisonEntry("runs/last.ckpt+pca64", "runs/last.ckpt", pca=64),
     ]
 
 
 @pytest.mark.parametrize("text", ["", "a,,b", "+fit", "a+pca0", "a+pca", "a+pca512x", "a+other"])
 def test_what_means_no_extractor_is_refused(text: str) -> None:
     with pytest.raises(InvalidRequest) as refused:
-        read_entries(text)
+        parse_entries(text)
     assert refused.value.code == "bad_extractors"
 
 

@@ -6,9 +6,9 @@ from typing import Any
 
 import pytest
 
-from shared.comparison import check_can_explain, check_can_rerank
+from shared.comparison import check_explainable, check_rerankable
 from shared.errors import Unprocessable
-from shared.recipes import get_recipe
+from shared.recipes import get_extractor_config
 
 HUB = "torchhub:/models/mine:my_entry"
 VITB = "anyloc-vitb14"
@@ -19,7 +19,7 @@ def spec(dimension: int, clusters: int | None) -> dict[str, Any]:
 
 
 def recipe_of(name: str) -> Any:
-    return get_recipe(name, allow_test_extractors=True)
+    return get_extractor_config(name, allow_test_extractors=True)
 
 
 @pytest.mark.parametrize(
@@ -34,8 +34,8 @@ def recipe_of(name: str) -> Any:
 def test_sums_over_patches_can_be_explained(
     name: str, of_generation: dict[str, Any] | None
 ) -> None:
-    check_can_explain(recipe_of(name), of_generation)
-    check_can_rerank(recipe_of(name))
+    check_explainable(recipe_of(name), of_generation)
+    check_rerankable(recipe_of(name))
 
 
 @pytest.mark.parametrize(
@@ -51,12 +51,12 @@ def test_what_is_no_sum_over_patches_says_why(
     name: str, of_generation: dict[str, Any], why: str
 ) -> None:
     with pytest.raises(Unprocessable, match=why) as refused:
-        check_can_explain(recipe_of(name), of_generation)
+        check_explainable(recipe_of(name), of_generation)
     assert refused.value.code == "not_explainable"
 
 
 def test_one_feature_of_a_photo_can_t_be_reranked() -> None:
     with pytest.raises(Unprocessable, match="compares patches") as refused:
-        check_can_rerank(recipe_of(HUB))
+        check_rerankable(recipe_of(HUB))
     assert refused.value.code == "not_rerankable"
-    check_can_rerank(recipe_of(f"{VITB}:aggregator=gem"))
+    check_rerankable(recipe_of(f"{VITB}:aggregator=gem"))

@@ -12,20 +12,20 @@ from fastapi import FastAPI
 from pydantic import ValidationError
 from starlette.testclient import TestClient
 
-from services.console import PAGE
-from services.gateway.console import console_router
-from shared.problems import install_problem_handlers
+from services.console import PAGE_FOLDER
+from services.gateway.console import create_web_page_router
+from shared.problems import install_exception_handlers
 from shared.settings import Settings
 
 TILES = "https://tiles.example.org/{z}/{x}/{y}.png"
 HTML = {"Accept": "text/html,*/*"}
-SOURCES = sorted(PAGE.rglob("*"))
+SOURCES = sorted(PAGE_FOLDER.rglob("*"))
 
 
 def served(settings: Settings) -> TestClient:
     app = FastAPI(docs_url=None, redoc_url=None)
-    install_problem_handlers(app)
-    app.include_router(console_router(settings))
+    install_exception_handlers(app)
+    app.include_router(create_web_page_router(settings))
     return TestClient(app, base_url="http://localhost")
 
 
@@ -150,9 +150,9 @@ def test_no_file_of_the_page_names_another_server(path: Path) -> None:
 
 def test_every_module_that_is_imported_is_there(page: TestClient) -> None:
     wanted = set()
-    for path in PAGE.rglob("*.js"):
+    for path in PAGE_FOLDER.rglob("*.js"):
         for name in re.findall(r"(?:from|import)\s*\(?\"(\.[^\"]+)\"", path.read_text()):
-            wanted.add((path.parent / name).resolve().relative_to(PAGE).as_posix())
+            wanted.add((path.parent / name).resolve().relative_to(PAGE_FOLDER).as_posix())
     assert wanted
     for name in sorted(wanted):
         assert page.get(f"/console/{name}").status_code == 200, name

@@ -15,8 +15,8 @@ from PIL import Image
 from PIL.ExifTags import GPS, IFD, Base
 
 from shared.errors import Unprocessable
-from shared.photo_formats import sniff_media_type
-from shared.vision.decode import THUMBNAIL_PIXELS, decode
+from shared.photo_formats import detect_media_type
+from shared.vision.decode import THUMBNAIL_PIXELS, decode_photo
 from shared.vision.preprocessing import get_preprocessing
 from tests.support.photos import encoded, photo_bytes, photo_image, turned_photo
 
@@ -26,13 +26,13 @@ LOSSLESS = ("PNG", "BMP", "TIFF")
 
 
 def mean_colour(data: bytes) -> tuple[int, int, int]:
-    red, green, blue = decode(data, SQUARE, PIXELS).pixels.reshape(-1, 3).mean(axis=0)
+    red, green, blue = decode_photo(data, SQUARE, PIXELS).pixels.reshape(-1, 3).mean(axis=0)
     return round(red), round(green), round(blue)
 
 
 def reason(data: bytes, max_pixels: int = PIXELS) -> Unprocessable:
     with pytest.raises(Unprocessable) as caught:
-        decode(data, SQUARE, max_pixels)
+        decode_photo(data, SQUARE, max_pixels)
     return caught.value
 
 
@@ -57,17 +57,17 @@ FORMATS: dict[str, bytes] = {
 
 @pytest.mark.parametrize("name", FORMATS)
 def test_every_accepted_format_decodes_to_the_size_of_the_preprocessing(name: str) -> None:
-    decoded = decode(FORMATS[name], SQUARE, PIXELS)
+    decoded = decode_photo(FORMATS[name], SQUARE, PIXELS)
     assert decoded.pixels.shape == (32, 32, 3)
     assert decoded.pixels.dtype == np.uint8
     expected = SQUARE.apply(photo_image(1)).astype(float)
     assert np.abs(decoded.pixels - expected).mean() < 12, "these are not the photo's pixels"
-    assert sniff_media_type(FORMATS[name][:16]) is not None
+    assert detect_media_type(FORMATS[name][:16]) is not None
 
 
 @pytest.mark.parametrize("media", LOSSLESS)
 def test_lossless_formats_keep_every_pixel(media: str) -> None:
-    decoded = decode(photo_bytes(3, media), SQUARE, PIXELS)
+    decoded = decode_photo(photo_bytes(3, media), SQUARE, PIXELS)
     np.testing.assert_array_equal(decoded.pixels, SQUARE.apply(photo_image(3)))
 
 
@@ -85,7 +85,7 @@ def test_every_exif_orientation_comes_out_upright(orientation: int, media: str) 
     upright.paste((0, 255, 0), (24, 0, 48, 16))
     upright.paste((0, 0, 255), (24, 16, 48, 32))
     upright.paste((255, 255, 0), (0, 16, 24, 32))
-    decoded = decode(turned_photo(upright, orientation, media), SQUARE, PIXELS)
+    decoded = decode_photo(turned_photo(upright, orientation, media), SQUARE, PIXELS)
     assert corners(decoded.pixels) == ["red", "green", "blue", "yellow"]
     thumbnail = Image.open(io.BytesIO(decoded.thumbnail))
     assert thumbnail.size == (48, 32)
@@ -96,7 +96,7 @@ def test_every_exif_orientation_comes_out_upright(orientation: int, media: str) 
 def test_published_preprocessings_see_photos_as_they_are_stored(name: str) -> None:
     published = get_preprocessing(name)
     on_its_side = turned_photo(photo_image(1), 6, "PNG")
-    decoded = decode(on_its_side, published, PIXELS)
+    decoded = decode_photo(on_its_side, published, PIXELS)
     as_stored = photo_image(1).transpose(Image.Transpose.ROTATE_90)
     np.testing.assert_array_equal(decoded.pixels, published.apply(as_stored))
     assert Image.open(io.BytesIO(decoded.thumbnail)).size == (64, 48), "thumbnails are upright"
@@ -147,7 +147,7 @@ def test_transparent_parts_show_black_whatever_lies_under_them(
 def test_alpha_that_hides_nothing_changes_no_pixel() -> None:
     with_alpha = photo_image(4).convert("RGBA")
     for media in ("PNG", "TIFF"):
-        decoded = decode(encoded(with_alpha, media), SQUARE, PIXELS).pixels
+        decoded = decode_photo(encoded(with_alpha, media), SQUARE, PIXELS).pixels
         np.testing.assert_array_equal(decoded, SQUARE.apply(photo_image(4)))
 
 
@@ -173,7 +173,7 @@ def test_animated_webp_shows_its_first_frame() -> None:
 
 
 def test_photo_of_one_pixel_decodes() -> None:
-    decoded = decode(encoded(Image.new("RGB", (1, 1), (5, 6, 7)), "PNG"), SQUARE, PIXELS)
+    decoded = decode_photo(encoded(Image.new("RGB", (1, 1), (5, 6, 7)), "PNG"), SQUARE, PIXELS)
     assert set(map(tuple, decoded.pixels.reshape(-1, 3).tolist())) == {(5, 6, 7)}
     assert Image.open(io.BytesIO(decoded.thumbnail)).size == (1, 1)
 
@@ -200,7 +200,7 @@ def test_too_many_pixels_are_an_error_that_names_the_limit() -> None:
     assert error.code == "too_many_pixels"
     assert "64 x 48" in error.detail
     assert str(64 * 48 - 1) in error.detail
-    decode(photo_bytes(1, "PNG"), SQUARE, max_pixels=64 * 48)
+    decode_photo(photo_bytes(1, "PNG"), SQUARE, max_pixels=64 * 48)
 
 
 def private_exif() -> Image.Exif:
@@ -217,7 +217,7 @@ def test_thumbnails_carry_nothing_that_the_camera_wrote(media: str) -> None:
     if media == "JPEG":
         options |= {"comment": b"SecretComment", "dpi": (72, 72), "xmp": b"<x>SecretXmp</x>"}
     data = encoded(photo_image(1), media, **options)
-    thumbnail = decode(data, SQUARE, PIXELS).thumbnail
+    thumbnail = decode_photo(data, SQUARE, PIXELS).thumbnail
     assert b"Secret" in data
     assert b"Secret" not in thumbnail
     assert b"Exif" not in thumbnail
@@ -226,13 +226,13 @@ def test_thumbnails_carry_nothing_that_the_camera_wrote(media: str) -> None:
 
 def test_thumbnail_is_a_small_jpeg_of_the_same_shape() -> None:
     data = encoded(Image.new("RGB", (1000, 500), (1, 2, 3)), "PNG")
-    thumbnail = Image.open(io.BytesIO(decode(data, SQUARE, PIXELS).thumbnail))
+    thumbnail = Image.open(io.BytesIO(decode_photo(data, SQUARE, PIXELS).thumbnail))
     assert thumbnail.format == "JPEG"
     assert thumbnail.size == (THUMBNAIL_PIXELS, THUMBNAIL_PIXELS // 2)
 
 
 def test_small_photos_are_not_enlarged_for_their_thumbnail() -> None:
-    decoded = decode(photo_bytes(1), SQUARE, PIXELS)
+    decoded = decode_photo(photo_bytes(1), SQUARE, PIXELS)
     assert Image.open(io.BytesIO(decoded.thumbnail)).size == (64, 48)
 
 
@@ -246,7 +246,7 @@ def test_broken_exif_is_no_reason_to_refuse_the_pixels() -> None:
         b"Exif\0\0II*\0\x08\0\0\0\x01\0\x0f\x01\x05\0\x01\0\0\0\x08\0\0\0\0\0\0\0",
     ):
         data = encoded(photo_image(1), "JPEG", exif=exif)
-        assert decode(data, SQUARE, PIXELS).pixels.shape == (32, 32, 3)
+        assert decode_photo(data, SQUARE, PIXELS).pixels.shape == (32, 32, 3)
 
 
 @settings(max_examples=60, deadline=None)
@@ -257,6 +257,6 @@ def test_damaged_photos_decode_or_are_refused_and_raise_nothing_else(seed: int, 
     for _ in range(rng.choice([1, 3, 10])):
         data[rng.randrange(len(data))] = rng.randrange(256)
     try:
-        decode(bytes(data), SQUARE, 1_000_000)
+        decode_photo(bytes(data), SQUARE, 1_000_000)
     except Unprocessable as error:
         assert error.code in ("undecodable_photo", "too_many_pixels")  # noqa: PT017

@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch.nn.modules.module import register_module_forward_hook
 
-from shared.recipes import FACETS, RECIPES
+from shared.recipes import EXTRACTOR_CONFIGS, FACETS
 from shared.vision.backbones.dinov2 import SHAPES, Dinov2, VitShape, resample_positions
 from tests.support.vit import (
     PLAIN,
@@ -81,7 +81,7 @@ def test_features_of_each_published_depth_are_those_of_a_whole_forward_pass(
     size: str, tmp_path: Path
 ) -> None:
     """All blocks and heads, each head narrowed to 4 numbers; what AnyLoc takes of it."""
-    published, layer = SHAPES[size], RECIPES[f"anyloc-{size}"].layer
+    published, layer = SHAPES[size], EXTRACTOR_CONFIGS[f"anyloc-{size}"].layer
     assert layer is not None
     shape = replace(published, width=4 * published.heads)
     weights = random_weights(shape)
@@ -211,7 +211,7 @@ def test_timm_would_resample_positions_otherwise() -> None:
 def test_shapes_are_those_of_timms_networks_and_of_the_recipes(size: str) -> None:
     import timm
 
-    shape, recipe = SHAPES[size], RECIPES[f"anyloc-{size}"]
+    shape, recipe = SHAPES[size], EXTRACTOR_CONFIGS[f"anyloc-{size}"]
     assert (shape.depth, shape.width) == (recipe.depth, recipe.width)
     with torch.device("meta"):
         network: Any = timm.create_model(shape.timm_name, pretrained=False)

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from shared.errors import Misconfigured
-from shared.recipes import get_recipe
+from shared.recipes import get_extractor_config
 from shared.vision.backbones.dinov2 import Dinov2, VitShape
 from shared.vision.extractors import Extractor
 from tests.support.vit import (
@@ -238,7 +238,7 @@ def test_weights_that_can_not_be_downloaded_are_an_error_and_never_random() -> N
     said = refusal(None, "weights_missing")
     assert "DINO_WEIGHTS is not set" in said
     with pytest.raises(Misconfigured, match=r"timm/vit_giant_patch14_dinov2\.lvd142m"):
-        Extractor(get_recipe("anyloc-vitg14", allow_test_extractors=False), CPU)
+        Extractor(get_extractor_config("anyloc-vitg14", allow_test_extractors=False), CPU)
 
 
 def test_timms_file_in_the_cache_is_taken_without_asking_the_hub(offline_cache: Path) -> None:

@@ -11,7 +11,7 @@ import pytest
 
 from shared.disk_reserve import RESERVE_BYTES, DiskReserve
 from shared.errors import StorageFull
-from shared.home import address_file, announced
+from shared.home import announce_server, server_address_file
 from shared.objects import FolderStore
 
 GIGABYTE = 1_000_000_000
@@ -72,8 +72,8 @@ def test_a_server_without_room_for_its_address_starts_and_says_so(
     def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    address_file(tmp_path).write_text("of a server that was killed")
+    server_address_file(tmp_path).write_text("of a server that was killed")
     monkeypatch.setattr("shared.home.write_private", full)
-    with announced(tmp_path, "http://127.0.0.1:1"):
-        assert not address_file(tmp_path).exists()
+    with announce_server(tmp_path, "http://127.0.0.1:1"):
+        assert not server_address_file(tmp_path).exists()
     assert "--server http://127.0.0.1:1" in caplog.text

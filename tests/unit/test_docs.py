@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tools.make_api_page import PAGE, description, page
+from tools.make_api_page import PAGE, openapi_description, render_page
 
 ROOT = Path(__file__).parents[2]
 PAGES = sorted([ROOT / "README.md", *ROOT.glob("docs/**/*.md"), ROOT / "benchmarks/RESULTS.md"])
@@ -25,11 +25,11 @@ def anchors(text: str) -> set[str]:
 
 
 def test_page_of_calls_is_what_the_server_describes() -> None:
-    assert PAGE.read_text() == page(), "run `make api-page`"
+    assert PAGE.read_text() == render_page(), "run `make api-page`"
 
 
 def test_every_call_is_described_in_a_sentence() -> None:
-    for path, methods in description()["paths"].items():
+    for path, methods in openapi_description()["paths"].items():
         for method, call in methods.items():
             assert call.get("description"), f"{method} {path}"
 
@@ -37,7 +37,7 @@ def test_every_call_is_described_in_a_sentence() -> None:
 def test_every_call_stands_in_the_short_page() -> None:
     """By the last word of its path that is no parameter."""
     missing = []
-    for path in description()["paths"]:
+    for path in openapi_description()["paths"]:
         words = [word for word in path.split("/") if word and not word.startswith("{")]
         if words and f"/{words[-1]}" not in SHORT:
             missing.append(path)

@@ -10,10 +10,10 @@ import pytest
 import torch
 
 from services.cli import extractor_checks
-from services.cli.extractor_checks import device_check, extractor_check, memory_check
+from services.cli.extractor_checks import check_device, check_extractor, check_memory
 from shared import machine
 from shared.errors import Misconfigured
-from shared.machine import ram_bytes
+from shared.machine import memory_limit_bytes
 from shared.settings import Settings
 from shared.vision.backbones import dinov2
 from shared.vision.backbones.dinov2 import SHAPES
@@ -46,11 +46,11 @@ def test_weights_that_fit_are_named_without_being_loaded(
     def load(*_arguments: object) -> None:
         raise AssertionError("the weights were loaded")
 
-    monkeypatch.setattr(dinov2, "fill", load)
+    monkeypatch.setattr(dinov2, "load_vit_weights", load)
     settings = settings_with(
         monkeypatch, DINO_MODEL="dinov2_vits14", DESC_LAYER="0", DINO_WEIGHTS=small
     )
-    said = extractor_check(settings)
+    said = check_extractor(settings)
     assert "anyloc-vits14:layer=0" in said
     assert str(small) in said
     assert "GB) fit" in said
@@ -61,7 +61,7 @@ def test_weights_without_the_chosen_layer_are_found_out(
 ) -> None:
     settings = settings_with(monkeypatch, DINO_MODEL="dinov2_vits14", DINO_WEIGHTS=small)
     with pytest.raises(Misconfigured, match=r"it has no tensor blocks\.1\.norm1\.weight") as caught:
-        extractor_check(settings)
+        check_extractor(settings)
     assert caught.value.code == "weights_unfit"
 
 
@@ -75,7 +75,7 @@ def test_missing_weights_come_with_three_ways_to_get_them(
     path = {"DINO_WEIGHTS": tmp_path / "gone.pth"} if given else {}
     settings = settings_with(monkeypatch, DINO_MODEL="dinov2_vitg14", **path)
     with pytest.raises(Misconfigured) as caught:
-        extractor_check(settings)
+        check_extractor(settings)
     assert caught.value.code == "weights_missing"
     assert ("gone.pth does not exist" if given else "not in the Hugging Face cache") in (
         caught.value.detail
@@ -85,7 +85,7 @@ def test_missing_weights_come_with_three_ways_to_get_them(
 
 
 def test_other_extractors_are_loaded() -> None:
-    assert "test-tiny-avg: weights" in extractor_check(Settings())
+    assert "test-tiny-avg: weights" in check_extractor(Settings())
 
 
 def test_an_entry_of_torch_hub_is_tried_and_never_downloaded(
@@ -95,12 +95,12 @@ def test_an_entry_of_torch_hub_is_tried_and_never_downloaded(
     monkeypatch.setattr("shared.vision.torchhub_code.GITHUB", "unreachable")
     missing = f"torchhub:somebody/places@{COMMIT}:colours"
     with pytest.raises(Misconfigured, match="its code is not here") as caught:
-        extractor_check(settings_with(monkeypatch, EXTRACTOR=missing))
+        check_extractor(settings_with(monkeypatch, EXTRACTOR=missing))
     assert caught.value.code == "weights_missing"
     assert str(tmp_path) not in caught.value.detail
     monkeypatch.setenv("EXTRACTOR", f"torchhub:{write_hub(tmp_path / 'hub')}:colours")
-    assert "load" in extractor_check(Settings())
-    assert "tells its size only when it is loaded" in memory_check(Settings())
+    assert "load" in check_extractor(Settings())
+    assert "tells its size only when it is loaded" in check_memory(Settings())
 
 
 # --- device and memory -----------------------------------------------------------------------
@@ -109,7 +109,7 @@ def test_an_entry_of_torch_hub_is_tried_and_never_downloaded(
 def test_missing_cuda_is_found_out(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     settings = settings_with(monkeypatch, DEVICE="cuda")
-    for check in (device_check, memory_check):
+    for check in (check_device, check_memory):
         with pytest.raises(Misconfigured, match="nvidia-smi"):
             check(settings)
 
@@ -123,7 +123,7 @@ def pretend_gpu(monkeypatch: pytest.MonkeyPatch, total: int) -> None:
 
 def test_memory_that_is_enough_is_shown_with_the_estimate(monkeypatch: pytest.MonkeyPatch) -> None:
     pretend_gpu(monkeypatch, 16 * GB)
-    said = memory_check(settings_with(monkeypatch, DINO_MODEL="dinov2_vitg14", DEVICE="cuda"))
+    said = check_memory(settings_with(monkeypatch, DINO_MODEL="dinov2_vitg14", DEVICE="cuda"))
     assert "anyloc-vitg14 takes about 6.2 GB (weights 4.5, a batch of 16 photos 0.6)" in said
     assert "the GPU has 16.0 GB" in said
 
@@ -132,7 +132,7 @@ def test_a_gpu_that_is_too_small_comes_with_what_to_do(monkeypatch: pytest.Monke
     pretend_gpu(monkeypatch, 4 * GB)
     settings = settings_with(monkeypatch, DINO_MODEL="dinov2_vitg14", DEVICE="cuda")
     with pytest.raises(Misconfigured) as caught:
-        memory_check(settings)
+        check_memory(settings)
     assert caught.value.code == "memory_short"
     assert "a smaller DINO_MODEL" in caught.value.detail
     assert "DEVICE=cpu" in caught.value.detail
@@ -145,7 +145,7 @@ def test_a_batch_that_is_too_large_comes_with_what_to_do(monkeypatch: pytest.Mon
         monkeypatch, DINO_MODEL="dinov2_vitg14", DEVICE="cuda", BATCH_PHOTOS="64"
     )
     with pytest.raises(Misconfigured, match="a smaller BATCH_PHOTOS than 64"):
-        memory_check(settings)
+        check_memory(settings)
 
 
 def test_memory_of_one_large_photo_is_counted_whatever_the_batch(
@@ -159,25 +159,25 @@ def test_memory_of_one_large_photo_is_counted_whatever_the_batch(
         BATCH_PHOTOS="1",
     )
     with pytest.raises(Misconfigured, match="preprocessing square224") as caught:
-        memory_check(settings)  # 21 times the pixels of 224 x 224
+        check_memory(settings)  # 21 times the pixels of 224 x 224
     assert "6.4 GB (weights 4.5, a batch of 1 photos 0.8)" in caught.value.detail
     assert "BATCH_PHOTOS" not in caught.value.detail
 
 
 def test_ram_that_is_too_small_is_found_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(extractor_checks, "ram_bytes", lambda: 2 * GB)
+    monkeypatch.setattr(extractor_checks, "memory_limit_bytes", lambda: 2 * GB)
     settings = settings_with(monkeypatch, DINO_MODEL="dinov2_vitl14", DEVICE="cpu")
     with pytest.raises(Misconfigured) as caught:
-        memory_check(settings)
+        check_memory(settings)
     assert "this machine has 2.0 GB" in caught.value.detail
     assert "DEVICE=cpu" not in caught.value.detail
 
 
 def test_ram_of_a_container_is_its_limit(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     limit = tmp_path / "memory.max"
-    monkeypatch.setattr(machine, "CONTAINER_LIMIT", limit)
+    monkeypatch.setattr(machine, "CGROUP_MEMORY_LIMIT_FILE", limit)
     whole = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    assert ram_bytes() == whole
+    assert memory_limit_bytes() == whole
     for written, expected in (("max\n", whole), ("1000000\n", 1_000_000), ("9" * 30, whole)):
         limit.write_text(written)
-        assert ram_bytes() == expected
+        assert memory_limit_bytes() == expected

@@ -12,7 +12,7 @@ import pytest
 
 from shared.errors import Misconfigured
 from shared.vision import download as download_module
-from shared.vision.download import TRIES, download
+from shared.vision.download import MAX_DOWNLOAD_ATTEMPTS, download_file
 from tests.support.files_server import FilesServer, files_server
 
 CONTENT = np.random.default_rng(0).bytes(5_000_000)
@@ -21,7 +21,7 @@ HASH = hashlib.sha256(CONTENT).hexdigest()
 
 @pytest.fixture(autouse=True)
 def _no_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(download_module, "PAUSE_SECONDS", 0)
+    monkeypatch.setattr(download_module, "RETRY_PAUSE_SECONDS", 0)
 
 
 @pytest.fixture
@@ -46,17 +46,17 @@ def break_off(server: FilesServer, target: Path, after: int = 2_000_000) -> int:
     server.refuse = []
     with pytest.raises(httpx2.HTTPError):
         # The first answer breaks off; every later one brings nothing.
-        download(f"{server.url}/weights", target, on_progress=lambda *_: _refuse_all(server))
+        download_file(f"{server.url}/weights", target, on_progress=lambda *_: _refuse_all(server))
     return begun(target).stat().st_size
 
 
 def _refuse_all(server: FilesServer) -> None:
-    server.refuse = [503] * TRIES
+    server.refuse = [503] * MAX_DOWNLOAD_ATTEMPTS
 
 
 def test_a_file_comes_whole_with_its_progress(server: FilesServer, target: Path) -> None:
     seen: list[tuple[int, int | None]] = []
-    download(
+    download_file(
         f"{server.url}/weights",
         target,
         sha256=HASH,
@@ -70,7 +70,7 @@ def test_a_file_comes_whole_with_its_progress(server: FilesServer, target: Path)
 
 def test_a_break_costs_only_what_was_not_there_yet(server: FilesServer, target: Path) -> None:
     server.break_after = [2_000_000, 1_000_000]
-    download(f"{server.url}/weights", target, sha256=HASH)
+    download_file(f"{server.url}/weights", target, sha256=HASH)
     assert target.read_bytes() == CONTENT
     assert [part for _, part in server.asked] == [None, "bytes=2000000-", "bytes=3000000-"]
 
@@ -81,7 +81,7 @@ def test_a_later_call_goes_on_where_an_earlier_one_ended(server: FilesServer, ta
     assert not target.exists()
     server.refuse, server.asked = [], []
     seen: list[int] = []
-    download(
+    download_file(
         f"{server.url}/weights", target, sha256=HASH, on_progress=lambda done, _: seen.append(done)
     )
     assert target.read_bytes() == CONTENT
@@ -93,14 +93,14 @@ def test_a_file_that_has_changed_meanwhile_comes_anew(server: FilesServer, targe
     break_off(server, target)
     server.refuse = []
     server.files["/weights"] = changed = CONTENT[::-1]
-    download(f"{server.url}/weights", target)
+    download_file(f"{server.url}/weights", target)
     assert target.read_bytes() == changed
 
 
 def test_a_server_without_ranges_sends_all_of_it_again(server: FilesServer, target: Path) -> None:
     server.ranges = False
     server.break_after = [2_000_000]
-    download(f"{server.url}/weights", target, sha256=HASH)
+    download_file(f"{server.url}/weights", target, sha256=HASH)
     assert target.read_bytes() == CONTENT
     assert [part for _, part in server.asked] == [None, None]
 
@@ -111,7 +111,7 @@ def test_a_download_that_was_complete_is_not_asked_for_again(
     break_off(server, target)
     server.refuse = []
     begun(target).write_bytes(CONTENT)
-    download(f"{server.url}/weights", target, sha256=HASH)
+    download_file(f"{server.url}/weights", target, sha256=HASH)
     assert target.read_bytes() == CONTENT
     assert server.asked[-1] == ("/weights", f"bytes={len(CONTENT)}-")
 
@@ -120,7 +120,7 @@ def test_more_than_there_is_is_thrown_away(server: FilesServer, target: Path) ->
     break_off(server, target)
     server.refuse = []
     begun(target).write_bytes(CONTENT + b"more")
-    download(f"{server.url}/weights", target, sha256=HASH)
+    download_file(f"{server.url}/weights", target, sha256=HASH)
     assert target.read_bytes() == CONTENT
 
 
@@ -129,31 +129,31 @@ def test_a_file_with_another_hash_is_refused_and_not_kept(
     server: FilesServer, target: Path, expected: str
 ) -> None:
     with pytest.raises(Misconfigured, match="is not the file that it should be") as caught:
-        download(f"{server.url}/weights", target, sha256=expected)
+        download_file(f"{server.url}/weights", target, sha256=expected)
     assert caught.value.code == "download_corrupt"
     assert {path.suffix for path in target.parent.iterdir()} <= {".lock"}
 
 
 def test_the_beginning_of_a_hash_is_enough(server: FilesServer, target: Path) -> None:
-    download(f"{server.url}/weights", target, sha256=HASH[:8].upper())
+    download_file(f"{server.url}/weights", target, sha256=HASH[:8].upper())
     assert target.read_bytes() == CONTENT
 
 
 def test_what_is_not_there_is_asked_for_once(server: FilesServer, target: Path) -> None:
     with pytest.raises(httpx2.HTTPStatusError, match="404"):
-        download(f"{server.url}/others", target)
+        download_file(f"{server.url}/others", target)
     assert len(server.asked) == 1
 
 
 def test_a_busy_server_is_asked_again(server: FilesServer, target: Path) -> None:
     server.refuse = [503, 429]
-    download(f"{server.url}/weights", target, sha256=HASH)
+    download_file(f"{server.url}/weights", target, sha256=HASH)
     assert target.read_bytes() == CONTENT
 
 
 def test_a_file_that_is_there_is_not_asked_for(server: FilesServer, target: Path) -> None:
     target.parent.mkdir()
     target.write_bytes(b"here")
-    download(f"{server.url}/weights", target, sha256=HASH)
+    download_file(f"{server.url}/weights", target, sha256=HASH)
     assert target.read_bytes() == b"here"
     assert server.asked == []

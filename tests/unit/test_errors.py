@@ -8,7 +8,7 @@ import pickle
 import pytest
 
 from shared import errors
-from shared.errors import PlacewiseError, Unprocessable, invalid_field
+from shared.errors import PlacewiseError, Unprocessable, invalid_field_error
 
 KINDS = [
     kind
@@ -45,7 +45,7 @@ def test_every_status_has_one_kind_of_error() -> None:
 
 
 def test_invalid_field_names_the_field_for_people_and_for_programs() -> None:
-    error = invalid_field("latitude", "is missing")
+    error = invalid_field_error("latitude", "is missing")
     assert isinstance(error, Unprocessable)
     assert error.detail == "latitude: is missing"
     assert error.extra["errors"] == [{"field": "latitude", "detail": "is missing"}]

@@ -9,10 +9,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as some
 
-from shared.estimate.calibration import cross_validated, learn_confidence, learn_threshold
-from shared.estimate.evidence import Evidence
-from shared.estimate.figures import auroc, calibration_error, recall_at_precision
-from shared.estimate.places import ELSEWHERE_M, Spot, elsewhere, metres_between, same_place
+from shared.estimate.calibration import cross_validate, fit_confidence, fit_threshold
+from shared.estimate.evidence import PlaceEvidence
+from shared.estimate.figures import auroc, expected_calibration_error, recall_at_precision
+from shared.estimate.places import (
+    DIFFERENT_PLACE_M,
+    PhotoLocation,
+    distance_between_m,
+    is_different_place,
+    is_same_place,
+)
 
 YES, NO = True, False
 
@@ -21,10 +27,10 @@ YES, NO = True, False
 
 
 def test_the_calibration_error_of_one_bin_is_the_gap_between_said_and_true() -> None:
-    assert calibration_error([0.9] * 4, [YES, YES, YES, NO]) == pytest.approx(0.15)
-    assert calibration_error([0.25] * 4, [YES, NO, NO, NO]) == pytest.approx(0)
-    assert calibration_error([1.0], [NO]) == 1
-    assert calibration_error([0.5], [YES]) == 0.5
+    assert expected_calibration_error([0.9] * 4, [YES, YES, YES, NO]) == pytest.approx(0.15)
+    assert expected_calibration_error([0.25] * 4, [YES, NO, NO, NO]) == pytest.approx(0)
+    assert expected_calibration_error([1.0], [NO]) == 1
+    assert expected_calibration_error([0.5], [YES]) == 0.5
 
 
 def test_the_calibration_error_is_the_mean_over_bins_of_equally_many() -> None:
@@ -32,11 +38,11 @@ def test_the_calibration_error_is_the_mean_over_bins_of_equally_many() -> None:
     little."""
     said = [0.2] * 10 + [0.8] * 10
     truth = [YES] * 4 + [NO] * 6 + [YES] * 6 + [NO] * 4
-    assert calibration_error(said, truth) == pytest.approx(0.2)
+    assert expected_calibration_error(said, truth) == pytest.approx(0.2)
     mixed = [pair for both in zip(range(10), range(10, 20), strict=True) for pair in both]
-    assert calibration_error([said[i] for i in mixed], [truth[i] for i in mixed]) == pytest.approx(
-        0.2
-    )
+    assert expected_calibration_error(
+        [said[i] for i in mixed], [truth[i] for i in mixed]
+    ) == pytest.approx(0.2)
 
 
 def test_the_auroc_counts_pairs_in_the_right_order() -> None:
@@ -97,15 +103,15 @@ def test_recall_at_a_precision_is_the_best_over_all_cuts(
 # --- what may be learnt ----------------------------------------------------------------------
 
 
-def some_evidence(count: int, seed: int = 0, shift: float = 0.0) -> list[Evidence]:
-    rows = np.random.default_rng(seed).normal(shift, 1, (count, len(fields(Evidence))))
-    return [Evidence(*row) for row in rows.tolist()]
+def some_evidence(count: int, seed: int = 0, shift: float = 0.0) -> list[PlaceEvidence]:
+    rows = np.random.default_rng(seed).normal(shift, 1, (count, len(fields(PlaceEvidence))))
+    return [PlaceEvidence(*row) for row in rows.tolist()]
 
 
 def test_a_threshold_wants_enough_impostors() -> None:
-    assert learn_threshold(some_evidence(19)) is None
-    assert learn_threshold(some_evidence(20)) is not None
-    assert learn_threshold([]) is None
+    assert fit_threshold(some_evidence(19)) is None
+    assert fit_threshold(some_evidence(20)) is not None
+    assert fit_threshold([]) is None
 
 
 @pytest.mark.parametrize("impostors", [20, 39, 60, 300])
@@ -115,7 +121,7 @@ def test_about_one_in_twenty_strangers_is_accepted_and_no_more(impostors: int) -
     exceeding = []
     for _ in range(400):
         drawn = chance.uniform(0, 1, impostors)
-        threshold = learn_threshold([Evidence(*[x] * len(fields(Evidence))) for x in drawn])
+        threshold = fit_threshold([PlaceEvidence(*[x] * len(fields(PlaceEvidence))) for x in drawn])
         assert threshold is not None
         exceeding.append(1 - threshold)
     assert 0.03 < np.mean(exceeding) < 0.055
@@ -131,9 +137,9 @@ def test_no_confidence_is_learnt_from_too_few_or_of_one_kind() -> None:
         [(e, n < 7) for n, e in enumerate(evidence)],
         [],
     ):
-        assert learn_confidence(judged) is None
-        assert cross_validated(judged) is None
-    assert learn_confidence([(e, n % 2 == 0) for n, e in enumerate(evidence)]) is not None
+        assert fit_confidence(judged) is None
+        assert cross_validate(judged) is None
+    assert fit_confidence([(e, n % 2 == 0) for n, e in enumerate(evidence)]) is not None
 
 
 def test_a_confidence_tells_right_from_wrong_and_stays_between_0_and_1() -> None:
@@ -141,14 +147,14 @@ def test_a_confidence_tells_right_from_wrong_and_stays_between_0_and_1() -> None
     for apart in (1.0, 50.0):
         judged = [(e, True) for e in some_evidence(40, 1, apart)]
         judged += [(e, False) for e in some_evidence(40, 2, -apart)]
-        learnt = learn_confidence(judged)
+        learnt = fit_confidence(judged)
         assert learnt is not None
         said = [learnt.probability(e) for e, _ in judged]
         assert all(0 < p < 1 for p in said)
         found = auroc(said, [ok for _, ok in judged])
         assert found is not None
         assert found > 0.9
-        predicted = cross_validated(judged)
+        predicted = cross_validate(judged)
         assert predicted is not None
         assert len(predicted) == len(judged)
 
@@ -162,28 +168,70 @@ metres_north = some.floats(0, 300)
 @pytest.mark.parametrize(
     ("one", "other", "same", "apart"),
     [
-        pytest.param(Spot(0, 0, None), Spot(0, 0, None), True, False, id="one spot"),
-        pytest.param(Spot(0, 0, "a"), Spot(50, 0, "a"), True, False, id="one label, far apart"),
-        pytest.param(Spot(0, 0, "a"), Spot(0, 0, "b"), True, False, id="two labels, one spot"),
-        pytest.param(Spot(0, 0, "a"), Spot(1, 0, "b"), False, True, id="two labels, two spots"),
-        pytest.param(Spot(None, None, "a"), Spot(None, None, "b"), False, True, id="two rooms"),
-        pytest.param(Spot(None, None, "a"), Spot(0, 0, None), False, False, id="incomparable"),
-        pytest.param(Spot(None, None, None), Spot(0, 0, "a"), False, False, id="unknown"),
-        pytest.param(Spot(None, None, None), Spot(None, None, None), False, False, id="nothing"),
+        pytest.param(
+            PhotoLocation(0, 0, None), PhotoLocation(0, 0, None), True, False, id="one spot"
+        ),
+        pytest.param(
+            PhotoLocation(0, 0, "a"),
+            PhotoLocation(50, 0, "a"),
+            True,
+            False,
+            id="one label, far apart",
+        ),
+        pytest.param(
+            PhotoLocation(0, 0, "a"),
+            PhotoLocation(0, 0, "b"),
+            True,
+            False,
+            id="two labels, one spot",
+        ),
+        pytest.param(
+            PhotoLocation(0, 0, "a"),
+            PhotoLocation(1, 0, "b"),
+            False,
+            True,
+            id="two labels, two spots",
+        ),
+        pytest.param(
+            PhotoLocation(None, None, "a"),
+            PhotoLocation(None, None, "b"),
+            False,
+            True,
+            id="two rooms",
+        ),
+        pytest.param(
+            PhotoLocation(None, None, "a"),
+            PhotoLocation(0, 0, None),
+            False,
+            False,
+            id="incomparable",
+        ),
+        pytest.param(
+            PhotoLocation(None, None, None), PhotoLocation(0, 0, "a"), False, False, id="unknown"
+        ),
+        pytest.param(
+            PhotoLocation(None, None, None),
+            PhotoLocation(None, None, None),
+            False,
+            False,
+            id="nothing",
+        ),
     ],
 )
-def test_which_photos_show_one_place(one: Spot, other: Spot, same: bool, apart: bool) -> None:
+def test_which_photos_show_one_place(
+    one: PhotoLocation, other: PhotoLocation, same: bool, apart: bool
+) -> None:
     for here, there in ((one, other), (other, one)):
-        assert same_place(here, there, 25) == same
-        assert elsewhere(here, there) == apart
+        assert is_same_place(here, there, 25) == same
+        assert is_different_place(here, there) == apart
 
 
 @settings(max_examples=50)
 @given(metres_north)
 def test_between_near_and_far_is_neither(metres: float) -> None:
-    here, there = Spot(0, 7, None), Spot(metres / DEGREE_M, 7, None)
-    found = metres_between(here, there)
+    here, there = PhotoLocation(0, 7, None), PhotoLocation(metres / DEGREE_M, 7, None)
+    found = distance_between_m(here, there)
     assert found == pytest.approx(metres, abs=0.01)
-    if abs(metres - 25) > 0.1 and abs(metres - ELSEWHERE_M) > 0.1:
-        assert same_place(here, there, 25) == (metres < 25)
-        assert elsewhere(here, there) == (metres > ELSEWHERE_M)
+    if abs(metres - 25) > 0.1 and abs(metres - DIFFERENT_PLACE_M) > 0.1:
+        assert is_same_place(here, there, 25) == (metres < 25)
+        assert is_different_place(here, there) == (metres > DIFFERENT_PLACE_M)

@@ -11,16 +11,20 @@ import numpy as np
 import pytest
 
 from services.trainer.evaluation.average_precision import average_precisions
-from services.trainer.evaluation.bootstrap import LEAST_CLUSTERS, intervals, paired
-from services.trainer.evaluation.calibration import calibrate
-from services.trainer.evaluation.clusters import alone, clusters_of
+from services.trainer.evaluation.bootstrap import (
+    MIN_CLUSTERS,
+    bootstrap_intervals,
+    paired_differences,
+)
+from services.trainer.evaluation.calibration import calibrate_scores
+from services.trainer.evaluation.clusters import cluster_queries, singleton_clusters
 from services.trainer.evaluation.distance_error import distance_error
-from services.trainer.evaluation.hits import found_within, hits_of
-from services.trainer.evaluation.measure import measure
-from services.trainer.evaluation.metres import metres_of
+from services.trainer.evaluation.hits import compute_hits, hits_at_k
+from services.trainer.evaluation.measure import compute_metrics
+from services.trainer.evaluation.metres import match_distances
 from services.trainer.evaluation.precision_recall import precision_recall
-from services.trainer.evaluation.recalls import count_recalls
-from shared.datasets.sets import Shot
+from services.trainer.evaluation.recalls import compute_recalls
+from shared.datasets.sets import DatasetPhoto
 
 
 def indices(*rows: list[int]) -> list[np.ndarray[Any, np.dtype[np.int64]]]:
@@ -32,23 +36,23 @@ POSITIVES = indices([4, 2], [1], [], [3])
 """right at ranks 1 and 3; at rank 3; nothing to find; not found"""
 
 
-def shot(east: float | None = None, **said: Any) -> Shot:
+def shot(east: float | None = None, **said: Any) -> DatasetPhoto:
     north = None if east is None else 5_000_000.0
     given: dict[str, Any] = {"easting": east, "northing": north, "zone": "32T", **said}
-    return Shot(path=Path("photo.jpg"), name="photo.jpg", **given)
+    return DatasetPhoto(path=Path("photo.jpg"), name="photo.jpg", **given)
 
 
 def test_recall_is_told_with_and_without_queries_that_have_no_positive() -> None:
-    found = count_recalls(RANKED, POSITIVES, (1, 3))
-    assert found.of_all == {1: 1 / 4, 3: 2 / 4}
-    assert found.of_findable == {1: 1 / 3, 3: 2 / 3}
+    found = compute_recalls(RANKED, POSITIVES, (1, 3))
+    assert found.recall_all == {1: 1 / 4, 3: 2 / 4}
+    assert found.recall_findable == {1: 1 / 3, 3: 2 / 3}
     assert (found.queries, found.without_positive) == (4, 1)
 
 
 def test_hits_stand_where_the_right_photos_are_ranked() -> None:
-    hits = hits_of(RANKED, POSITIVES)
+    hits = compute_hits(RANKED, POSITIVES)
     assert hits.astype(int).tolist() == [[1, 0, 1], [0, 0, 1], [0, 0, 0], [0, 0, 0]]
-    assert found_within(hits, (1, 3)).tolist() == [[1, 1], [0, 1], [0, 0], [0, 0]]
+    assert hits_at_k(hits, (1, 3)).tolist() == [[1, 1], [0, 1], [0, 0], [0, 0]]
 
 
 def test_average_precision_is_that_of_the_textbook_cut_at_the_depth() -> None:
@@ -62,7 +66,7 @@ def test_average_precision_is_that_of_the_textbook_cut_at_the_depth() -> None:
 def test_precision_and_recall_go_by_the_score_and_equal_scores_are_believed_together() -> None:
     scores = np.array([0.9, 0.8, 0.8, 0.5, 0.4])
     right = np.array([True, True, False, False, True])
-    curve = precision_recall(scores, right, findable=4)
+    curve = precision_recall(scores, right, queries_with_positive=4)
     assert curve is not None
     assert curve.thresholds.tolist() == [0.9, 0.8, 0.5, 0.4]
     assert curve.precision.tolist() == pytest.approx([1, 2 / 3, 2 / 4, 3 / 5])
@@ -71,7 +75,7 @@ def test_precision_and_recall_go_by_the_score_and_equal_scores_are_believed_toge
 
 
 def test_there_is_no_curve_where_nothing_could_be_found() -> None:
-    assert precision_recall(np.array([0.5]), np.array([False]), findable=0) is None
+    assert precision_recall(np.array([0.5]), np.array([False]), queries_with_positive=0) is None
 
 
 def test_distance_error_counts_queries_whose_first_match_lies_within_x_metres() -> None:
@@ -87,7 +91,7 @@ def test_distance_error_counts_queries_whose_first_match_lies_within_x_metres() 
 def test_each_ranked_photo_has_its_metres_from_its_own_query() -> None:
     queries = [shot(500_000.0), shot(500_100.0), shot(None)]
     database = [shot(500_030.0, northing=5_000_040.0), shot(500_000.0), shot(None)]
-    metres = metres_of(queries, database, np.array([[0, 1, 2], [1, 0, 2], [0, 1, 2]]))
+    metres = match_distances(queries, database, np.array([[0, 1, 2], [1, 0, 2], [0, 1, 2]]))
     assert metres[0, :2].tolist() == [50.0, 0.0]
     assert metres[1, :2].tolist() == pytest.approx([100.0, np.hypot(70, 40)])
     assert np.isnan(metres[:, 2]).all()
@@ -95,30 +99,30 @@ def test_each_ranked_photo_has_its_metres_from_its_own_query() -> None:
 
 
 def test_queries_cluster_by_sequence_then_place_then_square() -> None:
-    many = range(LEAST_CLUSTERS)
+    many = range(MIN_CLUSTERS)
     named = [shot(0.0, sequence=f"drive {n}", place="one") for n in many for _ in range(2)]
-    assert clusters_of(named).kind == "sequences"
-    assert clusters_of(named).of.tolist() == [n for n in many for _ in range(2)]
+    assert cluster_queries(named).kind == "sequences"
+    assert cluster_queries(named).of.tolist() == [n for n in many for _ in range(2)]
     placed = [shot(0.0, place=f"place {n}") for n in many]
-    assert clusters_of(placed).kind == "places"
+    assert cluster_queries(placed).kind == "places"
     apart = [shot(100.0 * n) for n in many]
     near = [shot(100.0 * n + 49.0) for n in many]
-    assert clusters_of([*apart, *near]).kind == "squares of 50 m"
-    assert clusters_of([*apart, *near]).of.tolist() == [*many, *many]
+    assert cluster_queries([*apart, *near]).kind == "squares of 50 m"
+    assert cluster_queries([*apart, *near]).of.tolist() == [*many, *many]
     lost = [shot(None) for _ in many]
-    assert clusters_of(lost).kind == "queries"
+    assert cluster_queries(lost).kind == "queries"
 
 
 def test_squares_are_told_apart_by_degrees_as_by_metres() -> None:
-    degrees = [shot(None, latitude=60.0, longitude=10 + n * 0.01) for n in range(LEAST_CLUSTERS)]
-    assert clusters_of(degrees).count == LEAST_CLUSTERS
+    degrees = [shot(None, latitude=60.0, longitude=10 + n * 0.01) for n in range(MIN_CLUSTERS)]
+    assert cluster_queries(degrees).count == MIN_CLUSTERS
     beside = [*degrees, shot(None, latitude=60.0, longitude=10.0)]
-    assert clusters_of(beside).count == LEAST_CLUSTERS
+    assert cluster_queries(beside).count == MIN_CLUSTERS
 
 
 def test_interval_is_that_of_the_binomial_where_queries_are_independent() -> None:
     values = (np.arange(400) < 100).astype(float)[:, None]
-    found = intervals(values, np.arange(400))
+    found = bootstrap_intervals(values, np.arange(400))
     assert found is not None
     # 0.25 +- 1.96 * sqrt(0.25 * 0.75 / 400)
     assert found[0].low == pytest.approx(0.2076, abs=0.006)
@@ -127,15 +131,15 @@ def test_interval_is_that_of_the_binomial_where_queries_are_independent() -> Non
 
 def test_copies_of_queries_in_their_clusters_make_no_interval_narrower() -> None:
     values = (np.arange(100) < 40).astype(float)[:, None]
-    once = intervals(values, np.arange(100))
-    copied = intervals(np.repeat(values, 9, axis=0), np.repeat(np.arange(100), 9))
+    once = bootstrap_intervals(values, np.arange(100))
+    copied = bootstrap_intervals(np.repeat(values, 9, axis=0), np.repeat(np.arange(100), 9))
     assert once is not None
     assert copied is not None
     assert copied[0].as_json() == pytest.approx(once[0].as_json())
 
 
 def test_there_is_no_interval_from_a_handful_of_clusters() -> None:
-    assert intervals(np.ones((100, 1)), np.arange(100) % (LEAST_CLUSTERS - 1)) is None
+    assert bootstrap_intervals(np.ones((100, 1)), np.arange(100) % (MIN_CLUSTERS - 1)) is None
 
 
 def test_runs_are_compared_query_by_query() -> None:
@@ -143,29 +147,31 @@ def test_runs_are_compared_query_by_query() -> None:
     second = (np.arange(200) % 2).astype(float)[:, None]
     first = second.copy()
     first[:20:2] = 1.0
-    (difference,) = paired(first, second, np.arange(200))
+    (difference,) = paired_differences(first, second, np.arange(200))
     assert difference.mean == pytest.approx(0.05)
     assert (difference.won, difference.lost) == (10, 0)
-    assert difference.beyond_chance
+    assert difference.is_significant
     assert difference.low is not None
     assert 0.01 < difference.low < 0.05
-    own = intervals(first, np.arange(200))
+    own = bootstrap_intervals(first, np.arange(200))
     assert own is not None
     assert own[0].low < second.mean(), "the unpaired interval can't tell them apart"
-    (same,) = paired(second, second, np.arange(200))
-    assert (same.mean, same.low, same.high, same.beyond_chance) == (0, 0, 0, False)
+    (same,) = paired_differences(second, second, np.arange(200))
+    assert (same.mean, same.low, same.high, same.is_significant) == (0, 0, 0, False)
 
 
 def test_runs_on_other_queries_are_not_compared() -> None:
     with pytest.raises(ValueError, match="different shape"):
-        paired(np.ones((3, 1)), np.ones((4, 1)), np.arange(3))
+        paired_differences(np.ones((3, 1)), np.ones((4, 1)), np.arange(3))
 
 
 def test_score_that_tells_right_from_wrong_is_calibrated_and_ranks_them() -> None:
     random = np.random.default_rng(0)
     chance = random.uniform(0, 1, 4000)
     right = random.uniform(0, 1, 4000) < 1 / (1 + np.exp(-12 * (chance - 0.5)))
-    found = calibrate(chance, right, findable=4000, clusters=alone(4000))
+    found = calibrate_scores(
+        chance, right, queries_with_positive=4000, clusters=singleton_clusters(4000)
+    )
     assert found.calibration_error is not None
     assert found.calibration_error < 0.03
     assert found.auroc is not None
@@ -176,21 +182,26 @@ def test_score_that_tells_right_from_wrong_is_calibrated_and_ranks_them() -> Non
 def test_score_that_says_nothing_is_found_out() -> None:
     random = np.random.default_rng(1)
     right = random.uniform(0, 1, 2000) < 0.5
-    found = calibrate(random.uniform(0, 1, 2000), right, findable=2000, clusters=alone(2000))
+    found = calibrate_scores(
+        random.uniform(0, 1, 2000),
+        right,
+        queries_with_positive=2000,
+        clusters=singleton_clusters(2000),
+    )
     assert found.auroc == pytest.approx(0.5, abs=0.05)
     assert found.recall_at_99_precision < 0.02
 
 
 def test_calibration_error_is_unknown_where_there_is_too_little_to_learn_from() -> None:
-    found = calibrate(np.linspace(0, 1, 10), np.ones(10, bool), 10, alone(10))
+    found = calibrate_scores(np.linspace(0, 1, 10), np.ones(10, bool), 10, singleton_clusters(10))
     assert (found.auroc, found.calibration_error, found.recall_at_99_precision) == (None, None, 1.0)
 
 
 def test_all_figures_of_a_ranking_come_together() -> None:
     scores = np.array([[0.9, 0.1, 0.1], [0.2, 0.1, 0.1], [0.3, 0.1, 0.1], [0.4, 0.1, 0.1]])
     metres = np.array([[3.0, 9, 9], [100, 9, 9], [200, 9, 9], [np.nan, 9, 9]])
-    found = measure(
-        RANKED, POSITIVES, alone(4), scores=scores.astype(np.float32), metres=metres
+    found = compute_metrics(
+        RANKED, POSITIVES, singleton_clusters(4), scores=scores.astype(np.float32), metres=metres
     ).as_json()
     assert found["recall"] == {"1": 0.25}, "no k beyond the rankings' depth"
     assert found["recall_findable"] == {"1": pytest.approx(1 / 3)}
@@ -205,7 +216,7 @@ def test_all_figures_of_a_ranking_come_together() -> None:
 
 
 def test_figures_of_queries_without_any_positive_are_unknown_and_still_json() -> None:
-    found = measure(RANKED, indices([], [], [], []), alone(4)).as_json()
+    found = compute_metrics(RANKED, indices([], [], [], []), singleton_clusters(4)).as_json()
     assert found["recall"] == {"1": 0.0}
     assert found["recall_findable"] == {"1": None}
     assert found["mean_average_precision"]["mean"] is None

@@ -13,17 +13,17 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch.nn.functional import normalize
 
-from shared.recipes import RECIPES, Recipe
-from shared.vision.explain import explain
-from shared.vision.overlay import AGAINST, FOR, draw_overlay
-from shared.vision.pooling import average
+from shared.recipes import EXTRACTOR_CONFIGS, ExtractorConfig
+from shared.vision.explain import explain_similarities
+from shared.vision.overlay import NEGATIVE_COLOUR, POSITIVE_COLOUR, draw_overlay
+from shared.vision.pooling import average_pooling
 from shared.vision.vlad import soft_vlad, vlad
-from shared.vision.vocabulary import Centres, check_centres
+from shared.vision.vocabulary import ClusterCentres, parse_centres
 
 WIDTH, PATCHES, CLUSTERS = 24, 60, 7
-VLAD = RECIPES["test-tiny-vlad"]
+VLAD = EXTRACTOR_CONFIGS["test-tiny-vlad"]
 SOFT = replace(VLAD, aggregator="soft-vlad", temperature=3.0)
-MEAN = RECIPES["test-tiny-avg"]
+MEAN = EXTRACTOR_CONFIGS["test-tiny-avg"]
 
 
 def features(seed: int, count: int = PATCHES) -> torch.Tensor:
@@ -32,14 +32,16 @@ def features(seed: int, count: int = PATCHES) -> torch.Tensor:
 
 
 @pytest.fixture
-def centres() -> Centres:
-    return check_centres((0.5 * features(99, CLUSTERS)).numpy())
+def centres() -> ClusterCentres:
+    return parse_centres((0.5 * features(99, CLUSTERS)).numpy())
 
 
-def described(recipe: Recipe, photo: torch.Tensor, centres: Centres) -> torch.Tensor:
+def described(
+    recipe: ExtractorConfig, photo: torch.Tensor, centres: ClusterCentres
+) -> torch.Tensor:
     c = torch.from_numpy(centres.array)
     if recipe.aggregator == "avg":
-        return average(photo[None])[0]
+        return average_pooling(photo[None])[0]
     if recipe.aggregator == "vlad":
         return vlad(photo[None], c)[0]
     return soft_vlad(photo[None], c, recipe.temperature)[0]
@@ -47,13 +49,15 @@ def described(recipe: Recipe, photo: torch.Tensor, centres: Centres) -> torch.Te
 
 @pytest.mark.parametrize("recipe", [VLAD, SOFT, MEAN], ids=lambda recipe: recipe.aggregator)
 def test_shares_of_patches_and_of_clusters_add_up_to_the_cosine(
-    recipe: Recipe, centres: Centres
+    recipe: ExtractorConfig, centres: ClusterCentres
 ) -> None:
     query = features(1)
     query[5] = 0  # a patch without direction
     rows = torch.stack([described(recipe, features(seed), centres) for seed in (2, 3, 4)])
     cosines = (rows @ described(recipe, query, centres)).numpy()
-    found = explain(recipe, query, centres if recipe.needs_vocabulary else None, rows.numpy())
+    found = explain_similarities(
+        recipe, query, centres if recipe.needs_vocabulary else None, rows.numpy()
+    )
     assert len(found) == len(cosines)
     for shares, cosine in zip(found, cosines, strict=True):
         assert shares.patches.shape == (PATCHES,)
@@ -67,47 +71,51 @@ def test_shares_of_patches_and_of_clusters_add_up_to_the_cosine(
             assert shares.clusters is None
 
 
-def test_share_of_a_cluster_is_the_product_of_its_two_blocks(centres: Centres) -> None:
+def test_share_of_a_cluster_is_the_product_of_its_two_blocks(centres: ClusterCentres) -> None:
     query, other = (described(VLAD, features(seed), centres) for seed in (1, 2))
-    (shares,) = explain(VLAD, features(1), centres, other[None].numpy())
+    (shares,) = explain_similarities(VLAD, features(1), centres, other[None].numpy())
     blocks = (query * other).reshape(CLUSTERS, WIDTH).sum(dim=1)
     assert shares.clusters == pytest.approx(blocks.numpy(), abs=1e-6)
 
 
 @pytest.mark.parametrize("recipe", [VLAD, SOFT], ids=lambda recipe: recipe.aggregator)
-def test_weighted_shares_add_up_to_the_weighted_score(recipe: Recipe, centres: Centres) -> None:
+def test_weighted_shares_add_up_to_the_weighted_score(
+    recipe: ExtractorConfig, centres: ClusterCentres
+) -> None:
     words = (0.0, 2.0, 0.5, 1.0, 0.0, 3.0, 0.1)
     query, other = (described(recipe, features(seed), centres) for seed in (1, 2))
     weighted = normalize(query * torch.tensor(words).repeat_interleave(WIDTH), dim=0)
-    (shares,) = explain(recipe, features(1), centres, other[None].numpy(), words)
+    (shares,) = explain_similarities(recipe, features(1), centres, other[None].numpy(), words)
     assert shares.clusters is not None
     assert shares.clusters[[0, 4]].tolist() == [0, 0]
     for kind in (shares.clusters, shares.patches):
         assert kind.sum() == pytest.approx(float(weighted @ other), abs=2e-6)
 
 
-def test_cluster_that_one_photo_does_not_use_has_no_share(centres: Centres) -> None:
+def test_cluster_that_one_photo_does_not_use_has_no_share(centres: ClusterCentres) -> None:
     near = normalize(torch.from_numpy(centres.array[:2]).repeat(5, 1) + 0.05 * features(7, 10))
     row = described(VLAD, features(2), centres)
-    (shares,) = explain(VLAD, near, centres, row[None].numpy())
+    (shares,) = explain_similarities(VLAD, near, centres, row[None].numpy())
     assert shares.clusters is not None
     assert np.flatnonzero(shares.clusters).tolist() == [0, 1]
 
 
 def test_photo_without_any_direction_explains_nothing_and_divides_by_nothing(
-    centres: Centres,
+    centres: ClusterCentres,
 ) -> None:
     row = described(VLAD, features(2), centres)
     blank = torch.zeros(PATCHES, WIDTH)
-    (by_clusters,) = explain(VLAD, blank, centres, row[None].numpy())
-    (by_patches,) = explain(MEAN, blank, None, features(3, 1).numpy())
+    (by_clusters,) = explain_similarities(VLAD, blank, centres, row[None].numpy())
+    (by_patches,) = explain_similarities(MEAN, blank, None, features(3, 1).numpy())
     assert not by_clusters.patches.any()
     assert not by_patches.patches.any()
 
 
 def test_descriptor_that_is_no_sum_is_refused() -> None:
     with pytest.raises(ValueError, match="gem"):
-        explain(replace(MEAN, aggregator="gem"), features(1), None, features(2, 1).numpy())
+        explain_similarities(
+            replace(MEAN, aggregator="gem"), features(1), None, features(2, 1).numpy()
+        )
 
 
 def pixels_of(overlay: str) -> NDArray[np.uint8]:
@@ -125,8 +133,8 @@ def test_overlay_has_a_pixel_for_each_patch_and_is_clear_where_nothing_is_added(
     assert full == 0.4
     assert pixels.shape == (2, 3, 4)
     assert pixels[..., 3].tolist() == [[255, 0, 128], [64, 0, 0]]
-    assert tuple(pixels[0, 0, :3]) == FOR
-    assert tuple(pixels[0, 2, :3]) == AGAINST
+    assert tuple(pixels[0, 0, :3]) == POSITIVE_COLOUR
+    assert tuple(pixels[0, 2, :3]) == NEGATIVE_COLOUR
 
 
 def test_overlay_of_nothing_is_clear() -> None:

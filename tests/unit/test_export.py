@@ -14,8 +14,8 @@ import pytest
 from rich.progress import Progress
 
 from services.cli.export_descriptors import export_descriptors
-from services.cli.export_geojson import write_geojson
-from services.cli.export_pairs import PairNames, write_pairs
+from services.cli.export_geojson import export_geojson
+from services.cli.export_pairs import PairNames, export_pairs
 from shared.client import Client
 from shared.errors import Conflict, InvalidRequest, NotFound
 from tests.unit.test_client import FakeServer, running_server
@@ -68,7 +68,7 @@ def refuse(server: FakeServer, code: str) -> None:
 
 def pairs_of(client: Client, names: PairNames = PairNames.FILENAME) -> tuple[str, dict[str, Any]]:
     file = io.BytesIO()
-    report = write_pairs(client, file, 2, names, Progress(disable=True))
+    report = export_pairs(client, file, 2, names, Progress(disable=True))
     return file.getvalue().decode(), report
 
 
@@ -115,7 +115,7 @@ def test_geojson_has_longitude_first_and_an_estimate_for_each_query(
     )
     will_find(server, "a.jpg", latitude=45.5, longitude=7.25, in_map=True)
     file = io.BytesIO()
-    report = write_geojson(client, file, True, Progress(disable=True))
+    report = export_geojson(client, file, True, Progress(disable=True))
     found = json.loads(file.getvalue())
     assert found["type"] == "FeatureCollection"
     one, query, estimate = found["features"]
@@ -131,7 +131,7 @@ def test_geojson_of_an_empty_map_is_an_empty_collection(server: FakeServer, clie
     server.will_answer(200, {"total_images": 0})
     will_list(server)
     file = io.BytesIO()
-    write_geojson(client, file, False, Progress(disable=True))
+    export_geojson(client, file, False, Progress(disable=True))
     assert json.loads(file.getvalue()) == {"type": "FeatureCollection", "features": []}
 
 

@@ -15,11 +15,16 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from shared.errors import Misconfigured
-from shared.recipes import RECIPES, get_recipe
-from shared.vision.extractors import SHIPPED, Extractor, choose_device, spec_fingerprint
-from shared.vision.pooling import average, gem
+from shared.recipes import EXTRACTOR_CONFIGS, get_extractor_config
+from shared.vision.extractors import (
+    SHIPPED_VOCABULARIES,
+    Extractor,
+    choose_device,
+    spec_fingerprint,
+)
+from shared.vision.pooling import average_pooling, gem_pooling
 from shared.vision.vlad import soft_vlad, vlad
-from shared.vision.vocabulary import check_centres, decode_centres
+from shared.vision.vocabulary import decode_centres, parse_centres
 
 CPU = torch.device("cpu")
 DAISY = 985  # of ImageNet's classes
@@ -27,12 +32,12 @@ DAISY = 985  # of ImageNet's classes
 
 @pytest.fixture(scope="module")
 def efficientnet() -> Extractor:
-    return Extractor(RECIPES["efficientnet-lite0-vlad"], CPU)
+    return Extractor(EXTRACTOR_CONFIGS["efficientnet-lite0-vlad"], CPU)
 
 
 @pytest.fixture(scope="module")
 def tiny() -> Extractor:
-    return Extractor(RECIPES["test-tiny-vlad"], CPU)
+    return Extractor(EXTRACTOR_CONFIGS["test-tiny-vlad"], CPU)
 
 
 def package_photo(name: str) -> Image.Image:
@@ -66,19 +71,19 @@ def test_missing_cuda_is_an_error_and_not_a_slow_fallback(
 def test_fingerprint_changes_with_the_vocabulary_and_with_nothing_else(tiny: Extractor) -> None:
     rng = np.random.default_rng(0)
     array = rng.standard_normal((8, 16)).astype(np.float32)
-    first = spec_fingerprint(tiny.spec(check_centres(array)))
-    assert spec_fingerprint(tiny.spec(check_centres(array.copy()))) == first
+    first = spec_fingerprint(tiny.spec(parse_centres(array)))
+    assert spec_fingerprint(tiny.spec(parse_centres(array.copy()))) == first
     array[0, 0] += 1e-3
-    assert spec_fingerprint(tiny.spec(check_centres(array))) != first
+    assert spec_fingerprint(tiny.spec(parse_centres(array))) != first
 
 
 def test_fingerprint_tells_extractors_apart(tiny: Extractor) -> None:
-    average = Extractor(RECIPES["test-tiny-avg"], CPU)
-    assert spec_fingerprint(average.spec(None)) != spec_fingerprint(tiny.spec(None))
+    average_pooling = Extractor(EXTRACTOR_CONFIGS["test-tiny-avg"], CPU)
+    assert spec_fingerprint(average_pooling.spec(None)) != spec_fingerprint(tiny.spec(None))
 
 
 def test_spec_says_the_length_of_the_descriptors_that_are_made(tiny: Extractor) -> None:
-    centres = check_centres(np.random.default_rng(2).standard_normal((5, 16)).astype(np.float32))
+    centres = parse_centres(np.random.default_rng(2).standard_normal((5, 16)).astype(np.float32))
     photos = np.random.default_rng(3).integers(0, 256, (2, 32, 32, 3), dtype=np.uint8)
     rows = tiny.describe(photos, centres)
     assert rows.dtype == np.float32
@@ -100,11 +105,13 @@ def test_specs_of_stored_generations_mean_what_they_meant(efficientnet: Extracto
 
 
 def chosen(options: str) -> Extractor:
-    return Extractor(get_recipe(f"test-tiny-vlad:{options}", allow_test_extractors=True), CPU)
+    return Extractor(
+        get_extractor_config(f"test-tiny-vlad:{options}", allow_test_extractors=True), CPU
+    )
 
 
 def test_specs_tell_aggregators_temperatures_and_preprocessings_apart() -> None:
-    centres = check_centres(np.random.default_rng(2).standard_normal((5, 16)).astype(np.float32))
+    centres = parse_centres(np.random.default_rng(2).standard_normal((5, 16)).astype(np.float32))
     specs = [
         chosen(options).spec(None if "gem" in options or "avg" in options else centres)
         for options in (
@@ -123,8 +130,8 @@ AGGREGATIONS: dict[str, Callable[[torch.Tensor, torch.Tensor], torch.Tensor]] = 
     "aggregator=soft-vlad,temperature=3.5": lambda features, centres: soft_vlad(
         features, centres, 3.5
     ),
-    "aggregator=gem": lambda features, _centres: gem(features),
-    "aggregator=avg": lambda features, _centres: average(features),
+    "aggregator=gem": lambda features, _centres: gem_pooling(features),
+    "aggregator=avg": lambda features, _centres: average_pooling(features),
 }
 
 
@@ -132,7 +139,7 @@ AGGREGATIONS: dict[str, Callable[[torch.Tensor, torch.Tensor], torch.Tensor]] = 
 def test_the_aggregator_of_the_name_is_at_work(options: str) -> None:
     made = chosen(options)
     array = np.random.default_rng(2).standard_normal((5, 16)).astype(np.float32)
-    centres = check_centres(array) if made.recipe.needs_vocabulary else None
+    centres = parse_centres(array) if made.recipe.needs_vocabulary else None
     photos = np.random.default_rng(3).integers(0, 256, (2, 32, 32, 3), dtype=np.uint8)
     expected = AGGREGATIONS[options](made.features(photos), torch.from_numpy(array))
     assert np.array_equal(made.describe(photos, centres), expected.numpy())
@@ -145,7 +152,7 @@ def test_features_that_are_not_finite_make_a_row_of_nan_and_harm_no_other(
 ) -> None:
     made = chosen(options)
     array = np.random.default_rng(2).standard_normal((5, 16)).astype(np.float32)
-    centres = check_centres(array) if made.recipe.needs_vocabulary else None
+    centres = parse_centres(array) if made.recipe.needs_vocabulary else None
     photos = np.random.default_rng(3).integers(0, 256, (3, 32, 32, 3), dtype=np.uint8)
     sound = made.describe(photos, centres)
     features = made.features(photos).clone()
@@ -206,11 +213,11 @@ def test_features_are_the_stride_16_map_of_a_network_that_recognises_a_daisy(
 ) -> None:
     import timm
 
-    from shared.vision.backbones.efficientnet_lite0 import _in_order, weights_path
+    from shared.vision.backbones.efficientnet_lite0 import _rename_tensors, weights_path
 
     model = timm.create_model("tf_efficientnet_lite0", pretrained=False)
     state = torch.load(weights_path(), map_location="cpu", weights_only=True)
-    model.load_state_dict(_in_order(state, model))
+    model.load_state_dict(_rename_tensors(state, model))
     model.eval()
     flower = pixels_of(efficientnet, [package_photo("flower.jpg")])
     batch = torch.from_numpy(flower).permute(0, 3, 1, 2).float() / 127.5 - 1
@@ -255,7 +262,7 @@ def test_shipped_vocabulary_is_the_file_that_its_provenance_describes(
 ) -> None:
     shipped = efficientnet.shipped_vocabulary()
     assert shipped is not None
-    centres = decode_centres((SHIPPED / "efficientnet-lite0.npy").read_bytes())
+    centres = decode_centres((SHIPPED_VOCABULARIES / "efficientnet-lite0.npy").read_bytes())
     assert hashlib.sha256(centres.array.tobytes()).hexdigest() == shipped[1]["sha256"]
     assert shipped[1]["clusters"] == centres.clusters
 

@@ -8,20 +8,20 @@ from torch.nn.functional import normalize
 
 from shared.errors import Unprocessable
 from shared.vision import batches as batches_module
-from shared.vision.batches import Batches, PointsInMemory
-from shared.vision.fit import PATCHES_PER_CLUSTER, Fit
-from shared.vision.vlad import assign
+from shared.vision.batches import InMemoryPoints, PointBatches
+from shared.vision.fit import PATCHES_PER_CLUSTER, VocabularyFit
+from shared.vision.vlad import assign_clusters
 from tests.support.points import clustered_points, full_kmeans, mean_cosine, unit_points
 
 
-def finish(fit: Fit) -> torch.Tensor:
+def finish(fit: VocabularyFit) -> torch.Tensor:
     while not fit.done:
         fit.step()
     return torch.from_numpy(fit.centres().array)
 
 
-def fit_of(points: torch.Tensor, clusters: int, seed: int) -> Fit:
-    return Fit(PointsInMemory(points), clusters, seed)
+def fit_of(points: torch.Tensor, clusters: int, seed: int) -> VocabularyFit:
+    return VocabularyFit(InMemoryPoints(points), clusters, seed)
 
 
 @pytest.fixture
@@ -43,7 +43,7 @@ def test_separated_clusters_are_found() -> None:
     generator = torch.Generator().manual_seed(4)
     noise = 0.05 * torch.randn(5, 400, 5, generator=generator)
     points = normalize((torch.eye(5)[:, None] + noise).flatten(0, 1), dim=1)
-    labels = assign(points, finish(fit_of(points, 5, 0))).reshape(5, 400)
+    labels = assign_clusters(points, finish(fit_of(points, 5, 0))).reshape(5, 400)
     assert all(len(set(group.tolist())) == 1 for group in labels)
     assert len(set(labels[:, 0].tolist())) == 5
 
@@ -51,7 +51,7 @@ def test_separated_clusters_are_found() -> None:
 def test_centres_are_the_means_of_their_points() -> None:
     points = clustered_points(7, 8_000, 16, 12)
     centres = finish(fit_of(points, 8, 0))
-    labels = assign(points, centres)
+    labels = assign_clusters(points, centres)
     means = torch.stack([points[labels == k].mean(dim=0) for k in range(len(centres))])
     assert float((means - centres).norm(dim=1).max()) < 0.02, "they have settled"
     assert float(centres.norm(dim=1).max()) < 0.99, "and are not normalised again"
@@ -107,13 +107,13 @@ def test_no_points_are_an_error_that_says_so() -> None:
 def test_a_shuffled_pass_has_every_batch_once_and_reads_no_block_twice() -> None:
     read: list[int] = []
 
-    class Counted(PointsInMemory):
+    class Counted(InMemoryPoints):
         def read(self, begin: int, end: int) -> torch.Tensor:
             read.append(end - begin)
             return super().read(begin, end)
 
     points = unit_points(1, 10_000, 16)
-    batches = Batches(Counted(points), 1024)
+    batches = PointBatches(Counted(points), 1024)
     order = batches.shuffled([0, 1])
     assert sorted(order) == list(range(10))
     assert order not in (sorted(order), batches.shuffled([0, 2]))

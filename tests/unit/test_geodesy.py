@@ -11,11 +11,11 @@ from hypothesis import example, given
 
 from shared.geodesy import (
     EARTH_RADIUS_M,
-    centre_of,
     distance_m,
     distances_m,
-    latitude_band,
-    without_dust,
+    flush_to_zero,
+    latitude_bounds,
+    weighted_centroid,
 )
 from tests.support.photo_filters import HALF_EARTH_M, metres, points
 
@@ -67,9 +67,9 @@ def test_many_distances_at_once_are_those_of_one_at_a_time() -> None:
 
 @given(points, points)
 def test_nothing_within_the_radius_lies_outside_its_band(one: Point, other: Point) -> None:
-    south, north = latitude_band(one[0], distance_m(*one, *other))
+    south, north = latitude_bounds(one[0], distance_m(*one, *other))
     assert south <= other[0] <= north
-    south, north = latitude_band(one[0], 100_000)
+    south, north = latitude_bounds(one[0], 100_000)
     assert north - south == pytest.approx(200_000 / DEGREE_M)
 
 
@@ -87,15 +87,21 @@ def test_the_centre_of_points_lies_between_them(
     spots: list[Point], weights: list[float], expected: tuple[float, float | None]
 ) -> None:
     latitudes, longitudes = np.array(spots, dtype=np.float64).T
-    latitude, longitude = centre_of(latitudes, longitudes, np.array(weights, dtype=np.float64))
+    latitude, longitude = weighted_centroid(
+        latitudes, longitudes, np.array(weights, dtype=np.float64)
+    )
     assert latitude == pytest.approx(expected[0], abs=1e-9)
     if expected[1] is not None:
         assert abs(longitude) == pytest.approx(expected[1], abs=1e-9)
 
 
 def test_dust_is_the_zero_that_was_meant() -> None:
-    assert [without_dust(degrees) for degrees in (5e-324, -1e-13, 0.0)] == [0, 0, 0]
-    assert [without_dust(degrees) for degrees in (-1e-12, 45.07, -180.0)] == [-1e-12, 45.07, -180.0]
+    assert [flush_to_zero(degrees) for degrees in (5e-324, -1e-13, 0.0)] == [0, 0, 0]
+    assert [flush_to_zero(degrees) for degrees in (-1e-12, 45.07, -180.0)] == [
+        -1e-12,
+        45.07,
+        -180.0,
+    ]
 
 
 def test_the_radius_is_that_of_the_ellipsoids_mean() -> None:

@@ -20,9 +20,9 @@ from hypothesis import strategies as st
 from services.search import answer as answer_module
 from services.search import device as device_module
 from services.search import gpu
-from services.search.answer import Question
-from services.search.device import Residency, open_device
-from services.search.gpu import Asked, Device, DeviceFailed, Unfit
+from services.search.answer import SearchOptions
+from services.search.device import GpuResidency, open_search_device
+from services.search.gpu import GpuDevice, GpuError, GpuQuery, GpuUnsupported
 from services.search.snapshot import Snapshot
 from shared.errors import Misconfigured
 from shared.search_protocol import Mode
@@ -42,19 +42,19 @@ KINDS = ("float16", "int8")
 
 @pytest.fixture(autouse=True)
 def always_worth_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(answer_module, "worth_codes", lambda selected, k: True)
+    monkeypatch.setattr(answer_module, "sign_codes_pay_off", lambda selected, k: True)
 
 
-def device_with(free_bytes: float = math.inf) -> Device:
-    return Device(torch.device("cpu"), lambda: free_bytes, 0)
+def device_with(free_bytes: float = math.inf) -> GpuDevice:
+    return GpuDevice(torch.device("cpu"), lambda: free_bytes, 0)
 
 
 def on_device(snapshot: Snapshot, kind: str) -> Snapshot:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(gpu, "KINDS", (kind,))
-        found = Residency(device_with()).fill(snapshot)
-    assert found.resident is not None
-    assert found.resident.kind == kind
+        patch.setattr(gpu, "ROW_FORMATS", (kind,))
+        found = GpuResidency(device_with()).update(snapshot)
+    assert found.gpu_snapshot is not None
+    assert found.gpu_snapshot.row_format == kind
     return found
 
 
@@ -63,7 +63,7 @@ def on_device(snapshot: Snapshot, kind: str) -> Snapshot:
 def test_answers_equal_brute_force_with_order_and_ties(case: Case, kind: str) -> None:
     pieces = min(case.pieces, len(case.rows))
     snapshot = on_device(snapshot_of(case.rows, pieces, "int8"), kind)
-    found = answer(snapshot, case.query, case.asked, Question(case.k, case.min_score))
+    found = answer(snapshot, case.query, case.asked, SearchOptions(case.k, case.min_score))
     assert hits_of(found) == case.expected
     if case.asked.any() and case.query.any():
         assert found.certificate == "bound"
@@ -78,11 +78,11 @@ def test_no_score_is_further_off_than_its_bound(kind: str, dimension: int) -> No
     rows[1] = 1 / math.sqrt(dimension)
     rows[2] = 0
     snapshot = on_device(snapshot_of(rows, 2, "int8"), kind)
-    resident = snapshot.resident
+    resident = snapshot.gpu_snapshot
     assert resident is not None
     queries = np.stack([rows[0], rows[1], rows[5] * np.float32(1e-20), -rows[9]])
     chunks = list(resident.chunks.values())
-    scores, bounds = gpu._scores(chunks, kind, queries, torch.device("cpu"))
+    scores, bounds = gpu._score_all_rows(chunks, kind, queries, torch.device("cpu"))
     unit = queries.astype(np.float64)
     unit /= np.linalg.norm(unit, axis=1, keepdims=True)
     errors = np.abs(scores.numpy() - unit @ rows.astype(np.float64).T)
@@ -94,51 +94,53 @@ def test_no_score_is_further_off_than_its_bound(kind: str, dimension: int) -> No
 def test_queries_of_a_batch_do_not_see_each_other(kind: str) -> None:
     rows = places(5, 120, DIMENSION)
     snapshot = on_device(snapshot_of(rows, by="int8"), kind)
-    assert snapshot.resident is not None
+    assert snapshot.gpu_snapshot is not None
     rng = np.random.default_rng(1)
     batch = [
-        Asked(rows[number], rng.random(120) < 0.7, k, least)
+        GpuQuery(rows[number], rng.random(120) < 0.7, k, least)
         for number, k, least in ((3, 1, -math.inf), (7, 20, 0.1), (50, 400, -math.inf))
     ]
-    together = snapshot.resident.candidates(batch)
+    together = snapshot.gpu_snapshot.candidates(batch)
     for asked, found in zip(batch, together, strict=True):
-        (alone,) = snapshot.resident.candidates([asked])
+        (alone,) = snapshot.gpu_snapshot.candidates([asked])
         np.testing.assert_array_equal(found.rows, alone.rows)
         assert found.floor == pytest.approx(alone.floor, abs=1e-6)
-        assert asked.rows[found.rows].all()
+        assert asked.row_mask[found.rows].all()
 
 
 def test_only_new_chunks_are_copied_to_the_device(monkeypatch: pytest.MonkeyPatch) -> None:
     rows = places(6, 90, DIMENSION)
     whole = snapshot_of(rows, 3, "int8")
     first = replace(whole, chunks=whole.chunks[:2])
-    residency = Residency(device_with())
-    old = residency.fill(first)
+    residency = GpuResidency(device_with())
+    old = residency.update(first)
     copied: list[int] = []
-    make = Device._half
+    make = GpuDevice._copy_as_float16
 
-    def counted(self: Device, some: Any) -> Any:
+    def counted(self: GpuDevice, some: Any) -> Any:
         copied.append(len(some))
         return make(self, some)
 
-    monkeypatch.setattr(Device, "_half", counted)
-    new = residency.carry(whole, old)
+    monkeypatch.setattr(GpuDevice, "_copy_as_float16", counted)
+    new = residency.carry_over(whole, old)
     assert copied == [30]
-    found = answer(new, rows[80], np.ones(90, bool), Question(5))
+    found = answer(new, rows[80], np.ones(90, bool), SearchOptions(5))
     assert hits_of(found) == brute_force(rows, rows[80], 5, np.ones(90, bool))
-    monkeypatch.setattr(device_module, "QUICK_BYTES", 0)
-    assert residency.carry(whole, old).resident is None, "many rows are copied while none waits"
-    assert residency.wants(residency.carry(whole, old))
+    monkeypatch.setattr(device_module, "MAX_SYNC_COPY_BYTES", 0)
+    assert residency.carry_over(whole, old).gpu_snapshot is None, (
+        "many rows are copied while none waits"
+    )
+    assert residency.needs_update(residency.carry_over(whole, old))
 
 
 def test_memory_of_a_forgotten_snapshot_and_of_merged_chunks_is_free() -> None:
     whole = snapshot_of(places(6, 90, DIMENSION), 3, "int8")
-    residency = Residency(device_with())
-    old = residency.fill(whole)
-    assert old.resident is not None
-    resident = weakref.ref(old.resident)
-    tensors = [weakref.ref(chunk.numbers) for chunk in old.resident.chunks.values()]
-    new = residency.carry(replace(whole, chunks=whole.chunks[1:]), old)
+    residency = GpuResidency(device_with())
+    old = residency.update(whole)
+    assert old.gpu_snapshot is not None
+    resident = weakref.ref(old.gpu_snapshot)
+    tensors = [weakref.ref(chunk.numbers) for chunk in old.gpu_snapshot.chunks.values()]
+    new = residency.carry_over(replace(whole, chunks=whole.chunks[1:]), old)
     del old
     gc.collect()
     assert [tensor() is None for tensor in tensors] == [True, False, False]
@@ -150,17 +152,17 @@ def test_memory_of_a_forgotten_snapshot_and_of_merged_chunks_is_free() -> None:
 
 def test_rows_that_do_not_fit_are_searched_by_the_cpu() -> None:
     snapshot = snapshot_of(places(6, 90, DIMENSION), 3, "int8")
-    residency = Residency(device_with(1000))
-    found = residency.fill(snapshot)
-    assert found.resident is None
-    assert not residency.wants(found), "it is tried again later, not at every look"
-    assert not residency.lacks_int8(found)
+    residency = GpuResidency(device_with(1000))
+    found = residency.update(snapshot)
+    assert found.gpu_snapshot is None
+    assert not residency.needs_update(found), "it is tried again later, not at every look"
+    assert not residency.needs_int8_codes(found)
     unbounded = replace(snapshot, chunks=tuple(replace(c, int8=None) for c in snapshot.chunks))
-    little = Residency(device_with(90_000))
-    assert little.fill(unbounded).resident is None
-    assert little.lacks_int8(unbounded), "a byte for each number would fit"
-    assert little.fill(snapshot).resident is not None
-    assert not Residency(device_with(1000)).lacks_int8(unbounded)
+    little = GpuResidency(device_with(90_000))
+    assert little.update(unbounded).gpu_snapshot is None
+    assert little.needs_int8_codes(unbounded), "a byte for each number would fit"
+    assert little.update(snapshot).gpu_snapshot is not None
+    assert not GpuResidency(device_with(1000)).needs_int8_codes(unbounded)
 
 
 def out_of_memory(*_: object, **__: object) -> Any:
@@ -171,23 +173,23 @@ def test_device_out_of_memory_when_asked_leaves_the_query_to_the_cpu(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     rows = places(6, 90, DIMENSION)
-    residency = Residency(device_with())
-    snapshot = residency.fill(snapshot_of(rows, by="int8"))
+    residency = GpuResidency(device_with())
+    snapshot = residency.update(snapshot_of(rows, by="int8"))
     everything = np.ones(90, bool)
     with monkeypatch.context() as patch, caplog.at_level(logging.ERROR):
-        patch.setattr(gpu, "_scores", out_of_memory)
-        found = answer(snapshot, rows[3], everything, Question(7))
+        patch.setattr(gpu, "_score_all_rows", out_of_memory)
+        found = answer(snapshot, rows[3], everything, SearchOptions(7))
     assert hits_of(found) == brute_force(rows, rows[3], 7, everything)
     assert "searched by the CPU: CUDA out of memory" in caplog.text
     (status,) = residency.status([snapshot])
     assert status.failure == "CUDA out of memory"
     assert status.generations == {}
-    assert residency.wants(snapshot), "what failed is taken from the device"
-    without = residency.fill(snapshot)
-    assert without.resident is None
-    assert not residency.wants(without), "and tried again after a while"
+    assert residency.needs_update(snapshot), "what failed is taken from the device"
+    without = residency.update(snapshot)
+    assert without.gpu_snapshot is None
+    assert not residency.needs_update(without), "and tried again after a while"
     monkeypatch.setattr(residency, "_again", {})
-    (status,) = residency.status([residency.fill(without)])
+    (status,) = residency.status([residency.update(without)])
     assert status.failure is None
     assert status.generations == {snapshot.generation_id: "float16"}
     assert status.resident_bytes >= 90 * DIMENSION * 2
@@ -197,45 +199,45 @@ def test_device_out_of_memory_when_loading_is_told_and_tried_again_later(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     snapshot = snapshot_of(places(6, 90, DIMENSION), by="int8")
-    residency = Residency(device_with())
+    residency = GpuResidency(device_with())
     with monkeypatch.context() as patch, caplog.at_level(logging.ERROR):
-        patch.setattr(Device, "_half", out_of_memory)
-        assert residency.fill(snapshot).resident is None
+        patch.setattr(GpuDevice, "_copy_as_float16", out_of_memory)
+        assert residency.update(snapshot).gpu_snapshot is None
     assert "is searched by the CPU for now: CUDA out of memory" in caplog.text
     (status,) = residency.status([snapshot])
     assert status.failure == "CUDA out of memory"
-    assert not residency.wants(snapshot)
+    assert not residency.needs_update(snapshot)
     monkeypatch.setattr(residency, "_again", {})
-    assert residency.wants(snapshot)
+    assert residency.needs_update(snapshot)
 
 
 def test_dense_mode_never_asks_the_device(monkeypatch: pytest.MonkeyPatch) -> None:
     rows = places(6, 90, DIMENSION)
     snapshot = on_device(snapshot_of(rows, by="int8"), "float16")
-    monkeypatch.setattr(gpu, "_scores", out_of_memory)
-    found = answer(snapshot, rows[3], np.ones(90, bool), Question(7, mode=Mode.DENSE))
+    monkeypatch.setattr(gpu, "_score_all_rows", out_of_memory)
+    found = answer(snapshot, rows[3], np.ones(90, bool), SearchOptions(7, mode=Mode.DENSE))
     assert found.certificate == "exhaustive"
 
 
 def test_device_that_adds_up_carelessly_is_found_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    device_with().trial()
-    exact = gpu._half_products
+    device_with().self_test()
+    exact = gpu._float16_products
 
     def in_float16(chunk: Any, columns: Any) -> Any:
         return exact(chunk, columns).half().double()
 
-    monkeypatch.setattr(gpu, "_half_products", in_float16)
-    with pytest.raises(Unfit, match="less exactly"):
-        device_with().trial()
+    monkeypatch.setattr(gpu, "_float16_products", in_float16)
+    with pytest.raises(GpuUnsupported, match="less exactly"):
+        device_with().self_test()
 
 
 def test_device_failures_are_told_from_other_errors(monkeypatch: pytest.MonkeyPatch) -> None:
     snapshot = on_device(snapshot_of(places(6, 90, DIMENSION), by="int8"), "float16")
-    assert snapshot.resident is not None
-    monkeypatch.setattr(gpu, "_scores", out_of_memory)
-    with pytest.raises(DeviceFailed, match="out of memory"):
-        snapshot.resident.candidates(
-            [Asked(np.ones(DIMENSION, np.float32), np.ones(90, bool), 1, -math.inf)]
+    assert snapshot.gpu_snapshot is not None
+    monkeypatch.setattr(gpu, "_score_all_rows", out_of_memory)
+    with pytest.raises(GpuError, match="out of memory"):
+        snapshot.gpu_snapshot.candidates(
+            [GpuQuery(np.ones(DIMENSION, np.float32), np.ones(90, bool), 1, -math.inf)]
         )
 
 
@@ -247,15 +249,15 @@ def test_without_a_gpu_search_uses_the_cpu_or_says_what_is_missing(
     driver = tmp_path / "driver"
     if sees_driver:
         driver.touch()
-    monkeypatch.setattr(device_module, "DRIVERS", (driver,))
-    assert open_device("auto") is None
-    assert open_device("cpu") is None
+    monkeypatch.setattr(device_module, "DRIVER_PATHS", (driver,))
+    assert open_search_device("auto") is None
+    assert open_search_device("cpu") is None
     with pytest.raises(Misconfigured, match="no CUDA device"):
-        open_device("cuda")
+        open_search_device("cuda")
 
 
 def test_without_pytorch_search_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    assert open_device("auto") is None
+    assert open_search_device("auto") is None
     with pytest.raises(Misconfigured, match="search-gpu"):
-        open_device("cuda")
+        open_search_device("cuda")

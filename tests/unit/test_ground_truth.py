@@ -11,30 +11,32 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from shared.datasets import recall
-from shared.datasets.distances import metres_apart
+from shared.datasets.distances import pairwise_distances_m
 from shared.datasets.ground_truth import find_positives
-from shared.datasets.recall import true_positives
-from shared.datasets.rules import Rule, parse_rule
-from shared.datasets.shots import Shot
+from shared.datasets.recall import positives_within
+from shared.datasets.rules import PositiveRule, parse_rule
+from shared.datasets.shots import DatasetPhoto
 from shared.errors import InvalidRequest
 from shared.geodesy import distance_m
 
 
-def shot(**said: object) -> Shot:
-    return Shot(Path("photo.jpg"), "photo.jpg", **said)  # type: ignore[arg-type]
+def shot(**said: object) -> DatasetPhoto:
+    return DatasetPhoto(Path("photo.jpg"), "photo.jpg", **said)  # type: ignore[arg-type]
 
 
-def at(east: float, north: float, zone: str | None = None, **said: object) -> Shot:
+def at(east: float, north: float, zone: str | None = None, **said: object) -> DatasetPhoto:
     return shot(easting=east, northing=north, zone=zone, **said)
 
 
-def on_earth(latitude: float, longitude: float) -> Shot:
+def on_earth(latitude: float, longitude: float) -> DatasetPhoto:
     """A photo in the zone that it lies in, its metres to the centimetre as file names have them."""
     east, north, number, letter = utm.from_latlon(latitude, longitude)
     return at(round(float(east), 2), round(float(north), 2), f"{number}{letter}")
 
 
-def positives(rule: str, queries: list[Shot], database: list[Shot]) -> list[list[int]]:
+def positives(
+    rule: str, queries: list[DatasetPhoto], database: list[DatasetPhoto]
+) -> list[list[int]]:
     return [found.tolist() for found in find_positives(parse_rule(rule), queries, database)]
 
 
@@ -59,7 +61,7 @@ def test_positives_are_those_of_the_full_matrix(
 ) -> None:
     queries = np.array(asked, np.float64).reshape(-1, 2) / 10 + (480_000.0, 4_880_000.0)
     database = np.array(there, np.float64).reshape(-1, 2) / 10 + (480_000.0, 4_880_000.0)
-    found = true_positives(queries, database, within_m)
+    found = positives_within(queries, database, within_m)
     assert [row.tolist() for row in found] == by_full_matrix(queries, database, within_m)
 
 
@@ -68,33 +70,33 @@ def test_positives_are_the_same_however_few_pairs_are_measured_at_once(
 ) -> None:
     queries = np.random.default_rng(0).uniform(0, 300, (200, 2))
     database = np.random.default_rng(1).uniform(0, 300, (300, 2))
-    monkeypatch.setattr(recall, "CANDIDATES_AT_ONCE", 7)
-    found = true_positives(queries, database)
+    monkeypatch.setattr(recall, "MAX_CANDIDATES_PER_BLOCK", 7)
+    found = positives_within(queries, database)
     assert [row.tolist() for row in found] == by_full_matrix(queries, database, 25.0)
 
 
 def test_query_far_from_a_small_database_has_no_positive() -> None:
     database = np.zeros((5, 2))
-    found = true_positives(np.array([[1e9, -1e9], [0.0, 0.0]]), database, 0.0)
+    found = positives_within(np.array([[1e9, -1e9], [0.0, 0.0]]), database, 0.0)
     assert [row.tolist() for row in found] == [[], [0, 1, 2, 3, 4]]
 
 
 @pytest.mark.parametrize(
     ("text", "rule"),
     [
-        ("radius", Rule("radius", radius_m=25)),
-        ("radius 10", Rule("radius", radius_m=10)),
-        ("Radius 2.5 m", Rule("radius", radius_m=2.5)),
-        ("radius:25m", Rule("radius", radius_m=25)),
-        ("heading", Rule("heading", radius_m=25, degrees=40)),
-        ("heading 25 m 40 deg", Rule("heading", radius_m=25, degrees=40)),
-        ("heading 10 30", Rule("heading", radius_m=10, degrees=30)),
-        ("frames 5", Rule("frames", frames=5)),
-        ("frames 2 in sequence", Rule("frames", frames=2, in_sequence=True)),
-        ("place-label", Rule("place-label")),
+        ("radius", PositiveRule("radius", radius_m=25)),
+        ("radius 10", PositiveRule("radius", radius_m=10)),
+        ("Radius 2.5 m", PositiveRule("radius", radius_m=2.5)),
+        ("radius:25m", PositiveRule("radius", radius_m=25)),
+        ("heading", PositiveRule("heading", radius_m=25, degrees=40)),
+        ("heading 25 m 40 deg", PositiveRule("heading", radius_m=25, degrees=40)),
+        ("heading 10 30", PositiveRule("heading", radius_m=10, degrees=30)),
+        ("frames 5", PositiveRule("frames", frames=5)),
+        ("frames 2 in sequence", PositiveRule("frames", frames=2, same_sequence=True)),
+        ("place-label", PositiveRule("place-label")),
     ],
 )
-def test_rule_is_read_and_written_alike(text: str, rule: Rule) -> None:
+def test_rule_is_read_and_written_alike(text: str, rule: PositiveRule) -> None:
     assert parse_rule(text) == rule
     assert parse_rule(str(rule)) == rule
 
@@ -217,7 +219,7 @@ def test_place_rule_matches_labels_and_a_photo_without_one_matches_none() -> Non
 
 def test_metres_apart_are_straight_in_a_zone_and_over_its_border_those_of_the_earth() -> None:
     west, east = on_earth(48.0, 11.999), on_earth(48.0, 12.001)
-    metres = metres_apart([west, at(0, 0), west], [east, at(3, 4), shot()])
+    metres = pairwise_distances_m([west, at(0, 0), west], [east, at(3, 4), shot()])
     assert metres[0] == pytest.approx(distance_m(48.0, 11.999, 48.0, 12.001), abs=0.02)
     assert metres[1] == 5
     assert np.isnan(metres[2])

@@ -15,8 +15,8 @@ from PIL.ExifTags import GPS, IFD, Base
 
 from shared.errors import Unprocessable
 from shared.intake.photo_header import read_photo_header
-from shared.photo_formats import sniff_media_type
-from shared.vision.decode import THUMBNAIL_PIXELS, decode
+from shared.photo_formats import detect_media_type
+from shared.vision.decode import THUMBNAIL_PIXELS, decode_photo
 from shared.vision.preprocessing import get_preprocessing
 from tests.support.photos import photo_image
 
@@ -58,9 +58,9 @@ def no_decoder(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_heic_is_known_by_its_content() -> None:
-    assert sniff_media_type(PHOTO[:16]) == "image/heic"
-    assert sniff_media_type(b"\0\0\0\x20ftypavif\0\0\0\0") is None
-    assert sniff_media_type(b"\0\0\0\x20ftypisom\0\0\0\0") is None
+    assert detect_media_type(PHOTO[:16]) == "image/heic"
+    assert detect_media_type(b"\0\0\0\x20ftypavif\0\0\0\0") is None
+    assert detect_media_type(b"\0\0\0\x20ftypisom\0\0\0\0") is None
 
 
 def test_header_says_size_and_place_without_the_decoder(no_decoder: None) -> None:
@@ -77,13 +77,13 @@ def test_header_and_decoder_agree_on_what_is_upright(orientation: int) -> None:
     exif[Base.Orientation] = orientation
     data = heic(image, exif=exif.tobytes())
     header = read_photo_header(io.BytesIO(data), PIXELS)
-    with Image.open(io.BytesIO(decode(data, SQUARE, PIXELS).thumbnail)) as thumbnail:
+    with Image.open(io.BytesIO(decode_photo(data, SQUARE, PIXELS).thumbnail)) as thumbnail:
         assert (header.width > header.height) == (thumbnail.width > thumbnail.height)
     assert pillow_heif.open_heif(io.BytesIO(data)).size == (header.width, header.height)
 
 
 def test_pixels_and_thumbnail_are_those_of_the_photo() -> None:
-    decoded = decode(PHOTO, SQUARE, PIXELS)
+    decoded = decode_photo(PHOTO, SQUARE, PIXELS)
     expected = SQUARE.apply(photo_image(1, 320, 200)).astype(float)
     assert np.abs(decoded.pixels - expected).mean() < 12
     with Image.open(io.BytesIO(decoded.thumbnail)) as thumbnail:
@@ -100,14 +100,14 @@ def test_too_many_pixels_are_refused_from_the_header(no_decoder: None) -> None:
 
 def test_an_extractor_without_the_decoder_says_what_to_install(no_decoder: None) -> None:
     with pytest.raises(Unprocessable) as caught:
-        decode(PHOTO, SQUARE, PIXELS)
+        decode_photo(PHOTO, SQUARE, PIXELS)
     assert caught.value.code == "no_heic_decoder"
     assert "placewise[heic]" in caught.value.detail
 
 
 def test_an_avif_that_calls_itself_mif1_is_refused() -> None:
     data = PHOTO.replace(b"ftypheic", b"ftypmif1").replace(b"hvc1", b"av01")
-    assert sniff_media_type(data[:16]) == "image/heic"
+    assert detect_media_type(data[:16]) == "image/heic"
     with pytest.raises(Unprocessable) as caught:
         read_photo_header(io.BytesIO(data), PIXELS)
     assert caught.value.code == "undecodable_photo"
@@ -137,5 +137,5 @@ def test_no_damage_to_a_header_is_more_than_a_refusal() -> None:
 @pytest.mark.parametrize("kept", [0.3, 0.6, 0.9])
 def test_a_photo_that_is_cut_off_can_not_be_decoded(kept: float) -> None:
     with pytest.raises(Unprocessable) as caught:
-        decode(PHOTO[: int(len(PHOTO) * kept)], SQUARE, PIXELS)
+        decode_photo(PHOTO[: int(len(PHOTO) * kept)], SQUARE, PIXELS)
     assert caught.value.code == "undecodable_photo"

@@ -8,10 +8,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from services.search.kernels import EXACT_TERMS, product
-from shared.codes.int8 import MOST, MOST_OF_QUERY, Int8Codes, Int8Query, int8_codes
-from shared.codes.rotation import rotation
-from shared.codes.stored import decode_codes, decode_int8, encode_codes, encode_int8
+from services.search.kernels import INT32_SAFE_TERMS, int8_product
+from shared.codes.int8 import INT8_MAX, QUERY_MAX, Int8Codes, Int8Query, int8_codes
+from shared.codes.rotation import get_rotation
+from shared.codes.stored import (
+    decode_int8_codes,
+    decode_sign_codes,
+    encode_int8_codes,
+    encode_sign_codes,
+)
 
 ANYLOC = 98_304
 
@@ -27,7 +32,7 @@ def adversarial(dimension: int) -> Rows:
     rows[3] = np.where(rng.random(dimension) < 0.5, 1e-6, 1.0)
     rows[4] = rng.standard_cauchy(dimension)
     rows[5, -(-dimension // 8) :] = 0
-    turn = rotation(dimension)
+    turn = get_rotation(dimension)
     if dimension == turn.padded <= 512:  # a row that the rotation turns into one strong number
         rows[6] = turn.rotate(np.eye(dimension, dtype=np.float32))[:, 5]
     rows /= np.linalg.norm(rows, axis=1, keepdims=True)
@@ -47,7 +52,7 @@ def test_no_score_is_further_off_than_its_bound(dimension: int) -> None:
     for row in (*rows[[0, 1, 2, 4, 6]], -rows[3], rows[5] * np.float32(1e-20)):
         if not row.any():
             continue
-        query = Int8Query.of(row)
+        query = Int8Query.from_row(row)
         whole = codes.numbers.astype(np.int64) @ query.numbers.astype(np.int64)
         scores = codes.scales.astype(np.float64) * query.scale * whole
         bounds = codes.errors + codes.lengths.astype(np.float64) * query.error
@@ -65,13 +70,13 @@ def test_bound_is_as_tight_as_a_byte_for_a_number_allows() -> None:
     rows /= np.linalg.norm(rows, axis=1, keepdims=True)
     codes = int8_codes(rows)
     assert 0.008 < codes.errors.min() <= codes.errors.max() < 0.0125
-    assert Int8Query.of(rows[0]).error < 2e-4
+    assert Int8Query.from_row(rows[0]).error < 2e-4
 
 
 @pytest.mark.parametrize("dimension", [64, 448, 7168])
 def test_computed_rotation_is_as_near_to_the_exact_one_as_is_claimed(dimension: int) -> None:
     """The exact one: the same steps on whole numbers of float64, which errs 10^-9 as much."""
-    turn = rotation(dimension)
+    turn = get_rotation(dimension)
     rows = adversarial(dimension)[:10]
     exact = np.zeros((len(rows), turn.padded))
     exact[:, :dimension] = rows
@@ -98,17 +103,17 @@ def test_computed_rotation_is_as_near_to_the_exact_one_as_is_claimed(dimension: 
 
 def test_products_of_the_largest_numbers_are_exact() -> None:
     """Where 32 bits would not hold their sum."""
-    length = 3 * EXACT_TERMS + 64
-    row = np.full(length, -MOST, np.int8)
-    query = np.full(length, MOST_OF_QUERY, np.int16)
-    assert product(row, query) == -MOST * MOST_OF_QUERY * length
-    assert MOST * MOST_OF_QUERY * EXACT_TERMS < 2**31
+    length = 3 * INT32_SAFE_TERMS + 64
+    row = np.full(length, -INT8_MAX, np.int8)
+    query = np.full(length, QUERY_MAX, np.int16)
+    assert int8_product(row, query) == -INT8_MAX * QUERY_MAX * length
+    assert INT8_MAX * QUERY_MAX * INT32_SAFE_TERMS < 2**31
 
 
 def test_both_parts_of_a_query_are_bytes() -> None:
     rng = np.random.default_rng(2)
-    query = Int8Query.of(rng.standard_normal(4096).astype(np.float32))
-    for numbers in (query.numbers, np.array([MOST_OF_QUERY, -MOST_OF_QUERY, 0, 1], np.int16)):
+    query = Int8Query.from_row(rng.standard_normal(4096).astype(np.float32))
+    for numbers in (query.numbers, np.array([QUERY_MAX, -QUERY_MAX, 0, 1], np.int16)):
         high, low = Int8Query(numbers, 1.0, 0.0).parts.astype(np.int64)
         np.testing.assert_array_equal(128 * high + low, numbers)
 
@@ -122,16 +127,16 @@ def same(a: Int8Codes, b: Int8Codes) -> bool:
 
 def test_stored_codes_are_those_that_were_made_and_nothing_else_is_taken_for_them() -> None:
     rows = adversarial(512)
-    data = encode_int8(rows, "ab" * 32)
+    data = encode_int8_codes(rows, "ab" * 32)
     expected = {"rows": len(rows), "dimension": 512, "chunk_sha256": "ab" * 32}
-    assert same(decode_int8(data, **expected), int8_codes(rows))  # type: ignore[arg-type]
+    assert same(decode_int8_codes(data, **expected), int8_codes(rows))  # type: ignore[arg-type]
     for change in ({"rows": 8}, {"dimension": 513}, {"chunk_sha256": "cd" * 32}):
         with pytest.raises(ValueError, match="other rows"):
-            decode_int8(data, **(expected | change))  # type: ignore[arg-type]
+            decode_int8_codes(data, **(expected | change))  # type: ignore[arg-type]
     damaged = bytearray(data)
     damaged[-70] ^= 1
-    for wrong in (bytes(damaged), data[:-9], b"", encode_codes(rows, "ab" * 32)):
+    for wrong in (bytes(damaged), data[:-9], b"", encode_sign_codes(rows, "ab" * 32)):
         with pytest.raises(ValueError):
-            decode_int8(wrong, **expected)  # type: ignore[arg-type]
+            decode_int8_codes(wrong, **expected)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="levels"):
-        decode_codes(data, **expected)  # type: ignore[arg-type]
+        decode_sign_codes(data, **expected)  # type: ignore[arg-type]

@@ -12,11 +12,24 @@ import pytest
 from pydantic import SecretStr, ValidationError
 from starlette.datastructures import Headers
 
-from services.gateway.keys import Caller, CatalogKeys, Keys, NoKeys, read_bearer
-from shared.api_keys import Scope, granted, hash_key, is_loopback, new_key, shown_prefix
+from services.gateway.keys import (
+    ApiKeyAuthenticator,
+    Authenticator,
+    Caller,
+    LocalhostAuthenticator,
+    parse_bearer,
+)
+from shared.api_keys import (
+    Scope,
+    api_key_prefix,
+    expand_scopes,
+    generate_api_key,
+    hash_api_key,
+    is_loopback,
+)
 from shared.catalog.session import Catalog
 from shared.errors import Forbidden, Unauthorized, Unavailable
-from shared.home import announced, running_server
+from shared.home import announce_server, find_running_server
 from shared.private_files import write_private
 from shared.settings import Settings
 
@@ -30,7 +43,7 @@ KEY = "pw_0123456789abcdef"
     "header", ["Bearer abc", "bearer abc", "BEARER abc", "Bearer   abc", "Bearer abc "]
 )
 def test_the_key_is_read_whatever_the_schemes_case(header: str) -> None:
-    assert read_bearer(header) == "abc"
+    assert parse_bearer(header) == "abc"
 
 
 @pytest.mark.parametrize(
@@ -52,7 +65,7 @@ def test_the_key_is_read_whatever_the_schemes_case(header: str) -> None:
 )
 def test_a_header_without_a_bearer_key_holds_none(header: str | None) -> None:
     with pytest.raises(Unauthorized) as caught:
-        read_bearer(header)
+        parse_bearer(header)
     assert caught.value.code == "key_missing"
     assert "Authorization: Bearer KEY" in caught.value.detail
 
@@ -65,26 +78,26 @@ def none_stored(migrated_sqlite: Path) -> Iterator[Catalog]:
     opened.close()
 
 
-def check(keys: Keys, **headers: str) -> Caller:
-    return asyncio.run(keys.check(Headers(headers)))
+def check(keys: Authenticator, **headers: str) -> Caller:
+    return asyncio.run(keys.authenticate(Headers(headers)))
 
 
 def test_any_of_the_keys_beside_the_catalog_opens_everything(none_stored: Catalog) -> None:
-    keys = CatalogKeys(none_stored, hash_key(KEY), hash_key("another"))
+    keys = ApiKeyAuthenticator(none_stored, hash_api_key(KEY), hash_api_key("another"))
     assert check(keys, authorization=f"Bearer {KEY}").scopes == set(Scope)
     check(keys, authorization="Bearer another", origin="https://elsewhere.example")
-    for wrong in (KEY[:-1], KEY + "x", KEY.upper(), hash_key(KEY)):
+    for wrong in (KEY[:-1], KEY + "x", KEY.upper(), hash_api_key(KEY)):
         with pytest.raises(Unauthorized) as caught:
             check(keys, authorization=f"Bearer {wrong}")
         assert caught.value.code == "key_unknown"
         assert wrong not in caught.value.detail
     with pytest.raises(Unauthorized):
-        check(CatalogKeys(none_stored), authorization=f"Bearer {KEY}")
+        check(ApiKeyAuthenticator(none_stored), authorization=f"Bearer {KEY}")
 
 
 def test_while_the_catalog_is_away_only_the_keys_beside_it_open() -> None:
     away = Catalog("postgresql+psycopg://nobody@127.0.0.1:9/none")
-    keys = CatalogKeys(away, hash_key(KEY))
+    keys = ApiKeyAuthenticator(away, hash_api_key(KEY))
     check(keys, authorization=f"Bearer {KEY}")
     with pytest.raises(Unavailable) as caught:
         check(keys, authorization="Bearer pw_of_the_catalog")
@@ -93,17 +106,17 @@ def test_while_the_catalog_is_away_only_the_keys_beside_it_open() -> None:
 
 
 def test_a_key_is_long_random_and_shows_little_of_itself() -> None:
-    made = {new_key() for _ in range(100)}
-    assert len({shown_prefix(key) for key in made}) == 100
+    made = {generate_api_key() for _ in range(100)}
+    assert len({api_key_prefix(key) for key in made}) == 100
     for key in made:
         assert re.fullmatch(r"pw_[\w-]{43}", key)
-        assert len(key) - len(shown_prefix(key)) > 32
+        assert len(key) - len(api_key_prefix(key)) > 32
 
 
 def test_an_admin_may_everything_and_no_other_scope_implies_one() -> None:
-    assert granted([Scope.ADMIN]) == set(Scope)
-    assert granted([Scope.WRITE]) == {Scope.WRITE}
-    assert granted([Scope.READ, Scope.WRITE]) == {Scope.READ, Scope.WRITE}
+    assert expand_scopes([Scope.ADMIN]) == set(Scope)
+    assert expand_scopes([Scope.WRITE]) == {Scope.WRITE}
+    assert expand_scopes([Scope.READ, Scope.WRITE]) == {Scope.READ, Scope.WRITE}
 
 
 LOCAL = [
@@ -118,9 +131,9 @@ LOCAL = [
 
 @pytest.mark.parametrize("host", LOCAL)
 def test_without_keys_whoever_calls_this_machine_may(host: str) -> None:
-    check(NoKeys(), host=host)
-    check(NoKeys(), host=host, authorization="Bearer whatever")
-    check(NoKeys(), host=host, origin=f"http://{host}")
+    check(LocalhostAuthenticator(), host=host)
+    check(LocalhostAuthenticator(), host=host, authorization="Bearer whatever")
+    check(LocalhostAuthenticator(), host=host, origin=f"http://{host}")
 
 
 @pytest.mark.parametrize(
@@ -141,7 +154,7 @@ def test_without_keys_whoever_calls_this_machine_may(host: str) -> None:
 )
 def test_without_keys_no_page_of_elsewhere_may_call(said: dict[str, str]) -> None:
     with pytest.raises(Forbidden) as caught:
-        check(NoKeys(), **said)
+        check(LocalhostAuthenticator(), **said)
     assert caught.value.code == "foreign_page"
     refused = said.get("origin") if is_local(said.get("host", "")) else said.get("host", "")
     assert repr(refused) in caught.value.detail, "what was refused is named"
@@ -156,13 +169,13 @@ def is_local(host: str) -> bool:
 )
 def test_without_keys_what_a_proxy_forwards_is_refused(header: str) -> None:
     with pytest.raises(Forbidden, match="ADMIN_KEY") as caught:
-        check(NoKeys(), **{"host": "localhost:8000", header: "127.0.0.1"})
+        check(LocalhostAuthenticator(), **{"host": "localhost:8000", header: "127.0.0.1"})
     assert caught.value.code == "forwarded_request"
     assert header.lower() in caught.value.detail.lower()
 
 
 def test_without_keys_a_page_that_is_trusted_may_call_this_machine() -> None:
-    keys = NoKeys(["https://maps.example"])
+    keys = LocalhostAuthenticator(["https://maps.example"])
     check(keys, host="localhost:8000", origin="https://maps.example")
     for said in ({"origin": "https://maps.example.evil"}, {"host": "maps.example"}):
         with pytest.raises(Forbidden):
@@ -223,5 +236,5 @@ def test_what_is_written_privately_is_readable_by_its_user_alone(tmp_path: Path)
 
 
 def test_a_folder_without_a_server_gives_no_key_away(tmp_path: Path) -> None:
-    with announced(tmp_path, "http://127.0.0.1:1", KEY):
-        assert running_server(tmp_path) is None, "nobody holds the folder's lock"
+    with announce_server(tmp_path, "http://127.0.0.1:1", KEY):
+        assert find_running_server(tmp_path) is None, "nobody holds the folder's lock"

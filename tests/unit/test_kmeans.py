@@ -7,23 +7,23 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from shared.vision.kmeans import Pass, Seeding
-from shared.vision.vlad import assign
+from shared.vision.kmeans import KMeansPass, KMeansPlusPlus
+from shared.vision.vlad import assign_clusters
 from tests.support.points import unit_points
 
 
 def seeds_of(points: torch.Tensor, clusters: int, seed: int) -> torch.Tensor:
-    seeding = Seeding(points, seed)
+    seeding = KMeansPlusPlus(points, seed)
     while len(seeding.chosen) < clusters:
         seeding.next()
     return seeding.centres()
 
 
-def walk(points: torch.Tensor, centres: torch.Tensor, batch: int) -> Pass:
+def walk(points: torch.Tensor, centres: torch.Tensor, batch: int) -> KMeansPass:
     """A pass of Lloyd's, in batches."""
-    one = Pass.begin(centres)
+    one = KMeansPass.begin(centres)
     for part in torch.split(points, batch):
-        one.see(part, centres)
+        one.accumulate(part, centres)
     return one
 
 
@@ -44,10 +44,10 @@ def test_more_seeds_than_distinct_points_repeat_them() -> None:
 def test_seeding_goes_on_where_it_was_interrupted() -> None:
     points = unit_points(4, 60, 5)
     at_once = seeds_of(points, 12, seed=3)
-    first = Seeding(points, seed=3)
+    first = KMeansPlusPlus(points, seed=3)
     for _ in range(5):
         first.next()
-    second = Seeding.resume(
+    second = KMeansPlusPlus.resume(
         points,
         chosen=list(first.chosen),
         distances=first.distances.clone(),
@@ -76,7 +76,7 @@ def test_a_pass_is_the_same_in_batches_of_any_size(batch: int) -> None:
     assert torch.equal(cut.counts, whole.counts)
     torch.testing.assert_close(cut.end(centres), whole.end(centres))
     expected = torch.stack(
-        [points[assign(points, centres) == k].mean(dim=0) for k in range(len(centres) - 1)]
+        [points[assign_clusters(points, centres) == k].mean(dim=0) for k in range(len(centres) - 1)]
     )
     torch.testing.assert_close(cut.end(centres)[:-1], expected)
 
@@ -84,12 +84,12 @@ def test_a_pass_is_the_same_in_batches_of_any_size(batch: int) -> None:
 def test_after_each_mini_batch_a_centre_is_the_mean_of_what_it_was_given() -> None:
     points = unit_points(6, 400, 4)
     centres = seeds_of(points, 5, seed=0)
-    one = Pass.begin(centres)
+    one = KMeansPass.begin(centres)
     given_to: list[list[torch.Tensor]] = [[] for _ in range(5)]
     for part in torch.split(points, 50):
-        for point, label in zip(part, assign(part, centres).tolist(), strict=True):
+        for point, label in zip(part, assign_clusters(part, centres).tolist(), strict=True):
             given_to[label].append(point)
-        one.see(part, centres)
+        one.accumulate(part, centres)
         centres = one.means(centres)
     torch.testing.assert_close(centres, torch.stack([torch.stack(g).mean(dim=0) for g in given_to]))
 
@@ -113,4 +113,4 @@ def test_no_cluster_is_left_empty_when_there_are_enough_distinct_points(
     centres = points[:1].repeat(clusters, 1)
     for _ in range(60):
         centres = walk(points, centres, batch=25).end(centres)
-    assert len(set(assign(points, centres).tolist())) == clusters
+    assert len(set(assign_clusters(points, centres).tolist())) == clusters

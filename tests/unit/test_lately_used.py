@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import pytest
 
-from services.extractor.lately_used import LatelyUsed
+from services.extractor.lately_used import LruCache
 
 
 def test_value_that_was_used_least_lately_is_made_anew() -> None:
     made: list[str] = []
-    kept: LatelyUsed[str, str] = LatelyUsed(2)
+    kept: LruCache[str, str] = LruCache(2)
 
     def use(key: str) -> str:
         def make() -> str:
@@ -26,7 +26,7 @@ def test_value_that_was_used_least_lately_is_made_anew() -> None:
 
 
 def test_value_that_can_not_be_made_is_tried_again_and_displaces_nothing() -> None:
-    kept: LatelyUsed[str, int] = LatelyUsed(1)
+    kept: LruCache[str, int] = LruCache(1)
     kept.get("there", lambda: 1)
     with pytest.raises(ZeroDivisionError):
         kept.get("broken", lambda: 1 // 0)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from services.extractor.loaded import MOST_EXTRACTORS, LoadedModels
+from services.extractor.loaded import MAX_EXTRACTORS, ModelRegistry
 from shared.errors import Misconfigured
 from shared.objects import FolderStore
 from shared.settings import Settings
@@ -15,25 +15,27 @@ from tests.support.hub import write_hub
 
 
 @pytest.fixture
-def models(store: FolderStore, settings: Settings) -> LoadedModels:
-    return LoadedModels(store, settings.model_copy(update={"device": "cpu"}), none_added)
+def models(store: FolderStore, settings: Settings) -> ModelRegistry:
+    return ModelRegistry(store, settings.model_copy(update={"device": "cpu"}), none_added)
 
 
-def test_an_extractor_is_loaded_once_under_all_its_spellings(models: LoadedModels) -> None:
+def test_an_extractor_is_loaded_once_under_all_its_spellings(models: ModelRegistry) -> None:
     loaded = models.extractor("test-tiny-vlad")
     assert models.extractor("test-tiny-vlad:clusters=8") is loaded
     assert models.extractor("test-tiny-vlad:clusters=08") is loaded
 
 
-def test_extractors_that_differ_in_what_follows_the_backbone_share_it(models: LoadedModels) -> None:
+def test_extractors_that_differ_in_what_follows_the_backbone_share_it(
+    models: ModelRegistry,
+) -> None:
     vlad, average = models.extractor("test-tiny-vlad:clusters=3"), models.extractor("test-tiny-avg")
     assert average.backbone is vlad.backbone
     assert (vlad.recipe.clusters, average.recipe.aggregator) == (3, "avg")
 
 
-def test_extractors_used_least_lately_are_let_go(models: LoadedModels) -> None:
+def test_extractors_used_least_lately_are_let_go(models: ModelRegistry) -> None:
     first = models.extractor("test-tiny-vlad:clusters=1")
-    for clusters in range(2, MOST_EXTRACTORS + 2):
+    for clusters in range(2, MAX_EXTRACTORS + 2):
         models.extractor(f"test-tiny-vlad:clusters={clusters}")
     assert models.extractor("test-tiny-vlad:clusters=1") is not first
 
@@ -43,10 +45,10 @@ def test_code_that_is_no_longer_allowed_is_not_executed(
 ) -> None:
     name = f"torchhub:{write_hub(tmp_path / 'hub')}:colours"
     monkeypatch.setenv("TORCHHUB_ALLOWED", name)
-    assert LoadedModels(store, Settings(), none_added).extractor(name).dimension(None) == 24
+    assert ModelRegistry(store, Settings(), none_added).extractor(name).dimension(None) == 24
     monkeypatch.setenv("TORCHHUB_ALLOWED", f"{name}:dimension=8")
     with pytest.raises(Misconfigured) as caught:
-        LoadedModels(store, Settings(), none_added).extractor(name)
+        ModelRegistry(store, Settings(), none_added).extractor(name)
     assert caught.value.code == "torchhub_not_allowed"
     assert name in caught.value.detail
 
@@ -56,7 +58,7 @@ def test_networks_of_one_folder_share_nothing_unless_all_of_the_name_agrees(
 ) -> None:
     name = f"torchhub:{write_hub(tmp_path / 'hub')}:colours"
     monkeypatch.setenv("TORCHHUB_ALLOWED", f"{name} {name}:dimension=8")
-    models = LoadedModels(store, Settings(), none_added)
+    models = ModelRegistry(store, Settings(), none_added)
     assert models.extractor(f"{name}:dimension=8").dimension(None) == 8
     assert models.extractor(name).dimension(None) == 24
     assert models.extractor(name) is models.extractor(name)

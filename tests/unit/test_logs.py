@@ -9,8 +9,8 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from shared.settings import Settings
-from shared.telemetry.logs import set_up_logs
-from shared.telemetry.request_id import accept_request_id, under_request_id
+from shared.telemetry.logs import configure_logging
+from shared.telemetry.request_id import request_id_context, request_id_or_new
 
 Set = Callable[..., None]
 
@@ -25,7 +25,7 @@ def set_up(monkeypatch: pytest.MonkeyPatch) -> Iterator[Set]:
     def make(**variables: str) -> None:
         for name, value in variables.items():
             monkeypatch.setenv(name, value)
-        set_up_logs(Settings(), "gateway")
+        configure_logging(Settings(), "gateway")
 
     yield make
     root.handlers[:], level, levels = before
@@ -38,7 +38,7 @@ def test_json_lines_hold_what_was_said_by_whom_and_for_which_request(
     set_up: Set, capsys: pytest.CaptureFixture[str]
 ) -> None:
     set_up(LOG_FORMAT="json")
-    with under_request_id("r-1"):
+    with request_id_context("r-1"):
         logging.getLogger("services.gateway").info("stored %s", "a\nb", extra={"jobs": [1, 2]})
     logging.getLogger("uvicorn.error").warning("uvicorn's own")
     logging.getLogger("celery.worker").warning("celery's own")
@@ -70,7 +70,7 @@ def test_json_lines_hold_what_was_said_by_whom_and_for_which_request(
 
 def test_text_lines_end_with_the_facts(set_up: Set, capsys: pytest.CaptureFixture[str]) -> None:
     set_up()
-    with under_request_id("r-1"):
+    with request_id_context("r-1"):
         logging.getLogger("services.gateway").info("stored", extra={"status": 202})
     logging.getLogger("services.gateway").debug("only with DEBUG")
     (line,) = capsys.readouterr().err.splitlines()
@@ -125,7 +125,7 @@ def test_no_value_of_a_caller_starts_a_line_or_controls_a_terminal(
 
 @pytest.mark.parametrize("sent", [None, "", "a b", "a\nb", "x" * 129, "é", "{{7*7}}"])
 def test_an_id_that_no_header_or_log_should_hold_is_replaced(sent: str | None) -> None:
-    made = accept_request_id(sent)
+    made = request_id_or_new(sent)
     assert made != sent
     assert len(made) == 36
-    assert accept_request_id("my-id:1/2") == "my-id:1/2"
+    assert request_id_or_new("my-id:1/2") == "my-id:1/2"

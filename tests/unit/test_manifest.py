@@ -5,13 +5,18 @@ from __future__ import annotations
 import pytest
 
 from shared.errors import InvalidRequest, PlacewiseError
-from shared.intake.manifest import MOST_NAMED, Said, read_csv, read_jsonl
+from shared.intake.manifest import (
+    MAX_REPORTED_LINES,
+    ManifestEntry,
+    read_csv_manifest,
+    read_jsonl_manifest,
+)
 from shared.intake.photo_fields import read_form_fields
 
 
 def refused(data: bytes) -> PlacewiseError:
     with pytest.raises(InvalidRequest) as caught:
-        read_jsonl(data, "the manifest")
+        read_jsonl_manifest(data, "the manifest")
     assert caught.value.code == "bad_manifest"
     return caught.value
 
@@ -24,11 +29,11 @@ def test_lines_give_the_forms_fields_by_the_photos_names() -> None:
         b'{"path": "in/b.jpg", "place": "h\xc3\xa4ll", "metadata": {"n": [1]}, "heading": null}\r\n'
         b'{"file": "c.jpg", "captured_at": "2026-05-01", "role": "query"}'
     )
-    said = read_jsonl(data, "the manifest")
+    said = read_jsonl_manifest(data, "the manifest")
     assert said == [
-        Said(1, "a.jpg", {"latitude": "45.5", "longitude": "-7", "tags": "x,y"}),
-        Said(3, "in/b.jpg", {"place": "häll", "metadata": '{"n": [1]}'}),
-        Said(4, "c.jpg", {"captured_at": "2026-05-01", "role": "query"}),
+        ManifestEntry(1, "a.jpg", {"latitude": "45.5", "longitude": "-7", "tags": "x,y"}),
+        ManifestEntry(3, "in/b.jpg", {"place": "häll", "metadata": '{"n": [1]}'}),
+        ManifestEntry(4, "c.jpg", {"captured_at": "2026-05-01", "role": "query"}),
     ]
     fields = [read_form_fields(one.fields) for one in said]
     assert (fields[0].latitude, fields[0].longitude, fields[0].tags) == (45.5, -7, ["x", "y"])
@@ -63,14 +68,14 @@ def test_a_bad_line_is_named_with_its_number(line: bytes, why: str) -> None:
 
 
 def test_a_wrong_value_is_no_bad_line_but_the_photos_own_error() -> None:
-    [said] = read_jsonl(b'{"file": "a", "latitude": 95, "longitude": 7}', "the manifest")
+    [said] = read_jsonl_manifest(b'{"file": "a", "latitude": 95, "longitude": 7}', "the manifest")
     with pytest.raises(PlacewiseError, match="latitude"):
         read_form_fields(said.fields)
 
 
 def test_only_the_first_bad_lines_are_named() -> None:
     error = refused(b"oops\n" * 1000)
-    assert len(error.extra["errors"]) == MOST_NAMED
+    assert len(error.extra["errors"]) == MAX_REPORTED_LINES
 
 
 @pytest.mark.parametrize(
@@ -86,7 +91,7 @@ def test_only_the_first_bad_lines_are_named() -> None:
 )
 def test_a_table_that_can_not_be_understood_is_refused(table: bytes, why: str) -> None:
     with pytest.raises(InvalidRequest) as caught:
-        read_csv(table, "photos.csv")
+        read_csv_manifest(table, "photos.csv")
     assert caught.value.code == "bad_table"
     assert "photos.csv" in caught.value.detail
     assert why in caught.value.detail

@@ -9,7 +9,7 @@ from torch.nn.functional import normalize
 
 from shared.vision import matching
 from shared.vision.local_features import LocalFeatures
-from shared.vision.matching import WEIGHT, mutual_matches, rerank_score, spatial_vote
+from shared.vision.matching import VOTE_WEIGHT, mutual_matches, rerank_score, spatial_vote
 
 CPU = torch.device("cpu")
 WIDTH, SIDE = 32, 12
@@ -22,7 +22,7 @@ def noise(seed: int, count: int) -> torch.Tensor:
 
 def scene(seed: int = 0, rows: int = SIDE, columns: int = SIDE) -> LocalFeatures:
     """A photo each of whose patches looks different."""
-    return LocalFeatures.of(noise(seed, rows * columns), (rows, columns))
+    return LocalFeatures.from_features(noise(seed, rows * columns), (rows, columns))
 
 
 def shifted(photo: LocalFeatures, down: int, right: int) -> LocalFeatures:
@@ -101,9 +101,9 @@ def test_grids_of_two_sizes_are_compared_by_their_places() -> None:
 
 
 def test_rerank_score_is_the_similarity_raised_by_the_vote() -> None:
-    assert rerank_score(0.25, scene(), scene(), CPU) == pytest.approx(0.25 + WEIGHT, abs=1e-3)
-    lone = LocalFeatures.of(torch.eye(WIDTH)[:1], (1, 1))
-    other = LocalFeatures.of(torch.eye(WIDTH)[1:2], (1, 1))
+    assert rerank_score(0.25, scene(), scene(), CPU) == pytest.approx(0.25 + VOTE_WEIGHT, abs=1e-3)
+    lone = LocalFeatures.from_features(torch.eye(WIDTH)[:1], (1, 1))
+    other = LocalFeatures.from_features(torch.eye(WIDTH)[1:2], (1, 1))
     assert rerank_score(0.25, lone, other, CPU) == 0.25
 
 

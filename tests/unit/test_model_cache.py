@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from services.extractor.model_cache import LEFT_OVER_SECONDS, ModelCache
+from services.extractor.model_cache import STALE_PARTIAL_SECONDS, ModelFileCache
 from shared.errors import NotFound, Unavailable
 from shared.objects import FolderStore
 
@@ -50,8 +50,8 @@ def test_a_model_is_fetched_once_and_read_from_the_folder_then(
     bucket: Bucket, folder: Path
 ) -> None:
     key, sha256 = put(bucket, b"weights")
-    first = ModelCache(bucket, folder, 100).file(key, sha256)
-    again = ModelCache(bucket, folder, 100).file(key, sha256)  # another process
+    first = ModelFileCache(bucket, folder, 100).local_path(key, sha256)
+    again = ModelFileCache(bucket, folder, 100).local_path(key, sha256)  # another process
     assert first == again
     assert first.read_bytes() == b"weights"
     assert bucket.fetched == 1
@@ -60,19 +60,19 @@ def test_a_model_is_fetched_once_and_read_from_the_folder_then(
 def test_where_objects_are_files_nothing_is_copied(tmp_path: Path, folder: Path) -> None:
     store = FolderStore(tmp_path / "objects")
     key, sha256 = put(store, b"weights")
-    assert ModelCache(store, folder, 100).file(key, sha256).read_bytes() == b"weights"
+    assert ModelFileCache(store, folder, 100).local_path(key, sha256).read_bytes() == b"weights"
     assert not folder.exists()
     store.put(key, b"weightz")
     with pytest.raises(Unavailable) as caught:
-        ModelCache(store, folder, 100).file(key, sha256)
+        ModelFileCache(store, folder, 100).local_path(key, sha256)
     assert caught.value.code == "model_corrupt"
 
 
 def test_a_spoilt_file_is_fetched_again(bucket: Bucket, folder: Path) -> None:
     key, sha256 = put(bucket, b"weights")
-    cache = ModelCache(bucket, folder, 100)
-    cache.file(key, sha256).write_bytes(b"wei")
-    assert cache.file(key, sha256).read_bytes() == b"weights"
+    cache = ModelFileCache(bucket, folder, 100)
+    cache.local_path(key, sha256).write_bytes(b"wei")
+    assert cache.local_path(key, sha256).read_bytes() == b"weights"
     assert bucket.fetched == 2
 
 
@@ -80,31 +80,31 @@ def test_what_is_not_what_was_stored_is_refused_and_not_kept(bucket: Bucket, fol
     key, sha256 = put(bucket, b"weights")
     bucket.put(key, b"others")
     with pytest.raises(Unavailable) as caught:
-        ModelCache(bucket, folder, 100).file(key, sha256)
+        ModelFileCache(bucket, folder, 100).local_path(key, sha256)
     assert caught.value.code == "model_corrupt"
     assert list(folder.iterdir()) == []
     bucket.delete(key)
     with pytest.raises(NotFound):
-        ModelCache(bucket, folder, 100).file(key, sha256)
+        ModelFileCache(bucket, folder, 100).local_path(key, sha256)
 
 
 def test_what_was_used_least_lately_makes_room(bucket: Bucket, folder: Path) -> None:
-    cache = ModelCache(bucket, folder, 25)
+    cache = ModelFileCache(bucket, folder, 25)
     stored = [put(bucket, bytes([number]) * 10) for number in range(4)]
-    paths = [cache.file(*one) for one in stored[:3]]  # two fit beside the one that is fetched
+    paths = [cache.local_path(*one) for one in stored[:3]]  # two fit beside the one that is fetched
     for age, path in zip((300, 200, 100), paths, strict=True):
         os.utime(path, (time.time() - age, time.time() - age))
-    cache.file(*stored[0])  # used just now
+    cache.local_path(*stored[0])  # used just now
     left_over = folder / "killed.partial"
     left_over.write_bytes(b"half")
-    os.utime(left_over, (time.time() - LEFT_OVER_SECONDS - 1,) * 2)
-    newest = cache.file(*stored[3])
+    os.utime(left_over, (time.time() - STALE_PARTIAL_SECONDS - 1,) * 2)
+    newest = cache.local_path(*stored[3])
     assert set(folder.iterdir()) == {paths[0], paths[2], newest}
 
 
 def test_a_model_larger_than_the_cache_is_used_all_the_same(bucket: Bucket, folder: Path) -> None:
-    cache = ModelCache(bucket, folder, 0)
+    cache = ModelFileCache(bucket, folder, 0)
     for number in range(2):
-        path = cache.file(*put(bucket, bytes([number]) * 10))
+        path = cache.local_path(*put(bucket, bytes([number]) * 10))
         assert path.read_bytes() == bytes([number]) * 10
         assert list(folder.iterdir()) == [path]

@@ -12,7 +12,7 @@ from safetensors.torch import save
 
 from shared.errors import Unavailable
 from shared.vision.place_models.checkpoint import Checkpoint, load_checkpoint
-from shared.vision.place_models.model_file import METADATA, encode_model, read_model
+from shared.vision.place_models.model_file import METADATA_KEY, encode_model_file, read_model_file
 from tests.support.checkpoints import SIDES, write_checkpoint
 
 
@@ -22,10 +22,10 @@ def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Checkpoint:
 
 
 def test_what_is_read_describes_as_what_was_written(checkpoint: Checkpoint, tmp_path: Path) -> None:
-    data = encode_model(checkpoint)
+    data = encode_model_file(checkpoint)
     path = tmp_path / "model.safetensors"
     path.write_bytes(data)
-    found = read_model(path)
+    found = read_model_file(path)
     assert found.fingerprint == checkpoint.fingerprint
     assert found.model.config == checkpoint.config
     assert not found.model.training
@@ -36,17 +36,17 @@ def test_what_is_read_describes_as_what_was_written(checkpoint: Checkpoint, tmp_
 
 
 def test_the_same_model_makes_the_same_bytes(checkpoint: Checkpoint) -> None:
-    assert encode_model(checkpoint) == encode_model(checkpoint)
+    assert encode_model_file(checkpoint) == encode_model_file(checkpoint)
 
 
 def test_the_file_holds_the_models_tensors_and_says_which_network_they_are_of(
     checkpoint: Checkpoint, tmp_path: Path
 ) -> None:
     path = tmp_path / "model.safetensors"
-    path.write_bytes(encode_model(checkpoint))
+    path.write_bytes(encode_model_file(checkpoint))
     with safe_open(path, framework="pt") as file:
         assert set(file.keys()) == checkpoint.model.state_dict().keys()
-        about = json.loads(file.metadata()[METADATA])
+        about = json.loads(file.metadata()[METADATA_KEY])
     assert (about["format"], about["fingerprint"]) == (1, checkpoint.fingerprint)
     assert about["config"]["image_size"] == list(SIDES)
 
@@ -60,14 +60,14 @@ def test_a_file_that_this_release_does_not_understand_is_refused(
     said = {"format": 1, "config": config, "fingerprint": checkpoint.fingerprint}
     for metadata, weights in (
         ({}, tensors),
-        ({METADATA: json.dumps({**said, "format": 2})}, tensors),
-        ({METADATA: json.dumps({**said, "config": {**config, "agg_arch": "New"}})}, tensors),
-        ({METADATA: json.dumps(said)}, {"one": torch.zeros(1)}),
+        ({METADATA_KEY: json.dumps({**said, "format": 2})}, tensors),
+        ({METADATA_KEY: json.dumps({**said, "config": {**config, "agg_arch": "New"}})}, tensors),
+        ({METADATA_KEY: json.dumps(said)}, {"one": torch.zeros(1)}),
     ):
         path.write_bytes(save(weights, metadata))
         with pytest.raises(Unavailable) as caught:
-            read_model(path)
+            read_model_file(path)
         assert caught.value.code == "model_unreadable"
     path.write_bytes(b"not at all")
     with pytest.raises(Unavailable):
-        read_model(path)
+        read_model_file(path)

@@ -5,15 +5,15 @@ from __future__ import annotations
 import pytest
 
 from shared.errors import Misconfigured
-from shared.model_names import read_trained_name
-from shared.recipes import get_recipe
+from shared.model_names import parse_trained_model_name
+from shared.recipes import get_extractor_config
 from shared.settings import Settings
 
 
 def test_a_name_means_a_model_that_was_added_and_a_path_means_a_file() -> None:
-    added = read_trained_name("gsv:night-walks.2")
+    added = parse_trained_model_name("gsv:night-walks.2")
     assert (added.registered, added.file) == ("night-walks.2", None)
-    file = read_trained_name("gsv:/models/best epoch.ckpt")
+    file = parse_trained_model_name("gsv:/models/best epoch.ckpt")
     assert (file.registered, file.file) == (None, "/models/best epoch.ckpt")
     assert [name.extractor for name in (added, file)] == [
         "gsv:night-walks.2",
@@ -26,15 +26,15 @@ def test_a_name_means_a_model_that_was_added_and_a_path_means_a_file() -> None:
 )
 def test_what_is_neither_is_refused(name: str) -> None:
     with pytest.raises(Misconfigured) as caught:
-        get_recipe(name, allow_test_extractors=False)
+        get_extractor_config(name, allow_test_extractors=False)
     assert caught.value.code == "bad_model_name"
 
 
 def test_only_the_loaded_model_tells_how_photos_are_brought_to_size() -> None:
-    recipe = get_recipe("gsv:walks", allow_test_extractors=False)
+    recipe = get_extractor_config("gsv:walks", allow_test_extractors=False)
     assert (recipe.name, recipe.aggregator) == ("gsv:walks", "none")
     assert (recipe.width, recipe.dimension, recipe.preprocessing) == (None, None, None)
-    other = get_recipe("gsv:nights", allow_test_extractors=False)
+    other = get_extractor_config("gsv:nights", allow_test_extractors=False)
     assert recipe.local_features != other.local_features
 
 

@@ -42,7 +42,7 @@ def caches(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path / "huggingface"))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
-    monkeypatch.setattr(download, "PAUSE_SECONDS", 0)
+    monkeypatch.setattr(download, "RETRY_PAUSE_SECONDS", 0)
     return tmp_path
 
 
@@ -119,11 +119,17 @@ def test_fingerprint_is_that_of_the_spec_and_is_computed_once(
     assert "these look like the weights of dinov2-vits14" in other["note"]
 
     read: list[Path] = []
-    recipe = next(r for r in weights_here.listed(Settings()) if r.name == VITS)
-    assert weights_here.look(recipe, Settings(), read.append).fingerprint == found["fingerprint"]
+    recipe = next(r for r in weights_here.list_recipes(Settings()) if r.name == VITS)
+    assert (
+        weights_here.inspect_weights(recipe, Settings(), read.append).fingerprint
+        == found["fingerprint"]
+    )
     assert read == [], "it is known by now"
     save({name: 2 * tensor for name, tensor in weights.items()}, file)
-    assert weights_here.look(recipe, Settings(), read.append).fingerprint != found["fingerprint"]
+    assert (
+        weights_here.inspect_weights(recipe, Settings(), read.append).fingerprint
+        != found["fingerprint"]
+    )
     assert read == [file]
 
 
@@ -153,7 +159,7 @@ def test_weights_are_fetched_ahead_of_time(server: FilesServer, vits_weights: by
 def test_an_interrupted_fetch_goes_on_where_it_ended(
     server: FilesServer, vits_weights: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(download, "TRIES", 1)
+    monkeypatch.setattr(download, "MAX_DOWNLOAD_ATTEMPTS", 1)
     server.break_after = [5_000_000]
     refused = command("fetch", VITS, exit_code=1)
     assert refused["code"] == "weights_missing"

@@ -8,7 +8,7 @@ import faiss
 import numpy as np
 import pytest
 
-from services.trainer.evaluation.nearest import nearest
+from services.trainer.evaluation.nearest import exact_knn
 from shared.errors import Misconfigured
 
 Rows = np.ndarray[Any, np.dtype[np.float32]]
@@ -28,7 +28,7 @@ def full_product(queries: Rows, database: Rows, k: int) -> Any:
 def test_hundred_thousand_rows_in_blocks_rank_as_in_the_full_product() -> None:
     database, queries = unit_rows(100_000, 64, 0), unit_rows(40, 64, 1)
     # 4,000 rows a block, and less than half of the queries at once
-    found = nearest(queries, database, 20, block_bytes=4_000 * 64 * 4)
+    found = exact_knn(queries, database, 20, block_bytes=4_000 * 64 * 4)
     assert found.indices.tolist() == full_product(queries, database, 20).tolist()
     gathered = np.einsum("qd,qkd->qk", queries, database[found.indices])
     np.testing.assert_allclose(found.scores, gathered, atol=1e-6)
@@ -39,36 +39,36 @@ def test_copies_are_ranked_by_index_in_blocks_of_any_size(rows_a_block: int) -> 
     """Each row lies there 40 times, more often than candidates are kept."""
     originals = unit_rows(5, 33, 2)
     database = np.tile(originals, (40, 1))
-    found = nearest(originals, database, 8, block_bytes=rows_a_block * 33 * 4)
+    found = exact_knn(originals, database, 8, block_bytes=rows_a_block * 33 * 4)
     for place, row in enumerate(found.indices):
         assert row.tolist() == [place + 5 * copy for copy in range(8)]
 
 
 def test_rows_without_length_are_ranked_by_index() -> None:
     """A photo of one colour may have no features: its row is 0 and nothing is nearer than else."""
-    found = nearest(np.zeros((1, 4), np.float32), unit_rows(60, 4, 3), 5, block_bytes=160)
+    found = exact_knn(np.zeros((1, 4), np.float32), unit_rows(60, 4, 3), 5, block_bytes=160)
     assert found.indices.tolist() == [[0, 1, 2, 3, 4]]
     assert found.scores.tolist() == [[0, 0, 0, 0, 0]]
 
 
 def test_ranking_is_no_longer_than_the_database_and_is_there_for_no_query() -> None:
     database = unit_rows(3, 8, 4)
-    assert nearest(database, database, 10).indices.shape == (3, 3)
-    assert nearest(database[:0], database, 2).indices.shape == (0, 2)
+    assert exact_knn(database, database, 10).indices.shape == (3, 3)
+    assert exact_knn(database[:0], database, 2).indices.shape == (0, 2)
 
 
 def test_rows_are_read_from_a_mapped_file(tmp_path: Any) -> None:
     database, queries = unit_rows(500, 16, 5), unit_rows(9, 16, 6)
     np.save(tmp_path / "rows.npy", database)
     mapped = np.load(tmp_path / "rows.npy", mmap_mode="r")
-    found = nearest(queries, mapped, 5, block_bytes=64 * 16 * 4)
+    found = exact_knn(queries, mapped, 5, block_bytes=64 * 16 * 4)
     assert found.indices.tolist() == full_product(queries, database, 5).tolist()
 
 
 def test_progress_ends_where_it_said_it_would() -> None:
     told: list[tuple[int, int]] = []
     rows = unit_rows(10, 4, 7)
-    nearest(rows, rows, 1, block_bytes=4 * 16, told=lambda *heard: told.append(heard))
+    exact_knn(rows, rows, 1, block_bytes=4 * 16, on_progress=lambda *heard: told.append(heard))
     assert told[-1] == (100, 100)
     assert [done for done, _ in told] == sorted(done for done, _ in told)
 
@@ -76,5 +76,5 @@ def test_progress_ends_where_it_said_it_would() -> None:
 def test_gpu_that_faiss_does_not_have_is_a_named_error(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(faiss, "get_num_gpus", lambda: 0)
     with pytest.raises(Misconfigured, match="--faiss_gpu False") as refused:
-        nearest(unit_rows(2, 4, 8), unit_rows(2, 4, 9), 1, faiss_gpu=True)
+        exact_knn(unit_rows(2, 4, 8), unit_rows(2, 4, 9), 1, faiss_gpu=True)
     assert refused.value.code == "faiss_gpu_missing"

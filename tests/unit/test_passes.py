@@ -12,14 +12,14 @@ import torch
 from numpy.typing import NDArray
 
 from services.extractor import loaded as loaded_module
-from services.extractor.loaded import LoadedModels
+from services.extractor.loaded import ModelRegistry
 from shared.errors import Misconfigured
 from shared.objects import FolderStore
-from shared.recipes import RECIPES, get_recipe
+from shared.recipes import EXTRACTOR_CONFIGS, get_extractor_config
 from shared.settings import Settings
 from shared.vision.backbones.tiny import TinyBackbone
 from shared.vision.extractors import Extractor
-from shared.vision.passes import PassLimit, PhotoDoesNotFit, in_passes
+from shared.vision.passes import BatchSizeLimit, PhotoTooLargeForGpu, run_in_batches
 from tests.support.added import none_added
 
 CPU, CUDA = torch.device("cpu"), torch.device("cuda")
@@ -41,8 +41,8 @@ class SmallGpu(TinyBackbone):
         return super().features(pixels)
 
 
-def on(backbone: SmallGpu, limit: PassLimit | None = None) -> Extractor:
-    recipe = get_recipe(
+def on(backbone: SmallGpu, limit: BatchSizeLimit | None = None) -> Extractor:
+    recipe = get_extractor_config(
         "test-tiny-vlad:aggregator=avg,preprocessing=square224", allow_test_extractors=True
     )
     return Extractor(recipe, CPU, backbone=backbone, limit=limit)
@@ -79,9 +79,9 @@ def test_larger_photos_go_through_in_fewer_once_memory_ran_out() -> None:
 def test_photo_that_does_not_fit_alone_is_an_error_that_names_it() -> None:
     backbone = SmallGpu(SIDE * SIDE)
     mixed = [*photos(2), *photos(1, 2 * SIDE), *photos(1)]
-    with pytest.raises(PhotoDoesNotFit, match="448 x 448 pixels") as described:
+    with pytest.raises(PhotoTooLargeForGpu, match="448 x 448 pixels") as described:
         on(backbone).describe(mixed, None)
-    with pytest.raises(PhotoDoesNotFit, match="448 x 448 pixels") as sampled:
+    with pytest.raises(PhotoTooLargeForGpu, match="448 x 448 pixels") as sampled:
         on(backbone).local_features(mixed)
     for caught in (described.value, sampled.value):
         assert (caught.code, caught.place) == ("gpu_out_of_memory", 2)
@@ -105,17 +105,17 @@ def test_model_that_leaves_no_room_for_one_photo_is_refused_when_it_is_loaded() 
 
 
 @pytest.fixture
-def models(settings: Settings, tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> LoadedModels:
+def models(settings: Settings, tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> ModelRegistry:
     """With room for one extractor at a time."""
-    monkeypatch.setattr(loaded_module, "MOST_EXTRACTORS", 1)
-    return LoadedModels(
+    monkeypatch.setattr(loaded_module, "MAX_EXTRACTORS", 1)
+    return ModelRegistry(
         FolderStore(tmp_path), settings.model_copy(update={"device": "cpu"}), none_added
     )
 
 
-def test_what_fits_is_remembered_when_the_model_is_loaded_anew(models: LoadedModels) -> None:
+def test_what_fits_is_remembered_when_the_model_is_loaded_anew(models: ModelRegistry) -> None:
     first = models.extractor("test-tiny-avg")
-    first.limit.ran_out(8, SIDE * SIDE)
+    first.limit.record_out_of_memory(8, SIDE * SIDE)
     other = models.extractor("test-slow-avg")
     again = models.extractor("test-tiny-avg")
     assert again.backbone is not first.backbone
@@ -125,7 +125,7 @@ def test_what_fits_is_remembered_when_the_model_is_loaded_anew(models: LoadedMod
 
 @pytest.mark.parametrize(("device", "warmed"), [(CPU, []), (CUDA, [7])])
 def test_models_are_warmed_up_on_a_gpu_when_they_are_loaded(
-    models: LoadedModels, monkeypatch: pytest.MonkeyPatch, device: torch.device, warmed: list[int]
+    models: ModelRegistry, monkeypatch: pytest.MonkeyPatch, device: torch.device, warmed: list[int]
 ) -> None:
     asked: list[int] = []
 
@@ -162,7 +162,7 @@ def test_threads_share_a_gpu_one_pass_at_a_time(device: torch.device, most: int)
 
     def work() -> None:
         meeting.wait()
-        list(in_passes(photos(1), run, PassLimit(), device))
+        list(run_in_batches(photos(1), run, BatchSizeLimit(), device))
 
     threads = [threading.Thread(target=work) for _ in range(2)]
     for thread in threads:
@@ -174,6 +174,6 @@ def test_threads_share_a_gpu_one_pass_at_a_time(device: torch.device, most: int)
 
 def test_tiny_extractor_is_what_the_small_gpu_pretends_to_be() -> None:
     """The stand-in describes as the extractor does that it replaces."""
-    made = Extractor(RECIPES["test-tiny-avg"], CPU)
+    made = Extractor(EXTRACTOR_CONFIGS["test-tiny-avg"], CPU)
     few = photos(2, 32)
     assert np.array_equal(made.describe(few, None), on(SmallGpu(10**9)).describe(few, None))

@@ -10,7 +10,7 @@ import torch
 
 from shared.objects import FolderStore
 from shared.vision import patches as patches_module
-from shared.vision.patches import Patches, PatchStore, choose_photos, most_photos
+from shared.vision.patches import PatchStore, StoredPatches, max_photos_to_sample, sample_photos
 from tests.support.points import unit_points
 
 WIDTH = 8
@@ -19,13 +19,13 @@ PATCHES = 6
 
 
 @pytest.fixture
-def kept(store: FolderStore, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Patches]:
+def kept(store: FolderStore, monkeypatch: pytest.MonkeyPatch) -> Callable[..., StoredPatches]:
     """Stores photos in batches, each photo with a share of `bytes_in_all`; then opens them."""
     prefixes = iter(f"work/{number}/patches-" for number in range(100))
 
     def keep(
         photos: list[torch.Tensor], batch: int, seed: int = 0, bytes_in_all: int = 1_000_000
-    ) -> Patches:
+    ) -> StoredPatches:
         monkeypatch.setattr(patches_module, "PATCHES_BYTES", bytes_in_all)
         found = PatchStore(store, next(prefixes), WIDTH)
         for first in range(0, len(photos), batch):
@@ -43,13 +43,13 @@ def rows(points: torch.Tensor) -> set[tuple[float, ...]]:
     return {tuple(point.tolist()) for point in points}
 
 
-def test_all_patches_are_kept_where_there_is_room(kept: Callable[..., Patches]) -> None:
+def test_all_patches_are_kept_where_there_is_room(kept: Callable[..., StoredPatches]) -> None:
     found = kept(photos(), batch=4)
     assert len(found) == PHOTOS * PATCHES
     assert rows(found.read(0, len(found))) == rows(torch.cat(photos()))
 
 
-def test_any_piece_can_be_read(kept: Callable[..., Patches]) -> None:
+def test_any_piece_can_be_read(kept: Callable[..., StoredPatches]) -> None:
     found = kept(photos(), batch=3)
     whole = found.read(0, len(found))
     for begin in range(len(found)):
@@ -57,7 +57,7 @@ def test_any_piece_can_be_read(kept: Callable[..., Patches]) -> None:
             assert torch.equal(found.read(begin, end), whole[begin:end])
 
 
-def test_photos_share_the_room_equally(kept: Callable[..., Patches]) -> None:
+def test_photos_share_the_room_equally(kept: Callable[..., StoredPatches]) -> None:
     found = kept(photos(), batch=4, bytes_in_all=PHOTOS * 2 * WIDTH * 4)
     assert len(found) == PHOTOS * 2
     for number, photo in enumerate(photos()):
@@ -65,7 +65,7 @@ def test_photos_share_the_room_equally(kept: Callable[..., Patches]) -> None:
 
 
 def test_what_is_kept_depends_on_the_seed_and_not_on_the_batches(
-    kept: Callable[..., Patches],
+    kept: Callable[..., StoredPatches],
 ) -> None:
     little = PHOTOS * 3 * WIDTH * 4
     first = kept(photos(), batch=1, bytes_in_all=little)
@@ -75,7 +75,9 @@ def test_what_is_kept_depends_on_the_seed_and_not_on_the_batches(
     assert not torch.equal(first.read(0, len(first)), seeded.read(0, len(seeded)))
 
 
-def test_patches_that_no_centre_can_describe_are_left_out(kept: Callable[..., Patches]) -> None:
+def test_patches_that_no_centre_can_describe_are_left_out(
+    kept: Callable[..., StoredPatches],
+) -> None:
     flat, odd, *good = photos()[:4]
     odd[2], odd[3] = torch.nan, torch.inf
     found = kept([torch.zeros_like(flat), odd, *good], batch=3)
@@ -83,21 +85,21 @@ def test_patches_that_no_centre_can_describe_are_left_out(kept: Callable[..., Pa
     assert bool(torch.isfinite(found.read(0, len(found))).all())
 
 
-def test_photos_of_different_sizes_are_kept_together(kept: Callable[..., Patches]) -> None:
+def test_photos_of_different_sizes_are_kept_together(kept: Callable[..., StoredPatches]) -> None:
     found = kept([unit_points(1, 3, WIDTH), unit_points(2, 5, WIDTH)], batch=2)
     assert len(found) == 8
 
 
 def test_photos_are_chosen_by_seed_in_a_random_order_each_once() -> None:
-    chosen = choose_photos(100, 40, WIDTH, seed=3)
+    chosen = sample_photos(100, 40, WIDTH, seed=3)
     assert len(set(chosen)) == 40
     assert chosen != sorted(chosen)
-    assert chosen == choose_photos(100, 40, WIDTH, seed=3) != choose_photos(100, 40, WIDTH, seed=4)
-    assert sorted(choose_photos(30, 1000, WIDTH, seed=0)) == list(range(30))
+    assert chosen == sample_photos(100, 40, WIDTH, seed=3) != sample_photos(100, 40, WIDTH, seed=4)
+    assert sorted(sample_photos(30, 1000, WIDTH, seed=0)) == list(range(30))
 
 
 def test_there_are_never_more_photos_than_patches_that_can_be_kept() -> None:
     width = 131_072
-    chosen = choose_photos(10_000, 10_000, width, seed=0)
-    assert len(chosen) == most_photos(width) == 256_000_000 // (4 * width)
+    chosen = sample_photos(10_000, 10_000, width, seed=0)
+    assert len(chosen) == max_photos_to_sample(width) == 256_000_000 // (4 * width)
     assert np.unique(chosen).size == len(chosen)

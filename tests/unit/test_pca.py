@@ -15,17 +15,17 @@ from sklearn.decomposition import PCA
 
 from shared.errors import Unprocessable
 from shared.objects import FolderStore
-from shared.vision.pca import Projection, Rows, Whitening
-from shared.vision.pca_file import WhiteningFile, decode_whitening
-from shared.vision.pca_fit import PcaFit, fit, fit_columns
+from shared.vision.pca import PcaProjection, PcaWhitening, Rows
+from shared.vision.pca_file import PcaWhiteningFile, decode_whitening
+from shared.vision.pca_fit import PcaFit, fit_pca, fit_pca_columns
 from shared.vision.pca_rows import (
     SAMPLE_BYTES,
     ArrayColumns,
     StoredColumns,
     block_width,
-    choose_rows,
+    sample_rows,
     sample_size,
-    usable,
+    usable_rows,
 )
 
 CPU = torch.device("cpu")
@@ -41,13 +41,13 @@ def unit_rows(count: int, dimension: int, seed: int = 0) -> Rows:
     return units
 
 
-def projected(rows: Rows, by: Whitening) -> Rows:
-    return Projection(by, CPU).project(rows)
+def projected(rows: Rows, by: PcaWhitening) -> Rows:
+    return PcaProjection(by, CPU).project(rows)
 
 
 def refusal(code: str, rows: Rows, kept: int) -> str:
     with pytest.raises(Unprocessable) as caught:
-        fit(rows, kept)
+        fit_pca(rows, kept)
     assert caught.value.code == code
     return caught.value.detail
 
@@ -68,7 +68,7 @@ def refusal(code: str, rows: Rows, kept: int) -> str:
 )
 def test_rows_are_whitened_as_by_scikit_learn(count: int, dimension: int, kept: int) -> None:
     rows, queries = unit_rows(count, dimension), unit_rows(20, dimension, seed=1)
-    ours = fit(rows, kept, block_bytes=40_000)
+    ours = fit_pca(rows, kept, block_bytes=40_000)
     theirs = PCA(n_components=kept, whiten=True, svd_solver="full").fit(rows.astype(np.float64))
     expected = theirs.transform(queries.astype(np.float64))
     expected /= np.linalg.norm(expected, axis=1, keepdims=True)
@@ -83,7 +83,7 @@ def test_both_ways_give_the_same_projection() -> None:
     rows = unit_rows(160, 150)
     by_columns, by_rows = ArrayColumns(rows), ArrayColumns(rows)
     by_rows.width = 40  # blocks: the products are those of the rows then
-    found, other = fit_columns(by_columns, 20), fit_columns(by_rows, 20)
+    found, other = fit_pca_columns(by_columns, 20), fit_pca_columns(by_rows, 20)
     np.testing.assert_allclose(found.mean, other.mean, atol=1e-7)
     np.testing.assert_allclose(found.variances, other.variances, rtol=1e-6)
     np.testing.assert_allclose(found.directions, other.directions, atol=1e-3)
@@ -92,7 +92,7 @@ def test_both_ways_give_the_same_projection() -> None:
 
 def test_whitened_rows_vary_equally_in_all_directions() -> None:
     rows = unit_rows(500, 80)
-    by = fit(rows, 16)
+    by = fit_pca(rows, 16)
     flat = (rows - by.mean) @ by.directions.T
     np.testing.assert_allclose(np.cov(flat.T), np.eye(16), atol=1e-3)
     np.testing.assert_allclose(np.linalg.norm(projected(rows, by), axis=1), 1, atol=1e-5)
@@ -100,13 +100,13 @@ def test_whitened_rows_vary_equally_in_all_directions() -> None:
 
 def test_blocks_make_no_difference() -> None:
     rows = unit_rows(70, 300)
-    whole, pieces = fit(rows, 10), fit(rows, 10, block_bytes=1)
+    whole, pieces = fit_pca(rows, 10), fit_pca(rows, 10, block_bytes=1)
     np.testing.assert_allclose(whole.directions, pieces.directions, atol=1e-4)
     np.testing.assert_allclose(whole.mean, pieces.mean, atol=1e-7)
 
 
 def test_signs_do_not_depend_on_how_the_directions_were_found() -> None:
-    by = fit(unit_rows(70, 300), 10)
+    by = fit_pca(unit_rows(70, 300), 10)
     strongest = np.abs(by.directions).argmax(axis=1)
     assert (by.directions[np.arange(10), strongest] > 0).all()
 
@@ -118,7 +118,7 @@ def test_fit_holds_no_matrix_of_the_dimension(tmp_path: Path) -> None:
     for row in file:
         row[:] = rng.standard_normal(dimension, dtype=np.float32)
     tracemalloc.start()
-    by = fit(file, kept, block_bytes=1_000_000)
+    by = fit_pca(file, kept, block_bytes=1_000_000)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert by.directions.shape == (kept, dimension)
@@ -127,7 +127,7 @@ def test_fit_holds_no_matrix_of_the_dimension(tmp_path: Path) -> None:
 
 
 def test_a_row_that_is_the_mean_or_nothing_becomes_zero_and_one_that_is_nan_stays_so() -> None:
-    by = fit(unit_rows(70, 30), 5)
+    by = fit_pca(unit_rows(70, 30), 5)
     rows = np.stack([by.mean, np.zeros(30, np.float32), np.full(30, np.nan, np.float32)])
     found = projected(rows, by)
     assert not found[:2].any()
@@ -139,7 +139,7 @@ def test_a_fit_is_the_same_when_it_was_interrupted_between_any_two_steps(
     count: int, dimension: int
 ) -> None:
     rows = ArrayColumns(unit_rows(count, dimension), block_bytes=40_000)
-    whole = fit_columns(rows, 12)
+    whole = fit_pca_columns(rows, 12)
     parts, saved, progress = [], None, []
     while True:
         torn = PcaFit(rows, 12)
@@ -169,7 +169,10 @@ def test_stored_rows_are_fitted_as_those_in_memory(tmp_path: Path, count: int) -
         StoredColumns(store, "work/rows-", 200, width, begin).add(rows[begin : begin + 7])
     stored = StoredColumns(store, "work/rows-", 200, width, count)
     np.testing.assert_array_equal(stored.read(6), rows[:, 180:])  # the last block, a narrow one
-    assert fit_columns(stored, 5).sha256 == fit(rows, 5, block_bytes=12_000 * count // 50).sha256
+    assert (
+        fit_pca_columns(stored, 5).sha256
+        == fit_pca(rows, 5, block_bytes=12_000 * count // 50).sha256
+    )
 
 
 def test_rows_that_a_crash_has_left_are_written_again(tmp_path: Path) -> None:
@@ -193,18 +196,18 @@ def test_the_sample_is_large_enough_for_the_directions_and_small_enough_for_the_
 
 
 def test_a_sample_is_the_same_for_its_seed_and_ascends() -> None:
-    chosen = choose_rows(40, 10, 0)
+    chosen = sample_rows(40, 10, 0)
     assert sorted(set(chosen)) == list(chosen)
     assert len(chosen) == 10
-    np.testing.assert_array_equal(chosen, choose_rows(40, 10, 0))
-    assert list(choose_rows(40, 10, 1)) != list(chosen)
-    assert list(choose_rows(4, 10, 0)) == [0, 1, 2, 3]
+    np.testing.assert_array_equal(chosen, sample_rows(40, 10, 0))
+    assert list(sample_rows(40, 10, 1)) != list(chosen)
+    assert list(sample_rows(4, 10, 0)) == [0, 1, 2, 3]
 
 
 def test_rows_that_say_nothing_are_not_learnt_from() -> None:
     rows = unit_rows(4, 8)
     rows[1], rows[2, 3] = 0, np.nan
-    assert list(usable(rows)) == [True, False, False, True]
+    assert list(usable_rows(rows)) == [True, False, False, True]
 
 
 # --- what is refused -------------------------------------------------------------------------
@@ -214,7 +217,7 @@ def test_more_rows_than_dimensions_are_needed() -> None:
     assert "needs more than 20 described photos" in refusal(
         "pca_too_few_rows", unit_rows(20, 64), 20
     )
-    assert fit(unit_rows(21, 64), 20).kept == 20
+    assert fit_pca(unit_rows(21, 64), 20).kept == 20
 
 
 def test_descriptors_do_not_become_longer() -> None:
@@ -234,13 +237,15 @@ def test_photos_that_are_all_alike_bear_few_directions(count: int) -> None:
 
 
 @pytest.fixture(scope="module")
-def fitted() -> Whitening:
-    return fit(unit_rows(70, 30), 6)
+def fitted() -> PcaWhitening:
+    return fit_pca(unit_rows(70, 30), 6)
 
 
 @pytest.mark.parametrize("spec", [None, {"extractor": "test", "preprocessing": {"version": 1}}])
-def test_a_file_holds_the_whole_whitening(fitted: Whitening, spec: dict[str, Any] | None) -> None:
-    data = WhiteningFile(fitted, spec).encode()
+def test_a_file_holds_the_whole_whitening(
+    fitted: PcaWhitening, spec: dict[str, Any] | None
+) -> None:
+    data = PcaWhiteningFile(fitted, spec).encode()
     read = decode_whitening(data)
     back = read.whitening
     for name in ("mean", "directions", "variances"):
@@ -254,22 +259,22 @@ def test_a_file_holds_the_whole_whitening(fitted: Whitening, spec: dict[str, Any
     assert read.encode() == data
 
 
-def test_a_whitening_fits_the_descriptors_that_it_was_learnt_from(fitted: Whitening) -> None:
+def test_a_whitening_fits_the_descriptors_that_it_was_learnt_from(fitted: PcaWhitening) -> None:
     spec = {"dimension": 30, "backbone": "a", "layer": 3, "decoder": "1", "precision": "float32"}
-    known = WhiteningFile(fitted, spec)
-    known.check_fits({**spec, "decoder": "2", "precision": "float16"})
-    WhiteningFile(fitted, None).check_fits({**spec, "layer": 4})
+    known = PcaWhiteningFile(fitted, spec)
+    known.check_compatible({**spec, "decoder": "2", "precision": "float16"})
+    PcaWhiteningFile(fitted, None).check_compatible({**spec, "layer": 4})
     with pytest.raises(Unprocessable, match="layer is 4, was 3") as caught:
-        known.check_fits({**spec, "layer": 4})
+        known.check_compatible({**spec, "layer": 4})
     assert caught.value.code == "pca_unfit"
-    for either in (known, WhiteningFile(fitted, None)):
+    for either in (known, PcaWhiteningFile(fitted, None)):
         with pytest.raises(Unprocessable, match="of 30 dimensions, and these have 31"):
-            either.check_fits({**spec, "dimension": 31})
+            either.check_compatible({**spec, "dimension": 31})
 
 
-def test_fingerprint_is_that_of_the_projection(fitted: Whitening) -> None:
-    assert fit(unit_rows(70, 30), 6).sha256 == fitted.sha256
-    assert fit(unit_rows(70, 30, seed=1), 6).sha256 != fitted.sha256
+def test_fingerprint_is_that_of_the_projection(fitted: PcaWhitening) -> None:
+    assert fit_pca(unit_rows(70, 30), 6).sha256 == fitted.sha256
+    assert fit_pca(unit_rows(70, 30, seed=1), 6).sha256 != fitted.sha256
 
 
 @pytest.mark.parametrize(
@@ -288,9 +293,9 @@ def test_fingerprint_is_that_of_the_projection(fitted: Whitening) -> None:
     ],
 )
 def test_files_that_would_spoil_descriptors_are_refused(
-    fitted: Whitening, name: str, value: NDArray[np.generic] | None, said: str
+    fitted: PcaWhitening, name: str, value: NDArray[np.generic] | None, said: str
 ) -> None:
-    stored = load(WhiteningFile(fitted, None).encode())
+    stored = load(PcaWhiteningFile(fitted, None).encode())
     if value is None:
         del stored[name]
     else:
@@ -298,8 +303,8 @@ def test_files_that_would_spoil_descriptors_are_refused(
     assert said in unfit(save(stored))
 
 
-def test_files_that_are_none_are_refused(fitted: Whitening) -> None:
-    data = WhiteningFile(fitted, None).encode()
+def test_files_that_are_none_are_refused(fitted: PcaWhitening) -> None:
+    data = PcaWhiteningFile(fitted, None).encode()
     for broken in (b"", b"\x93NUMPY", data[:-1], data[:100], data + b"x"):
         assert "not a whole one" in unfit(broken)
     whole = load(data)

@@ -9,7 +9,7 @@ import pytest
 from shared.errors import Unprocessable
 from shared.intake.photo_fields import (
     MAX_TAGS,
-    MAX_TEXT,
+    MAX_TEXT_CHARACTERS,
     PhotoFields,
     check_metadata,
     read_form_fields,
@@ -112,9 +112,9 @@ def test_times_that_are_none_are_refused(text: str) -> None:
 
 
 def test_texts_have_a_length_and_no_nul() -> None:
-    assert read_form_fields({"place": "x" * MAX_TEXT}).place == "x" * MAX_TEXT
-    assert refused_field({"place": "x" * (MAX_TEXT + 1)}) == "place"
-    assert refused_field({"tags": "a," + "x" * (MAX_TEXT + 1)}) == "tags"
+    assert read_form_fields({"place": "x" * MAX_TEXT_CHARACTERS}).place == "x" * MAX_TEXT_CHARACTERS
+    assert refused_field({"place": "x" * (MAX_TEXT_CHARACTERS + 1)}) == "place"
+    assert refused_field({"tags": "a," + "x" * (MAX_TEXT_CHARACTERS + 1)}) == "tags"
     assert refused_field({"place": "a\0b"}) == "place"
     assert refused_field({"tags": "a\0b"}) == "tags"
 

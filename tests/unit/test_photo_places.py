@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from services.cli.photo_places import find_photos
-from shared.datasets.utm_names import fields_of_name
+from shared.datasets.utm_names import upload_fields_of_file_name
 from shared.errors import InvalidRequest
 
 # The Mole Antonelliana in Turin, zone 32T.
@@ -38,12 +38,12 @@ def table_of(folder: Path, text: str, encoding: str = "utf-8") -> Path:
 def test_name_with_latitude_and_longitude_needs_no_zone() -> None:
     name = f"@{EAST}@{NORTH}@32@T@45.0691@7.6931@pano@tile@370.5@@@@@@.jpg"
     expected = {"latitude": "45.0691", "longitude": "7.6931", "heading": "10.5"}
-    assert fields_of_name(name, None) == expected
+    assert upload_fields_of_file_name(name, None) == expected
 
 
 @pytest.mark.parametrize("zone", [None, "33T"])
 def test_name_with_its_own_zone_goes_before_the_option(zone: str | None) -> None:
-    fields = fields_of_name(f"@{EAST}@{NORTH}@32@T@@@@@@@@@@@.jpg", zone)
+    fields = upload_fields_of_file_name(f"@{EAST}@{NORTH}@32@T@@@@@@@@@@@.jpg", zone)
     assert float(fields["latitude"]) == pytest.approx(LATITUDE, abs=1e-3)
     assert float(fields["longitude"]) == pytest.approx(LONGITUDE, abs=1e-3)
     assert "heading" not in fields
@@ -52,20 +52,20 @@ def test_name_with_its_own_zone_goes_before_the_option(zone: str | None) -> None
 @pytest.mark.parametrize("name", [f"@{EAST}@{NORTH}@.jpg", f"@{EAST}@{NORTH}@@@@@@@@@@@@@.jpg"])
 @pytest.mark.parametrize("zone", ["32T", "32t"])
 def test_name_without_a_zone_takes_the_option(name: str, zone: str) -> None:
-    fields = fields_of_name(name, zone)
+    fields = upload_fields_of_file_name(name, zone)
     assert float(fields["latitude"]) == pytest.approx(LATITUDE, abs=1e-3)
     assert float(fields["longitude"]) == pytest.approx(LONGITUDE, abs=1e-3)
 
 
 def test_southern_zone_lies_south() -> None:
-    fields = fields_of_name("@334000@6252000@56@H@@@@@@@@@@@.jpg", None)
+    fields = upload_fields_of_file_name("@334000@6252000@56@H@@@@@@@@@@@.jpg", None)
     assert float(fields["latitude"]) == pytest.approx(-33.86, abs=0.02)
     assert float(fields["longitude"]) == pytest.approx(151.2, abs=0.02)
 
 
 def test_name_without_any_zone_is_an_error_that_names_the_option() -> None:
     with pytest.raises(InvalidRequest) as caught:
-        fields_of_name(f"@{EAST}@{NORTH}@@@@@@@@@@@@@.jpg", None)
+        upload_fields_of_file_name(f"@{EAST}@{NORTH}@@@@@@@@@@@@@.jpg", None)
     assert caught.value.code == "no_utm_zone"
     assert "--utm-zone" in caught.value.detail
 
@@ -82,14 +82,14 @@ def test_name_without_any_zone_is_an_error_that_names_the_option() -> None:
 )
 def test_coordinates_that_are_none_are_an_error_that_names_the_file(name: str) -> None:
     with pytest.raises(InvalidRequest) as caught:
-        fields_of_name(name, None)
+        upload_fields_of_file_name(name, None)
     assert caught.value.code == "bad_coordinates"
     assert name in caught.value.detail
 
 
 @pytest.mark.parametrize("name", ["photo.jpg", "me@home.jpg", "a@1@2@3@4@.jpg", "@me.jpg"])
 def test_ordinary_names_say_nothing(name: str) -> None:
-    assert fields_of_name(name, "32T") == {}
+    assert upload_fields_of_file_name(name, "32T") == {}
 
 
 def test_photos_are_found_below_the_folder_in_the_order_of_their_paths(tmp_path: Path) -> None:

@@ -17,8 +17,8 @@ from shared.vision.place_models.aggregators.convap import ConvAP
 from shared.vision.place_models.aggregators.cosplace import CosPlace
 from shared.vision.place_models.aggregators.mixvpr import MixVPR
 from shared.vision.place_models.aggregators.netvlad import NetVLAD
-from shared.vision.place_models.aggregators.pooling import Average, GeM
-from shared.vision.place_models.aggregators.salad import SALAD, transport
+from shared.vision.place_models.aggregators.pooling import AveragePooling, GeM
+from shared.vision.place_models.aggregators.salad import SALAD, optimal_transport
 
 Array = NDArray[np.float64]
 Weights = dict[str, Array]
@@ -80,7 +80,7 @@ def check(aggregator: Aggregator, formula: Callable[[Array, Weights], Array]) ->
 
 def test_average_is_the_mean_of_each_channel() -> None:
     maps = torch.tensor([[[[1.0, 2.0], [3.0, 6.0]], [[4.0, 4.0], [4.0, 4.0]]]])
-    row = Average(2)(maps)  # means 3 and 4: of length 5
+    row = AveragePooling(2)(maps)  # means 3 and 4: of length 5
     np.testing.assert_allclose(row, [[0.6, 0.8]], atol=1e-7)
 
 
@@ -214,7 +214,7 @@ def test_salad_takes_the_class_token_where_there_is_one() -> None:
 
 def test_transport_keeps_the_masses() -> None:
     scores = torch.randn(2, 4, 50, generator=torch.Generator().manual_seed(3))
-    plan = transport(scores, torch.tensor(1.0))
+    plan = optimal_transport(scores, torch.tensor(1.0))
     assert bool((plan >= 0).all())
     assert float(plan.sum(dim=1).max()) <= 1 + 1e-5  # of a feature: what is left is the dustbin's
     np.testing.assert_allclose(plan.sum(dim=2), np.ones((2, 4)), atol=0.05)  # of a cluster
@@ -258,7 +258,7 @@ def test_boq_asks_each_blocks_positions_with_learnt_queries() -> None:
 @pytest.mark.parametrize(
     "aggregator",
     [
-        Average(CHANNELS),
+        AveragePooling(CHANNELS),
         GeM(CHANNELS),
         CosPlace(CHANNELS, 9),
         ConvAP(CHANNELS, 7),

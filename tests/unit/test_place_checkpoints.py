@@ -12,30 +12,30 @@ from typing import Any
 import pytest
 import torch
 
-from services.extractor.add_model import about
+from services.extractor.add_model import training_card
 from shared.errors import NotFound, Unprocessable
 from shared.vision.place_models.checkpoint import (
     Checkpoint,
     checkpoint_state,
-    fingerprint,
     load_checkpoint,
+    model_fingerprint,
 )
-from shared.vision.place_models.config import ModelConfig
-from shared.vision.place_models.model import PlaceModel, build_model
+from shared.vision.place_models.config import VprModelConfig
+from shared.vision.place_models.model import VprModel, build_vpr_model
 from tests.support.fit_memory import forget_peak_memory, memory_bytes
 
 SWOLLEN_BYTES = 256 << 20
 ZEROS = bytes(4 << 20)
 
 
-def some_model(seed: int = 0, **changes: Any) -> PlaceModel:
+def some_model(seed: int = 0, **changes: Any) -> VprModel:
     torch.manual_seed(seed)
     values = {"pretrained": False, "agg_arch": "GeM", "layers_to_crop": [3], "image_size": (32, 48)}
-    return build_model(ModelConfig.read(values | changes))
+    return build_vpr_model(VprModelConfig.parse(values | changes))
 
 
 @pytest.fixture(scope="module")
-def model() -> PlaceModel:
+def model() -> VprModel:
     return some_model()
 
 
@@ -51,7 +51,7 @@ def refusal(path: Path) -> Unprocessable:
 
 
 def test_a_checkpoint_brings_back_the_model_and_where_it_comes_from(
-    model: PlaceModel, tmp_path: Path
+    model: VprModel, tmp_path: Path
 ) -> None:
     file = saved(tmp_path / "model.ckpt", checkpoint_state(model, lr=0.1, cities=["Oslo"]))
     found = load_checkpoint(file)
@@ -59,14 +59,14 @@ def test_a_checkpoint_brings_back_the_model_and_where_it_comes_from(
     with torch.inference_mode():
         assert torch.equal(found.model(photos), model(photos))
     assert found.config == model.config
-    assert found.fingerprint == fingerprint(model)
+    assert found.fingerprint == model_fingerprint(model)
     assert found.about == {"lr": 0.1, "cities": ["Oslo"]}
     assert not found.model.training
     assert not any(parameter.requires_grad for parameter in found.model.parameters())
 
 
 def test_what_lightning_keeps_beside_the_model_is_no_hindrance(
-    model: PlaceModel, tmp_path: Path
+    model: VprModel, tmp_path: Path
 ) -> None:
     state = checkpoint_state(model) | {
         "epoch": 7,
@@ -79,15 +79,15 @@ def test_what_lightning_keeps_beside_the_model_is_no_hindrance(
     state["state_dict"]["loss.weight"] = torch.zeros(2)
     found = load_checkpoint(saved(tmp_path / "last.ckpt", state))
     assert found.about == {"epoch": 7, "global_step": 4382}
-    assert found.fingerprint == fingerprint(model)
+    assert found.fingerprint == model_fingerprint(model)
 
 
-def test_the_fingerprint_follows_what_decides_a_descriptor(model: PlaceModel) -> None:
-    first = fingerprint(model)
-    assert fingerprint(some_model(layers_to_freeze=-1)) == first
-    assert fingerprint(some_model(seed=1)) != first
-    assert fingerprint(some_model(image_size=(64, 96))) != first
-    assert fingerprint(some_model(agg_config={"eps": 1e-5})) != first
+def test_the_fingerprint_follows_what_decides_a_descriptor(model: VprModel) -> None:
+    first = model_fingerprint(model)
+    assert model_fingerprint(some_model(layers_to_freeze=-1)) == first
+    assert model_fingerprint(some_model(seed=1)) != first
+    assert model_fingerprint(some_model(image_size=(64, 96))) != first
+    assert model_fingerprint(some_model(agg_config={"eps": 1e-5})) != first
 
 
 class Bomb:
@@ -99,7 +99,7 @@ class Bomb:
 
 
 def test_a_checkpoint_that_would_execute_something_is_refused(
-    model: PlaceModel, tmp_path: Path
+    model: VprModel, tmp_path: Path
 ) -> None:
     target = tmp_path / "executed"
     file = saved(tmp_path / "bomb.ckpt", checkpoint_state(model) | {"callbacks": Bomb(target)})
@@ -116,7 +116,7 @@ def test_what_is_no_checkpoint_is_refused(damage: bytes, tmp_path: Path) -> None
     assert refusal(file).code == "checkpoint_unreadable"
 
 
-def test_a_torn_checkpoint_is_refused(model: PlaceModel, tmp_path: Path) -> None:
+def test_a_torn_checkpoint_is_refused(model: VprModel, tmp_path: Path) -> None:
     file = saved(tmp_path / "torn.ckpt", checkpoint_state(model))
     file.write_bytes(file.read_bytes()[:-1000])
     assert refusal(file).code == "checkpoint_unreadable"
@@ -128,7 +128,7 @@ def test_a_missing_checkpoint_is_not_found(tmp_path: Path) -> None:
     assert refused.value.code == "checkpoint_not_found"
 
 
-def test_tensors_of_another_network_are_refused_by_name(model: PlaceModel, tmp_path: Path) -> None:
+def test_tensors_of_another_network_are_refused_by_name(model: VprModel, tmp_path: Path) -> None:
     stem = "model.backbone.stem.0.weight"
     state = checkpoint_state(model)
     tensors = state["state_dict"]
@@ -154,7 +154,7 @@ def test_a_file_that_does_not_say_which_network_it_holds_is_refused(
 
 
 def test_a_checkpoint_can_not_ask_for_more_memory_than_it_has_bytes(
-    model: PlaceModel, tmp_path: Path
+    model: VprModel, tmp_path: Path
 ) -> None:
     """A head of 2^20 x 2^20 numbers is laid out and refused; in memory it would be 4 TB."""
     state = checkpoint_state(model)
@@ -195,7 +195,7 @@ def repeated_views(path: Path) -> Path:
     head = {"agg_arch": "ConvAP", "agg_config": {"out_channels": 1 << 14, "s1": 2, "s2": 2}}
     values: dict[str, Any] = {"pretrained": False, "image_size": (32, 48), **head}
     with torch.device("meta"):
-        large = build_model(ModelConfig.read(values))
+        large = build_vpr_model(VprModelConfig.parse(values))
     state = checkpoint_state(large)
     for name, tensor in state["state_dict"].items():
         state["state_dict"][name] = torch.ones((), dtype=tensor.dtype).expand(tensor.shape)
@@ -204,7 +204,7 @@ def repeated_views(path: Path) -> Path:
 
 @pytest.mark.parametrize("kind", ["storage", "pickle", "overlapping", "repeated views"])
 def test_a_hostile_checkpoint_is_refused_before_it_swells(
-    model: PlaceModel, tmp_path: Path, kind: str
+    model: VprModel, tmp_path: Path, kind: str
 ) -> None:
     buffer = io.BytesIO()
     torch.save(checkpoint_state(model), buffer)
@@ -223,7 +223,7 @@ def test_a_hostile_checkpoint_is_refused_before_it_swells(
     assert memory_bytes("VmHWM") - before < SWOLLEN_BYTES / 4
 
 
-def test_an_unknown_network_in_a_checkpoint_is_named(model: PlaceModel, tmp_path: Path) -> None:
+def test_an_unknown_network_in_a_checkpoint_is_named(model: VprModel, tmp_path: Path) -> None:
     state = checkpoint_state(model)
     state["hyper_parameters"]["model"] |= {"backbone_arch": "vgg16"}
     assert refusal(saved(tmp_path / "other.ckpt", state)).code == "unknown_backbone"
@@ -323,9 +323,12 @@ def test_a_refusal_names_what_is_refused_and_gives_no_unsafe_advice(tmp_path: Pa
     assert "weights_only" not in detail
 
 
-def test_a_long_value_that_is_named_many_times_is_not_copied_as_often(model: PlaceModel) -> None:
+def test_a_long_value_that_is_named_many_times_is_not_copied_as_often(model: VprModel) -> None:
     rows = ["x" * 10_000] * 100_000
     hostile = Checkpoint(model, model.config, "0", {"epoch": 3, "rows": [rows] * 100_000})
-    assert about(hostile) == {"epoch": 3, "left_out": "the hyperparameters, which are too long"}
+    assert training_card(hostile) == {
+        "epoch": 3,
+        "left_out": "the hyperparameters, which are too long",
+    }
     plain = Checkpoint(model, model.config, "0", {"lr": 0.1, "steps": 1 << 100, "cities": ["Oslo"]})
-    assert about(plain) == {"lr": 0.1, "steps": "<int>", "cities": ["Oslo"]}
+    assert training_card(plain) == {"lr": 0.1, "steps": "<int>", "cities": ["Oslo"]}

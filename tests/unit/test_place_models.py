@@ -14,25 +14,25 @@ from safetensors.torch import save_file
 
 from shared.errors import Misconfigured, Unprocessable
 from shared.torchhub_names import IMAGENET_MEAN, IMAGENET_STD
-from shared.vision.backbones.base import normalise_pixels, unit_features
+from shared.vision.backbones.base import normalise_features, normalise_pixels
 from shared.vision.backbones.efficientnet_lite0 import EfficientNetLite0
 from shared.vision.place_models.backbones import StagedBackbone, build_backbone, pretrained
-from shared.vision.place_models.backbones.dinov2 import dinov2
-from shared.vision.place_models.config import STAGES, ModelConfig
-from shared.vision.place_models.model import PlaceModel, build_model
+from shared.vision.place_models.backbones.dinov2 import build_dinov2
+from shared.vision.place_models.config import STAGES, VprModelConfig
+from shared.vision.place_models.model import VprModel, build_vpr_model
 from tests.support.vit import PLAIN, plain_forward, random_weights, save
 
 CPU = torch.device("cpu")
 
 
-def config(**changes: Any) -> ModelConfig:
-    return ModelConfig.read({"pretrained": False, "image_size": (64, 96), **changes})
+def config(**changes: Any) -> VprModelConfig:
+    return VprModelConfig.parse({"pretrained": False, "image_size": (64, 96), **changes})
 
 
-def laid_out(**changes: Any) -> PlaceModel:
+def laid_out(**changes: Any) -> VprModel:
     """A model without memory for its weights: shapes alone."""
     with torch.device("meta"):
-        return build_model(config(**changes))
+        return build_vpr_model(config(**changes))
 
 
 def noise(height: int = 64, width: int = 96, count: int = 2) -> torch.Tensor:
@@ -76,7 +76,7 @@ def test_each_backbone_makes_the_map_that_is_documented(
 @pytest.mark.parametrize("name", ["resnet18", "efficientnet_b0", "efficientnet_lite0", "swin_t"])
 def test_descriptors_are_unit_rows_of_float32(name: str) -> None:
     torch.manual_seed(0)
-    model = build_model(config(backbone_arch=name, agg_arch="GeM", layers_to_freeze=-1))
+    model = build_vpr_model(config(backbone_arch=name, agg_arch="GeM", layers_to_freeze=-1))
     model.train()  # with the statistics of a fresh BatchNorm, a deep network's signal fades
     with torch.inference_mode():
         rows = model(noise())
@@ -216,7 +216,7 @@ def test_nothing_is_frozen_with_minus_one_and_the_stem_alone_with_zero() -> None
 
 def test_the_last_blocks_of_a_transformer_can_be_trained_alone() -> None:
     torch.manual_seed(0)
-    backbone = dinov2("dinov2_vits14", False, None, shape=PLAIN)
+    backbone = build_dinov2("dinov2_vits14", False, None, shape=PLAIN)
     backbone.freeze(PLAIN.depth - 1)
     backbone.train()
     backbone(noise(56, 70)).maps.square().sum().backward()
@@ -231,7 +231,7 @@ def test_dinov2_makes_the_tokens_of_a_whole_forward_pass_and_norms_them(tmp_path
     file = save(weights, tmp_path / "weights.pth")
     pixels = np.random.default_rng(0).integers(0, 256, (2, 56, 70, 3), dtype=np.uint8)
     photos = normalise_pixels(torch.from_numpy(pixels), IMAGENET_MEAN, IMAGENET_STD)
-    backbone = dinov2("dinov2_vits14", True, file, shape=PLAIN).eval()
+    backbone = build_dinov2("dinov2_vits14", True, file, shape=PLAIN).eval()
     assert torch.equal(backbone.state_dict()["norm.weight"], weights["norm.weight"])
     with torch.inference_mode():
         maps, token = backbone(photos)
@@ -241,7 +241,7 @@ def test_dinov2_makes_the_tokens_of_a_whole_forward_pass_and_norms_them(tmp_path
     assert token is not None
     assert token.shape == (2, PLAIN.width)
     wanted = plain_forward(weights, PLAIN, pixels)[-1]["token"]
-    features = unit_features(plain.flatten(2).transpose(1, 2))
+    features = normalise_features(plain.flatten(2).transpose(1, 2))
     np.testing.assert_allclose(features, wanted, atol=1e-4)
     normed = torch.nn.functional.layer_norm(
         plain.permute(0, 2, 3, 1),
@@ -261,7 +261,7 @@ def test_lite0_with_its_published_weights_is_the_embedded_defaults_network() -> 
     with torch.inference_mode():
         maps = build_backbone(chosen, None)(photos).maps
     wanted = EfficientNetLite0(CPU).features(torch.from_numpy(pixels))
-    features = unit_features(maps.flatten(2).transpose(1, 2))
+    features = normalise_features(maps.flatten(2).transpose(1, 2))
     np.testing.assert_allclose(features, wanted, atol=1e-4)
 
 
@@ -272,7 +272,7 @@ def no_network(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     def fail(url: str, target: Path, **_: object) -> None:
         raise httpx2.ConnectError("no route to host")
 
-    monkeypatch.setattr(pretrained, "download", fail)
+    monkeypatch.setattr(pretrained, "download_file", fail)
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
     folder = tmp_path / "hub" / "checkpoints"
     folder.mkdir(parents=True)
@@ -285,10 +285,10 @@ def test_pretrained_weights_come_from_the_cache_or_from_a_file(no_network: Path)
     wanted = published["layer2.1.conv2.weight"]
     file = no_network / "mine.safetensors"
     save_file(published, file)
-    given = build_model(config(pretrained=True), weights=file)
+    given = build_vpr_model(config(pretrained=True), weights=file)
     assert torch.equal(given.state_dict()["backbone.stages.1.1.conv2.weight"], wanted)
     torch.save(published, no_network / "resnet18-f37072fd.pth")
-    cached = build_model(config(pretrained=True))
+    cached = build_vpr_model(config(pretrained=True))
     assert torch.equal(cached.state_dict()["backbone.stages.1.1.conv2.weight"], wanted)
 
 
@@ -296,10 +296,10 @@ def test_weights_that_can_not_be_had_are_missing_and_never_random(no_network: Pa
     for name, weights in (("resnet18", None), ("resnet18", no_network / "none.pth"),
                           ("efficientnet_lite0", no_network / "none.pth")):  # fmt: skip
         with pytest.raises(Misconfigured) as refused:
-            build_model(config(backbone_arch=name, pretrained=True), weights=weights)
+            build_vpr_model(config(backbone_arch=name, pretrained=True), weights=weights)
         assert refused.value.code == "weights_missing"
     with pytest.raises(Misconfigured, match=r"no route to host.*\(1\).*\(2\).*\(3\).*\(4\)"):
-        build_model(config(pretrained=True))
+        build_vpr_model(config(pretrained=True))
 
 
 def test_another_networks_weights_are_refused(no_network: Path) -> None:
@@ -309,5 +309,5 @@ def test_another_networks_weights_are_refused(no_network: Path) -> None:
     (no_network / "torn.pth").write_bytes(b"PK\x03\x04 torn")
     for name in ("resnet18-f37072fd.pth", "other.pth", "torn.pth"):
         with pytest.raises(Misconfigured) as refused:
-            build_model(config(pretrained=True), weights=no_network / name)
+            build_vpr_model(config(pretrained=True), weights=no_network / name)
         assert refused.value.code == "weights_unfit"

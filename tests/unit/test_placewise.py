@@ -17,7 +17,7 @@ import placewise
 from placewise import answers
 from services.gateway import batches, evaluations, figures, history, maps, schemas
 from tests.unit.test_client import FakeServer, running_server
-from tools.make_sync_client import FILES, ROOT, synchronous
+from tools.make_sync_client import GENERATED_FILES, ROOT, to_synchronous
 
 JOB = {
     "job_id": "01a1fca4-c1a2-7356-bf32-75e2c2a0d083",
@@ -59,25 +59,25 @@ PHOTO = {
 }
 STARTED = {"job_id": JOB["job_id"], "status": "queued", "status_url": "/", "result_url": None}
 SAME: list[tuple[type[BaseModel], type[BaseModel]]] = [
-    (answers.Photo, schemas.PhotoAnswer),
-    (answers.OnePhoto, schemas.OnePhotoAnswer),
-    (answers.Deleted, schemas.DeleteAnswer),
-    (answers.Uploaded, schemas.UploadAnswer),
-    (answers.Similar, schemas.SimilarityAnswer),
-    (answers.Estimate, schemas.EstimateAnswer),
-    (answers.Explanation, schemas.ExplanationAnswer),
-    (answers.ClusterShare, schemas.ClusterShareAnswer),
-    (answers.Progress, schemas.Progress),
-    (answers.Job, schemas.JobAnswer),
-    (answers.Started, schemas.JobStarted),
-    (answers.BatchStarted, batches.BatchStarted),
-    (answers.BatchItem, batches.BatchItemAnswer),
-    (answers.Vocabulary, schemas.VocabularyAnswer),
-    (answers.Generation, schemas.GenerationAnswer),
-    (answers.Evaluation, evaluations.EvaluationAnswer),
-    (answers.Search, history.SearchAnswer),
-    (answers.Map, maps.MapAnswer),
-    (answers.Stats, figures.StatsAnswer),
+    (answers.Photo, schemas.PhotoResponse),
+    (answers.OnePhoto, schemas.PhotoDetailResponse),
+    (answers.Deleted, schemas.DeletedPhotoResponse),
+    (answers.Uploaded, schemas.UploadResponse),
+    (answers.Similar, schemas.SimilarityResponse),
+    (answers.Estimate, schemas.EstimateResponse),
+    (answers.Explanation, schemas.ExplanationResponse),
+    (answers.ClusterShare, schemas.ClusterShareResponse),
+    (answers.Progress, schemas.JobProgress),
+    (answers.Job, schemas.JobResponse),
+    (answers.Started, schemas.JobAcceptedResponse),
+    (answers.BatchStarted, batches.BatchAcceptedResponse),
+    (answers.BatchItem, batches.BatchItemResponse),
+    (answers.Vocabulary, schemas.VocabularyResponse),
+    (answers.Generation, schemas.GenerationResponse),
+    (answers.Evaluation, evaluations.EvaluationResponse),
+    (answers.Search, history.SearchHistoryEntry),
+    (answers.Map, maps.MapResponse),
+    (answers.Stats, figures.StatsResponse),
 ]
 
 
@@ -87,9 +87,11 @@ def server() -> Iterator[FakeServer]:
         yield made
 
 
-@pytest.mark.parametrize("source", FILES)
+@pytest.mark.parametrize("source", GENERATED_FILES)
 def test_synchronous_client_is_made_of_the_asynchronous_one(source: str) -> None:
-    assert (ROOT / FILES[source]).read_text() == synchronous(source), "run `make client`"
+    assert (ROOT / GENERATED_FILES[source]).read_text() == to_synchronous(source), (
+        "run `make client`"
+    )
 
 
 @pytest.mark.parametrize(("mine", "servers"), SAME, ids=lambda kind: kind.__name__)

@@ -10,7 +10,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from shared.vision.pooling import average, gem
+from shared.vision.pooling import average_pooling, gem_pooling
 
 Matrix = NDArray[np.float64]
 Aggregate = Callable[[torch.Tensor], torch.Tensor]
@@ -41,7 +41,9 @@ def slow_gem(patches: Matrix) -> Matrix:
 
 
 BOTH = pytest.mark.parametrize(
-    ("aggregate", "formula"), [(average, slow_average), (gem, slow_gem)], ids=["avg", "gem"]
+    ("aggregate", "formula"),
+    [(average_pooling, slow_average), (gem_pooling, slow_gem)],
+    ids=["avg", "gem"],
 )
 
 
@@ -54,12 +56,15 @@ def test_rows_equal_the_formula(aggregate: Aggregate, formula: Callable[[Matrix]
 
 def test_gem_lies_between_the_mean_and_the_largest_and_differs_from_both() -> None:
     features = some_features(2).abs()
-    rows = gem(features)
-    for other in (average(features), torch.nn.functional.normalize(features.amax(dim=1), dim=-1)):
+    rows = gem_pooling(features)
+    for other in (
+        average_pooling(features),
+        torch.nn.functional.normalize(features.amax(dim=1), dim=-1),
+    ):
         assert float((rows - other).norm(dim=1).min()) > 0.01
 
 
-@pytest.mark.parametrize("aggregate", [average, gem])
+@pytest.mark.parametrize("aggregate", [average_pooling, gem_pooling])
 def test_zero_patches_stay_out(aggregate: Aggregate) -> None:
     features = some_features(3)
     blank = torch.cat([torch.zeros(3, 5, 16), features], dim=1)
@@ -67,7 +72,7 @@ def test_zero_patches_stay_out(aggregate: Aggregate) -> None:
     assert aggregate(torch.zeros(1, 4, 16)).tolist() == [[0.0] * 16]
 
 
-@pytest.mark.parametrize("aggregate", [average, gem])
+@pytest.mark.parametrize("aggregate", [average_pooling, gem_pooling])
 def test_rows_do_not_depend_on_the_batch(aggregate: Aggregate) -> None:
     features = some_features(4, photos=5)
     alone = torch.cat([aggregate(features[i : i + 1]) for i in range(5)])

@@ -10,13 +10,13 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from shared.recipes import RECIPES, get_recipe
-from shared.vision.backbones.base import unit_features
+from shared.recipes import EXTRACTOR_CONFIGS, get_extractor_config
+from shared.vision.backbones.base import normalise_features
 from shared.vision.backbones.dinov2 import Dinov2, VitShape
 from shared.vision.extractors import Extractor, spec_fingerprint
 from shared.vision.precision import PRECISIONS, Precision, choose_precision
 from shared.vision.vlad import vlad
-from shared.vision.vocabulary import Centres, check_centres
+from shared.vision.vocabulary import ClusterCentres, parse_centres
 from tests.support.hub import COMMIT
 from tests.support.photos import photo_image
 from tests.support.vit import PLAIN, SWIGLU, random_weights, save
@@ -32,7 +32,7 @@ def small_vit(shape: VitShape, folder: Path) -> Extractor:
     """A small network with random weights under the name of a large one."""
     file = save(random_weights(shape), folder / "weights.pth")
     backbone = Dinov2("vits14", shape.depth - 1, "value", CPU, file, shape=shape)
-    recipe = replace(RECIPES["anyloc-vits14"], width=shape.width)
+    recipe = replace(EXTRACTOR_CONFIGS["anyloc-vits14"], width=shape.width)
     return Extractor(recipe, CPU, backbone=backbone)
 
 
@@ -47,15 +47,20 @@ def pixels(count: int) -> NDArray[np.uint8]:
     return np.stack([np.asarray(photo_image(n, 224, 224)) for n in range(count)])
 
 
-def centres_of(extractor: Extractor) -> Centres:
+def centres_of(extractor: Extractor) -> ClusterCentres:
     """Five patches of a photo."""
     features = extractor.features(pixels(1))[0]
-    return check_centres(features[:: len(features) // 5][:5].clone().numpy())
+    return parse_centres(features[:: len(features) // 5][:5].clone().numpy())
 
 
 def test_auto_is_half_precision_for_dinov2_on_cuda_alone() -> None:
-    dino, convolutions = RECIPES["anyloc-vitg14"], RECIPES["efficientnet-lite0-vlad"]
-    theirs = get_recipe(f"torchhub:owner/name@{COMMIT}:entry", allow_test_extractors=False)
+    dino, convolutions = (
+        EXTRACTOR_CONFIGS["anyloc-vitg14"],
+        EXTRACTOR_CONFIGS["efficientnet-lite0-vlad"],
+    )
+    theirs = get_extractor_config(
+        f"torchhub:owner/name@{COMMIT}:entry", allow_test_extractors=False
+    )
     assert choose_precision("auto", dino, CUDA) == "bfloat16"
     assert choose_precision("auto", dino, CPU) == "float32"
     assert choose_precision("auto", convolutions, CUDA) == "float32"
@@ -66,7 +71,7 @@ def test_auto_is_half_precision_for_dinov2_on_cuda_alone() -> None:
 
 
 def test_spec_tells_precisions_apart_and_single_means_what_it_meant() -> None:
-    single = Extractor(RECIPES["test-tiny-avg"], CPU)
+    single = Extractor(EXTRACTOR_CONFIGS["test-tiny-avg"], CPU)
     half = single.at("bfloat16")
     assert single.spec(None)["precision"] == "float32"
     assert half.spec(None) == {**single.spec(None), "precision": "bfloat16"}
@@ -112,7 +117,9 @@ def test_single_precision_is_not_rounded_to_tf32(monkeypatch: pytest.MonkeyPatch
     before = torch.get_float32_matmul_precision()
     torch.set_float32_matmul_precision("high")
     try:
-        Extractor(RECIPES["test-tiny-avg"], CPU).features(np.zeros((1, 32, 32, 3), np.uint8))
+        Extractor(EXTRACTOR_CONFIGS["test-tiny-avg"], CPU).features(
+            np.zeros((1, 32, 32, 3), np.uint8)
+        )
         assert not torch.backends.cudnn.allow_tf32
         assert not torch.backends.cuda.matmul.allow_tf32
         assert torch.get_float32_matmul_precision() == "highest"
@@ -125,7 +132,7 @@ def test_patch_whose_length_overflows_is_told_apart_from_one_without_structure(
     dtype: torch.dtype,
 ) -> None:
     patches = torch.tensor([[3.0, 4.0], [0.0, 0.0], [3e38, 3e38], [float("inf"), 0.0]], dtype=dtype)
-    units = unit_features(patches)
+    units = normalise_features(patches)
     assert units.dtype == torch.float32
     np.testing.assert_allclose(units[:2], [[0.6, 0.8], [0.0, 0.0]], atol=1e-6)
     assert units[2:].isnan().all()
@@ -135,10 +142,10 @@ def test_patch_whose_length_overflows_is_told_apart_from_one_without_structure(
 def test_photo_whose_features_overflow_is_refused_and_not_described_without_them(
     precision: Precision, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    made = Extractor(RECIPES["test-tiny-vlad"], CPU, precision=precision)
+    made = Extractor(EXTRACTOR_CONFIGS["test-tiny-vlad"], CPU, precision=precision)
     photos = np.random.default_rng(3).integers(0, 256, (2, 32, 32, 3), dtype=np.uint8)
     photos[0] = 127  # about zero in every channel: its features stay small
-    centres = check_centres(np.random.default_rng(2).standard_normal((5, 16)).astype(np.float32))
+    centres = parse_centres(np.random.default_rng(2).standard_normal((5, 16)).astype(np.float32))
     huge = made.backbone._projection * 1e20  # type: ignore[attr-defined]
     monkeypatch.setattr(made.backbone, "_projection", huge)
     rows = made.describe(photos, centres)

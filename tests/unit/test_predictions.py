@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from services.cli.main import tree
+from services.cli.main import build_app
 from shared.datasets.ground_truth_files import write_ground_truth
 
 TRUTH = [[4, 2], [1], [], [3], [0, 5]]
@@ -30,7 +30,7 @@ def files(tmp_path: Path) -> tuple[Path, Path]:
 
 def run(*arguments: object, code: int = 0) -> dict[str, Any]:
     given = ["evaluate", *map(str, arguments), "--json"]
-    result = CliRunner().invoke(tree(["evaluate"]), given)
+    result = CliRunner().invoke(build_app(["evaluate"]), given)
     assert result.exit_code == code, result.output
     answer: dict[str, Any] = json.loads(result.stdout)
     return answer

@@ -13,16 +13,16 @@ import numpy as np
 import pytest
 
 from services.cli.store_checks import permissions_check
-from services.search.local_files import LocalFiles
-from services.trainer.evaluation.cache import CachedDescribe
-from shared.backup.folder import BackupFolder, Kept
+from services.search.local_files import MappedFileCache
+from services.trainer.evaluation.cache import CachedDescriber
+from shared.backup.folder import BackedUpObject, BackupFolder
 from shared.backup.rows import dump_rows
 from shared.catalog.schema import migrate
 from shared.catalog.session import Catalog
 from shared.errors import Misconfigured
-from shared.home import announced, lock_home
+from shared.home import announce_server, lock_home
 from shared.objects import FolderStore
-from shared.objects.upload_dir import place_originals
+from shared.objects.upload_dir import resolve_upload_dir
 from shared.private_files import create_private_file, make_private_folder
 from shared.settings import Settings
 
@@ -45,10 +45,10 @@ def check_private(folder: Path) -> int:
 @pytest.mark.usefixtures("no_umask")
 def test_home_catalog_and_marks_are_private(tmp_path: Path) -> None:
     home = tmp_path / "deep" / "home"
-    with lock_home(home), announced(home, "http://localhost"):
+    with lock_home(home), announce_server(home, "http://localhost"):
         catalog = Catalog(f"sqlite:///{home / 'catalog.sqlite'}")
         migrate(catalog)
-        place_originals(home, home / "objects", home / "photos")
+        resolve_upload_dir(home, home / "objects", home / "photos")
         with catalog.write():
             assert {path.name for path in home.iterdir()} >= {
                 "catalog.sqlite-wal",
@@ -65,10 +65,10 @@ def test_backup_is_private(migrated_sqlite: Path, tmp_path: Path) -> None:
     folder = BackupFolder(tmp_path / "backup")
     folder.open_for_writing()
     catalog = Catalog(f"sqlite:///{migrated_sqlite}")
-    with folder.locked(), catalog.read() as session:
+    with folder.exclusive_lock(), catalog.read() as session:
         dump_rows(session, folder.path / "catalog-1", lambda *_: None)
         folder.objects.put("originals/a", b"photo")
-        folder.note(Kept("originals/a", 5, "0" * 64, "2026-11-22T00:00:00+00:00"))
+        folder.note(BackedUpObject("originals/a", 5, "0" * 64, "2026-11-22T00:00:00+00:00"))
         assert check_private(folder.path) > 10
     catalog.close()
 
@@ -80,12 +80,14 @@ def test_caches_are_private(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
 
     describe.seconds, describe.photos = 0.0, 0  # type: ignore[attr-defined]
     (tmp_path / "photo.jpg").write_bytes(b"photo")
-    kept = CachedDescribe(describe, tmp_path / "rows", {}, most_bytes=10**9)  # type: ignore[arg-type]
+    kept = CachedDescriber(describe, tmp_path / "rows", {}, most_bytes=10**9)  # type: ignore[arg-type]
     list(kept([tmp_path / "photo.jpg"]))
     store = FolderStore(tmp_path / "objects")
     store.put("chunks/a.npy", b"rows")
     monkeypatch.setattr(store, "file", lambda key: None)  # as a bucket
-    LocalFiles(store, tmp_path / "search").map("chunks/a.npy", sha256(b"rows").hexdigest())
+    MappedFileCache(store, tmp_path / "search").map_object(
+        "chunks/a.npy", sha256(b"rows").hexdigest()
+    )
     for folder in ("rows", "search"):
         assert check_private(tmp_path / folder) > 1
 

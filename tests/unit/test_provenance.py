@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from shared.errors import Unprocessable
-from shared.recipes import get_recipe
+from shared.recipes import get_extractor_config
 from shared.vision.extractors import Extractor, choose_device
-from shared.vision.provenance import UNKNOWN, check_fits, of_features
-from shared.vision.vocabulary import Centres, check_centres
+from shared.vision.provenance import UNKNOWN_PROVENANCE, check_vocabulary_fits, feature_provenance
+from shared.vision.vocabulary import ClusterCentres, parse_centres
 
 
 @pytest.fixture(scope="module")
@@ -20,16 +20,16 @@ def tiny() -> Extractor:
 
 
 def load(name: str) -> Extractor:
-    return Extractor(get_recipe(name, allow_test_extractors=True), choose_device("cpu"))
+    return Extractor(get_extractor_config(name, allow_test_extractors=True), choose_device("cpu"))
 
 
-def centres(width: int = 16) -> Centres:
-    return check_centres(np.random.default_rng(0).standard_normal((4, width)).astype(np.float32))
+def centres(width: int = 16) -> ClusterCentres:
+    return parse_centres(np.random.default_rng(0).standard_normal((4, width)).astype(np.float32))
 
 
 def refusal(provenance: dict[str, Any], extractor: Extractor, width: int = 16) -> Unprocessable:
     with pytest.raises(Unprocessable) as caught:
-        check_fits(provenance, centres(width), extractor)
+        check_vocabulary_fits(provenance, centres(width), extractor)
     assert caught.value.code == "vocabulary_unfit"
     return caught.value
 
@@ -37,11 +37,13 @@ def refusal(provenance: dict[str, Any], extractor: Extractor, width: int = 16) -
 def test_what_makes_local_features_is_part_of_the_spec_of_their_descriptors(
     tiny: Extractor,
 ) -> None:
-    assert of_features(tiny).items() <= tiny.spec(centres()).items()
+    assert feature_provenance(tiny).items() <= tiny.spec(centres()).items()
 
 
 def test_a_vocabulary_of_the_same_features_fits_whatever_else_is_said(tiny: Extractor) -> None:
-    check_fits({**of_features(tiny), "photos": 3, "note": "mine"}, centres(), tiny)
+    check_vocabulary_fits(
+        {**feature_provenance(tiny), "photos": 3, "note": "mine"}, centres(), tiny
+    )
 
 
 @pytest.mark.parametrize(
@@ -58,7 +60,7 @@ def test_a_vocabulary_of_the_same_features_fits_whatever_else_is_said(tiny: Extr
 def test_a_vocabulary_of_other_features_is_refused_with_both_specs(
     tiny: Extractor, key: str, other: Any
 ) -> None:
-    own = of_features(tiny)
+    own = feature_provenance(tiny)
     error = refusal({**own, key: other}, tiny)
     assert error.extra == {"learnt_with": {**own, key: other}, "extractor_makes": own}
     said = "version 2" if isinstance(other, dict) else str(other)[:12]
@@ -68,8 +70,8 @@ def test_a_vocabulary_of_other_features_is_refused_with_both_specs(
 
 
 def test_a_vocabulary_of_unknown_origin_only_has_to_be_as_wide(tiny: Extractor) -> None:
-    check_fits(UNKNOWN, centres(), tiny)
-    detail = refusal(UNKNOWN, tiny, width=15).detail
+    check_vocabulary_fits(UNKNOWN_PROVENANCE, centres(), tiny)
+    detail = refusal(UNKNOWN_PROVENANCE, tiny, width=15).detail
     assert "15 dimensions" in detail
     assert "16" in detail
 
@@ -77,9 +79,9 @@ def test_a_vocabulary_of_unknown_origin_only_has_to_be_as_wide(tiny: Extractor) 
 def test_centres_of_another_width_are_refused_whatever_their_provenance_says(
     tiny: Extractor,
 ) -> None:
-    assert "12 dimensions" in refusal(of_features(tiny), tiny, width=12).detail
+    assert "12 dimensions" in refusal(feature_provenance(tiny), tiny, width=12).detail
 
 
 def test_an_extractor_without_clusters_takes_no_vocabulary() -> None:
     average = load("test-tiny-avg")
-    assert "uses no vocabulary" in refusal(of_features(average), average).detail
+    assert "uses no vocabulary" in refusal(feature_provenance(average), average).detail

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from shared.datasets.recall import rank, recall_at, true_positives
+from shared.datasets.recall import positives_within, rank_by_similarity, recall_at_k
 
 
 def indices(*rows: list[int]) -> list[np.ndarray[tuple[int], np.dtype[np.int64]]]:
@@ -17,7 +17,7 @@ def indices(*rows: list[int]) -> list[np.ndarray[tuple[int], np.dtype[np.int64]]
 def test_positive_lies_within_25_metres_the_25th_included() -> None:
     queries = np.array([[0.0, 0.0], [1000.0, 0.0]])
     database = np.array([[25.0, 0.0], [25.01, 0.0], [15.0, 20.0], [18.0, 18.0]])
-    first, second = true_positives(queries, database)
+    first, second = positives_within(queries, database)
     assert first.tolist() == [0, 2]
     assert second.tolist() == []
 
@@ -25,37 +25,37 @@ def test_positive_lies_within_25_metres_the_25th_included() -> None:
 def test_positives_are_the_same_however_many_queries_are_asked_at_once() -> None:
     queries = np.random.default_rng(0).uniform(0, 300, (700, 2))
     database = np.random.default_rng(1).uniform(0, 300, (90, 2))
-    together = true_positives(queries, database)
-    one_by_one = [true_positives(query[None], database)[0] for query in queries]
+    together = positives_within(queries, database)
+    one_by_one = [positives_within(query[None], database)[0] for query in queries]
     assert [found.tolist() for found in together] == [found.tolist() for found in one_by_one]
 
 
 def test_ranking_is_by_cosine_and_a_tie_goes_to_the_lower_index() -> None:
     database = np.array([[0.0, 1.0], [1.0, 0.0], [1.0, 0.0], [0.6, 0.8]], np.float32)
-    ranked = rank(np.array([[1.0, 0.0]], np.float32), database, 4)
+    ranked = rank_by_similarity(np.array([[1.0, 0.0]], np.float32), database, 4)
     assert ranked.tolist() == [[1, 2, 3, 0]]
 
 
 def test_ranking_is_no_longer_than_the_database() -> None:
     rows = np.eye(3, dtype=np.float32)
-    assert rank(rows, rows, 10).shape == (3, 3)
-    assert rank(rows[:0], rows, 2).shape == (0, 2)
+    assert rank_by_similarity(rows, rows, 10).shape == (3, 3)
+    assert rank_by_similarity(rows[:0], rows, 2).shape == (0, 2)
 
 
 def test_recall_counts_queries_with_a_positive_among_the_first_k() -> None:
     ranked = np.array([[4, 1, 2], [3, 0, 1], [9, 8, 7], [5, 6, 0]])
     positives = indices([4, 2], [1], [7], [3])
-    assert recall_at(ranked, positives, (1, 2, 3)) == {1: 0.25, 2: 0.25, 3: 0.75}
+    assert recall_at_k(ranked, positives, (1, 2, 3)) == {1: 0.25, 2: 0.25, 3: 0.75}
 
 
 def test_query_without_positives_counts_as_missed() -> None:
-    assert recall_at(np.array([[0], [0]]), indices([0], []), (1,)) == {1: 0.5}
+    assert recall_at_k(np.array([[0], [0]]), indices([0], []), (1,)) == {1: 0.5}
 
 
 def test_recall_of_no_query_is_not_a_number() -> None:
-    assert math.isnan(recall_at(np.empty((0, 5), np.int64), [], (1,))[1])
+    assert math.isnan(recall_at_k(np.empty((0, 5), np.int64), [], (1,))[1])
 
 
 def test_rankings_and_positives_must_be_of_the_same_queries() -> None:
     with pytest.raises(ValueError, match="2 rankings for 1 queries"):
-        recall_at(np.array([[0], [1]]), indices([0]))
+        recall_at_k(np.array([[0], [1]]), indices([0]))

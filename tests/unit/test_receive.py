@@ -12,9 +12,9 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.types import Message
 
 from services.gateway.form import MAX_FIELDS_BYTES, OVERHEAD_BYTES
-from services.gateway.receive import WRITE_BYTES, receive_file
+from services.gateway.receive import STORE_WRITE_BYTES, store_form_file
 from shared.errors import InvalidRequest, PlacewiseError, TooLarge, UnsupportedMedia
-from shared.intake.received import Received, check_photo_begin
+from shared.intake.received import StoredUpload, check_photo_signature
 from shared.objects import FolderStore
 from tests.support.photos import photo_bytes
 
@@ -75,7 +75,7 @@ def receive(
     headers: dict[str, str] | None = None,
     max_bytes: int = LIMIT,
     check_begin: Callable[[bytes], object] = lambda begin: None,
-) -> Received:
+) -> StoredUpload:
     if isinstance(body, bytes):
         body = Body([body])
     sent = {"content-type": f"multipart/form-data; boundary={BOUNDARY}"} | (headers or {})
@@ -87,7 +87,7 @@ def receive(
         "headers": [(k.encode(), v.encode()) for k, v in sent.items()],
     }
     request = Request(scope, body.receive)
-    return asyncio.run(receive_file(request, store, KEY, max_bytes, check_begin))
+    return asyncio.run(store_form_file(request, store, KEY, max_bytes, check_begin))
 
 
 def refused(store: FolderStore, body: Body | bytes, **options: object) -> PlacewiseError:
@@ -102,13 +102,15 @@ def assert_nothing_left(store: FolderStore) -> None:
     assert [path for path in Path(store.root).rglob("*") if path.is_file()] == []
 
 
-@pytest.mark.parametrize("beyond", [-1, 0, 1, 2 * WRITE_BYTES + 1])
+@pytest.mark.parametrize("beyond", [-1, 0, 1, 2 * STORE_WRITE_BYTES + 1])
 @pytest.mark.parametrize("piece", [65_536, 10**9])
 def test_file_of_any_size_is_stored_and_opened_whole(
     store: FolderStore, beyond: int, piece: int
 ) -> None:
-    data = (PHOTO + bytes(range(256)) * 10_000)[: WRITE_BYTES + beyond]
-    received = receive(store, Body(in_pieces(file(data) + END, piece)), max_bytes=10 * WRITE_BYTES)
+    data = (PHOTO + bytes(range(256)) * 10_000)[: STORE_WRITE_BYTES + beyond]
+    received = receive(
+        store, Body(in_pieces(file(data) + END, piece)), max_bytes=10 * STORE_WRITE_BYTES
+    )
     assert store.get(KEY) == data
     assert received.sha256 == hashlib.sha256(data).hexdigest()
     with received.open(store) as opened:
@@ -121,7 +123,7 @@ def test_pieces_of_any_size_give_the_same_file_and_fields(store: FolderStore, si
     body = field("latitude", "45.07") + file() + field("place", "Café") + field("tags", "") + END
     received = receive(store, Body(in_pieces(body, size)))
     assert store.get(KEY) == PHOTO
-    assert received == Received(
+    assert received == StoredUpload(
         key=KEY,
         filename="street.jpg",
         size_bytes=len(PHOTO),
@@ -161,7 +163,7 @@ def test_first_bytes_are_checked_once_and_whole(store: FolderStore, size: int) -
 
 def test_what_is_no_photo_is_refused_without_reading_the_rest(store: FolderStore) -> None:
     body = Body(in_pieces(file(b"this is a text, not a photo " * 2000) + END, 200))
-    error = refused(store, body, check_begin=check_photo_begin)
+    error = refused(store, body, check_begin=check_photo_signature)
     assert isinstance(error, UnsupportedMedia)
     assert error.code == "unsupported_photo"
     assert body.taken <= 2
@@ -336,7 +338,7 @@ def test_what_was_there_under_the_key_survives_a_refused_body(store: FolderStore
     ],
 )
 def test_media_type_is_told_by_the_content(media: str, expected: str) -> None:
-    assert check_photo_begin(photo_bytes(1, media)[:16]) == expected
+    assert check_photo_signature(photo_bytes(1, media)[:16]) == expected
 
 
 @pytest.mark.parametrize(
@@ -345,4 +347,4 @@ def test_media_type_is_told_by_the_content(media: str, expected: str) -> None:
 )
 def test_other_contents_are_unsupported(begin: bytes) -> None:
     with pytest.raises(UnsupportedMedia):
-        check_photo_begin(begin)
+        check_photo_signature(begin)

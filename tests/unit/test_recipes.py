@@ -9,20 +9,20 @@ import pytest
 
 from shared.errors import Misconfigured
 from shared.recipes import (
-    AGGREGATORS,
-    PREPROCESSINGS,
-    RECIPES,
-    Recipe,
-    get_recipe,
-    with_options,
+    EXTRACTOR_AGGREGATORS,
+    EXTRACTOR_CONFIGS,
+    PREPROCESSING_NAMES,
+    ExtractorConfig,
+    add_extractor_options,
+    get_extractor_config,
 )
 from shared.vision.preprocessing import PREPROCESSINGS as IN_VISION
 
 ANYLOC_OPTIONS = "Its options: aggregator, clusters, facet, layer, preprocessing."
 
 
-def recipe(name: str) -> Recipe:
-    return get_recipe(name, allow_test_extractors=False)
+def recipe(name: str) -> ExtractorConfig:
+    return get_extractor_config(name, allow_test_extractors=False)
 
 
 def refusal(name: str, code: str) -> str:
@@ -37,7 +37,7 @@ def refusal(name: str, code: str) -> str:
 def test_test_extractors_are_refused_unless_allowed(name: str) -> None:
     assert "ALLOW_TEST_EXTRACTORS" in refusal(name, "test_extractor")
     refusal(f"{name}:clusters=3", "test_extractor")
-    assert get_recipe(name, allow_test_extractors=True).name == name
+    assert get_extractor_config(name, allow_test_extractors=True).name == name
 
 
 @pytest.mark.parametrize("name", ["anyloc", "", "anyloc:layer=9", ":clusters=3", "ANYLOC-VITB14"])
@@ -69,7 +69,7 @@ def test_anyloc_takes_the_value_facet_of_its_authors_layer(
 def test_dimension_follows_the_clusters_of_vlad_only() -> None:
     assert recipe("efficientnet-lite0-vlad").dimension == 7168
     assert recipe("efficientnet-lite0-vlad:clusters=8").dimension == 8 * 112
-    assert RECIPES["test-tiny-avg"].dimension == 16
+    assert EXTRACTOR_CONFIGS["test-tiny-avg"].dimension == 16
 
 
 def test_options_are_taken() -> None:
@@ -145,22 +145,24 @@ def test_bad_options_are_named_with_what_is_allowed(name: str, said: list[str]) 
 
 def test_an_extractor_without_a_vocabulary_has_no_clusters() -> None:
     with pytest.raises(Misconfigured, match=r"no option 'clusters'.*It has none"):
-        get_recipe("test-tiny-avg:clusters=3", allow_test_extractors=True)
+        get_extractor_config("test-tiny-avg:clusters=3", allow_test_extractors=True)
 
 
 def test_slow_extractor_takes_its_time_and_width_from_its_name() -> None:
-    found = get_recipe("test-slow-avg:width=98304,milliseconds=500", allow_test_extractors=True)
+    found = get_extractor_config(
+        "test-slow-avg:width=98304,milliseconds=500", allow_test_extractors=True
+    )
     assert found.name == "test-slow-avg:milliseconds=500,width=98304"
     assert (found.milliseconds, found.dimension) == (500, 98_304)
     for other in ("test-slow-avg", "test-slow-avg:width=98304", "test-slow-avg:milliseconds=500"):
-        recipe = get_recipe(other, allow_test_extractors=True)
+        recipe = get_extractor_config(other, allow_test_extractors=True)
         assert recipe.local_features != found.local_features
 
 
 @pytest.mark.parametrize("option", ["width=15", "width=131073", "milliseconds=60001"])
 def test_slow_extractor_says_what_it_can_do(option: str) -> None:
     with pytest.raises(Misconfigured, match="a whole number from"):
-        get_recipe(f"test-slow-avg:{option}", allow_test_extractors=True)
+        get_extractor_config(f"test-slow-avg:{option}", allow_test_extractors=True)
 
 
 def test_shipped_vocabulary_begins_a_map_whatever_number_later_fits_make() -> None:
@@ -180,17 +182,17 @@ def test_aggregators_without_a_vocabulary_have_the_length_of_a_local_feature() -
 
 
 def test_names_take_further_options() -> None:
-    assert with_options("anyloc-vitb14", {"layer": None}) == "anyloc-vitb14"
-    assert with_options("anyloc-vitb14", {"layer": 9}) == "anyloc-vitb14:layer=9"
-    further = with_options("anyloc-vitb14:layer=9", {"facet": "key", "layer": None})
+    assert add_extractor_options("anyloc-vitb14", {"layer": None}) == "anyloc-vitb14"
+    assert add_extractor_options("anyloc-vitb14", {"layer": 9}) == "anyloc-vitb14:layer=9"
+    further = add_extractor_options("anyloc-vitb14:layer=9", {"facet": "key", "layer": None})
     assert further == "anyloc-vitb14:layer=9,facet=key"
 
 
 def test_preprocessings_are_those_that_vision_has() -> None:
-    assert set(IN_VISION) == {*PREPROCESSINGS, "square32"}
-    for found in RECIPES.values():
+    assert set(IN_VISION) == {*PREPROCESSING_NAMES, "square32"}
+    for found in EXTRACTOR_CONFIGS.values():
         assert found.preprocessing in IN_VISION
-        assert found.aggregator in AGGREGATORS
+        assert found.aggregator in EXTRACTOR_AGGREGATORS
 
 
 def test_only_what_changes_the_local_features_needs_another_backbone() -> None:

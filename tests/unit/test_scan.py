@@ -12,15 +12,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from services.search.answer import DECIMALS, Answer, Question, answer
+from services.search.answer import SCORE_DECIMALS, SearchOptions, SearchResult, execute_query
 from services.search.loaded_chunk import LoadedChunk
 from services.search.photo_columns import PhotoColumns
 from services.search.scan import FLOAT32_MARGIN
-from services.search.select import select
+from services.search.select import build_row_mask
 from services.search.snapshot import Snapshot
-from services.search.together import Glances
+from services.search.together import QueryBatcher
 from shared.ids import new_id
-from shared.photo_filter import EVERYTHING
+from shared.photo_filter import NO_FILTER
 from tests.support.photo_facts import facts_of
 
 Rows = NDArray[np.float32]
@@ -62,7 +62,10 @@ def brute_force(
     exact = query.astype(np.float64)
     exact /= np.linalg.norm(exact)
     scored = [
-        (-round(float(np.clip(row.astype(np.float64) @ exact, -1, 1)), DECIMALS), photo(number))
+        (
+            -round(float(np.clip(row.astype(np.float64) @ exact, -1, 1)), SCORE_DECIMALS),
+            photo(number),
+        )
         for row, number in zip(rows, numbers, strict=True)
         if number not in dead
     ]
@@ -76,19 +79,23 @@ def hits_of(
     min_score: float | None = None,
     exclude: frozenset[UUID] = frozenset(),
 ) -> list[tuple[UUID, float]]:
-    found = ask(chunks, query, Question(k, min_score), exclude)
+    found = ask(chunks, query, SearchOptions(k, min_score), exclude)
     return [(hit.photo_id, hit.score) for hit in found.hits]
 
 
 def ask(
     chunks: list[LoadedChunk],
     query: Rows,
-    question: Question,
+    question: SearchOptions,
     exclude: frozenset[UUID] = frozenset(),
-) -> Answer:
+) -> SearchResult:
     snapshot = Snapshot(new_id(), new_id(), 1, tuple(chunks))
-    return answer(
-        snapshot, query, select(snapshot.photos, EVERYTHING, exclude), question, Glances()
+    return execute_query(
+        snapshot,
+        query,
+        build_row_mask(snapshot.photos, NO_FILTER, exclude),
+        question,
+        QueryBatcher(),
     )
 
 
@@ -127,7 +134,7 @@ def test_answers_equal_brute_force_with_order_and_ties(
         return
     chunks = split(rows, pieces, numbers, dead)
     expected = brute_force(rows, numbers, query, k, dead)
-    found = ask(chunks, query, Question(k))
+    found = ask(chunks, query, SearchOptions(k))
     assert [(hit.photo_id, hit.score) for hit in found.hits] == expected
     assert found.certificate == "exhaustive"
     assert found.certified_k == len(expected)
@@ -217,10 +224,10 @@ def test_fewer_rows_than_asked_are_all_answered() -> None:
 
 def test_nothing_loaded_answers_nothing() -> None:
     query = unit_rows(1, 1, 4)[0]
-    nothing = Answer((), "exhaustive", 0, 0, 0)
-    assert ask([], query, Question(5)) == nothing
+    nothing = SearchResult((), "exhaustive", 0, 0, 0)
+    assert ask([], query, SearchOptions(5)) == nothing
     empty = chunk_of(np.empty((0, 4), dtype=np.float32), [])
-    assert ask([empty], query, Question(5)) == nothing
+    assert ask([empty], query, SearchOptions(5)) == nothing
 
 
 def test_empty_chunk_between_others_shifts_nothing() -> None:

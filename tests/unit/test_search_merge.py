@@ -10,13 +10,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shared.ids import new_id
-from shared.search_http.merge import merge, merge_status
+from shared.search_http.merge import merge_responses, merge_statuses
 from shared.search_protocol import (
     EXHAUSTIVE,
     NONE,
     STATISTICAL,
-    Hit,
-    Lag,
+    ReplicationLag,
+    SearchHit,
     SearchRequest,
     SearchResponse,
     SearchStatus,
@@ -34,7 +34,7 @@ def answer(*hits: tuple[int, float], **changes: Any) -> SearchResponse:
         "snapshot_version": 7,
     }
     return SearchResponse(
-        hits=tuple(Hit(photo_id=UUID(int=number), score=score) for number, score in ordered),
+        hits=tuple(SearchHit(photo_id=UUID(int=number), score=score) for number, score in ordered),
         **(values | changes),
     )
 
@@ -54,7 +54,7 @@ def test_the_merged_order_is_that_of_one_list_also_for_equal_scores(
     shards: list[list[tuple[int, float]]] = [[] for _ in range(of)]
     for number, score in enumerate(scores):
         shards[number * 7 % of].append((number, score))
-    merged = merge([answer(*hits) for hits in shards], k)
+    merged = merge_responses([answer(*hits) for hits in shards], k)
     whole = sorted(enumerate(scores), key=lambda hit: (-hit[1], hit[0]))
     assert ranked(merged) == whole[:k]
 
@@ -64,14 +64,14 @@ def test_what_was_ranked_by_weighted_scores_is_merged_by_them_ties_by_photo() ->
         return answer().model_copy(
             update={
                 "hits": tuple(
-                    Hit(photo_id=UUID(int=number), score=score, weighted_score=by)
+                    SearchHit(photo_id=UUID(int=number), score=score, weighted_score=by)
                     for number, score, by in hits
                 )
             }
         )
 
     shards = [weighted((4, 0.1, 0.9), (1, 0.8, 0.3)), weighted((3, 0.2, 0.9), (2, 0.9, 0.5))]
-    assert ranked(merge(shards, k=3)) == [(3, 0.2), (4, 0.1), (2, 0.9)]
+    assert ranked(merge_responses(shards, k=3)) == [(3, 0.2), (4, 0.1), (2, 0.9)]
 
 
 def test_a_message_without_weights_is_one_that_the_release_before_understands() -> None:
@@ -86,18 +86,18 @@ def test_a_message_without_weights_is_one_that_the_release_before_understands() 
 
 
 def test_a_photo_that_two_shards_have_for_a_moment_is_answered_once() -> None:
-    merged = merge([answer((1, 0.9), (2, 0.8)), answer((1, 0.7), (3, 0.6))], k=3)
+    merged = merge_responses([answer((1, 0.9), (2, 0.8)), answer((1, 0.7), (3, 0.6))], k=3)
     assert ranked(merged) == [(1, 0.9), (2, 0.8), (3, 0.6)]
 
 
 def test_the_sums_the_least_version_and_all_that_is_missing_are_told() -> None:
-    merged = merge(
+    merged = merge_responses(
         [
             answer(snapshot_version=9, rows_scanned=3, rows_reranked=1, missing=("chunks/a",)),
             answer(snapshot_version=8, rows_scanned=4, rows_reranked=2, missing=("chunks/b",)),
         ],
         k=1,
-        away=[Shard(3, 4), Shard(1, 4)],
+        unreachable=[Shard(3, 4), Shard(1, 4)],
     )
     assert (merged.snapshot_version, merged.rows_scanned, merged.rows_reranked) == (8, 7, 3)
     assert merged.missing == ("chunks/a", "chunks/b", "shard 1/4", "shard 3/4")
@@ -110,13 +110,16 @@ def test_nothing_is_certain_of_an_answer_that_lacks_a_part_of_the_map(
     missing: tuple[str, ...], away: list[Shard]
 ) -> None:
     """Also where a worker of the release before promised more."""
-    merged = merge([answer((1, 0.9), certified_k=1, missing=missing)], 1, away)
+    merged = merge_responses([answer((1, 0.9), certified_k=1, missing=missing)], 1, away)
     assert (merged.certificate, merged.certified_k) == (NONE, 0)
 
 
 def test_the_weakest_certificate_counts() -> None:
-    assert merge([answer(), answer()], 1).certificate == EXHAUSTIVE
-    assert merge([answer(), answer(certificate="of the future")], 1).certificate == "of the future"
+    assert merge_responses([answer(), answer()], 1).certificate == EXHAUSTIVE
+    assert (
+        merge_responses([answer(), answer(certificate="of the future")], 1).certificate
+        == "of the future"
+    )
 
 
 @given(data=st.data(), of=st.integers(1, 4), k=st.integers(1, 12))
@@ -134,7 +137,7 @@ def test_what_is_certain_when_shards_end_early_is_what_they_would_have_found(
         certain = sum(score > unseen for _, score in seen)
         certificate = STATISTICAL if len(seen) == len(hits) else NONE
         answers.append(answer(*seen, certified_k=certain, certificate=certificate))
-    merged = merge(answers, k)
+    merged = merge_responses(answers, k)
     truth = sorted(everything, key=lambda hit: (-hit[1], hit[0]))[:k]
     assert ranked(merged)[: merged.certified_k] == truth[: merged.certified_k]
     if all(one.certificate != NONE for one in answers):
@@ -142,8 +145,8 @@ def test_what_is_certain_when_shards_end_early_is_what_they_would_have_found(
 
 
 def test_largest_error_of_an_estimate_is_told_and_none_where_nothing_was_estimated() -> None:
-    assert merge([answer(), answer()], 1).max_z is None
-    assert merge([answer(max_z=1.5), answer(), answer(max_z=3.0)], 1).max_z == 3.0
+    assert merge_responses([answer(), answer()], 1).max_z is None
+    assert merge_responses([answer(max_z=1.5), answer(), answer(max_z=3.0)], 1).max_z == 3.0
 
 
 def test_what_a_newer_worker_adds_to_its_answer_is_passed_over() -> None:
@@ -153,8 +156,8 @@ def test_what_a_newer_worker_adds_to_its_answer_is_passed_over() -> None:
 
 def test_a_generation_is_there_once_every_shard_has_it() -> None:
     both, one = new_id(), new_id()
-    lag = Lag(versions=1, seconds=2.0, answers=True)
-    merged = merge_status(
+    lag = ReplicationLag(versions=1, seconds=2.0, answers=True)
+    merged = merge_statuses(
         {
             Shard(0, 2): SearchStatus(
                 rows=3, resident_bytes=30, versions={both: 7, one: 1}, missing=("chunks/a",)

@@ -10,8 +10,8 @@ import pytest
 
 from shared.errors import Gone, NotFound, Unavailable
 from shared.ids import new_id
-from shared.search_http.worker_call import WorkerAway, ask, read_status
-from shared.search_http.workers import Workers
+from shared.search_http.worker_call import WorkerUnavailable, call_search, fetch_status
+from shared.search_http.workers import WorkerDirectory
 from shared.search_protocol import SearchRequest, SearchStatus
 from shared.shards import Shard
 
@@ -33,8 +33,8 @@ class FakeWorkers:
             return httpx2.Response(200, text=found.model_dump_json())
         return found
 
-    def seen(self) -> Workers:
-        workers = Workers(list(self.answers), self.http)
+    def seen(self) -> WorkerDirectory:
+        workers = WorkerDirectory(list(self.answers), self.http)
         workers.look()
         return workers
 
@@ -138,10 +138,10 @@ def test_whoever_does_not_answer_as_a_search_worker_does_is_away(
     fake: FakeWorkers, answer: httpx2.Response | Exception
 ) -> None:
     fake.answers = {"http://a": answer}
-    with pytest.raises(WorkerAway, match="http://a"):
-        ask(fake.http, "http://a", REQUEST, 1.0)
-    with pytest.raises(WorkerAway):
-        read_status(fake.http, "http://a", 1.0)
+    with pytest.raises(WorkerUnavailable, match="http://a"):
+        call_search(fake.http, "http://a", REQUEST, 1.0)
+    with pytest.raises(WorkerUnavailable):
+        fetch_status(fake.http, "http://a", 1.0)
 
 
 @pytest.mark.parametrize("kind", [Gone, NotFound, Unavailable])
@@ -151,5 +151,5 @@ def test_what_a_worker_refuses_is_raised_as_the_error_that_it_was(
     problem = kind("some_code", "Some detail.", object_key="a").as_problem()
     fake.answers = {"http://a": httpx2.Response(kind.status, json=problem)}
     with pytest.raises(kind) as caught:
-        ask(fake.http, "http://a", REQUEST, 1.0)
+        call_search(fake.http, "http://a", REQUEST, 1.0)
     assert (caught.value.code, caught.value.extra) == ("some_code", {"object_key": "a"})

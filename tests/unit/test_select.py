@@ -11,9 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as some
 
 from services.search.photo_columns import PhotoColumns
-from services.search.select import select
-from shared.catalog.photos import PhotoFacts, PhotoRole
-from shared.photo_filter import EVERYTHING, Box, Circle, PhotoFilter
+from services.search.select import build_row_mask
+from shared.catalog.photos import PhotoFilterValues, PhotoRole
+from shared.photo_filter import NO_FILTER, Box, Circle, PhotoFilter
 from tests.support.photo_facts import facts_of
 from tests.support.photo_filters import HALF_EARTH_M, IDS, passes, photo_facts, photo_filters
 
@@ -21,10 +21,10 @@ MOMENT = datetime(2024, 5, 6, 7, 8, 9, 123456, tzinfo=UTC)
 
 
 def selected(
-    photos: list[PhotoFacts], wanted: PhotoFilter, exclude: frozenset[UUID] = frozenset()
+    photos: list[PhotoFilterValues], wanted: PhotoFilter, exclude: frozenset[UUID] = frozenset()
 ) -> list[UUID]:
     columns = PhotoColumns.of(len(photos), enumerate(photos))
-    return list(columns.photo_id[select(columns, wanted, exclude)])
+    return list(columns.photo_id[build_row_mask(columns, wanted, exclude)])
 
 
 @settings(max_examples=150, deadline=None)
@@ -46,7 +46,7 @@ def test_what_is_excluded_or_dead_or_asks_never_passes(data: some.DataObject) ->
     photos = [data.draw(photo_facts(photo_id)) for photo_id in IDS[:6]]
     columns = PhotoColumns.of(8, enumerate(photos))  # the last two rows belong to no photo
     excluded = frozenset(data.draw(some.sets(some.sampled_from(IDS[:8]))))
-    found = columns.photo_id[select(columns, EVERYTHING, excluded)]
+    found = columns.photo_id[build_row_mask(columns, NO_FILTER, excluded)]
     assert list(found) == [
         photo.photo_id
         for photo in photos
@@ -122,12 +122,14 @@ def test_bounds_of_the_time_are_inclusive_to_the_microsecond() -> None:
 def test_changed_columns_leave_those_before_them_alone() -> None:
     """Queries under way go on with the snapshot that they began with."""
     before = PhotoColumns.of(2, enumerate([facts_of(IDS[0], place="hall"), facts_of(IDS[1])]))
-    after = before.changed({IDS[1]: facts_of(IDS[1], place="hall", tags=("wet",), latitude=1.0)})
+    after = before.with_changes(
+        {IDS[1]: facts_of(IDS[1], place="hall", tags=("wet",), latitude=1.0)}
+    )
     in_hall = PhotoFilter(place="hall")
-    assert list(select(before, in_hall, ())) == [True, False]
-    assert list(select(after, in_hall, ())) == [True, True]
+    assert list(build_row_mask(before, in_hall, ())) == [True, False]
+    assert list(build_row_mask(after, in_hall, ())) == [True, True]
     assert np.isnan(before.latitude[1])
-    assert before.changed({IDS[7]: facts_of(IDS[7])}) is before
+    assert before.with_changes({IDS[7]: facts_of(IDS[7])}) is before
 
 
 def test_all_tags_are_wanted_and_their_case_matters() -> None:

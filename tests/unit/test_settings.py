@@ -137,7 +137,7 @@ def test_endpoints_are_hosts_with_or_without_a_port(
 ) -> None:
     for name, value in {**S3, "S3_ENDPOINT": endpoint}.items():
         monkeypatch.setenv(name, value)
-    assert Bucket.of(Settings()).endpoint == endpoint
+    assert Bucket.from_settings(Settings()).endpoint == endpoint
 
 
 def test_an_empty_variable_is_an_unset_one(monkeypatch: pytest.MonkeyPatch) -> None:

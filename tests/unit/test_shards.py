@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from shared.settings import Settings
-from shared.shards import WHOLE, Shard, names_a_shard
+from shared.shards import SINGLE_SHARD, Shard, is_shard_name
 
 
 @given(slot=st.integers(0, 10_000), of=st.integers(1, 50))
@@ -19,7 +19,7 @@ def test_every_slot_belongs_to_exactly_one_shard(slot: int, of: int) -> None:
 def test_a_shard_is_written_as_it_is_read() -> None:
     assert Shard.parse(" 2/3 ") == Shard(2, 3)
     assert str(Shard(2, 3)) == "2/3"
-    assert Shard.parse("0/1") == WHOLE
+    assert Shard.parse("0/1") == SINGLE_SHARD
 
 
 @pytest.mark.parametrize("text", ["", "3/3", "-1/3", "1", "1/0", "a/b", "1/2/3", "0.5/2"])
@@ -29,17 +29,17 @@ def test_what_is_no_shard_is_refused(text: str) -> None:
 
 
 def test_a_missing_shard_is_told_from_a_missing_object() -> None:
-    assert names_a_shard(Shard(1, 3).name)
-    assert not names_a_shard("chunks/a/b.npy")
+    assert is_shard_name(Shard(1, 3).name)
+    assert not is_shard_name("chunks/a/b.npy")
 
 
 def test_settings_name_a_shard_and_its_workers(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert (Settings().shard, Settings().search_addresses) == (WHOLE, ())
+    assert (Settings().shard, Settings().search_worker_urls) == (SINGLE_SHARD, ())
     monkeypatch.setenv("SEARCH_SHARD", "1/3")
     monkeypatch.setenv("SEARCH_URLS", "http://a:8000/, https://b:1 http://a:8000")
     settings = Settings()
     assert settings.shard == Shard(1, 3)
-    assert settings.search_addresses == ("http://a:8000", "https://b:1")
+    assert settings.search_worker_urls == ("http://a:8000", "https://b:1")
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from shared.recipes import get_recipe
+from shared.recipes import get_extractor_config
 from shared.vision.extractors import Extractor
 from tests.support.photos import photo_image
 
@@ -17,7 +17,7 @@ WIDTHS = (16, 7168, 98_304)
 
 
 def extractor(options: str) -> Extractor:
-    recipe = get_recipe(f"test-slow-avg:{options}", allow_test_extractors=True)
+    recipe = get_extractor_config(f"test-slow-avg:{options}", allow_test_extractors=True)
     return Extractor(recipe, torch.device("cpu"))
 
 

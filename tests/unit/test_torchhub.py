@@ -12,12 +12,12 @@ import torch
 from numpy.typing import NDArray
 
 from shared.errors import Misconfigured
-from shared.recipes import get_recipe
+from shared.recipes import get_extractor_config
 from shared.vision import torchhub_code
-from shared.vision.backbones.torchhub import HubModule
+from shared.vision.backbones.torchhub import TorchHubBackbone
 from shared.vision.extractors import Extractor, spec_fingerprint
-from shared.vision.pca import Projection
-from shared.vision.pca_fit import fit
+from shared.vision.pca import PcaProjection
+from shared.vision.pca_fit import fit_pca
 from shared.vision.preprocessing import get_preprocessing
 from tests.support.hub import COMMIT, MIT, NETWORKS, write_hub
 from tests.support.photos import photo_image
@@ -38,7 +38,7 @@ def torch_home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def extractor(folder: Path, entry: str) -> Extractor:
-    recipe = get_recipe(f"torchhub:{folder}:{entry}", allow_test_extractors=False)
+    recipe = get_extractor_config(f"torchhub:{folder}:{entry}", allow_test_extractors=False)
     return Extractor(recipe, CPU)
 
 
@@ -87,7 +87,7 @@ def test_descriptors_are_shortened_by_pca_as_those_of_other_extractors(folder: P
     made = extractor(folder, "colours")
     pixels = pixels_of(made, *range(8))
     whole = made.describe(pixels, None)
-    projection = Projection(fit(whole, 3), CPU)
+    projection = PcaProjection(fit_pca(whole, 3), CPU)
     rows = made.describe(pixels, None, projection)
     np.testing.assert_allclose(rows, projection.project(whole), atol=1e-5)
     spec = made.spec(None, projection)
@@ -245,7 +245,7 @@ def test_a_missing_folder_is_an_error_with_the_three_ways(tmp_path: Path) -> Non
 def test_weights_that_can_not_be_downloaded_are_an_error_with_the_three_ways(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("shared.vision.download.PAUSE_SECONDS", 0)
+    monkeypatch.setattr("shared.vision.download.RETRY_PAUSE_SECONDS", 0)
     assert "can't be downloaded" in refusal(folder, "from_network", "weights_missing")
 
 
@@ -253,14 +253,14 @@ def test_a_repository_in_torch_hubs_folder_is_taken_without_the_network(
     folder: Path, torch_home: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(torchhub_code, "GITHUB", "http://127.0.0.1:9")
-    monkeypatch.setattr("shared.vision.download.PAUSE_SECONDS", 0)
+    monkeypatch.setattr("shared.vision.download.RETRY_PAUSE_SECONDS", 0)
     name = f"torchhub:somebody/places@{COMMIT}:colours"
-    recipe = get_recipe(name, allow_test_extractors=False)
+    recipe = get_extractor_config(name, allow_test_extractors=False)
     with pytest.raises(Misconfigured) as caught:
         Extractor(recipe, CPU)
     assert caught.value.code == "weights_missing"
     shutil.copytree(folder, torch_home / f"somebody_places_{COMMIT}")
     found = Extractor(recipe, CPU)
     assert found.backbone.card["source"] == f"somebody/places@{COMMIT}"
-    assert isinstance(found.backbone, HubModule)
+    assert isinstance(found.backbone, TorchHubBackbone)
     assert found.spec(None)["code_fingerprint"] == torchhub_code.code_fingerprint(folder)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from shared.errors import Misconfigured
-from shared.recipes import get_recipe
-from shared.torchhub_names import IMAGENET_MEAN, HubEntry, read_hub_name
+from shared.recipes import get_extractor_config
+from shared.torchhub_names import IMAGENET_MEAN, TorchHubEntry, parse_torchhub_name
 from tests.support.hub import COMMIT
 
 REPOSITORY = f"torchhub:gmberton/eigenplaces@{COMMIT}:get_trained_model"
@@ -14,13 +14,13 @@ REPOSITORY = f"torchhub:gmberton/eigenplaces@{COMMIT}:get_trained_model"
 
 def refusal(name: str, code: str) -> str:
     with pytest.raises(Misconfigured) as caught:
-        read_hub_name(name)
+        parse_torchhub_name(name)
     assert caught.value.code == code
     return caught.value.detail
 
 
 def test_a_repository_is_read_with_its_commit_entry_and_arguments() -> None:
-    hub = read_hub_name(f"{REPOSITORY}:fc_output_dim=512,backbone=ResNet18,pretrained=true")
+    hub = parse_torchhub_name(f"{REPOSITORY}:fc_output_dim=512,backbone=ResNet18,pretrained=true")
     assert (hub.repository, hub.commit, hub.folder) == ("gmberton/eigenplaces", COMMIT, None)
     assert hub.entry == "get_trained_model"
     assert dict(hub.arguments) == {"backbone": "ResNet18", "fc_output_dim": 512, "pretrained": True}
@@ -28,8 +28,10 @@ def test_a_repository_is_read_with_its_commit_entry_and_arguments() -> None:
 
 
 def test_a_folder_is_read_with_what_its_network_wants_to_see() -> None:
-    hub = read_hub_name("torchhub:/models/mine/:entry:input.size=322x644,input.mean=0.5/0.5/0.25")
-    assert hub == HubEntry(
+    hub = parse_torchhub_name(
+        "torchhub:/models/mine/:entry:input.size=322x644,input.mean=0.5/0.5/0.25"
+    )
+    assert hub == TorchHubEntry(
         None, None, "/models/mine", "entry", height=322, width=644, mean=(0.5, 0.5, 0.25)
     )
 
@@ -50,10 +52,10 @@ def test_a_folder_is_read_with_what_its_network_wants_to_see() -> None:
     ],
 )
 def test_arguments_have_the_types_that_they_look_like(written: str, value: object) -> None:
-    hub = read_hub_name(f"{REPOSITORY}:x={written}")
+    hub = parse_torchhub_name(f"{REPOSITORY}:x={written}")
     assert hub.arguments == (("x", value),)
     assert type(hub.arguments[0][1]) is type(value)
-    assert read_hub_name(hub.name) == hub
+    assert parse_torchhub_name(hub.name) == hub
 
 
 @pytest.mark.parametrize(
@@ -68,9 +70,9 @@ def test_arguments_have_the_types_that_they_look_like(written: str, value: objec
     ],
 )
 def test_one_network_has_one_name(written: str, canonical: str) -> None:
-    recipe = get_recipe(f"{REPOSITORY}:{written}", allow_test_extractors=False)
+    recipe = get_extractor_config(f"{REPOSITORY}:{written}", allow_test_extractors=False)
     assert recipe.name == f"{REPOSITORY}:{canonical}".rstrip(":")
-    assert get_recipe(recipe.name, allow_test_extractors=False) == recipe
+    assert get_extractor_config(recipe.name, allow_test_extractors=False) == recipe
 
 
 @pytest.mark.parametrize("pin", ["", "@main", "@v1.0", f"@{COMMIT[:39]}", f"@{COMMIT}0"])
@@ -125,8 +127,8 @@ def test_options_that_can_not_be_used_are_refused(options: str) -> None:
 
 
 def test_networks_share_what_is_loaded_only_if_all_of_the_name_agrees() -> None:
-    one = get_recipe(f"{REPOSITORY}:x=1", allow_test_extractors=False)
-    same = get_recipe(f"{REPOSITORY}:x=01", allow_test_extractors=False)
-    other = get_recipe(f"{REPOSITORY}:x=2", allow_test_extractors=False)
+    one = get_extractor_config(f"{REPOSITORY}:x=1", allow_test_extractors=False)
+    same = get_extractor_config(f"{REPOSITORY}:x=01", allow_test_extractors=False)
+    other = get_extractor_config(f"{REPOSITORY}:x=2", allow_test_extractors=False)
     assert one.local_features == same.local_features != other.local_features
     assert (one.dimension, one.needs_vocabulary) == (None, False)

@@ -10,10 +10,10 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from services.cli.main import tree
-from services.cli.train_options import spelled_out
+from services.cli.main import build_app
+from services.cli.train_options import normalise_tokens
 from services.trainer.arguments import CITIES, TrainingArguments
-from services.trainer.configuration import known_keys, make_arguments, read_yaml, write_yaml
+from services.trainer.configuration import build_arguments, load_yaml, resolve_keys, save_yaml
 from shared.errors import InvalidRequest, NotFound
 
 PREDECESSORS: dict[str, Any] = {
@@ -85,8 +85,8 @@ PUBLISHED = r"""
 
 def read(tokens: list[str]) -> TrainingArguments:
     """What the command makes of its tokens."""
-    pairs = [token.removeprefix("--").partition("=") for token in spelled_out(tokens)]
-    return make_arguments(known_keys({name: value for name, _, value in pairs}, "test"))
+    pairs = [token.removeprefix("--").partition("=") for token in normalise_tokens(tokens)]
+    return build_arguments(resolve_keys({name: value for name, _, value in pairs}, "test"))
 
 
 @pytest.mark.parametrize("name", PREDECESSORS)
@@ -116,7 +116,7 @@ def test_the_published_command_ends_where_there_is_no_gpu_with_an_error_that_say
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
-    answer = CliRunner().invoke(tree(["train"]), ["train", *shlex.split(PUBLISHED)])
+    answer = CliRunner().invoke(build_app(["train"]), ["train", *shlex.split(PUBLISHED)])
     assert answer.exit_code == 1
     assert "no_gpu" in answer.output
     assert "--accelerator cpu" in answer.output.replace("\n", " ")
@@ -182,19 +182,19 @@ def test_lists_sizes_and_words_are_read(tokens: list[str], name: str, value: obj
 )
 def test_a_value_that_can_not_be_names_its_argument(name: str, text: str, said: str) -> None:
     with pytest.raises(InvalidRequest, match=said) as caught:
-        make_arguments({name: text})
+        build_arguments({name: text})
     assert f"--{name}" in caught.value.detail
 
 
 def test_an_option_that_there_is_not_names_the_nearest() -> None:
     with pytest.raises(typer.BadParameter, match="Did you mean batch_size"):
-        spelled_out(["--batchsize", "3"])
+        normalise_tokens(["--batchsize", "3"])
 
 
 def test_options_override_the_file(tmp_path: Path) -> None:
     file = tmp_path / "run.yaml"
     file.write_text("batch-size: 8\nlr: 0.001\nimage_size: [64, 96]\nval_set_names: [a]\n")
-    arguments = make_arguments(read_yaml(file), {"lr": "0.5"})
+    arguments = build_arguments(load_yaml(file), {"lr": "0.5"})
     assert arguments.lr == 0.5
     assert arguments.batch_size == 8
     assert arguments.image_size == (64, 96)
@@ -205,7 +205,7 @@ def test_an_unknown_key_of_a_file_names_the_nearest_and_the_file(tmp_path: Path)
     file = tmp_path / "run.yaml"
     file.write_text("milestone: [3]\n")
     with pytest.raises(InvalidRequest, match="milestones") as caught:
-        read_yaml(file)
+        load_yaml(file)
     assert str(file) in caught.value.detail
 
 
@@ -213,19 +213,19 @@ def test_a_file_that_is_no_mapping_is_refused(tmp_path: Path) -> None:
     file = tmp_path / "run.yaml"
     file.write_text("- lr\n")
     with pytest.raises(InvalidRequest, match="names with values"):
-        read_yaml(file)
+        load_yaml(file)
     with pytest.raises(NotFound, match="Can't read"):
-        read_yaml(tmp_path / "none.yaml")
+        load_yaml(tmp_path / "none.yaml")
 
 
 def test_a_written_configuration_is_read_as_the_same_run(tmp_path: Path) -> None:
     arguments = read(shlex.split(PUBLISHED))
-    write_yaml(arguments, tmp_path / "config.yaml")
-    assert make_arguments(read_yaml(tmp_path / "config.yaml")) == arguments
+    save_yaml(arguments, tmp_path / "config.yaml")
+    assert build_arguments(load_yaml(tmp_path / "config.yaml")) == arguments
 
 
 def test_the_help_shows_every_argument_in_its_group() -> None:
-    answer = CliRunner().invoke(tree(["train"]), ["train", "--help"], env={"COLUMNS": "200"})
+    answer = CliRunner().invoke(build_app(["train"]), ["train", "--help"], env={"COLUMNS": "200"})
     assert answer.exit_code == 0
     for name in TrainingArguments.model_fields:
         assert f"--{name} " in answer.output

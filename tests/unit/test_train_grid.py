@@ -9,10 +9,10 @@ from typing import Any
 
 import pytest
 
-from services.trainer.configuration import as_plain, make_arguments, write_yaml
-from services.trainer.display import Display, Quiet
-from services.trainer.grid import State, Trainer, outcome_of, run_grid
-from services.trainer.grid_plan import GridPlan, PlannedRun, read_plan
+from services.trainer.configuration import build_arguments, save_yaml, to_plain_dict
+from services.trainer.display import Display, NullDisplay
+from services.trainer.grid import RunFunctions, RunState, load_outcome, run_grid
+from services.trainer.grid_plan import GridPlan, PlannedRun, load_grid_plan
 from services.trainer.leaderboard import leaderboard, write_leaderboard
 from services.trainer.stop import RunStopped, StopRequest
 from shared.errors import Conflict, InvalidRequest, Misconfigured, PlacewiseError
@@ -33,7 +33,7 @@ fingerprints: {sfxs_val: abc}
 def plan_of(tmp_path: Path, text: str, **overrides: Any) -> GridPlan:
     file = tmp_path / "grid.yaml"
     file.write_text(text)
-    return read_plan(file, overrides)
+    return load_grid_plan(file, overrides)
 
 
 def test_a_grid_is_every_combination_and_every_listed_run(tmp_path: Path) -> None:
@@ -79,7 +79,7 @@ def test_a_grid_that_can_not_be_is_refused_before_its_first_run(
 
 
 def test_the_predecessors_grid_is_its_28_published_runs() -> None:
-    plan = read_plan(CONFIGS / "predecessor-grid.yaml", {})
+    plan = load_grid_plan(CONFIGS / "predecessor-grid.yaml", {})
     assert len(plan.runs) == 28
     best = plan.runs[25]
     assert best.name.startswith("26-cosplace-512")
@@ -92,12 +92,12 @@ def test_the_predecessors_grid_is_its_28_published_runs() -> None:
 
 @pytest.mark.parametrize("file", sorted(CONFIGS.glob("*.yaml")), ids=lambda file: file.name)
 def test_every_example_is_read(file: Path) -> None:
-    from services.trainer.configuration import read_yaml
+    from services.trainer.configuration import load_yaml
 
     if file.name.startswith("train-"):
-        make_arguments(read_yaml(file))
+        build_arguments(load_yaml(file))
     else:
-        assert read_plan(file, {}).runs
+        assert load_grid_plan(file, {}).runs
 
 
 def plain_plan(*names: str) -> GridPlan:
@@ -116,12 +116,12 @@ class Runs:
     def resume(
         self, folder: Path, changes: Any, display: Display, stop: StopRequest
     ) -> dict[str, Any]:
-        return self._end("resume", folder, make_arguments({"loss_name": "NTXentLoss"}))
+        return self._end("resume", folder, build_arguments({"loss_name": "NTXentLoss"}))
 
     def _end(self, how: str, folder: Path, arguments: Any) -> dict[str, Any]:
         self.calls.append(f"{how} {folder.name}")
         folder.mkdir(parents=True, exist_ok=True)
-        write_yaml(arguments, folder / "config.yaml")
+        save_yaml(arguments, folder / "config.yaml")
         ending = self.endings[folder.name]
         if isinstance(ending, Exception):
             raise ending
@@ -130,14 +130,16 @@ class Runs:
         return report
 
     def go(self, plan: GridPlan) -> list[Any]:
-        trainer = Trainer(self.begin, self.resume)
-        return run_grid(plan, self.out, trainer, Quiet(), StopRequest(), lambda outcomes: None)
+        trainer = RunFunctions(self.begin, self.resume)
+        return run_grid(
+            plan, self.out, trainer, NullDisplay(), StopRequest(), lambda outcomes: None
+        )
 
 
 def report_of(score: float, arguments: Any) -> dict[str, Any]:
     figures = {"s/R1": score, "s/R5": score, "s/R20": 1.0}
     return {
-        "arguments": as_plain(arguments),
+        "arguments": to_plain_dict(arguments),
         "monitor": "s/R1",
         "epochs": [
             {"number": 0, "figures": {"s/R1": score / 2, "s/R5": 0.0}},
@@ -156,10 +158,10 @@ def test_a_failed_run_is_named_and_the_others_are_made(tmp_path: Path) -> None:
     )
     outcomes = runs.go(plain_plan("a", "b", "c", "d"))
     assert [outcome.state for outcome in outcomes] == [
-        State.FINISHED,
-        State.FAILED,
-        State.FAILED,
-        State.FINISHED,
+        RunState.FINISHED,
+        RunState.FAILED,
+        RunState.FAILED,
+        RunState.FINISHED,
     ]
     assert outcomes[1].error == {"code": "RuntimeError", "detail": "out of memory"}
     assert "out of memory" in (tmp_path / "b" / "failed.json").read_text()
@@ -173,11 +175,11 @@ def test_a_grid_goes_on_where_it_was(tmp_path: Path) -> None:
     last = tmp_path / "begun" / "checkpoints" / "last.ckpt"
     last.parent.mkdir()
     last.write_bytes(b"")
-    assert outcome_of(plan.runs[1], tmp_path).state is State.INTERRUPTED
+    assert load_outcome(plan.runs[1], tmp_path).state is RunState.INTERRUPTED
     runs = Runs(tmp_path, begun=0.6, failed=0.7, new=0.8)
     outcomes = runs.go(plan)
     assert runs.calls == ["resume begun", "begin failed", "begin new"]
-    assert {outcome.state for outcome in outcomes} == {State.FINISHED}
+    assert {outcome.state for outcome in outcomes} == {RunState.FINISHED}
 
 
 def test_a_finished_run_of_other_arguments_is_not_passed_off_as_this_one(tmp_path: Path) -> None:

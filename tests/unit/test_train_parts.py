@@ -9,12 +9,12 @@ import pytest
 import torch
 
 from services.trainer.arguments import TrainingArguments
-from services.trainer.checkpoint_names import NameTemplate, folder_from
-from services.trainer.device import choose_device
-from services.trainer.keep import KeptCheckpoints
+from services.trainer.checkpoint_names import CheckpointNameTemplate, format_folder
+from services.trainer.device import resolve_device
+from services.trainer.keep import TopKCheckpoints
 from services.trainer.loggers import check_loggers
 from services.trainer.optimise import learning_rate, make_optimizer
-from services.trainer.random_state import random_state, set_random_state
+from services.trainer.random_state import restore_rng_state, rng_state
 from shared.errors import InvalidRequest, Misconfigured
 
 
@@ -73,32 +73,32 @@ PUBLISHED = (
 )
 
 
-def template(text: str, *, insert_names: bool = False) -> NameTemplate:
-    return NameTemplate(
+def template(text: str, *, insert_names: bool = False) -> CheckpointNameTemplate:
+    return CheckpointNameTemplate(
         text,
         {"backbone_arch": "resnet18", "lr": 0.0002},
         METRICS,
-        monitored="sfxs_val",
+        monitored_set="sfxs_val",
         insert_names=insert_names,
     )
 
 
 def test_a_name_carries_the_figures_and_drops_what_no_run_logs() -> None:
     made = template(PUBLISHED)
-    assert made.dropped == ["pitts30k_val/R1"]
-    assert made.filled(FIGURES) == "resnet18_epoch(07)_step(5000)_R5[0.8927]"
+    assert made.dropped_fields == ["pitts30k_val/R1"]
+    assert made.format_name(FIGURES) == "resnet18_epoch(07)_step(5000)_R5[0.8927]"
 
 
 def test_the_predecessors_default_name_has_figures_at_last() -> None:
     made = template("{model.encoder_arch}_epoch({epoch:02d})_R1[{R1:.4f}]_R5[{sfxs_val/R5:.4f}]")
-    assert made.dropped == []
-    assert made.filled(FIGURES) == "resnet18_epoch(07)_R1[0.8100]_R5[0.8927]"
+    assert made.dropped_fields == []
+    assert made.format_name(FIGURES) == "resnet18_epoch(07)_R1[0.8100]_R5[0.8927]"
 
 
 def test_a_name_is_no_path() -> None:
-    assert template("{sfxs_val/R1:.2f}/x").filled(FIGURES) == "0.81-x"
+    assert template("{sfxs_val/R1:.2f}/x").format_name(FIGURES) == "0.81-x"
     inserted = template("{sfxs_val/R1:.2f}", insert_names=True)
-    assert inserted.filled(FIGURES) == "sfxs_val-R1=0.81"
+    assert inserted.format_name(FIGURES) == "sfxs_val-R1=0.81"
 
 
 @pytest.mark.parametrize("text", ["{pitts30k_val/R1}", ""])
@@ -109,18 +109,18 @@ def test_a_name_of_which_nothing_is_left_is_refused(text: str) -> None:
 
 def test_a_format_that_does_not_fit_is_refused() -> None:
     with pytest.raises(InvalidRequest, match="can't be written"):
-        template("{epoch:02d}_{sfxs_val/R1:02d}").filled(FIGURES)
+        template("{epoch:02d}_{sfxs_val/R1:02d}").format_name(FIGURES)
 
 
 def test_a_folder_may_name_arguments_and_nothing_else() -> None:
-    assert folder_from("./LOGS/{self.backbone_arch}", {"backbone_arch": "a/b"}) == "./LOGS/a-b"
+    assert format_folder("./LOGS/{self.backbone_arch}", {"backbone_arch": "a/b"}) == "./LOGS/a-b"
     with pytest.raises(InvalidRequest, match="no argument"):
-        folder_from("./LOGS/{epoch}", {})
+        format_folder("./LOGS/{epoch}", {})
 
 
-def kept_in(folder: Path, *, top_k: int = 2, mode: str = "max") -> KeptCheckpoints:
-    name = NameTemplate("e{epoch}", {}, ["s/R1"])
-    return KeptCheckpoints(folder, name, "s/R1", mode, top_k, True)
+def kept_in(folder: Path, *, top_k: int = 2, mode: str = "max") -> TopKCheckpoints:
+    name = CheckpointNameTemplate("e{epoch}", {}, ["s/R1"])
+    return TopKCheckpoints(folder, name, "s/R1", mode, top_k, True)
 
 
 def write(path: Path, weights_only: bool) -> None:
@@ -139,31 +139,31 @@ def write(path: Path, weights_only: bool) -> None:
 def test_the_best_checkpoints_stay(tmp_path: Path, mode: str, top_k: int, stay: list[str]) -> None:
     kept = kept_in(tmp_path, mode=mode, top_k=top_k)
     for epoch, score in enumerate((0.1, 0.5, 0.9, 0.3, 0.7)):
-        kept.consider(write, {"s/R1": score}, epoch, step=epoch)
+        kept.save_if_best(write, {"s/R1": score}, epoch, step=epoch)
     assert sorted(path.stem for path in tmp_path.glob("*")) == stay
 
 
 def test_of_equal_scores_the_earlier_checkpoint_is_the_best(tmp_path: Path) -> None:
     kept = kept_in(tmp_path, top_k=1)
-    assert kept.consider(write, {"s/R1": 0.5}, 0, 0)
-    assert not kept.consider(write, {"s/R1": 0.5}, 1, 1)
-    assert not kept.consider(write, {"s/R1": math.nan}, 2, 2)
+    assert kept.save_if_best(write, {"s/R1": 0.5}, 0, 0)
+    assert not kept.save_if_best(write, {"s/R1": 0.5}, 1, 1)
+    assert not kept.save_if_best(write, {"s/R1": math.nan}, 2, 2)
     assert kept.best_path == tmp_path / "e0.ckpt"
 
 
 def test_the_last_checkpoint_holds_everything_whatever_the_best_ones_hold(tmp_path: Path) -> None:
     kept = kept_in(tmp_path)
-    kept.consider(write, {"s/R1": 0.5}, 0, 0)
-    kept.keep_last(write)
+    kept.save_if_best(write, {"s/R1": 0.5}, 0, 0)
+    kept.save_last(write)
     assert (tmp_path / "e0.ckpt").read_text() == "weights"
     assert kept.last_path.read_text() == "everything"
 
 
 def test_two_checkpoints_never_share_a_name(tmp_path: Path) -> None:
-    name = NameTemplate("same{lr}", {"lr": 1}, ["s/R1"])
-    kept = KeptCheckpoints(tmp_path, name, "s/R1", "max", 3, True)
+    name = CheckpointNameTemplate("same{lr}", {"lr": 1}, ["s/R1"])
+    kept = TopKCheckpoints(tmp_path, name, "s/R1", "max", 3, True)
     for epoch in range(3):
-        kept.consider(write, {"s/R1": 0.5}, epoch, 0)
+        kept.save_if_best(write, {"s/R1": 0.5}, epoch, 0)
     assert len(list(tmp_path.glob("*.ckpt"))) == 3
 
 
@@ -172,9 +172,9 @@ def test_random_numbers_go_on_where_they_were_kept() -> None:
 
     import numpy as np
 
-    state = random_state()
+    state = rng_state()
     drawn = (torch.rand(3).tolist(), np.random.rand(3).tolist(), random.random())
-    set_random_state(state)
+    restore_rng_state(state)
     assert (torch.rand(3).tolist(), np.random.rand(3).tolist(), random.random()) == drawn
 
 
@@ -182,7 +182,7 @@ def test_random_numbers_go_on_where_they_were_kept() -> None:
 def test_a_missing_gpu_is_named(accelerator: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     with pytest.raises(Misconfigured, match="--accelerator cpu") as caught:
-        choose_device(TrainingArguments(accelerator=accelerator))
+        resolve_device(TrainingArguments(accelerator=accelerator))
     assert caught.value.code == "no_gpu"
 
 
@@ -197,7 +197,7 @@ def test_a_missing_gpu_is_named(accelerator: str, monkeypatch: pytest.MonkeyPatc
 )
 def test_what_a_device_can_not_do_is_named(values: dict[str, object], code: str) -> None:
     with pytest.raises(InvalidRequest) as caught:
-        choose_device(TrainingArguments(accelerator="cpu", **values))
+        resolve_device(TrainingArguments(accelerator="cpu", **values))
     assert caught.value.code == code
 
 

@@ -12,12 +12,12 @@ import pytest
 import torch
 from PIL import Image
 
-from services.trainer.augment import augmented, to_tensor
-from services.trainer.batches import PlacePhotos, TrainingBatches
-from services.trainer.sampling import BatchPlan, Draw
+from services.trainer.augment import apply_randaugment, to_tensor
+from services.trainer.batches import PlaceDataset, ResumableDataLoader
+from services.trainer.sampling import PlaceBatchSampler, PlaceSample
 from shared.datasets.shots import TrainingPlace
 from shared.errors import Unprocessable
-from shared.vision.decode_small import decode_small
+from shared.vision.decode_small import decode_resized
 
 
 def places_of(**counts: int) -> list[TrainingPlace]:
@@ -30,7 +30,7 @@ def places_of(**counts: int) -> list[TrainingPlace]:
     return found
 
 
-PLAN = BatchPlan(
+PLAN = PlaceBatchSampler(
     places_of(oslo=10, rome=7),
     places_per_batch=4,
     photos_per_place=3,
@@ -41,7 +41,7 @@ PLAN = BatchPlan(
 )
 
 
-def cities(plan: BatchPlan, epoch: int = 0) -> list[str]:
+def cities(plan: PlaceBatchSampler, epoch: int = 0) -> list[str]:
     return [plan.places[draw.place].city for batch in plan.batches(epoch) for draw in batch]
 
 
@@ -110,10 +110,10 @@ def photos_on_disk(tmp_path: Path) -> list[TrainingPlace]:
 
 def batches_of(
     places: list[TrainingPlace], *, num_workers: int = 0, bad_is_error: bool = False
-) -> TrainingBatches:
-    plan = BatchPlan(places, 2, 2, False, True, 1, 7)
-    photos = PlacePhotos(plan, (32, 48), bad_is_error=bad_is_error)
-    return TrainingBatches(plan, photos, num_workers=num_workers, pin_memory=False)
+) -> ResumableDataLoader:
+    plan = PlaceBatchSampler(places, 2, 2, False, True, 1, 7)
+    photos = PlaceDataset(plan, (32, 48), fail_on_undecodable=bad_is_error)
+    return ResumableDataLoader(plan, photos, num_workers=num_workers, pin_memory=False)
 
 
 def test_a_batch_holds_each_places_photos_with_its_id(photos_on_disk: list[TrainingPlace]) -> None:
@@ -158,7 +158,7 @@ def test_a_photo_that_does_not_decode_is_left_out_and_named(
     broken = photos_on_disk[2].photos[1]
     broken.write_bytes(broken.read_bytes()[:200])
     batches = list(batches_of(photos_on_disk))
-    assert [path for batch in batches for path, _ in batch.bad] == [str(broken)]
+    assert [path for batch in batches for path, _ in batch.undecodable] == [str(broken)]
     assert sum(len(batch.photos) for batch in batches) == 7
     assert sorted(torch.cat([batch.labels for batch in batches]).tolist()).count(2) == 1
 
@@ -176,7 +176,7 @@ def test_a_photo_that_does_not_decode_is_an_error_where_that_was_asked(
 def test_augmentation_is_decided_by_its_seed() -> None:
     pixels = np.random.default_rng(0).integers(0, 255, (32, 32, 3)).astype(np.uint8)
     image = Image.fromarray(pixels)
-    first, again, other = (np.asarray(augmented(image, seed)) for seed in (5, 5, 6))
+    first, again, other = (np.asarray(apply_randaugment(image, seed)) for seed in (5, 5, 6))
     assert np.array_equal(first, again)
     assert not np.array_equal(first, other)
 
@@ -195,7 +195,7 @@ def test_a_large_jpeg_decoded_small_is_nearly_the_full_decoding(tmp_path: Path) 
     coarse = Image.fromarray(rng.integers(0, 255, (12, 16, 3)).astype(np.uint8))
     full = coarse.resize((1280, 960), Image.Resampling.BICUBIC)
     full.save(tmp_path / "large.jpg", quality=95)
-    small = np.asarray(decode_small(tmp_path / "large.jpg", (120, 160)), dtype=float)
+    small = np.asarray(decode_resized(tmp_path / "large.jpg", (120, 160)), dtype=float)
     wanted = np.asarray(full.resize((160, 120), Image.Resampling.BILINEAR), dtype=float)
     assert small.shape == (120, 160, 3)
     assert np.abs(small - wanted).mean() < 2
@@ -207,11 +207,11 @@ def test_a_photo_on_its_side_comes_out_upright(tmp_path: Path) -> None:
     exif = Image.Exif()
     exif[0x0112] = 6  # to be turned clockwise: the left becomes the top
     image.save(tmp_path / "side.jpg", exif=exif)
-    upright = np.asarray(decode_small(tmp_path / "side.jpg", (64, 32)))
+    upright = np.asarray(decode_resized(tmp_path / "side.jpg", (64, 32)))
     assert upright.shape == (64, 32, 3)
     assert upright[:24].mean() > 250
     assert upright[-24:].mean() < 5
 
 
 def test_a_draw_is_plain_enough_to_cross_processes() -> None:
-    assert Draw(1, (0, 1), 5) == Draw(1, (0, 1), 5)
+    assert PlaceSample(1, (0, 1), 5) == PlaceSample(1, (0, 1), 5)

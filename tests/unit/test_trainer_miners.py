@@ -14,7 +14,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from services.trainer.losses import make_loss
 from services.trainer.miners import MINERS, AngularMiner, batch_accuracy, make_miner
 from shared.errors import Unprocessable
-from shared.vision.place_models.aggregators.base import unit_rows
+from shared.vision.place_models.aggregators.base import normalise_rows
 from tests.unit.test_trainer_losses import (
     LABELS,
     NEGATIVES,
@@ -71,7 +71,7 @@ def test_angular_keeps_triplets_with_a_wide_angle_at_the_negative() -> None:
 def test_angular_finds_the_librarys_triplets_in_its_order_however_small_its_steps(
     degrees: float, numbers_at_once: int
 ) -> None:
-    rows = unit_rows(torch.randn(48, 16, generator=torch.Generator().manual_seed(0)))
+    rows = normalise_rows(torch.randn(48, 16, generator=torch.Generator().manual_seed(0)))
     labels = torch.tensor([0, 1, 2, 3, 4, 5] * 8)
     wanted = miners.AngularMiner(angle=degrees)(rows, labels)
     found = AngularMiner(degrees, numbers_at_once)(rows, labels)

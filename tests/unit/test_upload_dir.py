@@ -9,13 +9,13 @@ import pytest
 
 from shared.errors import Misconfigured
 from shared.ids import new_id
-from shared.objects.upload_dir import place_originals
+from shared.objects.upload_dir import resolve_upload_dir
 from shared.settings import Settings
 
 
 def place(home: Path, upload_dir: Path | None) -> Mapping[str, Path]:
     home.mkdir(exist_ok=True)
-    return place_originals(home, home / "objects", upload_dir)
+    return resolve_upload_dir(home, home / "objects", upload_dir)
 
 
 def refused(home: Path, upload_dir: Path | None, code: str) -> str:

@@ -7,15 +7,15 @@ from datetime import UTC, datetime
 import pytest
 
 from shared.datasets.utm_names import (
-    PhotoName,
-    Spot,
-    fields_of_name,
-    position_of_name,
-    spot_of_name,
+    FileNameLocation,
+    UtmFileName,
+    parse_utm_file_name,
+    upload_fields_of_file_name,
+    utm_position_of_file_name,
 )
 from shared.errors import InvalidRequest
 
-MOLE = PhotoName(
+MOLE = UtmFileName(
     east=396877.76,
     north=4991561.25,
     zone_number=32,
@@ -41,7 +41,7 @@ def test_written_name_has_all_fields_in_the_order_of_the_convention() -> None:
 
 
 def test_what_is_written_is_read_again() -> None:
-    fields = fields_of_name(MOLE.file_name(), None)
+    fields = upload_fields_of_file_name(MOLE.file_name(), None)
     assert float(fields["latitude"]) == pytest.approx(45.07, abs=0.01)
     assert float(fields["longitude"]) == pytest.approx(7.69, abs=0.01)
     assert fields["heading"] == "349.5"
@@ -49,8 +49,8 @@ def test_what_is_written_is_read_again() -> None:
 
 
 def test_written_degrees_are_exact_to_a_fifth_of_a_metre() -> None:
-    with_degrees = fields_of_name(MOLE.file_name(), None)
-    from_utm = fields_of_name("@396877.76@4991561.25@32@T@.jpg", None)
+    with_degrees = upload_fields_of_file_name(MOLE.file_name(), None)
+    from_utm = upload_fields_of_file_name("@396877.76@4991561.25@32@T@.jpg", None)
     assert float(with_degrees["latitude"]) == pytest.approx(float(from_utm["latitude"]), abs=1.5e-6)
     assert float(with_degrees["longitude"]) == pytest.approx(
         float(from_utm["longitude"]), abs=1.5e-6
@@ -58,8 +58,8 @@ def test_written_degrees_are_exact_to_a_fifth_of_a_metre() -> None:
 
 
 def test_southern_and_western_degrees_keep_their_sign() -> None:
-    rio = PhotoName(east=683466.0, north=7460687.0, zone_number=23, zone_letter="K")
-    fields = fields_of_name(rio.file_name(), None)
+    rio = UtmFileName(east=683466.0, north=7460687.0, zone_number=23, zone_letter="K")
+    fields = upload_fields_of_file_name(rio.file_name(), None)
     assert float(fields["latitude"]) == pytest.approx(-22.95, abs=0.01)
     assert float(fields["longitude"]) == pytest.approx(-43.21, abs=0.01)
     assert "heading" not in fields
@@ -68,7 +68,7 @@ def test_southern_and_western_degrees_keep_their_sign() -> None:
 
 def test_field_with_an_at_sign_is_refused_because_it_would_shift_all_others() -> None:
     with pytest.raises(ValueError, match="@"):
-        PhotoName(396877.76, 4991561.25, 32, "T", note="a@b").file_name()
+        UtmFileName(396877.76, 4991561.25, 32, "T", note="a@b").file_name()
 
 
 @pytest.mark.parametrize(
@@ -80,38 +80,42 @@ def test_field_with_an_at_sign_is_refused_because_it_would_shift_all_others() ->
     ],
 )
 def test_full_date_becomes_the_time_of_capture(timestamp: str, expected: str) -> None:
-    assert fields_of_name(stamped(timestamp), None)["captured_at"] == expected
+    assert upload_fields_of_file_name(stamped(timestamp), None)["captured_at"] == expected
 
 
 @pytest.mark.parametrize("timestamp", ["", "2019", "201905", "20191301", "2019050125", "yesterday"])
 def test_shorter_or_impossible_timestamp_is_left_alone(timestamp: str) -> None:
-    assert "captured_at" not in fields_of_name(stamped(timestamp), None)
+    assert "captured_at" not in upload_fields_of_file_name(stamped(timestamp), None)
 
 
 def test_position_is_the_two_first_fields() -> None:
-    assert position_of_name(MOLE.file_name()) == (396877.76, 4991561.25)
-    assert position_of_name("@1.5@2.5@.jpg") == (1.5, 2.5)
-    assert position_of_name("photo.jpg") is None
+    assert utm_position_of_file_name(MOLE.file_name()) == (396877.76, 4991561.25)
+    assert utm_position_of_file_name("@1.5@2.5@.jpg") == (1.5, 2.5)
+    assert utm_position_of_file_name("photo.jpg") is None
 
 
 def test_position_that_is_no_number_names_the_file() -> None:
     with pytest.raises(InvalidRequest) as caught:
-        position_of_name("@east@2@.jpg")
+        utm_position_of_file_name("@east@2@.jpg")
     assert caught.value.code == "bad_coordinates"
     assert "@east@2@.jpg" in caught.value.detail
 
 
 def test_spot_is_what_the_name_says_and_nothing_that_it_does_not() -> None:
-    full = spot_of_name(
+    full = parse_utm_file_name(
         "@0660329.93@1522162.46@47@P@013.76438@0100.48301@3TQZ-W_x@@398@@@@201905@4257_Bangkok@.jpg"
     )
-    assert full == Spot(660329.93, 1522162.46, "47P", 13.76438, 100.48301, 38.0, "4257_Bangkok")
-    assert spot_of_name("@1@2@.jpg") == Spot(1.0, 2.0, None, None, None, None, "")
-    assert spot_of_name("IMG_1.jpg") is None
+    assert full == FileNameLocation(
+        660329.93, 1522162.46, "47P", 13.76438, 100.48301, 38.0, "4257_Bangkok"
+    )
+    assert parse_utm_file_name("@1@2@.jpg") == FileNameLocation(
+        1.0, 2.0, None, None, None, None, ""
+    )
+    assert parse_utm_file_name("IMG_1.jpg") is None
 
 
 @pytest.mark.parametrize("name", ["@x@2@.jpg", "@nan@2@.jpg", "@inf@2@.jpg"])
 def test_spot_without_two_numbers_is_refused(name: str) -> None:
     with pytest.raises(InvalidRequest) as caught:
-        spot_of_name(name)
+        parse_utm_file_name(name)
     assert caught.value.code == "bad_coordinates"

@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from shared.vision.vlad import assign, soft_vlad, vlad
+from shared.vision.vlad import assign_clusters, soft_vlad, vlad
 from shared.vision.vocabulary_file import read_vocabulary
 
 Matrix = NDArray[np.float64]
@@ -167,12 +167,12 @@ def test_centre_is_subtracted_raw_and_not_normalised() -> None:
 def test_assignment_is_by_cosine_so_a_long_centre_attracts_no_more() -> None:
     centres = tensor(np.array([[10.0, 0.0], [0.1, 0.1]]))
     patches = tensor(unit(np.array([[1.0, 0.9], [1.0, 0.1]])))
-    assert assign(patches, centres).tolist() == [1, 0]
+    assert assign_clusters(patches, centres).tolist() == [1, 0]
 
 
 def test_first_of_equally_similar_centres_gets_the_patch() -> None:
     centres = tensor(np.array([[0.0, 1.0], [1.0, 0.0], [2.0, 0.0]]))
-    assert assign(tensor(np.array([[1.0, 0.0]])), centres).tolist() == [1]
+    assert assign_clusters(tensor(np.array([[1.0, 0.0]])), centres).tolist() == [1]
 
 
 def test_unused_clusters_stay_exactly_zero() -> None:

@@ -13,7 +13,7 @@ import pytest
 from numpy.typing import NDArray
 
 from shared.errors import Unprocessable
-from shared.vision.vocabulary import check_centres, decode_centres, encode_centres
+from shared.vision.vocabulary import decode_centres, encode_centres, parse_centres
 
 
 def good_centres(clusters: int = 4, width: int = 6) -> NDArray[np.float32]:
@@ -35,14 +35,14 @@ def npy_header(shape: str) -> bytes:
 
 def refusal(array: NDArray[Any], width: int | None = None) -> str:
     with pytest.raises(Unprocessable) as caught:
-        check_centres(array, width=width)
+        parse_centres(array, width=width)
     assert caught.value.code == "vocabulary_unfit"
     return caught.value.detail
 
 
 def test_centres_survive_writing_and_reading() -> None:
     array = good_centres()
-    checked = check_centres(array, width=6)
+    checked = parse_centres(array, width=6)
     back = decode_centres(encode_centres(checked), width=6)
     np.testing.assert_array_equal(back.array, array)
     assert (back.clusters, back.dimension) == (4, 6)
@@ -52,14 +52,14 @@ def test_centres_survive_writing_and_reading() -> None:
 @pytest.mark.parametrize("dtype", ["<f2", "<f8", ">f4"])
 def test_other_floating_point_types_become_float32(dtype: str) -> None:
     array = good_centres()
-    checked = check_centres(array.astype(dtype))
+    checked = parse_centres(array.astype(dtype))
     assert checked.array.dtype == np.float32
     np.testing.assert_allclose(checked.array, array, atol=2e-3)
 
 
 def test_fortran_order_does_not_change_the_hash() -> None:
     array = good_centres()
-    assert check_centres(np.asfortranarray(array)).sha256 == check_centres(array).sha256
+    assert parse_centres(np.asfortranarray(array)).sha256 == parse_centres(array).sha256
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])

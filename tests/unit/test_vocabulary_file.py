@@ -14,8 +14,8 @@ import pytest
 import torch
 
 from shared.errors import Unprocessable
-from shared.vision.provenance import UNKNOWN, Provenance
-from shared.vision.vocabulary import check_centres
+from shared.vision.provenance import UNKNOWN_PROVENANCE, Provenance
+from shared.vision.vocabulary import parse_centres
 from shared.vision.vocabulary_file import VocabularyFile, decode_vocabulary, read_vocabulary
 from tests.unit.test_vocabulary import Untrustworthy, good_centres, npy
 
@@ -30,13 +30,13 @@ def learnt(**others: Any) -> Provenance:
         "preprocessing": {"name": "square32", "version": 1},
         "photos": 17,
         "seed": 3,
-        "sha256": check_centres(good_centres()).sha256,
+        "sha256": parse_centres(good_centres()).sha256,
         **others,
     }
 
 
 def good_file() -> VocabularyFile:
-    return VocabularyFile(check_centres(good_centres()), learnt())
+    return VocabularyFile(parse_centres(good_centres()), learnt())
 
 
 def npz(compression: int = zipfile.ZIP_STORED, **members: bytes) -> bytes:
@@ -69,10 +69,10 @@ def test_a_file_is_what_numpy_reads_without_pickle_and_holds_no_clock() -> None:
 
 
 def test_centres_of_unknown_origin_are_written_alone() -> None:
-    found = VocabularyFile(check_centres(good_centres()), UNKNOWN)
+    found = VocabularyFile(parse_centres(good_centres()), UNKNOWN_PROVENANCE)
     assert found.suffix == ".npy"
     again = decode_vocabulary(found.encode())
-    assert again.provenance == UNKNOWN
+    assert again.provenance == UNKNOWN_PROVENANCE
     np.testing.assert_array_equal(again.centres.array, good_centres())
 
 
@@ -185,7 +185,7 @@ def test_published_anyloc_vocabularies_load(real_photos: Path) -> None:
     for file in files:
         read = read_vocabulary(file)
         found = read.centres
-        assert read.provenance == UNKNOWN
+        assert read.provenance == UNKNOWN_PROVENANCE
         assert (found.clusters, found.dimension) == (32, 1536), file.name
         lengths = np.linalg.norm(found.array, axis=1)
         assert lengths.min() < 0.7, "AnyLoc's centres are means of unit vectors, not unit vectors"

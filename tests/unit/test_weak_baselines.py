@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from shared.datasets.weak_baselines import WEAK_BASELINES, average_colour, thumbnail
+from shared.datasets.weak_baselines import BASELINE_DESCRIPTORS, average_colour, thumbnail
 from tests.support.photos import photo_image
 
 
-@pytest.mark.parametrize("name", WEAK_BASELINES)
+@pytest.mark.parametrize("name", BASELINE_DESCRIPTORS)
 def test_descriptor_is_a_unit_vector_and_most_like_itself(name: str) -> None:
-    rows = np.stack([WEAK_BASELINES[name](photo_image(number)) for number in range(6)])
+    rows = np.stack([BASELINE_DESCRIPTORS[name](photo_image(number)) for number in range(6)])
     assert np.linalg.norm(rows, axis=1) == pytest.approx(1, abs=1e-5)
     assert (rows @ rows.T).argmax(axis=1).tolist() == list(range(6))
 

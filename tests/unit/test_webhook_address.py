@@ -8,16 +8,21 @@ from typing import Any
 
 import pytest
 
-from services.steward.webhooks.sign import sign
+from services.steward.webhooks.sign import sign_webhook
 from shared.errors import PlacewiseError, Unprocessable
-from shared.webhook_address import Target, is_public, parse_target, resolve
+from shared.webhook_address import (
+    WebhookTarget,
+    is_public_address,
+    parse_webhook_url,
+    resolve_webhook_target,
+)
 
 
 @pytest.mark.parametrize(
     "address", ["8.8.8.8", "1.1.1.1", "2606:4700:4700::1111", "64:ff9b::808:808"]
 )
 def test_machines_of_the_internet_may_be_called(address: str) -> None:
-    assert is_public(ipaddress.ip_address(address))
+    assert is_public_address(ipaddress.ip_address(address))
 
 
 @pytest.mark.parametrize(
@@ -58,7 +63,7 @@ def test_machines_of_the_internet_may_be_called(address: str) -> None:
     ],
 )
 def test_no_machine_of_our_own_may_be_called_however_it_is_written(address: str) -> None:
-    assert not is_public(ipaddress.ip_address(address))
+    assert not is_public_address(ipaddress.ip_address(address))
 
 
 @pytest.mark.parametrize(
@@ -66,11 +71,11 @@ def test_no_machine_of_our_own_may_be_called_however_it_is_written(address: str)
     ["localhost", "127.0.0.1", "127.1", "2130706433", "0x7f000001", "0177.0.0.1", "[::1]", "0"],
 )
 def test_spellings_of_loopback_are_loopback(host: str) -> None:
-    target = parse_target(f"https://{host}/", allow_private=False)
+    target = parse_webhook_url(f"https://{host}/", allow_private=False)
     with pytest.raises(Unprocessable) as caught:
-        resolve(target, allow_private=False)
+        resolve_webhook_target(target, allow_private=False)
     assert caught.value.code == "webhook_address_forbidden"
-    assert resolve(target, allow_private=True) in ("127.0.0.1", "::1", "0.0.0.0")
+    assert resolve_webhook_target(target, allow_private=True) in ("127.0.0.1", "::1", "0.0.0.0")
 
 
 def test_a_name_with_one_private_address_is_refused_whole(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -82,12 +87,16 @@ def test_a_name_with_one_private_address_is_refused_whole(monkeypatch: pytest.Mo
 
     monkeypatch.setattr(socket, "getaddrinfo", both)
     with pytest.raises(Unprocessable, match=r"10\.0\.0\.1"):
-        resolve(Target("https", "both.example", 443, "/"), allow_private=False)
+        resolve_webhook_target(
+            WebhookTarget("https", "both.example", 443, "/"), allow_private=False
+        )
 
 
 def test_a_name_without_an_address_is_told_apart_from_a_forbidden_one() -> None:
     with pytest.raises(PlacewiseError) as caught:
-        resolve(Target("https", "no-such-name.invalid", 443, "/"), allow_private=False)
+        resolve_webhook_target(
+            WebhookTarget("https", "no-such-name.invalid", 443, "/"), allow_private=False
+        )
     assert caught.value.code == "webhook_name_unknown"
 
 
@@ -116,22 +125,22 @@ def test_a_name_without_an_address_is_told_apart_from_a_forbidden_one() -> None:
 )
 def test_what_is_no_address_of_a_webhook_is_refused(url: str) -> None:
     with pytest.raises(Unprocessable) as caught:
-        parse_target(url, allow_private=False)
+        parse_webhook_url(url, allow_private=False)
     assert caught.value.code == "invalid_field"
 
 
 def test_a_target_has_what_a_request_needs() -> None:
-    target = parse_target("https://Example.com:8443/a/b?c=d", allow_private=False)
-    assert target == Target("https", "example.com", 8443, "/a/b?c=d")
+    target = parse_webhook_url("https://Example.com:8443/a/b?c=d", allow_private=False)
+    assert target == WebhookTarget("https", "example.com", 8443, "/a/b?c=d")
     assert target.host_header == "example.com:8443"
-    assert parse_target("https://example.com", allow_private=False).path == "/"
-    assert parse_target("http://[::1]:80/", allow_private=True).host_header == "[::1]"
+    assert parse_webhook_url("https://example.com", allow_private=False).path == "/"
+    assert parse_webhook_url("http://[::1]:80/", allow_private=True).host_header == "[::1]"
 
 
 def test_the_signature_is_that_of_the_specification() -> None:
     # The example of the Standard Webhooks libraries.
     secret = "whsec_MfKQ9r8GKYqrTwjUPD8ILPZIo2LaLaSw"
     body = '{"test": 2432232314}'
-    assert sign(secret, "msg_p5jXN8AQM9LWM0D4loKWxJek", 1614265330, body) == (
+    assert sign_webhook(secret, "msg_p5jXN8AQM9LWM0D4loKWxJek", 1614265330, body) == (
         "v1,g0hM9SsE+OTPJTGt/tmIKtSyZlE3uFJELVlNIOLJ1OE="
     )

@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from rich.markup import escape
 from rich.table import Column, Table
 
-from services.cli.output import JsonOption, answers, explained, print_json
-from shared.datasets.audit import TIMES_THE_RULE, Suspect, find_suspects
+from services.cli.output import JsonOption, console, print_json, report_errors
+from shared.datasets.audit import MAX_RULE_MULTIPLE, SuspectLabel, find_suspect_labels
 from shared.datasets.sets import open_evaluation_set
 from shared.errors import InvalidRequest
 
-MOST_SHOWN = 50
+MAX_SUSPECTS_SHOWN = 50
 
 
 def audit(
@@ -42,9 +42,9 @@ def audit(
     Near is 4 times the rule's metres or frames, whatever the heading. Look at these pairs: where
     they show one place, the ground truth errs, and not the descriptor.
     """
-    with explained(as_json):
+    with report_errors(as_json):
         evaluation = open_evaluation_set(folder, name, protocol=protocol, rule=rule)
-        ranked = _table(predictions, "iu").astype(np.int64)
+        ranked = _load_array(predictions, "iu").astype(np.int64)
         outside = ranked.size and not 0 <= ranked.min() <= ranked.max() < len(evaluation.database)
         if outside:
             raise InvalidRequest(
@@ -52,8 +52,8 @@ def audit(
                 f"{predictions} speaks of photos {ranked.min()} to {ranked.max()}; the database of "
                 f"{evaluation.name} has {len(evaluation.database)}, from 0.",
             )
-        given = None if scores is None else _table(scores, "f").astype(np.float32)
-        suspects = find_suspects(evaluation, ranked, given, min_score=min_score)
+        given = None if scores is None else _load_array(scores, "f").astype(np.float32)
+        suspects = find_suspect_labels(evaluation, ranked, given, min_score=min_score)
     if as_json:
         print_json(
             {
@@ -66,23 +66,23 @@ def audit(
             }
         )
         return
-    answers.print(
+    console.print(
         f"{len(suspects)} of {len(evaluation.queries)} queries of {escape(evaluation.name)} have a "
-        f"confident first match within {TIMES_THE_RULE:g} times {escape(evaluation.rule)} that "
+        f"confident first match within {MAX_RULE_MULTIPLE:g} times {escape(evaluation.rule)} that "
         "counts as wrong.",
         soft_wrap=True,
     )
     if suspects:
-        _show(suspects)
+        _print_suspects(suspects)
 
 
-def _show(suspects: list[Suspect]) -> None:
+def _print_suspects(suspects: list[SuspectLabel]) -> None:
     table = Table(
         *(Column(name, justify="right") for name in ("score", "metres", "degrees")),
         "query",
         "first match",
     )
-    for one in suspects[:MOST_SHOWN]:
+    for one in suspects[:MAX_SUSPECTS_SHOWN]:
         table.add_row(
             "-" if one.score is None else f"{one.score:.3f}",
             "-" if one.metres is None else f"{one.metres:.1f}",
@@ -90,12 +90,12 @@ def _show(suspects: list[Suspect]) -> None:
             escape(one.query_name),
             escape(one.database_name),
         )
-    answers.print(table)
-    if len(suspects) > MOST_SHOWN:
-        answers.print(f"and {len(suspects) - MOST_SHOWN} more: --json lists all.")
+    console.print(table)
+    if len(suspects) > MAX_SUSPECTS_SHOWN:
+        console.print(f"and {len(suspects) - MAX_SUSPECTS_SHOWN} more: --json lists all.")
 
 
-def _table(path: Path, kinds: str) -> NDArray[Any]:
+def _load_array(path: Path, kinds: str) -> NDArray[Any]:
     try:
         rows: NDArray[Any] = np.load(path, allow_pickle=False)
     except (OSError, ValueError, EOFError) as error:

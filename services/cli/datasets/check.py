@@ -14,14 +14,19 @@ from rich.table import Column, Table
 
 from services.cli.output import (
     JsonOption,
-    answers,
-    explained,
-    messages,
+    console,
+    err_console,
     print_json,
+    printable_path,
     progress_bar,
-    shown,
+    report_errors,
 )
-from shared.datasets.recognise import Problem, Recognised, decode_all, recognise
+from shared.datasets.recognise import (
+    DatasetProblem,
+    DatasetReport,
+    find_undecodable_photos,
+    inspect_dataset,
+)
 from shared.datasets.shots import EvaluationSet, TrainingSet
 
 Json = dict[str, Any]
@@ -48,34 +53,34 @@ def check(
 
     Exits with 1 where something is wrong.
     """
-    with explained(as_json), progress_bar() as progress:
+    with report_errors(as_json), progress_bar() as progress:
         looking = progress.add_task("looking through the folder", total=None)
-        found = recognise(folder, protocol=protocol, rule=rule, min_photos=min_photos)
+        found = inspect_dataset(folder, protocol=protocol, rule=rule, min_photos=min_photos)
         progress.remove_task(looking)
         problems = list(found.problems)
         if decode:
             bar = progress.add_task("decoding", total=len(found.photos()))
-            problems += decode_all(found, lambda count: progress.advance(bar, count))
+            problems += find_undecodable_photos(found, lambda count: progress.advance(bar, count))
     if as_json:
-        print_json(_as_json(found, problems, decode))
+        print_json(_check_as_json(found, problems, decode))
     else:
-        _show(found, problems, decode)
+        _print_check(found, problems, decode)
     if problems:
         raise typer.Exit(1)
 
 
-def _as_json(found: Recognised, problems: list[Problem], decoded: bool) -> Json:
+def _check_as_json(found: DatasetReport, problems: list[DatasetProblem], decoded: bool) -> Json:
     return {
-        "root": shown(found.root),
+        "root": printable_path(found.root),
         "layouts": list(found.layouts),
-        "training": _training(found.training) if found.training else None,
-        "evaluation": [_evaluation(one) for one in found.evaluation],
+        "training": _training_summary(found.training) if found.training else None,
+        "evaluation": [_evaluation_summary(one) for one in found.evaluation],
         "decoded": decoded,
         "problems": [asdict(problem) for problem in problems],
     }
 
 
-def _training(training: TrainingSet) -> Json:
+def _training_summary(training: TrainingSet) -> Json:
     sizes = [len(place.photos) for place in training.places]
     places = Counter(place.city for place in training.places)
     photos: Counter[str] = Counter()
@@ -98,7 +103,7 @@ def _training(training: TrainingSet) -> Json:
     }
 
 
-def _evaluation(one: EvaluationSet) -> Json:
+def _evaluation_summary(one: EvaluationSet) -> Json:
     counts = [len(found) for found in one.positives]
     return {
         "name": one.name,
@@ -113,30 +118,30 @@ def _evaluation(one: EvaluationSet) -> Json:
     }
 
 
-def _show(found: Recognised, problems: list[Problem], decoded: bool) -> None:
-    answers.print(
-        f"{shown(found.root)}: {', '.join(dict.fromkeys(found.layouts))}.", soft_wrap=True
+def _print_check(found: DatasetReport, problems: list[DatasetProblem], decoded: bool) -> None:
+    console.print(
+        f"{printable_path(found.root)}: {', '.join(dict.fromkeys(found.layouts))}.", soft_wrap=True
     )
     if found.training is not None:
-        _show_training(_training(found.training))
+        _print_training(_training_summary(found.training))
     for one in found.evaluation:
-        _show_evaluation(_evaluation(one))
+        _print_evaluation(_evaluation_summary(one))
     if not problems:
-        answers.print(
+        console.print(
             "All photos decode." if decoded else "All photos are there; --decode opens them.",
             soft_wrap=True,
         )
     for problem in problems:
-        messages.print(f"[red]{problem.code}[/red] {escape(problem.detail)}", soft_wrap=True)
+        err_console.print(f"[red]{problem.code}[/red] {escape(problem.detail)}", soft_wrap=True)
         for example in problem.examples:
-            messages.print(f"  {escape(example)}", soft_wrap=True)
+            err_console.print(f"  {escape(example)}", soft_wrap=True)
         if problem.examples and problem.count > len(problem.examples):
-            messages.print(f"  and {problem.count - len(problem.examples)} more")
+            err_console.print(f"  and {problem.count - len(problem.examples)} more")
 
 
-def _show_training(figures: Json) -> None:
+def _print_training(figures: Json) -> None:
     sizes = figures["photos_per_place"]
-    answers.print(
+    console.print(
         f"To learn from: {figures['photos']} photos of {figures['places']} places in "
         f"{len(figures['cities'])} cities ({figures['layout']}), {sizes['least']} to "
         f"{sizes['most']} of a place, the median {sizes['median']:g}; fingerprint "
@@ -146,12 +151,12 @@ def _show_training(figures: Json) -> None:
     table = Table("city", Column("places", justify="right"), Column("photos", justify="right"))
     for city, counts in figures["cities"].items():
         table.add_row(escape(city), str(counts["places"]), str(counts["photos"]))
-    answers.print(table)
+    console.print(table)
 
 
-def _show_evaluation(one: Json) -> None:
+def _print_evaluation(one: Json) -> None:
     # Lines, not a table: names are long, and fingerprints must not be cut.
-    answers.print(
+    console.print(
         f"{escape(one['name'])}: {one['database']} database photos, {one['queries']} queries, of "
         f"which {one['queries_without_positives']} have no positive; "
         f"{one['positives_per_query']['mean']:.1f} positives each ({escape(one['rule'])}), "

@@ -8,19 +8,21 @@ from typing import Annotated
 
 import typer
 
-from services.cli.output import JsonOption, answers, explained, print_json, shown
+from services.cli.output import JsonOption, console, print_json, printable_path, report_errors
 from shared.datasets.ground_truth import find_positives
-from shared.datasets.ground_truth_files import said_path, write_ground_truth
-from shared.datasets.photo_lists import read_list
-from shared.datasets.rules import Rule, parse_rule
+from shared.datasets.ground_truth_files import sidecar_path, write_ground_truth
+from shared.datasets.photo_lists import read_photo_list
+from shared.datasets.rules import PositiveRule, parse_rule
 from shared.errors import InvalidRequest, Misconfigured
 
-List = Annotated[Path, typer.Option(help="A .npy of paths, a CSV, or a text of one path a line.")]
+PhotoListOption = Annotated[
+    Path, typer.Option(help="A .npy of paths, a CSV, or a text of one path a line.")
+]
 
 
 def ground_truth(
-    database: List,
-    queries: List,
+    database: PhotoListOption,
+    queries: PhotoListOption,
     out: Annotated[Path, typer.Option(help="The .npy to write, and beside it a .json.")],
     radius: Annotated[
         float | None, typer.Option(min=0, help="Metres, the bound included. Left out: 25.")
@@ -40,11 +42,11 @@ def ground_truth(
     The rows are in the order of the lists as given. OUT.json keeps the fingerprints of both lists,
     so that they are never taken for the rows of others.
     """
-    with explained(as_json):
-        meant = _meant(radius, rule)
+    with report_errors(as_json):
+        meant = _resolve_rule(radius, rule)
         if out.suffix != ".npy":
             raise InvalidRequest("bad_out", f"--out {out}: the file's name has to end in .npy.")
-        listed, asked = read_list(database, folder), read_list(queries, folder)
+        listed, asked = read_photo_list(database, folder), read_photo_list(queries, folder)
         found = find_positives(meant, asked, listed)
         try:
             write_ground_truth(
@@ -58,7 +60,7 @@ def ground_truth(
             raise Misconfigured("out_unwritable", f"Can't write {out}: {error}.") from error
     counts = [len(positives) for positives in found]
     figures = {
-        "out": shown(out),
+        "out": printable_path(out),
         "rule": str(meant),
         "database": len(listed),
         "queries": len(asked),
@@ -68,20 +70,20 @@ def ground_truth(
     if as_json:
         print_json(figures)
         return
-    answers.print(
-        f"{shown(out)}, and {shown(said_path(out))} beside it: {sum(counts)} positives ({meant}) "
+    console.print(
+        f"{printable_path(out)}, and {printable_path(sidecar_path(out))} beside it: {sum(counts)} positives ({meant}) "
         f"of {len(asked)} queries among {len(listed)} database photos; {counts.count(0)} queries "
         "have none.",
         soft_wrap=True,
     )
 
 
-def _meant(radius: float | None, rule: str | None) -> Rule:
+def _resolve_rule(radius: float | None, rule: str | None) -> PositiveRule:
     if rule is None:
         metres = 25.0 if radius is None else radius
         if not math.isfinite(metres):
             raise InvalidRequest("unknown_rule", f"--radius {metres} is no number of metres.")
-        return Rule("radius", radius_m=metres)
+        return PositiveRule("radius", radius_m=metres)
     if radius is not None:
         raise InvalidRequest("which_rule", "Give --radius or --rule, not both.")
     return parse_rule(rule)

@@ -10,21 +10,21 @@ from typing import Annotated, Any
 import typer
 from rich.table import Column, Table
 
-from services.cli.ladder import KS, climb
-from services.cli.output import JsonOption, answers, explained, print_json, progress_bar
-from shared.datasets.city.plan import CityOptions, Plan, make_plan
-from shared.datasets.city.training_files import TrainLayout, laid_out
-from shared.datasets.city.write import NOT_COMPARABLE, check_empty, describe, write_city
+from services.cli.ladder import BASELINE_KS, evaluate_baselines
+from services.cli.output import JsonOption, console, print_json, progress_bar, report_errors
+from shared.datasets.city.plan import CityOptions, CityPlan, make_plan
+from shared.datasets.city.training_files import TrainingLayoutName, with_training_layout
+from shared.datasets.city.write import NOT_COMPARABLE, check_output_empty, describe_city, write_city
 
 Json = dict[str, Any]
 
-KINDS = ("R@1 in map", "R@1 other way")
-SIZE = re.compile(r"(\d{2,4})x(\d{2,4})")
+RECALL_COLUMNS = ("R@1 in map", "R@1 other way")
+SIZE_PATTERN = re.compile(r"(\d{2,4})x(\d{2,4})")
 
 
 def parse_size(text: str) -> tuple[int, int]:
     """`320x240` -> (320, 240); typer.BadParameter for anything else, and outside 64 to 1920."""
-    match = SIZE.fullmatch(text)
+    match = SIZE_PATTERN.fullmatch(text)
     if match is None or not all(64 <= int(side) <= 1920 for side in match.groups()):
         raise typer.BadParameter("WxH is needed, each side from 64 to 1920, such as 320x240.")
     return int(match[1]), int(match[2])
@@ -53,8 +53,8 @@ def synth(
         bool, typer.Option(help="Draw a training set as well: nearly half of the work.")
     ] = True,
     layout: Annotated[
-        TrainLayout, typer.Option(help="Of the training set: folders, names, table.")
-    ] = TrainLayout.GSV_XS,
+        TrainingLayoutName, typer.Option(help="Of the training set: folders, names, table.")
+    ] = TrainingLayoutName.GSV_XS,
     as_json: JsonOption = False,
 ) -> None:
     """Draw a made-up city: database, queries and a training set, the same for the same arguments.
@@ -68,29 +68,29 @@ def synth(
     options = CityOptions(
         places, views, asked, seed, catalogue_seed, out_of_map, width, height, train
     )
-    with explained(as_json):
-        check_empty(out)
+    with report_errors(as_json):
+        check_output_empty(out)
         started = time.perf_counter()
-        plan = laid_out(make_plan(options), layout)
+        plan = with_training_layout(make_plan(options), layout)
         with progress_bar() as progress:
-            bar = progress.add_task("drawing", total=len(plan.shots))
+            bar = progress.add_task("drawing", total=len(plan.photos))
             write_city(plan, out, lambda count: progress.advance(bar, count))
             seconds = time.perf_counter() - started
-            rungs = climb(plan, out, progress) if ladder else []
+            rungs = evaluate_baselines(plan, out, progress) if ladder else []
         figures = {
-            **_figures(plan, out, seconds),
+            **_city_summary(plan, out, seconds),
             "ladder": rungs,
             "seconds": time.perf_counter() - started,
         }
     if as_json:
         print_json(figures)
         return
-    _show(figures)
+    _print_figures(figures)
 
 
-def _show(figures: Json) -> None:
+def _print_figures(figures: Json) -> None:
     counts, kinds, drawing = figures["counts"], figures["query_kinds"], figures["drawing"]
-    answers.print(
+    console.print(
         f"{figures['out']}: {counts['database']} database photos, {counts['query']} queries, "
         f"{counts.get('train', 0)} to learn from; {drawing['photos_per_second']:.0f} photos/s "
         f"drawn, {figures['seconds']:.0f} s in all.",
@@ -98,34 +98,36 @@ def _show(figures: Json) -> None:
     )
     if not figures["ladder"]:
         return
-    table = Table("rung", *(Column(f"R@{k}", justify="right") for k in KS), *KINDS)
+    table = Table(
+        "rung", *(Column(f"R@{k}", justify="right") for k in BASELINE_KS), *RECALL_COLUMNS
+    )
     for rung in figures["ladder"]:
         table.add_row(
             rung["rung"],
-            *(_percent(rung["recall"][str(k)]) for k in KS),
+            *(_format_percent(rung["recall"][str(k)]) for k in BASELINE_KS),
             *(
-                _percent(rung[f"recall_{kind}"]["1"]) if rung[f"recall_{kind}"] else "-"
+                _format_percent(rung[f"recall_{kind}"]["1"]) if rung[f"recall_{kind}"] else "-"
                 for kind in ("in_map", "other_way")
             ),
         )
-    answers.print(table)
-    answers.print(
+    console.print(table)
+    console.print(
         f"Over the {kinds.get('in_map', 0)} queries in the map and the "
         f"{kinds.get('other_way', 0)} there that look the other way; 25 m rule.",
         soft_wrap=True,
     )
-    answers.print(NOT_COMPARABLE, soft_wrap=True)
+    console.print(NOT_COMPARABLE, soft_wrap=True)
 
 
-def _percent(share: float) -> str:
+def _format_percent(share: float) -> str:
     return f"{share:.1%}"
 
 
-def _figures(plan: Plan, out: Path, seconds: float) -> Json:
-    about = describe(plan)
+def _city_summary(plan: CityPlan, out: Path, seconds: float) -> Json:
+    about = describe_city(plan)
     return {
         "out": str(out),
         "note": NOT_COMPARABLE,
         **{key: about[key] for key in ("arguments", "counts", "query_kinds")},
-        "drawing": {"seconds": seconds, "photos_per_second": len(plan.shots) / seconds},
+        "drawing": {"seconds": seconds, "photos_per_second": len(plan.photos) / seconds},
     }

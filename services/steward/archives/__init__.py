@@ -5,7 +5,7 @@ archive from its begin (but for a gzipped one). Names are labels: nothing is eve
 Whatever an archive declares is bounded before it is believed.
 """
 
-from services.steward.archives.member import Archive, Limits, Member
+from services.steward.archives.member import Archive, ArchiveLimits, ArchiveMember
 from services.steward.archives.open_archive import open_archive
 
-__all__ = ["Archive", "Limits", "Member", "open_archive"]
+__all__ = ["Archive", "ArchiveLimits", "ArchiveMember", "open_archive"]

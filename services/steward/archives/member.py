@@ -9,7 +9,7 @@ from typing import Protocol
 
 from shared.errors import PlacewiseError, TooLarge, Unprocessable
 
-PIECE_BYTES = 256 * 1024
+ARCHIVE_READ_BYTES = 256 * 1024
 
 
 class MemberKind(StrEnum):
@@ -19,7 +19,7 @@ class MemberKind(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Member:
+class ArchiveMember:
     name: str
     """As the archive says it: any text."""
     kind: MemberKind
@@ -36,12 +36,12 @@ class Member:
 
 
 @dataclass(frozen=True, slots=True)
-class Limits:
+class ArchiveLimits:
     members: int
     unpacked_bytes: int
 
     def check_members(self, count: int) -> None:
-        """TooLarge (`too_many_photos`)."""
+        """TooLarge (`too_many_photos_error`)."""
         if count > self.members:
             raise TooLarge(
                 "too_many_photos",
@@ -49,7 +49,7 @@ class Limits:
             )
 
     def check_unpacked(self, size_bytes: int) -> None:
-        """TooLarge (`batch_too_large`)."""
+        """TooLarge (`batch_too_large_error`)."""
         if size_bytes > self.unpacked_bytes:
             raise TooLarge(
                 "batch_too_large",
@@ -59,28 +59,28 @@ class Limits:
 
 
 class Archive(Protocol):
-    """Raises Unprocessable (`damaged_archive`, `damaged_member`) for what can't be read, and what
+    """Raises Unprocessable (`damaged_archive_error`, `damaged_member_error`) for what can't be read, and what
     the object store raises."""
 
-    def members(self) -> Iterator[Member]:
+    def members(self) -> Iterator[ArchiveMember]:
         """All of them, in the archive's order; TooLarge as `Limits` says."""
 
-    def read(self, member: Member) -> Iterator[bytes]:
+    def read(self, member: ArchiveMember) -> Iterator[bytes]:
         """The member's bytes in pieces of at most PIECE_BYTES, never more than it declares. Raises
         its `fault`."""
 
 
-def damaged_archive(what: str) -> PlacewiseError:
+def damaged_archive_error(what: str) -> PlacewiseError:
     return Unprocessable(
         "damaged_archive", f"The archive can't be read: {what}. Make it anew and upload it again."
     )
 
 
-def damaged_member(what: str) -> PlacewiseError:
+def damaged_member_error(what: str) -> PlacewiseError:
     return Unprocessable("damaged_member", f"The archive's member can't be read: {what}.")
 
 
-def odd_member(what: str) -> PlacewiseError:
+def unsupported_member_error(what: str) -> PlacewiseError:
     return Unprocessable(
         "unsupported_member", f"The archive's member is {what}, and no file of its own."
     )

@@ -2,27 +2,27 @@
 
 from __future__ import annotations
 
-from services.steward.archives.member import Archive, Limits
-from services.steward.archives.ranged import open_ranged
+from services.steward.archives.member import Archive, ArchiveLimits
+from services.steward.archives.ranged import open_buffered
 from services.steward.archives.tar_archive import TarArchive
 from services.steward.archives.zip_archive import ZipArchive
 from shared.archive_formats import (
     ACCEPTED_ARCHIVES,
-    SNIFFED_ARCHIVE_BYTES,
+    ARCHIVE_SIGNATURE_BYTES,
     ArchiveFormat,
-    sniff_archive,
+    detect_archive_format,
 )
 from shared.errors import Gone, Unprocessable
 from shared.objects import ObjectStore
 
 
-def open_archive(store: ObjectStore, key: str, limits: Limits) -> Archive:
+def open_archive(store: ObjectStore, key: str, limits: ArchiveLimits) -> Archive:
     """Raises Gone (`archive_gone`) and Unprocessable (`unsupported_archive`)."""
     info = store.head(key)
     if info is None:
         raise Gone("archive_gone", "The archive is no longer in the object store. Upload it again.")
-    found = sniff_archive(store.read_range(key, 0, SNIFFED_ARCHIVE_BYTES))
-    file = open_ranged(store, key, info.size_bytes)
+    found = detect_archive_format(store.read_range(key, 0, ARCHIVE_SIGNATURE_BYTES))
+    file = open_buffered(store, key, info.size_bytes)
     if found == ArchiveFormat.ZIP:
         return ZipArchive(file, info.size_bytes, limits)
     if found in (ArchiveFormat.TAR, ArchiveFormat.GZIP):

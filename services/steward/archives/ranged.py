@@ -15,11 +15,11 @@ from shared.objects import ObjectStore
 if TYPE_CHECKING:
     from _typeshed import WriteableBuffer
 
-BUFFER_BYTES = 256 * 1024  # one request
+RANGE_BUFFER_BYTES = 256 * 1024  # one request
 
 
-class RangedFile(io.RawIOBase):
-    """Seekable and unbuffered; `open_ranged` gives it a buffer."""
+class RangeReader(io.RawIOBase):
+    """Seekable and unbuffered; `open_buffered` gives it a buffer."""
 
     def __init__(self, store: ObjectStore, key: str, size_bytes: int) -> None:
         super().__init__()
@@ -53,9 +53,11 @@ class RangedFile(io.RawIOBase):
         return len(piece)
 
 
-def open_ranged(store: ObjectStore, key: str, size_bytes: int) -> io.BufferedReader:
+def open_buffered(store: ObjectStore, key: str, size_bytes: int) -> io.BufferedReader:
     """The object of that size, buffered."""
-    return io.BufferedReader(cast("io.RawIOBase", RangedFile(store, key, size_bytes)), BUFFER_BYTES)
+    return io.BufferedReader(
+        cast("io.RawIOBase", RangeReader(store, key, size_bytes)), RANGE_BUFFER_BYTES
+    )
 
 
 def read_exactly(file: io.BufferedIOBase, size_bytes: int) -> bytes:

@@ -13,13 +13,13 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 from services.steward.archives.member import (
-    PIECE_BYTES,
-    Limits,
-    Member,
+    ARCHIVE_READ_BYTES,
+    ArchiveLimits,
+    ArchiveMember,
     MemberKind,
-    damaged_archive,
-    damaged_member,
-    odd_member,
+    damaged_archive_error,
+    damaged_member_error,
+    unsupported_member_error,
 )
 from services.steward.archives.ranged import read_exactly
 from shared.archive_formats import is_tar_header
@@ -28,14 +28,20 @@ BLOCK_BYTES = 512
 MAX_HEADER_BYTES = 1024 * 1024  # of a pax header or a long name
 HEADERS_PER_MEMBER = 4
 
-FILE_TYPES = b"0\x007"
-WITHOUT_DATA = {b"1": "a link", b"2": "a link", b"3": "a device", b"4": "a device", b"6": "a pipe"}
-FOLDER, SPARSE = b"5", b"S"
-PAX, PAX_FOR_ALL, LONG_NAME, LONG_LINK = b"x", b"g", b"L", b"K"
+REGULAR_FILE_TYPES = b"0\x007"
+TYPES_WITHOUT_DATA = {
+    b"1": "a link",
+    b"2": "a link",
+    b"3": "a device",
+    b"4": "a device",
+    b"6": "a pipe",
+}
+FOLDER_TYPE, SPARSE_TYPE = b"5", b"S"
+PAX_TYPE, PAX_GLOBAL_TYPE, GNU_LONG_NAME_TYPE, GNU_LONG_LINK_TYPE = b"x", b"g", b"L", b"K"
 
 
 @dataclass(slots=True)
-class _Header:
+class _TarHeader:
     """One header, with what the ones before it said of its member."""
 
     name: str
@@ -45,12 +51,12 @@ class _Header:
 
 
 class TarArchive:
-    def __init__(self, file: io.BufferedReader, limits: Limits, *, gzipped: bool) -> None:
+    def __init__(self, file: io.BufferedReader, limits: ArchiveLimits, *, gzipped: bool) -> None:
         self._file: io.BufferedIOBase = gzip.GzipFile(mode="rb", fileobj=file) if gzipped else file
         self._gzipped = gzipped
         self._limits = limits
 
-    def members(self) -> Iterator[Member]:
+    def members(self) -> Iterator[ArchiveMember]:
         position = count = headers = 0
         pax: dict[str, str] = {}
         long_name: str | None = None
@@ -58,95 +64,100 @@ class TarArchive:
             headers += 1
             self._limits.check_members(headers // HEADERS_PER_MEMBER)
             data = position + BLOCK_BYTES
-            position = data + _in_blocks(header.size_bytes)
+            position = data + _padded_to_block(header.size_bytes)
             # Before seeking there: of a gzipped archive that means unpacking up to there.
             self._limits.check_unpacked(position)
-            if header.type == PAX:
-                pax = _read_pax(self._read_text(header.size_bytes))
-            elif header.type == LONG_NAME:
-                long_name = _text(self._read_text(header.size_bytes))
-            elif header.type not in (PAX_FOR_ALL, LONG_LINK):
+            if header.type == PAX_TYPE:
+                pax = _parse_pax(self._read_text(header.size_bytes))
+            elif header.type == GNU_LONG_NAME_TYPE:
+                long_name = _decode_text(self._read_text(header.size_bytes))
+            elif header.type not in (PAX_GLOBAL_TYPE, GNU_LONG_LINK_TYPE):
                 count += 1
                 self._limits.check_members(count)
                 size = _pax_size(pax, header.size_bytes)
-                position = data + _in_blocks(size)
+                position = data + _padded_to_block(size)
                 self._limits.check_unpacked(position)
                 header.name = pax.get("path") or long_name or header.name
                 header.size_bytes, header.pax = size, pax
-                yield _member(header, data)
+                yield _to_member(header, data)
                 pax, long_name = {}, None
         if self._gzipped:
-            self._read_to_the_end(position)
+            self._verify_trailer(position)
 
-    def read(self, member: Member) -> Iterator[bytes]:
+    def read(self, member: ArchiveMember) -> Iterator[bytes]:
         if member.fault is not None:
             raise member.fault
         left = member.size_bytes
-        with _explained():
+        with _as_damaged_archive():
             self._file.seek(member.offset)
         while left:
-            with _explained():
-                piece = self._file.read(min(PIECE_BYTES, left))
+            with _as_damaged_archive():
+                piece = self._file.read(min(ARCHIVE_READ_BYTES, left))
             if not piece:
-                raise damaged_member("the archive ends in the middle of it")
+                raise damaged_member_error("the archive ends in the middle of it")
             left -= len(piece)
             yield piece
 
-    def _read_header(self, position: int) -> _Header | None:
+    def _read_header(self, position: int) -> _TarHeader | None:
         """The header at the position; None at the archive's end mark."""
-        with _explained():
+        with _as_damaged_archive():
             self._file.seek(position)
             block = read_exactly(self._file, BLOCK_BYTES)
         if len(block) < BLOCK_BYTES:
-            raise damaged_archive("it ends in the middle, without a tar's end mark")
+            raise damaged_archive_error("it ends in the middle, without a tar's end mark")
         if not any(block):
             return None
         if not is_tar_header(block):
-            raise damaged_archive(
+            raise damaged_archive_error(
                 "it is not a tar" if position == 0 else f"at byte {position} there is no header"
             )
-        name = _text(block[:100])
+        name = _decode_text(block[:100])
         if block[257:262] == b"ustar" and block[263:265] == b"00" and block[345] != 0:
-            name = f"{_text(block[345:500])}/{name}"
-        header = _Header(name, block[156:157], _number(block[124:136]))
-        if header.type == FOLDER or header.type in WITHOUT_DATA:
+            name = f"{_decode_text(block[345:500])}/{name}"
+        header = _TarHeader(name, block[156:157], _parse_number(block[124:136]))
+        if header.type == FOLDER_TYPE or header.type in TYPES_WITHOUT_DATA:
             header.size_bytes = 0  # whatever it says, none follows
         return header
 
-    def _read_to_the_end(self, position: int) -> None:
+    def _verify_trailer(self, position: int) -> None:
         """Behind the end mark, where a gzip's checksum stands."""
-        with _explained():
-            while piece := self._file.read(PIECE_BYTES):
+        with _as_damaged_archive():
+            while piece := self._file.read(ARCHIVE_READ_BYTES):
                 position += len(piece)
                 self._limits.check_unpacked(position)
 
     def _read_text(self, size_bytes: int) -> bytes:
         if size_bytes > MAX_HEADER_BYTES:
-            raise damaged_archive(f"a header of {size_bytes} bytes")
-        with _explained():
+            raise damaged_archive_error(f"a header of {size_bytes} bytes")
+        with _as_damaged_archive():
             return read_exactly(self._file, size_bytes)
 
 
 @contextmanager
-def _explained() -> Iterator[None]:
-    """Turns what unpacking raises into `damaged_archive`."""
+def _as_damaged_archive() -> Iterator[None]:
+    """Turns what unpacking raises into `damaged_archive_error`."""
     try:
         yield
     except (EOFError, zlib.error, gzip.BadGzipFile) as error:
-        raise damaged_archive(str(error)) from None
+        raise damaged_archive_error(str(error)) from None
 
 
-def _member(header: _Header, data: int) -> Member:
+def _to_member(header: _TarHeader, data: int) -> ArchiveMember:
     kind, fault = MemberKind.FILE, None
-    if header.type == FOLDER or (header.name.endswith("/") and header.type in FILE_TYPES):
+    if header.type == FOLDER_TYPE or (
+        header.name.endswith("/") and header.type in REGULAR_FILE_TYPES
+    ):
         kind = MemberKind.FOLDER
-    elif header.type in WITHOUT_DATA:
-        kind, fault = MemberKind.OTHER, odd_member(WITHOUT_DATA[header.type])
-    elif header.type == SPARSE or any(name.startswith("GNU.sparse") for name in header.pax):
-        kind, fault = MemberKind.OTHER, odd_member("a sparse file")
-    elif header.type not in FILE_TYPES:
-        kind, fault = MemberKind.OTHER, odd_member(f"of the unknown type {header.type!r}")
-    return Member(
+    elif header.type in TYPES_WITHOUT_DATA:
+        kind, fault = MemberKind.OTHER, unsupported_member_error(TYPES_WITHOUT_DATA[header.type])
+    elif header.type == SPARSE_TYPE or any(name.startswith("GNU.sparse") for name in header.pax):
+        kind, fault = MemberKind.OTHER, unsupported_member_error("a sparse file")
+    elif header.type not in REGULAR_FILE_TYPES:
+        kind, fault = (
+            MemberKind.OTHER,
+            unsupported_member_error(f"of the unknown type {header.type!r}"),
+        )
+    return ArchiveMember(
         name=header.name,
         kind=kind,
         offset=data,
@@ -156,15 +167,15 @@ def _member(header: _Header, data: int) -> Member:
     )
 
 
-def _in_blocks(size_bytes: int) -> int:
+def _padded_to_block(size_bytes: int) -> int:
     return -(-size_bytes // BLOCK_BYTES) * BLOCK_BYTES
 
 
-def _text(data: bytes) -> str:
+def _decode_text(data: bytes) -> str:
     return data.split(b"\0", 1)[0].decode("utf-8", "replace")
 
 
-def _number(data: bytes) -> int:
+def _parse_number(data: bytes) -> int:
     """Octal digits; or, GNU's way for what is larger, bytes behind one with the highest bit."""
     if data[0] == 0x80:
         return int.from_bytes(data[1:], "big")
@@ -173,20 +184,20 @@ def _number(data: bytes) -> int:
     except ValueError:
         number = -1
     if number < 0:
-        raise damaged_archive(f"a member says that its size is {data!r}")
+        raise damaged_archive_error(f"a member says that its size is {data!r}")
     return number
 
 
-def _read_pax(data: bytes) -> dict[str, str]:
+def _parse_pax(data: bytes) -> dict[str, str]:
     """`LENGTH KEY=VALUE\\n`, again and again."""
     found = {}
     while data.strip(b"\0"):
         digits, blank, _ = data.partition(b" ")
         if not blank or not digits.isdigit() or not len(digits) + 3 <= int(digits) <= len(data):
-            raise damaged_archive("a pax header is broken")
+            raise damaged_archive_error("a pax header is broken")
         record, data = data[len(digits) + 1 : int(digits)], data[int(digits) :]
         key, _, value = record.rstrip(b"\n").partition(b"=")
-        found[_text(key)] = _text(value)
+        found[_decode_text(key)] = _decode_text(value)
     return found
 
 
@@ -195,5 +206,5 @@ def _pax_size(pax: dict[str, str], size_bytes: int) -> int:
     if said is None:
         return size_bytes
     if not (said.isascii() and said.isdigit() and len(said) < 20):
-        raise damaged_archive(f"a member says that its size is {said!r}")
+        raise damaged_archive_error(f"a member says that its size is {said!r}")
     return int(said)

@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 from pathlib import PurePosixPath
 from typing import Any
 
-from services.steward.archives import Archive, Member
+from services.steward.archives import Archive, ArchiveMember
 from services.steward.archives.member import MemberKind
-from shared.datasets.utm_names import fields_of_name
+from shared.datasets.utm_names import upload_fields_of_file_name
 from shared.errors import (
     InvalidRequest,
     PlacewiseError,
@@ -20,44 +20,44 @@ from shared.errors import (
 )
 from shared.intake.manifest import (
     MAX_MANIFEST_BYTES,
-    MOST_NAMED,
-    Said,
-    bad_lines,
-    read_csv,
-    read_jsonl,
+    MAX_REPORTED_LINES,
+    ManifestEntry,
+    bad_lines_error,
+    read_csv_manifest,
+    read_jsonl_manifest,
 )
 from shared.jobs import JobState
 from shared.photo_formats import PHOTO_SUFFIXES
 
-TABLE, MANIFEST = "photos.csv", "manifest.jsonl"
+TABLE_NAME, MANIFEST_NAME = "photos.csv", "manifest.jsonl"
 # Archives inside of archives.
 ARCHIVE_SUFFIXES = {".zip", ".tar", ".tgz", ".gz", ".bz2", ".xz", ".zst", ".7z", ".rar"}
 MAX_LABEL_CHARACTERS = 1000
 
 
 @dataclass(slots=True)
-class Listing:
+class BatchListing:
     items: list[dict[str, Any]] = field(default_factory=list)
     """Columns of BatchItem."""
     ignored: int = 0
     """Members that are no photos and were not meant to be: folders, texts, what systems leave."""
 
 
-def list_archive(archive: Archive) -> Listing:
+def list_archive_photos(archive: Archive) -> BatchListing:
     """What of the archive is to be brought in.
 
     Raises what `Archive.members` does, and Unprocessable or InvalidRequest: `no_photos`,
     `bad_table`, `bad_manifest`, `several_manifests`.
     """
-    listing = Listing()
-    photos: list[tuple[str, Member]] = []
-    tables: list[tuple[str, Member]] = []
+    listing = BatchListing()
+    photos: list[tuple[str, ArchiveMember]] = []
+    tables: list[tuple[str, ArchiveMember]] = []
     for member in archive.members():
-        name = _label(member.name)
+        name = _display_name(member.name)
         path = PurePosixPath(name)
-        if _is_clutter(path) or member.kind == MemberKind.FOLDER:
+        if _is_system_file(path) or member.kind == MemberKind.FOLDER:
             listing.ignored += 1
-        elif path.name in (TABLE, MANIFEST):
+        elif path.name in (TABLE_NAME, MANIFEST_NAME):
             tables.append((name, member))
         elif path.suffix.lower() in PHOTO_SUFFIXES | ARCHIVE_SUFFIXES:
             photos.append((name, member))
@@ -68,17 +68,17 @@ def list_archive(archive: Archive) -> Listing:
             "no_photos", f"The archive has no photo ({', '.join(sorted(PHOTO_SUFFIXES))}) in it."
         )
     said = _read_table(archive, tables, {name for name, _ in photos})
-    listing.items = list(_items(photos, said))
+    listing.items = list(_to_items(photos, said))
     return listing
 
 
-def _label(name: str) -> str:
+def _display_name(name: str) -> str:
     """What the member is called: for people, and for its line in the table. No path to anything."""
     kept = "".join(c for c in name.replace("\\", "/") if c.isprintable())
     return kept.removeprefix("./")[:MAX_LABEL_CHARACTERS] or "photo"
 
 
-def _is_clutter(path: PurePosixPath) -> bool:
+def _is_system_file(path: PurePosixPath) -> bool:
     """What macOS and others leave behind: `__MACOSX/`, `._a.jpg`, `.DS_Store`, `.git/`."""
     return any(
         part == "__MACOSX" or (part.startswith(".") and part not in (".", ".."))
@@ -87,8 +87,8 @@ def _is_clutter(path: PurePosixPath) -> bool:
 
 
 def _read_table(
-    archive: Archive, tables: list[tuple[str, Member]], names: set[str]
-) -> dict[str, Said]:
+    archive: Archive, tables: list[tuple[str, ArchiveMember]], names: set[str]
+) -> dict[str, ManifestEntry]:
     """What the outermost table says, by the photos' names."""
     if not tables:
         return {}
@@ -103,11 +103,11 @@ def _read_table(
     if member.size_bytes > MAX_MANIFEST_BYTES:
         raise TooLarge("manifest_too_large", f"{called} is larger than {MAX_MANIFEST_BYTES} bytes.")
     data = b"".join(archive.read(member))
-    is_table = called.endswith(TABLE)
-    lines = read_csv(data, called) if is_table else read_jsonl(data, called)
+    is_table = called.endswith(TABLE_NAME)
+    lines = read_csv_manifest(data, called) if is_table else read_jsonl_manifest(data, called)
     # Names in it are relative to where it lies: people pack a folder as a whole.
     folder = called[: called.rfind("/") + 1]
-    said = {folder + _label(line.name): line for line in lines}
+    said = {folder + _display_name(line.name): line for line in lines}
     strange = [
         (line.line, f"the archive has no photo {name!r}")
         for name, line in said.items()
@@ -115,27 +115,31 @@ def _read_table(
     ]
     if strange:
         code = "bad_table" if is_table else "bad_manifest"
-        raise bad_lines(code, called, strange[:MOST_NAMED])
+        raise bad_lines_error(code, called, strange[:MAX_REPORTED_LINES])
     return said
 
 
-def _items(photos: list[tuple[str, Member]], said: dict[str, Said]) -> Iterator[dict[str, Any]]:
+def _to_items(
+    photos: list[tuple[str, ArchiveMember]], manifest_lines: dict[str, ManifestEntry]
+) -> Iterator[dict[str, Any]]:
     times = Counter(name for name, _ in photos)
     for name, member in photos:
-        line = said.get(name)
+        line = manifest_lines.get(name)
         item: dict[str, Any] = {
             "name": name,
-            "source": place_of(member),
+            "source": member_location(member),
             "line": line.line if line else None,
         }
         try:
-            item["fields"] = _check(name, member, line, times[name])
+            item["fields"] = _validate_member(name, member, line, times[name])
         except PlacewiseError as error:
             item |= {"state": JobState.FAILED, "error": error.as_problem()}
         yield item
 
 
-def _check(name: str, member: Member, line: Said | None, times: int) -> dict[str, str]:
+def _validate_member(
+    name: str, member: ArchiveMember, manifest_line: ManifestEntry | None, times: int
+) -> dict[str, str]:
     """What is said of the photo; raises why it can't be brought in, as far as that can be told."""
     if member.fault is not None:
         raise member.fault
@@ -144,17 +148,20 @@ def _check(name: str, member: Member, line: Said | None, times: int) -> dict[str
         raise UnsupportedMedia(
             "nested_archive", "An archive inside of an archive is not unpacked: upload it itself."
         )
-    if line is not None and times > 1:
+    if manifest_line is not None and times > 1:
         raise Unprocessable(
             "ambiguous_name",
-            f"{times} photos of the archive are called {name!r}, and line {line.line} of its table "
+            f"{times} photos of the archive are called {name!r}, and line {manifest_line.line} of its table "
             "does not say which of them it means.",
         )
-    return {**fields_of_name(path.name, None), **(line.fields if line else {})}
+    return {
+        **upload_fields_of_file_name(path.name, None),
+        **(manifest_line.fields if manifest_line else {}),
+    }
 
 
-def place_of(member: Member) -> dict[str, Any]:
-    """What is kept of a member to find it again: `member_at` reads it."""
+def member_location(member: ArchiveMember) -> dict[str, Any]:
+    """What is kept of a member to find it again: `member_from_location` reads it."""
     return {
         "offset": member.offset,
         "size_bytes": member.size_bytes,
@@ -164,6 +171,6 @@ def place_of(member: Member) -> dict[str, Any]:
     }
 
 
-def member_at(name: str, place: dict[str, Any]) -> Member:
+def member_from_location(name: str, place: dict[str, Any]) -> ArchiveMember:
     """The member that `place_of` has kept."""
-    return Member(name=name, kind=MemberKind.FILE, **place)
+    return ArchiveMember(name=name, kind=MemberKind.FILE, **place)

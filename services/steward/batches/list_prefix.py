@@ -5,21 +5,21 @@ from __future__ import annotations
 from pathlib import PurePosixPath
 from typing import Any
 
-from services.steward.batches.list_archive import Listing
-from shared.datasets.utm_names import fields_of_name
+from services.steward.batches.list_archive import BatchListing
+from shared.datasets.utm_names import upload_fields_of_file_name
 from shared.errors import PlacewiseError, TooLarge, Unprocessable
 from shared.jobs import JobState
 from shared.objects import ObjectStore
 from shared.photo_formats import PHOTO_SUFFIXES
 
 
-def list_prefix(store: ObjectStore, prefix: str, most_photos: int) -> Listing:
+def list_prefix_photos(store: ObjectStore, prefix: str, max_photos: int) -> BatchListing:
     """The photos below the prefix in the order of their keys, with what their names say of them.
 
     Objects that have no photo's suffix, or a hidden name, are passed over and counted. Raises
-    Unprocessable (`no_photos`), TooLarge (`too_many_photos`), Unavailable.
+    Unprocessable (`no_photos`), TooLarge (`too_many_photos_error`), Unavailable.
     """
-    listing = Listing()
+    listing = BatchListing()
     keys: list[str] = []
     for info in store.list(prefix):
         path = PurePosixPath(info.key.removeprefix(prefix))
@@ -28,21 +28,21 @@ def list_prefix(store: ObjectStore, prefix: str, most_photos: int) -> Listing:
             listing.ignored += 1
             continue
         keys.append(info.key)
-        if len(keys) > most_photos:
+        if len(keys) > max_photos:
             raise TooLarge(
                 "too_many_photos",
-                f"There are more than {most_photos} photos below {prefix} (MAX_BATCH_PHOTOS). "
+                f"There are more than {max_photos} photos below {prefix} (MAX_BATCH_PHOTOS). "
                 "Name a longer prefix.",
             )
     if not keys:
         raise Unprocessable("no_photos", f"The object store has no photo below {prefix}.")
-    listing.items = [_item(key) for key in sorted(keys)]
+    listing.items = [_object_item(key) for key in sorted(keys)]
     return listing
 
 
-def _item(key: str) -> dict[str, Any]:
+def _object_item(key: str) -> dict[str, Any]:
     item: dict[str, Any] = {"name": key, "object_key": key}
     try:
-        return {**item, "fields": fields_of_name(PurePosixPath(key).name, None)}
+        return {**item, "fields": upload_fields_of_file_name(PurePosixPath(key).name, None)}
     except PlacewiseError as error:
         return {**item, "state": JobState.FAILED, "error": error.as_problem()}

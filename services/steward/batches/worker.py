@@ -14,39 +14,39 @@ from prometheus_client import CollectorRegistry
 from sqlalchemy import exists, select
 from sqlalchemy.orm import Session
 
-from services.steward.batches.bring_in import BringIn
-from services.steward.batches.list_archive import list_archive
-from services.steward.batches.list_prefix import list_prefix
+from services.steward.batches.bring_in import BatchItemImporter
+from services.steward.batches.list_archive import list_archive_photos
+from services.steward.batches.list_prefix import list_prefix_photos
 from services.steward.metrics import StewardMetrics
-from services.steward.take import Stopped, Taker
+from services.steward.take import JobInterrupted, JobRunner
 from shared.catalog.session import Catalog
 from shared.disk_space import DiskSpace
 from shared.errors import PlacewiseError, StorageFull
-from shared.jobs import Hints, Job, JobKind, JobState
+from shared.jobs import Job, JobKind, JobState, Wakeups
 from shared.jobs.batches import (
     BatchItem,
     BatchSource,
-    batch_result,
-    follow_items,
-    list_batch,
-    lock_map_and_batch,
-    note_progress,
-    photos_ahead,
-    queued_items,
-    waits_for_vocabulary,
+    add_batch_items,
+    count_queued_photos,
+    is_waiting_for_vocabulary,
+    lock_batch,
+    next_queued_items,
+    summarise_batch,
+    sync_item_states,
+    update_batch_progress,
 )
-from shared.jobs.finish import release, release_waiting, succeed
-from shared.jobs.leases import held, token_of
-from shared.jobs.table import WaitingFor, claimable
+from shared.jobs.finish import release_job, succeed_job, wake_waiting_jobs
+from shared.jobs.leases import get_lease_token, lock_leased_jobs
+from shared.jobs.table import WaitingFor, claimable_condition
 from shared.objects import ObjectStore
 from shared.settings import Settings
 
 log = logging.getLogger(__name__)
 
 SLICE_SECONDS = 2.0
-FOLLOW_SECONDS = 0.5  # between two looks at what the extractors have done
-TURN_SECONDS = 0.1  # in which another batch is taken first
-AT_ONCE = 50  # items read from the catalog in one go
+PROGRESS_POLL_SECONDS = 0.5  # between two looks at what the extractors have done
+YIELD_SECONDS = 0.1  # in which another batch is taken first
+READ_ITEMS = 50  # items read from the catalog in one go
 
 
 def resume_batches(catalog: Catalog, settings: Settings) -> None:
@@ -61,7 +61,7 @@ def resume_batches(catalog: Catalog, settings: Settings) -> None:
     except StorageFull:
         return
     with catalog.write() as session:
-        release_waiting(session, waits)
+        wake_waiting_jobs(session, waits)
 
 
 class BatchWorker:
@@ -71,7 +71,7 @@ class BatchWorker:
         self,
         catalog: Catalog,
         store: ObjectStore,
-        hints: Hints,
+        hints: Wakeups,
         settings: Settings,
         name: str,
         metrics: StewardMetrics | None = None,
@@ -80,57 +80,57 @@ class BatchWorker:
         self._store = store
         self._settings = settings
         self._disk = DiskSpace(settings)
-        self._bring_in = BringIn(catalog, store, hints, settings)
+        self._importer = BatchItemImporter(catalog, store, hints, settings)
         counted = metrics or StewardMetrics(CollectorRegistry())
-        self._taker = Taker(catalog, settings, name, (JobKind.BATCH,), counted)
+        self._runner = JobRunner(catalog, settings, name, (JobKind.BATCH,), counted)
 
     def run(self, stop: threading.Event) -> None:
         """Take batches until `stop` is set."""
-        self._taker.run(stop, lambda job: self._slice(job, stop))
+        self._runner.run(stop, lambda job: self._run_slice(job, stop))
 
-    def work_next(self, stop: threading.Event) -> bool:
+    def run_next(self, stop: threading.Event) -> bool:
         """A slice of the next batch; False when there is none."""
-        return self._taker.take_next(lambda job: self._slice(job, stop))
+        return self._runner.run_next(lambda job: self._run_slice(job, stop))
 
-    def _slice(self, job: Job, stop: threading.Event) -> None:
+    def _run_slice(self, job: Job, stop: threading.Event) -> None:
         until = time.monotonic() + SLICE_SECONDS
         if not job.params["listed"]:
-            self._list(job)
+            self._list_items(job)
         elif job.attempts >= self._settings.max_attempts:
-            self._give_up_next(job)
+            self._fail_suspect_item(job)
         try:
             while time.monotonic() < until and (items := self._next_items(job)):
                 for item in items:
                     if stop.is_set():
-                        raise Stopped
+                        raise JobInterrupted
                     self._disk.check()
-                    self._bring_in.bring_in(job, item)
+                    self._importer.import_item(job, item)
                     if time.monotonic() > until:
                         break
         except StorageFull as error:
             log.warning("the batch %s waits for disk space: %s", job.id, error)
-            self._rest(job, WaitingFor.DISK_SPACE)
+            self._finish_slice(job, WaitingFor.DISK_SPACE)
         else:
-            self._rest(job)
+            self._finish_slice(job)
 
-    def _list(self, job: Job) -> None:
+    def _list_items(self, job: Job) -> None:
         """Archives and prefixes come without items: the gateway lists files and keys."""
         with self._catalog.write() as session:
-            for mine in held(session, token_of(job), [job]):
+            for mine in lock_leased_jobs(session, get_lease_token(job), [job]):
                 mine.stage = "list"
         if job.params["source"] == BatchSource.PREFIX:
             most = self._settings.max_batch_photos
-            listing = list_prefix(self._store, job.params["prefix"], most)
+            listing = list_prefix_photos(self._store, job.params["prefix"], most)
         else:
-            listing = list_archive(self._bring_in.archive_of(job))
+            listing = list_archive_photos(self._importer.open_batch_archive(job))
         with self._catalog.write() as session:
-            for mine in held(session, token_of(job), [job]):
+            for mine in lock_leased_jobs(session, get_lease_token(job), [job]):
                 mine.params = {**mine.params, "ignored": listing.ignored}
-                list_batch(session, mine, listing.items)
+                add_batch_items(session, mine, listing.items)
                 return
-        raise Stopped
+        raise JobInterrupted
 
-    def _give_up_next(self, job: Job) -> None:
+    def _fail_suspect_item(self, job: Job) -> None:
         """Several workers have died since the last photo came in: the next one may be to blame."""
         error = PlacewiseError(
             "worker_fell",
@@ -138,48 +138,48 @@ class BatchWorker:
             "is fine, look at the steward's log and memory, then upload it again.",
         )
         with self._catalog.read() as session:
-            suspects = queued_items(session, job.id, 1)
+            suspects = next_queued_items(session, job.id, 1)
         if not suspects:
             raise error
         log.error("item %d of the batch %s has killed its workers", suspects[0].number, job.id)
-        self._bring_in.fail(job, suspects[0], error.as_problem())
+        self._importer.fail_item(job, suspects[0], error.as_problem())
 
     def _next_items(self, job: Job) -> list[BatchItem]:
         """The next queued items, as many as the extractors have room for."""
         most = self._settings.batch_ahead_photos
         with self._catalog.read() as session:
-            room = most - photos_ahead(session, most)
-            return queued_items(session, job.id, min(AT_ONCE, room)) if room > 0 else []
+            room = most - count_queued_photos(session, most)
+            return next_queued_items(session, job.id, min(READ_ITEMS, room)) if room > 0 else []
 
-    def _rest(self, job: Job, waiting_for: WaitingFor | None = None) -> None:
+    def _finish_slice(self, job: Job, waiting_for: WaitingFor | None = None) -> None:
         """The slice's end: note the progress; end the batch, or say when its queued items go on, or
         what they wait for."""
         with self._catalog.write() as session:
-            mine = lock_map_and_batch(session, job, token_of(job))
+            mine = lock_batch(session, job, get_lease_token(job))
             if mine is None:
-                raise Stopped
+                raise JobInterrupted
             mine.attempts = 0
-            counts = follow_items(session, mine)
+            counts = sync_item_states(session, mine)
             if counts[JobState.QUEUED]:
                 pause = 0.0 if waiting_for else self._pause_seconds(session, mine)
-                release(mine, after_seconds=pause, waiting_for=waiting_for)
+                release_job(mine, after_seconds=pause, waiting_for=waiting_for)
                 return
             if counts[JobState.RUNNING]:
                 mine.stage = "describe"
-                waits = waits_for_vocabulary(session, mine)
-                release(
+                waits = is_waiting_for_vocabulary(session, mine)
+                release_job(
                     mine,
-                    after_seconds=FOLLOW_SECONDS,
+                    after_seconds=PROGRESS_POLL_SECONDS,
                     waiting_for=WaitingFor.VOCABULARY if waits else None,
                 )
                 return
-            succeed(mine, batch_result(session, mine, counts))
-            note_progress(mine, counts)
-        self._bring_in.forget(job)
+            succeed_job(mine, summarise_batch(session, mine, counts))
+            update_batch_progress(mine, counts)
+        self._importer.close_archive(job)
 
     def _pause_seconds(self, session: Session, job: Job) -> float:
         most = self._settings.batch_ahead_photos
-        if photos_ahead(session, most) == most:
-            return FOLLOW_SECONDS
-        other = select(Job.id).where(claimable((JobKind.BATCH,)), Job.id != job.id)
-        return TURN_SECONDS if session.scalar(select(exists(other))) else 0.0
+        if count_queued_photos(session, most) == most:
+            return PROGRESS_POLL_SECONDS
+        other = select(Job.id).where(claimable_condition((JobKind.BATCH,)), Job.id != job.id)
+        return YIELD_SECONDS if session.scalar(select(exists(other))) else 0.0

@@ -19,8 +19,13 @@ from uuid import UUID
 from sqlalchemy import ColumnElement, select, update
 from sqlalchemy.exc import SQLAlchemyError
 
-from services.steward.webhooks.send import ATTEMPT_SECONDS, Outcome, in_daemon_thread, send
-from shared.catalog.away import Outage
+from services.steward.webhooks.send import (
+    ATTEMPT_SECONDS,
+    DeliveryAttempt,
+    in_daemon_thread,
+    send_webhook,
+)
+from shared.catalog.away import OutageLog
 from shared.catalog.base import db_now, db_now_plus
 from shared.catalog.session import Catalog
 from shared.catalog.webhooks import Delivery, DeliveryState, Webhook
@@ -28,16 +33,18 @@ from shared.settings import Settings
 
 log = logging.getLogger(__name__)
 
-LOOK_SECONDS = 1.0
+DELIVERY_POLL_SECONDS = 1.0
 MAX_WEBHOOKS = 32  # served at the same time
 MAX_IN_FLIGHT = 4  # attempts for one webhook
 CLAIM_SECONDS = 4 * ATTEMPT_SECONDS  # after which a try whose steward died is due again
 # Between tries, as the Standard Webhooks specification recommends: 10 tries within some three days.
-PAUSES_SECONDS = (5, 300, 1800, 7200, 18_000, 36_000, 50_400, 72_000, 86_400)
-SPREAD = 0.2  # of a pause, at random: receivers that come back are not met by everyone at once
+RETRY_DELAYS_SECONDS = (5, 300, 1800, 7200, 18_000, 36_000, 50_400, 72_000, 86_400)
+RETRY_JITTER = (
+    0.2  # of a pause, at random: receivers that come back are not met by everyone at once
+)
 
 
-class WebhookSender:
+class WebhookDispatcher:
     """Sends what is due; `run` until stopped. Any number of stewards may have one.
 
     Each webhook with due deliveries has a task of its own, so a receiver that hangs delays only
@@ -48,7 +55,7 @@ class WebhookSender:
         self._catalog = catalog
         self._allow_private = settings.webhook_private_addresses
         self._tls = ssl.create_default_context()
-        self._outage = Outage("sender of webhooks")
+        self._outage = OutageLog("sender of webhooks")
 
     def run(self, stop: threading.Event) -> None:
         """Send until `stop` is set. Attempts in flight are then cut off, not waited for: they
@@ -62,25 +69,27 @@ class WebhookSender:
             try:
                 due = await asyncio.to_thread(self.due_webhooks, list(tasks))
                 if not due:
-                    self._outage.over()
+                    self._outage.record_success()
             except SQLAlchemyError as error:
                 due = []
-                self._outage.met(error)
+                self._outage.record_error(error)
             # At random: webhooks with a backlog must not keep the others from the last places.
             for webhook_id in random.sample(due, min(len(due), MAX_WEBHOOKS - len(tasks))):
                 tasks[webhook_id] = asyncio.create_task(self._serve(webhook_id))
             awaited: set[asyncio.Future[Any]] = {stopped, *tasks.values()}
-            await asyncio.wait(awaited, timeout=LOOK_SECONDS, return_when=asyncio.FIRST_COMPLETED)
+            await asyncio.wait(
+                awaited, timeout=DELIVERY_POLL_SECONDS, return_when=asyncio.FIRST_COMPLETED
+            )
             for webhook_id in [one for one, task in tasks.items() if task.done()]:
                 tasks.pop(webhook_id).result()  # raises what nobody has foreseen
 
     async def _serve(self, webhook_id: UUID) -> None:
         try:
-            await self.send_due(webhook_id)
-            self._outage.over()
+            await self.deliver_due(webhook_id)
+            self._outage.record_success()
         except SQLAlchemyError as error:
-            self._outage.met(error)
-            await asyncio.sleep(LOOK_SECONDS)
+            self._outage.record_error(error)
+            await asyncio.sleep(DELIVERY_POLL_SECONDS)
 
     def due_webhooks(self, besides: Collection[UUID] = ()) -> list[UUID]:
         """Ids of webhooks with due deliveries, but for those in `besides`."""
@@ -88,18 +97,18 @@ class WebhookSender:
         with self._catalog.read() as session:
             return list(session.scalars(due.distinct()))
 
-    async def send_due(self, webhook_id: UUID) -> int:
+    async def deliver_due(self, webhook_id: UUID) -> int:
         """Attempt what is due for one webhook, MAX_IN_FLIGHT at most; how many that were."""
-        webhook, claimed = await asyncio.to_thread(self._claim, webhook_id)
+        webhook, claimed = await asyncio.to_thread(self._claim_due, webhook_id)
         ends = await asyncio.gather(
-            *(self._try(webhook, delivery) for delivery in claimed), return_exceptions=True
+            *(self._attempt(webhook, delivery) for delivery in claimed), return_exceptions=True
         )
         for error in ends:  # only now: one that can't be noted must not cut off the others
             if error is not None:
                 raise error
         return len(claimed)
 
-    def _claim(self, webhook_id: UUID) -> tuple[Webhook | None, list[Delivery]]:
+    def _claim_due(self, webhook_id: UUID) -> tuple[Webhook | None, list[Delivery]]:
         due = (
             select(Delivery)
             .where(*_is_due(), Delivery.webhook_id == webhook_id)
@@ -117,19 +126,21 @@ class WebhookSender:
                 session.refresh(delivery)
             return session.get(Webhook, webhook_id), claimed
 
-    async def _try(self, webhook: Webhook | None, delivery: Delivery) -> None:
+    async def _attempt(self, webhook: Webhook | None, delivery: Delivery) -> None:
         if webhook is None:  # deleted while the event was being written
-            outcome = Outcome(None, "the webhook was deleted", forbidden=True)
+            outcome = DeliveryAttempt(None, "the webhook was deleted", is_permanent=True)
         else:
-            outcome = await send(webhook, delivery, self._tls, allow_private=self._allow_private)
-        await asyncio.to_thread(self._note, delivery.id, delivery.attempts, outcome)
+            outcome = await send_webhook(
+                webhook, delivery, self._tls, allow_private=self._allow_private
+            )
+        await asyncio.to_thread(self._record_attempt, delivery.id, delivery.attempts, outcome)
 
-    def _note(self, delivery_id: UUID, attempts: int, outcome: Outcome) -> None:
+    def _record_attempt(self, delivery_id: UUID, attempts: int, outcome: DeliveryAttempt) -> None:
         values: dict[str, Any] = {"last_status": outcome.status, "last_error": outcome.error}
-        pause = pause_seconds(attempts)
+        pause = retry_delay_seconds(attempts)
         if outcome.error is None:
             values |= {"state": DeliveryState.DELIVERED, "ended_at": db_now()}
-        elif outcome.forbidden or pause is None:
+        elif outcome.is_permanent or pause is None:
             values |= {"state": DeliveryState.FAILED, "ended_at": db_now()}
             log.warning("webhook delivery %s is given up: %s", delivery_id, outcome.error)
         else:
@@ -148,8 +159,8 @@ def _is_due() -> tuple[ColumnElement[bool], ...]:
     return (Delivery.state == DeliveryState.PENDING, Delivery.next_attempt_at <= db_now())
 
 
-def pause_seconds(attempts: int) -> float | None:
+def retry_delay_seconds(attempts: int) -> float | None:
     """Until the next try, after so many; None when it is given up."""
-    if attempts > len(PAUSES_SECONDS):
+    if attempts > len(RETRY_DELAYS_SECONDS):
         return None
-    return PAUSES_SECONDS[attempts - 1] * random.uniform(1, 1 + SPREAD)  # noqa: S311
+    return RETRY_DELAYS_SECONDS[attempts - 1] * random.uniform(1, 1 + RETRY_JITTER)  # noqa: S311

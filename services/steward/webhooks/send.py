@@ -14,10 +14,10 @@ from typing import Any, TypeVar
 
 import httpcore2
 
-from services.steward.webhooks.sign import signed_headers
+from services.steward.webhooks.sign import signature_headers
 from shared.catalog.webhooks import Delivery, Webhook
 from shared.errors import PlacewiseError
-from shared.webhook_address import parse_target, resolve
+from shared.webhook_address import parse_webhook_url, resolve_webhook_target
 
 # Deadline of one attempt: name lookup, connection, TLS handshake, request and response head.
 ATTEMPT_SECONDS = 15.0
@@ -28,14 +28,14 @@ T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class DeliveryAttempt:
     """What came of a try."""
 
     status: int | None
     """HTTP status; None where there was no answer."""
     error: str | None
     """Why it was no success; None for 2xx."""
-    forbidden: bool = False
+    is_permanent: bool = False
     """The address may not be called: another try would find the same."""
 
 
@@ -59,9 +59,9 @@ class PinnedBackend(httpcore2.AnyIOBackend):
             await self._stream.aclose()
 
 
-async def send(
+async def send_webhook(
     webhook: Webhook, delivery: Delivery, tls: ssl.SSLContext, *, allow_private: bool
-) -> Outcome:
+) -> DeliveryAttempt:
     """Attempt the delivery once, for ATTEMPT_SECONDS at most.
 
     Never raises for what the network or the receiver does. `tls` verifies the receiver's
@@ -71,25 +71,29 @@ async def send(
         async with asyncio.timeout(ATTEMPT_SECONDS):
             status = await _post(webhook, delivery, tls, allow_private)
     except PlacewiseError as error:
-        return Outcome(None, error.detail, forbidden=error.code != "webhook_name_unknown")
+        return DeliveryAttempt(
+            None, error.detail, is_permanent=error.code != "webhook_name_unknown"
+        )
     except TimeoutError:
-        return Outcome(None, f"no answer within {ATTEMPT_SECONDS:g} seconds")
+        return DeliveryAttempt(None, f"no answer within {ATTEMPT_SECONDS:g} seconds")
     except (OSError, ValueError, *HTTP_ERRORS) as error:
-        return Outcome(None, f"{type(error).__name__}: {error}"[:500])
+        return DeliveryAttempt(None, f"{type(error).__name__}: {error}"[:500])
     if 200 <= status < 300:
-        return Outcome(status, None)
+        return DeliveryAttempt(status, None)
     if 300 <= status < 400:
-        return Outcome(status, f"answered HTTP {status}: redirects are not followed")
-    return Outcome(status, f"answered HTTP {status}")
+        return DeliveryAttempt(status, f"answered HTTP {status}: redirects are not followed")
+    return DeliveryAttempt(status, f"answered HTTP {status}")
 
 
 async def _post(
     webhook: Webhook, delivery: Delivery, tls: ssl.SSLContext, allow_private: bool
 ) -> int:
     """The response's status. Its body is not read: nothing in it is of use."""
-    target = parse_target(webhook.url, allow_private=allow_private)
-    address = await in_daemon_thread(lambda: resolve(target, allow_private=allow_private))
-    signed = signed_headers(
+    target = parse_webhook_url(webhook.url, allow_private=allow_private)
+    address = await in_daemon_thread(
+        lambda: resolve_webhook_target(target, allow_private=allow_private)
+    )
+    signed = signature_headers(
         webhook.secret, f"msg_{delivery.event_id}", int(time.time()), delivery.body
     )
     headers = [

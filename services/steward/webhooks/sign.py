@@ -9,7 +9,7 @@ import hmac
 from shared.catalog.webhooks import SECRET_PREFIX
 
 
-def sign(secret: str, message_id: str, timestamp_seconds: int, body: str) -> str:
+def sign_webhook(secret: str, message_id: str, timestamp_seconds: int, body: str) -> str:
     """`v1,` and the base64 of HMAC-SHA256 over `id.timestamp.body`.
 
     `secret` is `whsec_` and the key in base64; the time is Unix', so that a receiver can refuse
@@ -20,12 +20,12 @@ def sign(secret: str, message_id: str, timestamp_seconds: int, body: str) -> str
     return "v1," + base64.b64encode(hmac.new(key, signed, hashlib.sha256).digest()).decode()
 
 
-def signed_headers(
+def signature_headers(
     secret: str, message_id: str, timestamp_seconds: int, body: str
 ) -> dict[str, str]:
     """What a receiver needs to believe the body. The id is the same in every try."""
     return {
         "webhook-id": message_id,
         "webhook-timestamp": str(timestamp_seconds),
-        "webhook-signature": sign(secret, message_id, timestamp_seconds, body),
+        "webhook-signature": sign_webhook(secret, message_id, timestamp_seconds, body),
     }

@@ -10,21 +10,21 @@ from typing import Any
 
 import numpy as np
 
-from services.trainer.evaluation.bootstrap import Difference, paired
-from services.trainer.evaluation.hits import found_within, hits_of
-from services.trainer.evaluation.measure import Measured
+from services.trainer.evaluation.bootstrap import PairedDifference, paired_differences
+from services.trainer.evaluation.hits import compute_hits, hits_at_k
+from services.trainer.evaluation.measure import RetrievalMetrics
 from services.trainer.evaluation.nearest import Indices
 from services.trainer.evaluation.predictions import read_predictions
 from shared.errors import Conflict, InvalidRequest, NotFound
 
 
 @dataclass(frozen=True, slots=True)
-class Against:
+class RunComparison:
     """This run against another one, on one evaluation set."""
 
     other: str
     """what the other run calls itself"""
-    differences: dict[int, Difference]
+    differences: dict[int, PairedDifference]
     """by k: this run's recall less the other's"""
     won: list[int]
     """queries that are right at rank 1 here and wrong there"""
@@ -39,19 +39,19 @@ class Against:
         }
 
 
-def compare_with(
+def compare_with_run(
     folder: Path,
     set_name: str,
     fingerprint: str,
-    measured: Measured,
+    measured: RetrievalMetrics,
     positives: Sequence[Indices],
-) -> Against:
+) -> RunComparison:
     """This run's figures against those of an earlier `--out` folder.
 
     Raises NotFound (`no_run`), InvalidRequest (`bad_run`), Conflict (`runs_not_comparable`): the
     other run asked another set, other queries, or under other rules.
     """
-    about = _read(folder)
+    about = _load_metrics(folder)
     theirs = about.get("sets", {}).get(set_name)
     if theirs is None:
         raise NotFound(
@@ -69,11 +69,13 @@ def compare_with(
         raise InvalidRequest(
             "bad_run", f"{folder} holds predictions for {len(ranked)} of {len(positives)} queries."
         )
-    ks = [k for k in measured.recalls.of_all if k <= ranked.shape[1]]
-    hits = hits_of(ranked, positives)
-    found = paired(measured.within[:, : len(ks)], found_within(hits, ks), measured.clusters.of)
+    ks = [k for k in measured.recalls.recall_all if k <= ranked.shape[1]]
+    hits = compute_hits(ranked, positives)
+    found = paired_differences(
+        measured.within[:, : len(ks)], hits_at_k(hits, ks), measured.clusters.of
+    )
     gained = measured.hits[:, 0].astype(int) - hits[:, 0].astype(int)
-    return Against(
+    return RunComparison(
         other=str(about.get("run", {}).get("name") or folder.name),
         differences=dict(zip(ks, found, strict=True)),
         won=np.flatnonzero(gained > 0).tolist(),
@@ -81,7 +83,7 @@ def compare_with(
     )
 
 
-def _read(folder: Path) -> dict[str, Any]:
+def _load_metrics(folder: Path) -> dict[str, Any]:
     file = folder / "metrics.json"
     if not file.is_file():
         raise NotFound(

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from services.trainer.evaluation.hits import Hits
 
 
-def average_precisions(hits: Hits, positives: NDArray[np.int64]) -> NDArray[np.float64]:
+def average_precisions(hits: Hits, positive_counts: NDArray[np.int64]) -> NDArray[np.float64]:
     """(queries, k) hits, (queries,) how many positives each has -> (queries,) AP@k.
 
     AP@k is the sum, over the right ones among the first k, of the precision at their rank, divided
@@ -19,7 +19,7 @@ def average_precisions(hits: Hits, positives: NDArray[np.int64]) -> NDArray[np.f
     ranks = np.arange(1, hits.shape[1] + 1)
     precision = np.cumsum(hits, axis=1) / ranks
     sums = (precision * hits).sum(axis=1)
-    findable = np.minimum(positives, hits.shape[1]).astype(np.float64)
+    findable = np.minimum(positive_counts, hits.shape[1]).astype(np.float64)
     unknown = np.full(len(sums), np.nan)
     precisions: NDArray[np.float64] = np.divide(sums, findable, out=unknown, where=findable > 0)
     return precisions

@@ -14,15 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 RESAMPLES = 2000
-LEVEL = 0.95
-LEAST_CLUSTERS = 5  # of fewer, the draws say nothing about clusters that were never seen
-DRAWN_AT_ONCE = 4_000_000  # counts
+CONFIDENCE_LEVEL = 0.95
+MIN_CLUSTERS = 5  # of fewer, the draws say nothing about clusters that were never seen
+MAX_DRAWN_COUNTS = 4_000_000  # counts
 
 Values = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
-class Interval:
+class ConfidenceInterval:
     low: float
     high: float
 
@@ -31,7 +31,7 @@ class Interval:
 
 
 @dataclass(frozen=True, slots=True)
-class Difference:
+class PairedDifference:
     """Of the means of two runs on the same queries: the first less the second."""
 
     mean: float
@@ -42,51 +42,51 @@ class Difference:
     lost: int
 
     @property
-    def beyond_chance(self) -> bool:
+    def is_significant(self) -> bool:
         """Whether 0 lies outside of the interval."""
         return self.low is not None and self.high is not None and not self.low <= 0 <= self.high
 
     def as_json(self) -> dict[str, float | int | bool | None]:
-        return {**asdict(self), "beyond_chance": self.beyond_chance}
+        return {**asdict(self), "beyond_chance": self.is_significant}
 
 
-def intervals(
+def bootstrap_intervals(
     values: Values, clusters: NDArray[np.int64], *, resamples: int = RESAMPLES, seed: int = 0
-) -> list[Interval] | None:
+) -> list[ConfidenceInterval] | None:
     """(queries, figures), (queries,) numbers of clusters -> LEVEL interval of each figure's mean.
 
     None with fewer than LEAST_CLUSTERS clusters.
     """
     _, cluster = np.unique(clusters, return_inverse=True)
     count = int(cluster.max()) + 1 if len(cluster) else 0
-    if count < LEAST_CLUSTERS:
+    if count < MIN_CLUSTERS:
         return None
     sums = np.zeros((count, values.shape[1]))
     np.add.at(sums, cluster, values)
     sizes = np.bincount(cluster, minlength=count).astype(np.float64)
     random = np.random.default_rng(seed)
     means = []
-    at_once = max(1, DRAWN_AT_ONCE // count)
+    at_once = max(1, MAX_DRAWN_COUNTS // count)
     for begin in range(0, resamples, at_once):
         drawn = random.multinomial(
             count, np.full(count, 1 / count), size=min(at_once, resamples - begin)
         ).astype(np.float64)
         means.append((drawn @ sums) / (drawn @ sizes)[:, None])
-    tail = (1 - LEVEL) / 2
+    tail = (1 - CONFIDENCE_LEVEL) / 2
     low, high = np.quantile(np.concatenate(means), [tail, 1 - tail], axis=0)
-    return [Interval(float(a), float(b)) for a, b in zip(low, high, strict=True)]
+    return [ConfidenceInterval(float(a), float(b)) for a, b in zip(low, high, strict=True)]
 
 
-def paired(
+def paired_differences(
     first: Values, second: Values, clusters: NDArray[np.int64], *, seed: int = 0
-) -> list[Difference]:
+) -> list[PairedDifference]:
     """(queries, figures) of two runs -> the difference of each figure's mean, with its interval."""
     if first.shape != second.shape:
         raise ValueError(f"runs of different shape: {first.shape} and {second.shape}")
     difference = first - second
-    found = intervals(difference, clusters, seed=seed)
+    found = bootstrap_intervals(difference, clusters, seed=seed)
     return [
-        Difference(
+        PairedDifference(
             mean=float(column.mean()),
             low=found[place].low if found else None,
             high=found[place].high if found else None,

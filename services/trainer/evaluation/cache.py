@@ -15,13 +15,13 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from services.trainer.evaluation.describe import Describe, Rows
+from services.trainer.evaluation.describe import DescribeFunction, Rows
 from shared.errors import InvalidRequest
 from shared.private_files import FILE_MODE, make_private_folder
 
 BATCH = 32  # rows that are read from the cache together
 ROW_OVERHEAD_BYTES = 100  # of SQLite, for a row: key, page slack
-BUSY_SECONDS = 60.0
+BUSY_TIMEOUT_SECONDS = 60.0
 
 SCHEMA = """
 CREATE TABLE IF NOT EXISTS rows (photo BLOB PRIMARY KEY, row BLOB NOT NULL);
@@ -29,18 +29,18 @@ CREATE TABLE IF NOT EXISTS times (seconds REAL NOT NULL, photos INT NOT NULL);
 """
 
 
-class Timed(Describe, Protocol):
+class TimedDescriber(DescribeFunction, Protocol):
     """A Describe that says what its network took."""
 
     seconds: float
     photos: int
 
 
-class CachedDescribe:
+class CachedDescriber:
     """A Describe that asks `inner` only for photos whose row is not there yet."""
 
     def __init__(
-        self, inner: Timed, folder: Path, spec: Mapping[str, Any], *, most_bytes: int
+        self, inner: TimedDescriber, folder: Path, spec: Mapping[str, Any], *, most_bytes: int
     ) -> None:
         """`spec` is everything that decides a row's value; `most_bytes` is for all specs in
         `folder`. Beyond them, rows are made and not kept."""
@@ -49,7 +49,7 @@ class CachedDescribe:
         named = hashlib.sha256(json.dumps(spec, sort_keys=True).encode()).hexdigest()
         self._file = folder / f"{named[:32]}.sqlite"
         self._most_bytes = most_bytes
-        self.told: Callable[[int, int], None] = lambda done, most: None
+        self.on_lookup: Callable[[int, int], None] = lambda done, most: None
         """hears how many photos have been looked for, before the first row comes"""
 
     def __call__(self, photos: Sequence[Path]) -> Iterator[Rows]:
@@ -57,9 +57,9 @@ class CachedDescribe:
         try:
             keys, missing = [], []
             for photo in photos:
-                keys.append(_sha256(photo))
-                missing.append(not _is_there(kept, keys[-1]))
-                self.told(len(keys), len(photos))
+                keys.append(_photo_sha256(photo))
+                missing.append(not _has_row(kept, keys[-1]))
+                self.on_lookup(len(keys), len(photos))
             made = self._made([p for p, m in zip(photos, missing, strict=True) if m])
             for begin in range(0, len(photos), BATCH):
                 rows, new = [], []
@@ -68,7 +68,7 @@ class CachedDescribe:
                         rows.append(next(made))
                         new.append((keys[place], rows[-1].tobytes()))
                     else:
-                        rows.append(_row(kept, keys[place]))
+                        rows.append(_load_row(kept, keys[place]))
                 yield np.stack(rows)
                 self._keep(kept, new)  # not before: whoever takes them may find that they are bad
         finally:
@@ -93,7 +93,7 @@ class CachedDescribe:
     def _open(self) -> sqlite3.Connection:
         make_private_folder(self._folder)
         self._file.touch(FILE_MODE)
-        kept = sqlite3.connect(self._file, timeout=BUSY_SECONDS, isolation_level=None)
+        kept = sqlite3.connect(self._file, timeout=BUSY_TIMEOUT_SECONDS, isolation_level=None)
         kept.execute("PRAGMA journal_mode = WAL")
         kept.execute("PRAGMA synchronous = NORMAL")
         kept.executescript(SCHEMA)
@@ -128,7 +128,7 @@ class CachedDescribe:
         return sum(file.stat().st_size for file in self._folder.glob("*.sqlite*"))
 
 
-def _sha256(photo: Path) -> bytes:
+def _photo_sha256(photo: Path) -> bytes:
     try:
         with photo.open("rb") as file:
             digest = hashlib.file_digest(file, "sha256")
@@ -139,10 +139,10 @@ def _sha256(photo: Path) -> bytes:
     return digest.digest()
 
 
-def _is_there(kept: sqlite3.Connection, key: bytes) -> bool:
+def _has_row(kept: sqlite3.Connection, key: bytes) -> bool:
     return kept.execute("SELECT 1 FROM rows WHERE photo = ?", (key,)).fetchone() is not None
 
 
-def _row(kept: sqlite3.Connection, key: bytes) -> Any:
+def _load_row(kept: sqlite3.Connection, key: bytes) -> Any:
     (row,) = kept.execute("SELECT row FROM rows WHERE photo = ?", (key,)).fetchone()
     return np.frombuffer(row, np.float32)

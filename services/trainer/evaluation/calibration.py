@@ -7,16 +7,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from services.trainer.evaluation.clusters import Clusters
-from shared.estimate.calibration import FOLDS, learn_confidence
-from shared.estimate.evidence import Evidence
-from shared.estimate.figures import auroc, calibration_error, recall_at_precision
+from services.trainer.evaluation.clusters import QueryClusters
+from shared.estimate.calibration import FOLDS, fit_confidence
+from shared.estimate.evidence import PlaceEvidence
+from shared.estimate.figures import auroc, expected_calibration_error, recall_at_precision
 
-PRECISION = 0.99
+TARGET_PRECISION = 0.99
 
 
 @dataclass(frozen=True, slots=True)
-class Calibration:
+class ScoreCalibration:
     auroc: float | None
     """P(a right first match scores higher than a wrong one); None where all are of one kind."""
     recall_at_99_precision: float
@@ -27,31 +27,38 @@ class Calibration:
     where there are too few queries, right ones or wrong ones to learn from."""
 
 
-def calibrate(
-    scores: NDArray[np.floating], right: NDArray[np.bool_], findable: int, clusters: Clusters
-) -> Calibration:
-    """(queries,) cosines of the first match and whether it is right; `findable` queries have a
+def calibrate_scores(
+    scores: NDArray[np.floating],
+    correct: NDArray[np.bool_],
+    queries_with_positive: int,
+    clusters: QueryClusters,
+) -> ScoreCalibration:
+    """(queries,) cosines of the first match and whether it is right; `queries_with_positive` queries have a
     positive."""
-    said, truth = scores.astype(np.float64).tolist(), right.tolist()
-    confidence = _cross_validated(said, truth, clusters)
-    return Calibration(
+    said, truth = scores.astype(np.float64).tolist(), correct.tolist()
+    confidence = _cross_validated_confidence(said, truth, clusters)
+    return ScoreCalibration(
         auroc=auroc(said, truth),
-        recall_at_99_precision=recall_at_precision(said, truth, findable, PRECISION),
-        calibration_error=None if confidence is None else calibration_error(confidence, truth),
+        recall_at_99_precision=recall_at_precision(
+            said, truth, queries_with_positive, TARGET_PRECISION
+        ),
+        calibration_error=None
+        if confidence is None
+        else expected_calibration_error(confidence, truth),
     )
 
 
-def _cross_validated(
-    scores: list[float], right: list[bool], clusters: Clusters
+def _cross_validated_confidence(
+    scores: list[float], correct: list[bool], clusters: QueryClusters
 ) -> list[float] | None:
     """P(right) of each query, learnt from the queries of other folds; a cluster is of one fold."""
     fold = np.random.default_rng(0).permutation(int(clusters.of.max(initial=-1)) + 1) % FOLDS
     folds = fold[clusters.of] if len(scores) else np.empty(0, np.int64)
-    evidence = [Evidence(score, 0.0) for score in scores]  # the score alone
+    evidence = [PlaceEvidence(score, 0.0) for score in scores]  # the score alone
     predicted = [0.0] * len(scores)
     for held_out in range(FOLDS):
-        learnt = learn_confidence(
-            [(e, r) for e, r, f in zip(evidence, right, folds, strict=True) if f != held_out]
+        learnt = fit_confidence(
+            [(e, r) for e, r, f in zip(evidence, correct, folds, strict=True) if f != held_out]
         )
         if learnt is None:
             return None

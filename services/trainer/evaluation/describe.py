@@ -13,16 +13,16 @@ from numpy.typing import NDArray
 
 from shared.errors import PlacewiseError, Unprocessable
 
-MEMORY_BYTES = 1_000_000_000  # rows beyond it lie in a mapped file meanwhile
-NAMED = 20  # photos that an error lists; the others are counted
+MAX_ROWS_IN_MEMORY_BYTES = 1_000_000_000  # rows beyond it lie in a mapped file meanwhile
+MAX_PHOTOS_LISTED = 20  # photos that an error lists; the others are counted
 
 Rows = NDArray[np.float32]
 
 
-class Describe(Protocol):
+class DescribeFunction(Protocol):
     """Photos to their rows, batch by batch, in the photos' order: (b, D) float32, unit length.
 
-    A photo that can't be described is an Unprocessable error (`photos_refused`) that names it: a
+    A photo that can't be described is an Unprocessable error (`refused_photos_error`) that names it: a
     figure over the others would be one of another data set.
     """
 
@@ -30,14 +30,14 @@ class Describe(Protocol):
 
 
 @contextlib.contextmanager
-def described(
-    describe: Describe,
+def describe_to_matrix(
+    describe: DescribeFunction,
     photos: Sequence[Path],
     *,
-    memory_bytes: int = MEMORY_BYTES,
-    told: Callable[[int], None] = lambda more: None,
+    memory_bytes: int = MAX_ROWS_IN_MEMORY_BYTES,
+    on_progress: Callable[[int], None] = lambda more: None,
 ) -> Iterator[Rows]:
-    """(photos, D) rows for as long as the block lasts; `told` hears how many more are there.
+    """(photos, D) rows for as long as the block lasts; `on_progress` hears how many more are there.
 
     Raises Unprocessable (`features_not_finite`, and what `describe` raises).
     """
@@ -46,17 +46,19 @@ def described(
         done = 0
         for batch in describe(photos):
             if done == 0:
-                rows = _room(len(photos), batch.shape[1], memory_bytes, stack)
+                rows = _allocate_rows(len(photos), batch.shape[1], memory_bytes, stack)
             _check_finite(batch, photos[done : done + len(batch)])
             rows[done : done + len(batch)] = batch
             done += len(batch)
-            told(len(batch))
+            on_progress(len(batch))
         if done != len(photos):
             raise ValueError(f"{done} rows for {len(photos)} photos")
         yield rows
 
 
-def _room(count: int, dimension: int, memory_bytes: int, stack: contextlib.ExitStack) -> Rows:
+def _allocate_rows(
+    count: int, dimension: int, memory_bytes: int, stack: contextlib.ExitStack
+) -> Rows:
     if 4 * count * dimension <= memory_bytes:
         return np.empty((count, dimension), np.float32)
     folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="placewise-rows-"))
@@ -77,11 +79,13 @@ def _check_finite(batch: Rows, photos: Sequence[Path]) -> None:
         )
 
 
-def photos_refused(refused: Sequence[tuple[Path, PlacewiseError]], photos: int) -> Unprocessable:
+def refused_photos_error(
+    refused: Sequence[tuple[Path, PlacewiseError]], photos: int
+) -> Unprocessable:
     """The error that names the photos that can't be described, and why."""
-    lines = [f"{photo}: {error.detail}" for photo, error in refused[:NAMED]]
-    if len(refused) > NAMED:
-        lines.append(f"and {len(refused) - NAMED} more")
+    lines = [f"{photo}: {error.detail}" for photo, error in refused[:MAX_PHOTOS_LISTED]]
+    if len(refused) > MAX_PHOTOS_LISTED:
+        lines.append(f"and {len(refused) - MAX_PHOTOS_LISTED} more")
     return Unprocessable(
         "photos_refused",
         f"{len(refused)} of {photos} photos of the data set can't be described, and without them "

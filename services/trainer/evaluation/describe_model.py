@@ -12,19 +12,19 @@ import numpy as np
 import torch
 from PIL import Image
 
-from services.trainer.evaluation.describe import Rows, photos_refused
+from services.trainer.evaluation.describe import Rows, refused_photos_error
 from shared.errors import InvalidRequest, PlacewiseError, Unprocessable
-from shared.vision.decode import decode
-from shared.vision.passes import PassLimit, PhotoDoesNotFit, in_passes
+from shared.vision.decode import decode_photo
+from shared.vision.passes import BatchSizeLimit, PhotoTooLargeForGpu, run_in_batches
 from shared.vision.preprocessing import Preprocessing, get_preprocessing
 from shared.vision.resample import Pixels
 
 # The means and deviations of ImageNet's channels, with which the backbones were trained.
-MEAN = (0.485, 0.456, 0.406)
-DEVIATION = (0.229, 0.224, 0.225)
+IMAGENET_MEAN = (0.485, 0.456, 0.406)
+IMAGENET_STD = (0.229, 0.224, 0.225)
 
 
-class DescribeModel:
+class ModelDescriber:
     """Calls a network (B, 3, H, W) float32, ImageNet-normalised -> (B, D) on photos.
 
     `image_size`: (height, width), to which photos are squeezed, bilinear and antialiased, as in
@@ -48,14 +48,14 @@ class DescribeModel:
         self.preprocessing = (
             get_preprocessing(f"resize{image_size[0]}x{image_size[1]}")
             if image_size is not None
-            else Preprocessing("native", 1, True, max_pixels, (480, 640), _as_it_is)
+            else Preprocessing("native", 1, True, max_pixels, (480, 640), _keep_size)
         )
-        self._limit = PassLimit()
+        self._limit = BatchSizeLimit()
         self.seconds = 0.0
         """spent in the network, of `photos`; they are read and decoded meanwhile"""
         self.photos = 0
-        self._mean = torch.tensor(MEAN, device=device)[:, None, None] * 255
-        self._deviation = torch.tensor(DEVIATION, device=device)[:, None, None] * 255
+        self._mean = torch.tensor(IMAGENET_MEAN, device=device)[:, None, None] * 255
+        self._deviation = torch.tensor(IMAGENET_STD, device=device)[:, None, None] * 255
 
     def __call__(self, photos: Sequence[Path]) -> Iterator[Rows]:
         refused: list[tuple[Path, PlacewiseError]] = []
@@ -80,7 +80,7 @@ class DescribeModel:
                     begun = time.perf_counter()
                     try:
                         rows = self._rows(pixels)
-                    except PhotoDoesNotFit as error:
+                    except PhotoTooLargeForGpu as error:
                         refused.append((here[error.place], error))
                         continue
                     self.seconds += time.perf_counter() - begun
@@ -90,11 +90,11 @@ class DescribeModel:
             threads.shutdown(cancel_futures=True)
             self._model.train(was_training)
         if refused:
-            raise photos_refused(refused, len(photos))
+            raise refused_photos_error(refused, len(photos))
 
     def _read(self, photo: Path) -> Pixels | PlacewiseError:
         try:
-            return decode(photo.read_bytes(), self.preprocessing, self._max_pixels).pixels
+            return decode_photo(photo.read_bytes(), self.preprocessing, self._max_pixels).pixels
         except OSError as error:
             return InvalidRequest("photo_unreadable", f"It can't be read: {error.strerror}.")
         except Unprocessable as error:
@@ -102,7 +102,7 @@ class DescribeModel:
 
     def _rows(self, pixels: list[Pixels]) -> Rows:
         rows: Rows | None = None
-        for places, found in in_passes(pixels, self._run, self._limit, self._device):
+        for places, found in run_in_batches(pixels, self._run, self._limit, self._device):
             if rows is None:
                 rows = np.empty((len(pixels), found.shape[1]), np.float32)
             rows[places] = found.numpy()
@@ -117,5 +117,5 @@ class DescribeModel:
             return rows.float().cpu()
 
 
-def _as_it_is(image: Image.Image) -> Pixels:
+def _keep_size(image: Image.Image) -> Pixels:
     return np.asarray(image)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-WITHIN_M = (1, 2, 5, 10, 15, 20, 25, 30, 40, 50, 75, 100, 200, 500, 1000)
+DISTANCE_THRESHOLDS_M = (1, 2, 5, 10, 15, 20, 25, 30, 40, 50, 75, 100, 200, 500, 1000)
 
 
 def distance_error(metres: NDArray[np.float64]) -> dict[str, Any] | None:
@@ -22,5 +22,7 @@ def distance_error(metres: NDArray[np.float64]) -> dict[str, Any] | None:
         "queries": len(known),
         "without_position": int(len(metres) - len(known)),
         "median_m": float(np.median(known)),
-        "within": [{"metres": x, "share": float((known <= x).mean())} for x in WITHIN_M],
+        "within": [
+            {"metres": x, "share": float((known <= x).mean())} for x in DISTANCE_THRESHOLDS_M
+        ],
     }

@@ -8,14 +8,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.trainer.evaluation.nearest import Indices
-from shared.datasets.distances import metres_apart
-from shared.datasets.sets import Shot
+from shared.datasets.distances import pairwise_distances_m
+from shared.datasets.sets import DatasetPhoto
 
-Metres = NDArray[np.float64]
+Distances = NDArray[np.float64]
 
 
-def metres_of(queries: Sequence[Shot], database: Sequence[Shot], ranked: Indices) -> Metres:
+def match_distances(
+    queries: Sequence[DatasetPhoto], database: Sequence[DatasetPhoto], ranked: Indices
+) -> Distances:
     """(queries, k) database indices -> (queries, k) metres, NaN where one has no position."""
     asked = [query for query, row in zip(queries, ranked, strict=True) for _ in row]
     found = [database[number] for number in ranked.ravel().tolist()]
-    return metres_apart(asked, found).reshape(ranked.shape)
+    return pairwise_distances_m(asked, found).reshape(ranked.shape)

@@ -6,12 +6,12 @@ import math
 from collections.abc import Sequence
 
 
-def pareto_front(prices: Sequence[float], worths: Sequence[float]) -> list[bool]:
+def pareto_front(costs: Sequence[float], values: Sequence[float]) -> list[bool]:
     """Whether nothing else is at least as good in both and better in one: cheaper, or worth more.
 
     One whose price is NaN (not measured) is never on the front.
     """
-    points = list(zip(prices, worths, strict=True))
+    points = list(zip(costs, values, strict=True))
     return [
         not math.isnan(price)
         and not any(

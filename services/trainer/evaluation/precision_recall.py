@@ -24,19 +24,19 @@ class PrecisionRecall:
 
 
 def precision_recall(
-    scores: NDArray[np.floating], right: NDArray[np.bool_], findable: int
+    scores: NDArray[np.floating], correct: NDArray[np.bool_], queries_with_positive: int
 ) -> PrecisionRecall | None:
     """(queries,) scores of the first match and whether it is right; None without a findable query.
 
     Queries without a positive are asked, too: what is answered there counts against precision.
     """
-    if not findable or not len(scores):
+    if not queries_with_positive or not len(scores):
         return None
     order = np.argsort(-scores, kind="stable")
-    said, hits = scores[order], np.cumsum(right[order])
+    said, hits = scores[order], np.cumsum(correct[order])
     # Equal scores are believed together.
     cut = np.flatnonzero(np.append(said[1:] != said[:-1], True))
-    precision, recall = hits[cut] / (cut + 1), hits[cut] / findable
+    precision, recall = hits[cut] / (cut + 1), hits[cut] / queries_with_positive
     steps = np.diff(recall, prepend=0.0)
     return PrecisionRecall(
         said[cut].astype(np.float64), precision, recall, float((steps * precision).sum())

@@ -10,7 +10,7 @@ import numpy as np
 from services.trainer.evaluation.nearest import Indices
 from shared.errors import InvalidRequest
 
-SHOWN = 5  # wrong entries that an error names
+MAX_ENTRIES_SHOWN = 5  # wrong entries that an error names
 
 
 def read_predictions(path: Path) -> Indices:
@@ -45,7 +45,7 @@ def read_predictions(path: Path) -> Indices:
 
 
 def check_predictions(
-    path: Path, ranked: Indices, positives: Sequence[Indices], database: int | None
+    path: Path, ranked: Indices, positives: Sequence[Indices], database_size: int | None
 ) -> None:
     """Whether they can be about these queries, and about a database of that many photos; None
     where nobody has said how many.
@@ -58,9 +58,12 @@ def check_predictions(
             f"{path} holds predictions for {len(ranked)} queries, the ground truth is of "
             f"{len(positives)}. Both have to be of the same list, in the same order.",
         )
-    if database is not None and ranked.max() >= database:
+    if database_size is not None and ranked.max() >= database_size:
         raise _out_of_range(
-            path, ranked, ranked >= database, f"the database has {database} photos, 0 the first"
+            path,
+            ranked,
+            ranked >= database_size,
+            f"the database has {database_size} photos, 0 the first",
         )
 
 
@@ -68,6 +71,6 @@ def _out_of_range(
     path: Path, ranked: Indices, wrong: np.ndarray[tuple[int, ...], np.dtype[np.bool_]], why: str
 ) -> InvalidRequest:
     where = np.argwhere(wrong)
-    named = ", ".join(f"{ranked[q, k]} of query {q}" for q, k in where[:SHOWN].tolist())
-    more = f" and {len(where) - SHOWN} more" if len(where) > SHOWN else ""
+    named = ", ".join(f"{ranked[q, k]} of query {q}" for q, k in where[:MAX_ENTRIES_SHOWN].tolist())
+    more = f" and {len(where) - MAX_ENTRIES_SHOWN} more" if len(where) > MAX_ENTRIES_SHOWN else ""
     return InvalidRequest("bad_predictions", f"{path} is out of range: {named}{more}; {why}.")

@@ -6,16 +6,16 @@ import re
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from services.trainer.evaluation.against import Against
-from services.trainer.evaluation.measure import Measured
-from services.trainer.evaluation.nearest import Ranked, Scores
-from shared.datasets.audit import Suspect
-from shared.datasets.published import Published
-from shared.datasets.sets import EvaluationSet, Shot
+from services.trainer.evaluation.against import RunComparison
+from services.trainer.evaluation.measure import RetrievalMetrics
+from services.trainer.evaluation.nearest import Rankings, Scores
+from shared.datasets.audit import SuspectLabel
+from shared.datasets.published import PublishedResult
+from shared.datasets.sets import DatasetPhoto, EvaluationSet
 
 
 @dataclass(frozen=True)
-class Run:
+class EvaluationRun:
     """What answered, the same for all sets of a run."""
 
     name: str
@@ -26,17 +26,17 @@ class Run:
 
 
 @dataclass(frozen=True)
-class Result:
+class EvaluationResult:
     asked: EvaluationSet
     """Of a predictions file without lists, the database is empty."""
-    ranked: Ranked
+    ranked: Rankings
     has_scores: bool
-    measured: Measured
+    measured: RetrievalMetrics
     about: dict[str, Any]
     """`dimension`, `describe_ms_per_photo`, ... as far as they are known"""
-    against: Against | None = None
-    published: tuple[Published, ...] = ()
-    suspects: tuple[Suspect, ...] = ()
+    against: RunComparison | None = None
+    published: tuple[PublishedResult, ...] = ()
+    suspects: tuple[SuspectLabel, ...] = ()
     """confident first matches that the rule calls wrong and that lie just outside of it"""
 
     @property
@@ -48,7 +48,7 @@ class Result:
     def scores(self) -> Scores | None:
         return self.ranked.scores if self.has_scores else None
 
-    def match(self, query: int, rank: int) -> Shot | None:
+    def match(self, query: int, rank: int) -> DatasetPhoto | None:
         """The database photo at that rank, from 0; None where no list names it."""
         if not self.asked.database:
             return None

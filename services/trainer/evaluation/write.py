@@ -12,34 +12,34 @@ from typing import Any
 
 import numpy as np
 
-from services.trainer.evaluation.result import Result, Run
+from services.trainer.evaluation.result import EvaluationResult, EvaluationRun
 
-PACKAGES = ("numpy", "pillow", "torch", "torchvision", "timm", "faiss-cpu", "faiss-gpu")
+REPORTED_PACKAGES = ("numpy", "pillow", "torch", "torchvision", "timm", "faiss-cpu", "faiss-gpu")
 
 
-def metrics(run: Run, results: Sequence[Result]) -> dict[str, Any]:
+def build_metrics(run: EvaluationRun, results: Sequence[EvaluationResult]) -> dict[str, Any]:
     """Everything that was measured, and with what."""
     return {
         "run": {"name": run.name, "fingerprint": run.fingerprint, **run.about},
-        "versions": versions(),
+        "versions": package_versions(),
         "sets": {result.asked.name: result.as_json() for result in results},
     }
 
 
-def write_files(out: Path, run: Run, results: Sequence[Result]) -> None:
+def write_run_files(out: Path, run: EvaluationRun, results: Sequence[EvaluationResult]) -> None:
     """`predictions_SET.npy` and `.csv` of each set, and last `metrics.json`: where that is, all
     of them are."""
     out.mkdir(parents=True, exist_ok=True)
     for result in results:
         np.save(out / f"predictions_{result.file_name}.npy", result.ranked.indices)
-        _write_table(out / f"predictions_{result.file_name}.csv", result)
-    text = json.dumps(metrics(run, results), indent=2, ensure_ascii=False, allow_nan=False)
+        _write_predictions_csv(out / f"predictions_{result.file_name}.csv", result)
+    text = json.dumps(build_metrics(run, results), indent=2, ensure_ascii=False, allow_nan=False)
     partial = out / ".metrics.json.partial"
     partial.write_text(text + "\n", encoding="utf-8")
     partial.replace(out / "metrics.json")
 
 
-def write_pairs(file: Path, results: Sequence[Result]) -> int:
+def write_pairs(file: Path, results: Sequence[EvaluationResult]) -> int:
     """The pairs that a localisation goes on with (hloc): `query database` by name, a line each, in
     the order of the ranking; returns how many."""
     count = 0
@@ -52,10 +52,10 @@ def write_pairs(file: Path, results: Sequence[Result]) -> int:
     return count
 
 
-def versions() -> dict[str, str]:
+def package_versions() -> dict[str, str]:
     """Of what a figure may depend on, as far as it is installed."""
     found = {"python": platform.python_version(), "placewise": version("placewise")}
-    for package in PACKAGES:
+    for package in REPORTED_PACKAGES:
         try:
             found[package] = version(package)
         except PackageNotFoundError:
@@ -63,7 +63,7 @@ def versions() -> dict[str, str]:
     return found
 
 
-def _write_table(file: Path, result: Result) -> None:
+def _write_predictions_csv(file: Path, result: EvaluationResult) -> None:
     scores, metres = result.scores, result.measured.metres
     with file.open("w", encoding="utf-8", newline="") as opened:
         table = csv.writer(opened, lineterminator="\n")

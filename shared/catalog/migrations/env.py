@@ -19,7 +19,7 @@ if connection is None:
     )
 
 
-def note_who_understands(ctx: Any, step: Any, heads: Any, run_args: Any) -> None:
+def record_schema_compatibility(ctx: Any, step: Any, heads: Any, run_args: Any) -> None:
     """In the migration's own transaction: from which revision on releases can work with it."""
     understood_from = getattr(step.up_revision.module, "understood_from", None)
     if understood_from and inspect(ctx.connection).has_table(SchemaCompatibility.__tablename__):
@@ -34,7 +34,7 @@ context.configure(
     render_as_batch=connection.dialect.name == "sqlite",
     # Locks are held no longer than one migration takes.
     transaction_per_migration=connection.dialect.name != "sqlite",
-    on_version_apply=note_who_understands,
+    on_version_apply=record_schema_compatibility,
 )
 with context.begin_transaction():
     context.run_migrations()

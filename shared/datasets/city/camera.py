@@ -80,7 +80,7 @@ class Camera:
 
 
 @dataclass(frozen=True, slots=True)
-class Hits:
+class RayHits:
     """For each column the nearest plane: depth is infinite where there is none."""
 
     depth: Floats
@@ -92,9 +92,9 @@ class Hits:
     """metres towards the plane's normal per metre of depth"""
 
 
-def cast(
+def cast_rays(
     camera: Camera, slopes: Floats, starts: Floats, directions: Floats, lengths: Floats
-) -> Hits:
+) -> RayHits:
     """Rays of the given slopes against vertical planes that are seen from their right side.
 
     starts and directions are (planes, 2), lengths (planes,). A plane that runs left to right as
@@ -111,7 +111,7 @@ def cast(
     depth = np.where(seen & (depth > 0.3) & (along >= 0) & (along <= lengths), depth, np.inf)
     plane = depth.argmin(axis=1)
     rows = np.arange(len(slopes))
-    return Hits(
+    return RayHits(
         depth=depth[rows, plane],
         plane=plane,
         along=np.clip(along[rows, plane], 0, lengths[plane]),

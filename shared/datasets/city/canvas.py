@@ -12,14 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared.datasets.city.camera import Camera, Floats
-from shared.datasets.city.texture_memory import LEVELS, Packed, TextureMemory
+from shared.datasets.city.texture_memory import MIP_LEVELS, Packed, TextureCache
 
-FINE = 2
+SUPERSAMPLING = 2
 """canvas pixels per photo pixel, each way"""
 
 
 @dataclass(slots=True)
-class View:
+class RenderBuffers:
     """What the lens sees before any light falls on it; (x, y) arrays."""
 
     canvas: Packed
@@ -32,8 +32,8 @@ class View:
     """(width,) share of the street lamps' light, by night"""
 
 
-def gather(
-    memory: TextureMemory,
+def sample_texture(
+    memory: TextureCache,
     camera: Camera,
     columns: NDArray[np.int64],
     depth: Floats,
@@ -47,9 +47,9 @@ def gather(
 ) -> Packed:
     """(columns, last - first) texels; `top` is the height of the texture's upper edge."""
     per_row = (scale * depth / camera.focal).astype(np.float32)
-    horizon = camera.horizons(FINE)[columns]
+    horizon = camera.horizons(SUPERSAMPLING)[columns]
     start = (scale * (top - camera.eye) - per_row * horizon).astype(np.float32) + rim
-    ys = ((np.arange(first, last) + 0.5) / FINE).astype(np.float32)
+    ys = ((np.arange(first, last) + 0.5) / SUPERSAMPLING).astype(np.float32)
     v = per_row[:, None] * ys
     v += start[:, None]
     np.clip(v, 0, (rows - 1)[:, None], out=v)
@@ -58,15 +58,15 @@ def gather(
     return memory.pixels.take(index)
 
 
-def level_for(
+def choose_mip_level(
     finest: float, depth: NDArray[np.floating], camera: Camera, bias: float = 0.25
 ) -> NDArray[np.int64]:
     """Which smaller copy to read, so that about one texel falls on one canvas pixel."""
-    texels = finest * depth / (camera.focal * FINE)
-    return np.asarray(np.clip(np.log2(np.maximum(texels, 1.0)) + bias, 0, LEVELS - 1), np.int64)
+    texels = finest * depth / (camera.focal * SUPERSAMPLING)
+    return np.asarray(np.clip(np.log2(np.maximum(texels, 1.0)) + bias, 0, MIP_LEVELS - 1), np.int64)
 
 
-def row_of(camera: Camera, z: float, depth: Floats, columns: NDArray[np.int64]) -> Floats:
+def project_row(camera: Camera, z: float, depth: Floats, columns: NDArray[np.int64]) -> Floats:
     """Canvas row of the height z at the columns' depths."""
-    horizon = camera.horizons(FINE)[columns]
-    return np.asarray((horizon + camera.focal * (camera.eye - z) / depth) * FINE)
+    horizon = camera.horizons(SUPERSAMPLING)[columns]
+    return np.asarray((horizon + camera.focal * (camera.eye - z) / depth) * SUPERSAMPLING)

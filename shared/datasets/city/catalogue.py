@@ -12,12 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from shared.datasets.city.codes import PANES, SIGN, SOLID
+from shared.datasets.city.codes import CODE_SIGN, CODE_SOLID, PANE_CODES
 from shared.datasets.city.openings import WindowType, draw_door, draw_window
-from shared.datasets.city.random_streams import stream
+from shared.datasets.city.random_streams import random_stream
 from shared.datasets.city.street_things import (
     FOLIAGE,
-    Picture,
+    Sprite,
     draw_box,
     draw_lamp,
     draw_post_sign,
@@ -67,28 +67,28 @@ class Catalogue:
     doors: tuple[Image.Image, ...]
     signs: tuple[Image.Image, ...]
     """shop boards with names"""
-    blades: tuple[Picture, ...]
+    blades: tuple[Sprite, ...]
     """boards that stand out from a facade"""
     awnings: tuple[tuple[Colour, Colour], ...]
     trims: tuple[Colour, ...]
     roofs: tuple[Colour, ...]
-    trees: dict[str, tuple[Picture, ...]]
+    trees: dict[str, tuple[Sprite, ...]]
     """by foliage"""
-    vehicle_sides: tuple[Picture, ...]
-    vehicle_fronts: tuple[Picture, ...]
-    vehicle_rears: tuple[Picture, ...]
-    vehicle_screens: tuple[Picture, ...]
+    vehicle_sides: tuple[Sprite, ...]
+    vehicle_fronts: tuple[Sprite, ...]
+    vehicle_rears: tuple[Sprite, ...]
+    vehicle_screens: tuple[Sprite, ...]
     """the cabin's front and back"""
     cabins: tuple[tuple[float, float], ...]
     """metres from the nose to the cabin's front and to its back"""
-    lamps: tuple[Picture, ...]
-    posts: tuple[Picture, ...]
-    boxes: tuple[Picture, ...]
+    lamps: tuple[Sprite, ...]
+    posts: tuple[Sprite, ...]
+    boxes: tuple[Sprite, ...]
 
 
 def make_catalogue(seed: int) -> Catalogue:
     """The style of the city with that catalogue seed."""
-    rng = stream(seed, "catalogue")
+    rng = random_stream(seed, "catalogue")
     hue = rng.uniform(0.04, 0.16)  # the city's stone: from pink through ochre to straw
     kinds = [WALL_KINDS[i] for i in rng.permutation(len(WALL_KINDS))]
     colours = [_wall_colour(rng, hue) for _ in range(WALLS)]
@@ -115,7 +115,7 @@ def make_catalogue(seed: int) -> Catalogue:
         walls=walls,
         wall_colours=tuple(colours),
         windows=tuple(
-            tuple(draw_window(kind, variant, rng) for variant in range(PANES))
+            tuple(draw_window(kind, variant, rng) for variant in range(PANE_CODES))
             for kind in window_types
         ),
         window_types=window_types,
@@ -194,18 +194,24 @@ def _sign(name: str, colour: Colour, style: int) -> Image.Image:
     font = ImageFont.load_default(size=15)
     width = int(font.getlength(name)) + 16
     ground, ink = (colour, (244, 240, 228)) if style != 1 else ((238, 234, 222), colour)
-    board = Image.new("RGBA", (width, 20), (*ground, SIGN if style == 2 else SOLID))
+    board = Image.new("RGBA", (width, 20), (*ground, CODE_SIGN if style == 2 else CODE_SOLID))
     draw = ImageDraw.Draw(board)
     mask = Image.new("L", board.size)
     ImageDraw.Draw(mask).text((8, 1), name, fill=255, font=font)
-    board.paste((*ink, SIGN), (0, 0, *board.size), mask.point(lambda value: 255 * (value > 110)))
-    draw.rectangle((0, 0, width - 1, 19), outline=(*tuple(int(c * 0.6) for c in ground), SOLID))
+    board.paste(
+        (*ink, CODE_SIGN), (0, 0, *board.size), mask.point(lambda value: 255 * (value > 110))
+    )
+    draw.rectangle(
+        (0, 0, width - 1, 19), outline=(*tuple(int(c * 0.6) for c in ground), CODE_SOLID)
+    )
     return board
 
 
-def _blade(name: str, colour: Colour) -> Picture:
-    image = Image.new("RGBA", (32, 40), (*colour, SIGN))
+def _blade(name: str, colour: Colour) -> Sprite:
+    image = Image.new("RGBA", (32, 40), (*colour, CODE_SIGN))
     draw = ImageDraw.Draw(image)
-    draw.rectangle((0, 0, 31, 39), outline=(240, 236, 226, SOLID), width=2)
-    draw.text((9, 6), name[0], fill=(244, 240, 230, SIGN), font=ImageFont.load_default(size=22))
-    return Picture(image, 0.8, 1.0, bottom=3.1)
+    draw.rectangle((0, 0, 31, 39), outline=(240, 236, 226, CODE_SOLID), width=2)
+    draw.text(
+        (9, 6), name[0], fill=(244, 240, 230, CODE_SIGN), font=ImageFont.load_default(size=22)
+    )
+    return Sprite(image, 0.8, 1.0, bottom=3.1)

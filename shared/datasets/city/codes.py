@@ -9,27 +9,27 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-CLEAR = 0
+CODE_TRANSPARENT = 0
 """nothing is here: what is behind shows"""
-PANE_0 = 1
-PANES = 8
+CODE_FIRST_PANE = 1
+PANE_CODES = 8
 """codes 1 to 8: the panes of a window; each session lights some of the eight"""
-SHOP = 20
+CODE_SHOP = 20
 """a shop's window: shines in the evening"""
-SIGN = 21
-LAMP = 22
+CODE_SIGN = 21
+CODE_LAMP = 22
 """lamps and headlights"""
-FLAT = 30
+CODE_FLAT = 30
 """lies open to the sky: snow stays on it"""
-SOLID = 255
+CODE_SOLID = 255
 
 
-def light_table(lit_panes: tuple[int, ...], strength: float) -> NDArray[np.float32]:
+def emission_table(lit_panes: tuple[int, ...], strength: float) -> NDArray[np.float32]:
     """(256,) float32: how strongly a pixel of each code shines by itself, 0 by day."""
     table = np.zeros(256, np.float32)
     for pane in lit_panes:
-        table[PANE_0 + pane] = 0.9 * strength
-    table[SHOP] = 1.0 * strength
-    table[SIGN] = 0.8 * strength
-    table[LAMP] = 1.6 * strength
+        table[CODE_FIRST_PANE + pane] = 0.9 * strength
+    table[CODE_SHOP] = 1.0 * strength
+    table[CODE_SIGN] = 0.8 * strength
+    table[CODE_LAMP] = 1.6 * strength
     return table

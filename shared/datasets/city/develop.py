@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from PIL import Image, ImageFilter
 
 from shared.datasets.city.camera import Camera
-from shared.datasets.city.canvas import FINE, View
-from shared.datasets.city.codes import FLAT, light_table
-from shared.datasets.city.random_streams import stream
-from shared.datasets.city.sessions import Session
-from shared.datasets.city.walls import Grey, smooth_noise
+from shared.datasets.city.canvas import SUPERSAMPLING, RenderBuffers
+from shared.datasets.city.codes import CODE_FLAT, emission_table
+from shared.datasets.city.random_streams import random_stream
+from shared.datasets.city.sessions import CaptureSession
+from shared.datasets.city.walls import GreyImage, smooth_noise
 
 CLOUD_SHAPE = (256, 1024)
 GRAIN_SPARE = 256
@@ -28,17 +28,17 @@ Light = NDArray[np.float32]
 
 
 @dataclass(frozen=True, slots=True)
-class Film:
+class SkyAndGrain:
     """What every photo of a city shares: clouds to cut from, and grain."""
 
-    clouds: Grey
+    clouds: GreyImage
     grain: Light
     """(3, width + GRAIN_SPARE, height + GRAIN_SPARE) of standard deviation 1"""
 
     @classmethod
-    def of(cls, seed: int, width: int, height: int) -> Film:
+    def generate(cls, seed: int, width: int, height: int) -> SkyAndGrain:
         """For photos of that many pixels."""
-        rng = stream(seed, "film")
+        rng = random_stream(seed, "film")
         clouds = (
             0.6 * smooth_noise(rng, CLOUD_SHAPE, 64)
             + 0.3 * smooth_noise(rng, CLOUD_SHAPE, 24)
@@ -49,8 +49,12 @@ class Film:
         return cls(np.asarray(clouds, np.float32), grain)
 
 
-def develop(
-    view: View, camera: Camera, session: Session, film: Film, rng: np.random.Generator
+def postprocess(
+    view: RenderBuffers,
+    camera: Camera,
+    session: CaptureSession,
+    film: SkyAndGrain,
+    rng: np.random.Generator,
 ) -> Image.Image:
     """The RGB photo; `rng` is the photo's own."""
     light = _light(view, session)
@@ -75,30 +79,30 @@ def develop(
 
 def _mean(fine: NDArray[np.uint8] | Light) -> Light:
     """(FINE * w, FINE * h) -> (w, h) means."""
-    total = fine[::FINE, ::FINE].astype(np.float32)
+    total = fine[::SUPERSAMPLING, ::SUPERSAMPLING].astype(np.float32)
     for i, j in ((0, 1), (1, 0), (1, 1)):
-        total += fine[i::FINE, j::FINE]
-    return total * np.float32(1 / FINE**2)
+        total += fine[i::SUPERSAMPLING, j::SUPERSAMPLING]
+    return total * np.float32(1 / SUPERSAMPLING**2)
 
 
-def _mean_colours(view: View) -> Light:
+def _mean_colours(view: RenderBuffers) -> Light:
     """(3, width, height) shares of full brightness; what is see-through counts as black."""
     wide, high = view.canvas.shape
     packed = Image.frombuffer("RGBX", (high, wide), view.canvas, "raw", "RGBX", 0, 1)
-    small = np.asarray(packed.reduce(FINE))
+    small = np.asarray(packed.reduce(SUPERSAMPLING))
     planes = np.empty((3, *small.shape[:2]), np.float32)
     for plane in range(3):
         np.multiply(small[..., plane], np.float32(1 / 255), out=planes[plane])
     return planes
 
 
-def _light(view: View, session: Session) -> Light:
+def _light(view: RenderBuffers, session: CaptureSession) -> Light:
     """(3, width, height) what falls on each pixel, and what it gives by itself."""
     light = np.empty((3, *view.sun.shape), np.float32)
     shine = None
     if session.glow:
         codes = view.canvas >> 24
-        shine = _mean(light_table(session.lit_panes, session.glow).take(codes))
+        shine = _mean(emission_table(session.lit_panes, session.glow).take(codes))
     for plane in range(3):
         np.multiply(view.sun, np.float32(session.sun[plane]), out=light[plane])
         light[plane] += np.float32(session.ambient[plane])
@@ -109,9 +113,9 @@ def _light(view: View, session: Session) -> Light:
     return light
 
 
-def _weather(colours: Light, view: View, camera: Camera, session: Session) -> None:
+def _weather(colours: Light, view: RenderBuffers, camera: Camera, session: CaptureSession) -> None:
     """Snow whitens what lies open to the sky; rain darkens the ground and lets it mirror."""
-    flat = (view.canvas[::FINE, ::FINE] >> 24) == FLAT
+    flat = (view.canvas[::SUPERSAMPLING, ::SUPERSAMPLING] >> 24) == CODE_FLAT
     if session.snow:
         share = flat * np.float32(session.snow)
         for plane in colours:
@@ -123,7 +127,9 @@ def _weather(colours: Light, view: View, camera: Camera, session: Session) -> No
             plane += share * (np.float32(0.18 * gleam) - np.float32(0.45) * plane)
 
 
-def _sky(camera: Camera, session: Session, film: Film, rng: np.random.Generator) -> Light:
+def _sky(
+    camera: Camera, session: CaptureSession, film: SkyAndGrain, rng: np.random.Generator
+) -> Light:
     """(3, width, height): a gradient by elevation, with clouds; coarse, then made smooth."""
     width, height = camera.width // SKY_COARSE, camera.height // SKY_COARSE
     rows = np.arange(height, dtype=np.float32) * SKY_COARSE
@@ -148,7 +154,9 @@ def _sky(camera: Camera, session: Session, film: Film, rng: np.random.Generator)
     return planes
 
 
-def _expose(colours: Light, session: Session, film: Film, rng: np.random.Generator) -> Image.Image:
+def _expose(
+    colours: Light, session: CaptureSession, film: SkyAndGrain, rng: np.random.Generator
+) -> Image.Image:
     """Exposure, white balance, contrast, vignette, blur and grain."""
     exposure = math.exp(rng.normal(0, session.exposure_spread))
     balance = np.asarray(session.gain) * rng.normal(1, 0.01, 3) * exposure * 255
@@ -179,7 +187,7 @@ def _expose(colours: Light, session: Session, film: Film, rng: np.random.Generat
     return image
 
 
-def encode(photo: Image.Image, session: Session) -> bytes:
+def encode_jpeg(photo: Image.Image, session: CaptureSession) -> bytes:
     """The photo as the bytes of a JPEG file."""
     buffer = io.BytesIO()
     photo.save(buffer, "JPEG", quality=session.quality)

@@ -6,24 +6,24 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from shared.datasets.city.camera import Camera, Hits
-from shared.datasets.city.canvas import FINE, View, level_for, row_of
-from shared.datasets.city.codes import FLAT
-from shared.datasets.city.random_streams import stream
+from shared.datasets.city.camera import Camera, RayHits
+from shared.datasets.city.canvas import SUPERSAMPLING, RenderBuffers, choose_mip_level, project_row
+from shared.datasets.city.codes import CODE_FLAT
+from shared.datasets.city.random_streams import random_stream
 from shared.datasets.city.streets import PAVEMENT_M, Quarter
-from shared.datasets.city.texture_memory import TextureMemory
-from shared.datasets.city.walls import Grey, smooth_noise
+from shared.datasets.city.texture_memory import TextureCache
+from shared.datasets.city.walls import GreyImage, smooth_noise
 
 TILE_PIXELS = 512
 TILE_M = 16.0
 KERB_M = 0.16
-WHITE_LINE = np.uint32(FLAT << 24 | 0xC8CCCC)
-KERB_STONE = np.uint32(FLAT << 24 | 0x8E9498)
+WHITE_LINE = np.uint32(CODE_FLAT << 24 | 0xC8CCCC)
+KERB_STONE = np.uint32(CODE_FLAT << 24 | 0x8E9498)
 
 
 def draw_asphalt(seed: int) -> Image.Image:
     """A square tile of TILE_M metres that wraps around."""
-    rng = stream(seed, "asphalt")
+    rng = random_stream(seed, "asphalt")
     light = 0.42 + 0.012 * rng.normal(0, 1, (TILE_PIXELS, TILE_PIXELS)).astype(np.float32)
     light += 0.03 * smooth_noise(rng, light.shape, 64) + 0.015 * smooth_noise(rng, light.shape, 16)
     for _ in range(5):  # patches where it was mended
@@ -40,7 +40,7 @@ def draw_asphalt(seed: int) -> Image.Image:
 
 def draw_paving(seed: int) -> Image.Image:
     """A square tile of TILE_M metres that wraps around: slabs of half a metre."""
-    rng = stream(seed, "paving")
+    rng = random_stream(seed, "paving")
     rows, columns = np.mgrid[0:TILE_PIXELS, 0:TILE_PIXELS]
     slab = TILE_PIXELS // 32
     shades = rng.normal(0, 0.025, (32, 33))
@@ -52,37 +52,37 @@ def draw_paving(seed: int) -> Image.Image:
     return _tile(light.astype(np.float32), (1.02, 1.0, 0.96))
 
 
-def _tile(light: Grey, tint: tuple[float, float, float]) -> Image.Image:
+def _tile(light: GreyImage, tint: tuple[float, float, float]) -> Image.Image:
     colours = np.clip(light[..., None] * np.asarray(tint) * 255, 0, 255).astype(np.uint8)
-    codes = np.full((*light.shape, 1), FLAT, np.uint8)
+    codes = np.full((*light.shape, 1), CODE_FLAT, np.uint8)
     return Image.fromarray(np.concatenate([colours, codes], axis=2))
 
 
 def paint_ground(
-    view: View,
+    view: RenderBuffers,
     camera: Camera,
-    hits: Hits,
+    hits: RayHits,
     quarter: Quarter,
     sides: NDArray[np.int64],
-    memory: TextureMemory,
+    memory: TextureCache,
 ) -> None:
     """Paint what lies below the houses' feet; `hits` are those against the quarter's `sides`."""
     fine_height = view.canvas.shape[1]
     columns = np.arange(view.canvas.shape[0])
-    horizon = camera.horizons(FINE)
-    contact = row_of(camera, 0.0, hits.depth, columns)
-    first = max(0, int(min(contact.min(), horizon.min() * FINE)))
+    horizon = camera.horizons(SUPERSAMPLING)
+    contact = project_row(camera, 0.0, hits.depth, columns)
+    first = max(0, int(min(contact.min(), horizon.min() * SUPERSAMPLING)))
     if first >= fine_height:
         return
-    ys = (np.arange(first, fine_height) + 0.5) / FINE
+    ys = (np.arange(first, fine_height) + 0.5) / SUPERSAMPLING
     below = np.maximum(ys[None, :] - horizon[:, None], 0.4).astype(np.float32)
     depth = np.float32(camera.focal * camera.eye) / below
-    slopes = camera.slopes(FINE)
+    slopes = camera.slopes(SUPERSAMPLING)
     rays = camera.forward + slopes[:, None] * camera.right
     east = depth * rays[:, :1].astype(np.float32) + np.float32(camera.x % TILE_M)
     north = depth * rays[:, 1:].astype(np.float32) + np.float32(camera.y % TILE_M)
     per_metre = TILE_PIXELS / TILE_M
-    level = level_for(per_metre, depth[len(depth) // 2], camera, bias=0.6)
+    level = choose_mip_level(per_metre, depth[len(depth) // 2], camera, bias=0.6)
     scale = (per_metre / 2.0**level).astype(np.float32)
     mask = (TILE_PIXELS >> level) - 1
     shift = (np.log2(TILE_PIXELS) - level).astype(np.int32)
@@ -115,9 +115,9 @@ def paint_ground(
     )
     region = view.canvas[:, first:]
     np.copyto(region, texels, where=shown)
-    odd = first % FINE
-    coarse = shown[::FINE, odd::FINE]
-    start = (first + odd) // FINE
+    odd = first % SUPERSAMPLING
+    coarse = shown[::SUPERSAMPLING, odd::SUPERSAMPLING]
+    start = (first + odd) // SUPERSAMPLING
     target = view.depth[:, start : start + coarse.shape[1]]
-    np.copyto(target, depth[::FINE, odd::FINE], where=coarse)
+    np.copyto(target, depth[::SUPERSAMPLING, odd::SUPERSAMPLING], where=coarse)
     np.copyto(view.sun[:, start : start + coarse.shape[1]], np.float32(0.6), where=coarse)

@@ -15,7 +15,7 @@ from shared.datasets.city.catalogue import (
     WALLS,
     WINDOW_TYPES,
 )
-from shared.datasets.city.openings import px
+from shared.datasets.city.openings import metres_to_pixels
 from shared.datasets.city.walls import PIXELS_PER_METRE
 
 HEADROOM = 3.6
@@ -66,10 +66,10 @@ class House:
     @property
     def pixels(self) -> int:
         """Of its texture."""
-        return px(self.width) * px(self.top)
+        return metres_to_pixels(self.width) * metres_to_pixels(self.top)
 
 
-def arrange(rng: np.random.Generator, width: float, shopping: float, floors: int) -> House:
+def arrange_house(rng: np.random.Generator, width: float, shopping: float, floors: int) -> House:
     """A house for a plot `width` metres wide; `shopping` is the share of bays with a shop."""
     bays = max(1, round(width / rng.uniform(2.3, 3.3)))
     trade = rng.uniform() < shopping
@@ -104,6 +104,6 @@ def arrange(rng: np.random.Generator, width: float, shopping: float, floors: int
     )
 
 
-def bay_middle(house: House, bay: int) -> int:
+def bay_centre_column(house: House, bay: int) -> int:
     """The column of the facade's texture that is the middle of a bay."""
     return round((bay + 0.5) * house.width / house.bays * PIXELS_PER_METRE)

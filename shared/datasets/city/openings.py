@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from PIL import Image, ImageDraw
 
-from shared.datasets.city.codes import PANE_0, PANES, SHOP, SOLID
+from shared.datasets.city.codes import CODE_FIRST_PANE, CODE_SHOP, CODE_SOLID, PANE_CODES
 from shared.datasets.city.walls import PIXELS_PER_METRE, Colour
 
 GLASS: tuple[Colour, ...] = ((70, 86, 100), (84, 98, 108), (58, 70, 82), (96, 112, 122))
@@ -33,12 +33,12 @@ class WindowType:
     balcony: bool
 
 
-def px(metres: float) -> int:
+def metres_to_pixels(metres: float) -> int:
     """Metres as whole pixels of a facade's texture."""
     return round(metres * PIXELS_PER_METRE)
 
 
-def darker(colour: Colour, factor: float) -> Colour:
+def darken(colour: Colour, factor: float) -> Colour:
     """The colour times the factor, within range."""
     red, green, blue = (min(255, int(c * factor)) for c in colour)
     return red, green, blue
@@ -46,16 +46,22 @@ def darker(colour: Colour, factor: float) -> Colour:
 
 def draw_window(kind: WindowType, variant: int, rng: np.random.Generator) -> Image.Image:
     """An RGBA picture with the codes of `codes` as its fourth channel; `variant` below PANES."""
-    width, height, edge = px(kind.width), px(kind.height), max(1, px(kind.surround_width))
-    wing = px(kind.width * 0.48) if kind.shutters else 0
-    top = edge + (px(0.28) if kind.pediment else 0) + (width // 3 if kind.arched else 0)
-    rail = px(0.95) if kind.balcony else 0
-    side = max(wing, px(0.35) if kind.balcony else 0) + edge
+    width, height, edge = (
+        metres_to_pixels(kind.width),
+        metres_to_pixels(kind.height),
+        max(1, metres_to_pixels(kind.surround_width)),
+    )
+    wing = metres_to_pixels(kind.width * 0.48) if kind.shutters else 0
+    top = (
+        edge + (metres_to_pixels(0.28) if kind.pediment else 0) + (width // 3 if kind.arched else 0)
+    )
+    rail = metres_to_pixels(0.95) if kind.balcony else 0
+    side = max(wing, metres_to_pixels(0.35) if kind.balcony else 0) + edge
     picture = Image.new("RGBA", (width + 2 * side, top + height + edge + 3), (0, 0, 0, 0))
     draw = ImageDraw.Draw(picture)
     left, right, bottom = side, side + width - 1, top + height - 1
-    trim = (*kind.surround, SOLID)
-    glass = (*GLASS[int(rng.integers(len(GLASS)))], PANE_0 + variant % PANES)
+    trim = (*kind.surround, CODE_SOLID)
+    glass = (*GLASS[int(rng.integers(len(GLASS)))], CODE_FIRST_PANE + variant % PANE_CODES)
     if kind.arched:
         draw.ellipse(
             (left - edge, top - width // 2 - edge, right + edge, top + width // 2 + edge), fill=trim
@@ -67,10 +73,10 @@ def draw_window(kind: WindowType, variant: int, rng: np.random.Generator) -> Ima
     draw.rectangle((left, top, right, bottom), fill=glass)
     # The sky mirrored in the upper half, and the shadow of the reveal above and on the left.
     for row in range(top, top + height // 2):
-        mirrored = darker(glass[:3], 1.32 - 0.32 * (row - top) / max(1, height // 2))
+        mirrored = darken(glass[:3], 1.32 - 0.32 * (row - top) / max(1, height // 2))
         draw.line((left, row, right, row), fill=(*mirrored, glass[3]))
     _curtain(draw, (left, top, right, bottom), variant, glass[3], rng)
-    frame = (*kind.frame, SOLID)
+    frame = (*kind.frame, CODE_SOLID)
     draw.rectangle((left, top, right, bottom), outline=frame, width=2)
     for bar in range(1, kind.mullions + 1):
         x = left + bar * width // (kind.mullions + 1)
@@ -78,10 +84,14 @@ def draw_window(kind: WindowType, variant: int, rng: np.random.Generator) -> Ima
     for bar in range(1, kind.transoms + 1):
         y = top + bar * height // (kind.transoms + 1)
         draw.line((left, y, right, y), fill=frame, width=1)
-    draw.line((left, top, right, top), fill=(*darker(kind.surround, 0.45), SOLID), width=2)
-    sill = darker(kind.surround, 1.06)
-    draw.rectangle((left - edge - 2, bottom + 1, right + edge + 2, bottom + 3), fill=(*sill, SOLID))
-    draw.line((left - edge, bottom + 4, right + edge, bottom + 4), fill=(*darker(sill, 0.5), SOLID))
+    draw.line((left, top, right, top), fill=(*darken(kind.surround, 0.45), CODE_SOLID), width=2)
+    sill = darken(kind.surround, 1.06)
+    draw.rectangle(
+        (left - edge - 2, bottom + 1, right + edge + 2, bottom + 3), fill=(*sill, CODE_SOLID)
+    )
+    draw.line(
+        (left - edge, bottom + 4, right + edge, bottom + 4), fill=(*darken(sill, 0.5), CODE_SOLID)
+    )
     if kind.pediment:
         _pediment(draw, left - edge - 2, right + edge + 2, top - edge, kind.surround)
     if kind.shutters:
@@ -118,24 +128,24 @@ def _curtain(
 def _pediment(
     draw: ImageDraw.ImageDraw, left: int, right: int, bottom: int, colour: Colour
 ) -> None:
-    draw.rectangle((left, bottom - 3, right, bottom - 1), fill=(*darker(colour, 1.05), SOLID))
+    draw.rectangle((left, bottom - 3, right, bottom - 1), fill=(*darken(colour, 1.05), CODE_SOLID))
     draw.polygon(
         [(left, bottom - 4), (right, bottom - 4), ((left + right) // 2, bottom - 9)],
-        fill=(*colour, SOLID),
+        fill=(*colour, CODE_SOLID),
     )
-    draw.line((left, bottom, right, bottom), fill=(*darker(colour, 0.55), SOLID))
+    draw.line((left, bottom, right, bottom), fill=(*darken(colour, 0.55), CODE_SOLID))
 
 
 def _shutter(draw: ImageDraw.ImageDraw, box: tuple[int, int, int, int], colour: Colour) -> None:
-    draw.rectangle(box, fill=(*colour, SOLID), outline=(*darker(colour, 0.7), SOLID))
+    draw.rectangle(box, fill=(*colour, CODE_SOLID), outline=(*darken(colour, 0.7), CODE_SOLID))
     for y in range(box[1] + 3, box[3] - 1, 3):
-        draw.line((box[0] + 2, y, box[2] - 2, y), fill=(*darker(colour, 0.82), SOLID))
+        draw.line((box[0] + 2, y, box[2] - 2, y), fill=(*darken(colour, 0.82), CODE_SOLID))
 
 
 def _railing(draw: ImageDraw.ImageDraw, box: tuple[int, int, int, int]) -> None:
     left, top, right, bottom = box
-    iron = (44, 46, 50, SOLID)
-    draw.rectangle((left, bottom - 3, right, bottom), fill=(150, 146, 138, SOLID))
+    iron = (44, 46, 50, CODE_SOLID)
+    draw.rectangle((left, bottom - 3, right, bottom), fill=(150, 146, 138, CODE_SOLID))
     draw.line((left, top, right, top), fill=iron, width=2)
     for x in range(left, right + 1, 4):
         draw.line((x, top, x, bottom - 3), fill=iron)
@@ -143,40 +153,44 @@ def _railing(draw: ImageDraw.ImageDraw, box: tuple[int, int, int, int]) -> None:
 
 def draw_door(colour: Colour, panels: int, glazed: bool, rng: np.random.Generator) -> Image.Image:
     """A house door of about 1.3 x 2.6 m with its frame and steps, RGBA with codes."""
-    width, height = px(1.3), px(2.6)
-    picture = Image.new("RGBA", (width + 8, height + 4), (168, 162, 150, SOLID))
+    width, height = metres_to_pixels(1.3), metres_to_pixels(2.6)
+    picture = Image.new("RGBA", (width + 8, height + 4), (168, 162, 150, CODE_SOLID))
     draw = ImageDraw.Draw(picture)
-    draw.rectangle((4, 4, width + 3, height + 3), fill=(*colour, SOLID))
+    draw.rectangle((4, 4, width + 3, height + 3), fill=(*colour, CODE_SOLID))
     light = height // 5
-    draw.rectangle((6, 6, width + 1, light), fill=(*GLASS[0], PANE_0 + int(rng.integers(PANES))))
+    draw.rectangle(
+        (6, 6, width + 1, light), fill=(*GLASS[0], CODE_FIRST_PANE + int(rng.integers(PANE_CODES)))
+    )
     rows = max(1, panels)
     for row in range(rows):
         y0 = light + 5 + row * (height - light - 4) // rows
         y1 = light + 1 + (row + 1) * (height - light - 4) // rows
         for x0, x1 in ((7, width // 2 + 1), (width // 2 + 5, width)):
             if glazed and row == 0:
-                draw.rectangle((x0, y0, x1, y1), fill=(*GLASS[1], PANE_0 + 3))
+                draw.rectangle((x0, y0, x1, y1), fill=(*GLASS[1], CODE_FIRST_PANE + 3))
             else:
-                draw.rectangle((x0, y0, x1, y1), outline=(*darker(colour, 0.62), SOLID))
-                draw.line((x0, y0, x1, y0), fill=(*darker(colour, 1.3), SOLID))
-    draw.line((width // 2 + 3, light, width // 2 + 3, height), fill=(*darker(colour, 0.5), SOLID))
-    draw.rectangle((0, height + 1, width + 7, height + 3), fill=(140, 136, 128, SOLID))
+                draw.rectangle((x0, y0, x1, y1), outline=(*darken(colour, 0.62), CODE_SOLID))
+                draw.line((x0, y0, x1, y0), fill=(*darken(colour, 1.3), CODE_SOLID))
+    draw.line(
+        (width // 2 + 3, light, width // 2 + 3, height), fill=(*darken(colour, 0.5), CODE_SOLID)
+    )
+    draw.rectangle((0, height + 1, width + 7, height + 3), fill=(140, 136, 128, CODE_SOLID))
     return picture
 
 
 def draw_shop_glass(width: int, height: int, rng: np.random.Generator) -> Image.Image:
     """A display window of that many pixels, with things standing in it."""
-    picture = Image.new("RGBA", (width, height), (*darker(GLASS[2], 0.9), SHOP))
+    picture = Image.new("RGBA", (width, height), (*darken(GLASS[2], 0.9), CODE_SHOP))
     draw = ImageDraw.Draw(picture)
     for row in range(height // 2):
-        shade = darker(GLASS[1], 1.15 - 0.4 * row / max(1, height // 2))
-        draw.line((0, row, width, row), fill=(*shade, SHOP))
+        shade = darken(GLASS[1], 1.15 - 0.4 * row / max(1, height // 2))
+        draw.line((0, row, width, row), fill=(*shade, CODE_SHOP))
     x = int(rng.integers(2, 8))
     while x < width - 6:
         wide, high = int(rng.integers(4, 14)), int(height * rng.uniform(0.15, 0.55))
         hue = rng.integers(60, 220, 3)
-        fill = (int(hue[0]), int(hue[1]), int(hue[2]), SHOP)
+        fill = (int(hue[0]), int(hue[1]), int(hue[2]), CODE_SHOP)
         draw.rectangle((x, height - 3 - high, min(width - 3, x + wide), height - 3), fill=fill)
         x += wide + int(rng.integers(3, 16))
-    draw.line((width // 5, height - 1, width // 3, 0), fill=(168, 182, 190, SHOP), width=2)
+    draw.line((width // 5, height - 1, width // 3, 0), fill=(168, 182, 190, CODE_SHOP), width=2)
     return picture

@@ -14,21 +14,21 @@ from datetime import datetime, timedelta
 import numpy as np
 
 from shared.datasets.city.camera import Camera
-from shared.datasets.city.places import Place, quarter_with
-from shared.datasets.city.random_streams import stream
+from shared.datasets.city.places import ViewPoint, make_quarter
+from shared.datasets.city.random_streams import random_stream
 from shared.datasets.city.sessions import (
     DATABASE_SESSIONS,
     QUERY_SESSIONS,
     SESSIONS,
-    Session,
+    CaptureSession,
 )
 from shared.datasets.city.streets import Quarter
-from shared.datasets.utm_names import PhotoName
+from shared.datasets.utm_names import UtmFileName
 
 ZONE_NUMBER, ZONE_LETTER = 32, "T"
 ORIGIN_M = (480_000.0, 4_880_000.0)
 """open sea south of Genoa: nobody mistakes it for a real city"""
-APART_M = 400.0
+QUARTER_DISTANCE_M = 400.0
 """between two quarters: more than the 200 m that "out of map" promises"""
 LANE_M = 1.6
 """by which a camera drives to the right of the street's middle; it looks to the left"""
@@ -62,7 +62,7 @@ class CityOptions:
 
 
 @dataclass(frozen=True, slots=True)
-class Shot:
+class PlannedPhoto:
     """One photo to be taken."""
 
     role: str
@@ -72,7 +72,7 @@ class Shot:
     quarter: str
     place: int
     camera: Camera
-    session: Session
+    session: CaptureSession
     number: int
     """among the shots of its role"""
     folder: str
@@ -81,10 +81,10 @@ class Shot:
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class CityPlan:
     options: CityOptions
     quarters: dict[str, Quarter]
-    shots: list[Shot]
+    photos: list[PlannedPhoto]
     """neighbours in a street follow each other"""
 
 
@@ -93,7 +93,7 @@ def city_name(options: CityOptions) -> str:
     return f"synth{options.catalogue_seed}x{options.seed}"
 
 
-def make_plan(options: CityOptions) -> Plan:
+def make_plan(options: CityOptions) -> CityPlan:
     """All photos of the city with those options."""
     outside = round(options.queries * options.out_of_map)
     inside = options.queries - outside
@@ -104,11 +104,11 @@ def make_plan(options: CityOptions) -> Plan:
         ("outskirts", max(1, min(outside, options.places))),
         ("school", options.places),
     ):
-        quarter, found = quarter_with(options.seed, name, wanted, origin)
+        quarter, found = make_quarter(options.seed, name, wanted, origin)
         quarters[name], places[name] = quarter, found
-        origin = (quarter.far_east + APART_M, origin[1])
+        origin = (quarter.far_east + QUARTER_DISTANCE_M, origin[1])
     shots = _database_shots(options, places["map"])
-    rng = stream(options.seed, "queries")
+    rng = random_stream(options.seed, "queries")
     turned = round(inside * OTHER_WAY_SHARE)
     order = np.resize(rng.permutation(len(places["map"])), inside)
     for number in range(options.queries):
@@ -122,16 +122,16 @@ def make_plan(options: CityOptions) -> Plan:
     if options.train:
         shots += _train_shots(options, places["school"])
     shots.sort(key=lambda shot: (shot.quarter, shot.place, shot.role, shot.number))
-    return Plan(options, quarters, shots)
+    return CityPlan(options, quarters, shots)
 
 
-def _database_shots(options: CityOptions, places: list[Place]) -> list[Shot]:
+def _database_shots(options: CityOptions, places: list[ViewPoint]) -> list[PlannedPhoto]:
     """`views` shots of each place: sessions in turn, a step apart, a little turned."""
     shots = []
     steps = math.ceil(options.views / len(DATABASE_SESSIONS))
     for place in places:
         for view in range(options.views):
-            rng = stream(options.seed, "database", place.number, view)
+            rng = random_stream(options.seed, "database", place.number, view)
             session = DATABASE_SESSIONS[view % len(DATABASE_SESSIONS)]
             step = view // len(DATABASE_SESSIONS)
             share = 2 * step / (steps - 1) - 1 if steps > 1 else 0.0
@@ -146,13 +146,15 @@ def _database_shots(options: CityOptions, places: list[Place]) -> list[Shot]:
             )
             number = place.number * options.views + view
             shots.append(
-                _shot(options, "database", "in_map", "map", place, camera, session, number)
+                _plan_photo(options, "database", "in_map", "map", place, camera, session, number)
             )
     return shots
 
 
-def _query_shot(options: CityOptions, place: Place, quarter: str, kind: str, number: int) -> Shot:
-    rng = stream(options.seed, "query", number)
+def _query_shot(
+    options: CityOptions, place: ViewPoint, quarter: str, kind: str, number: int
+) -> PlannedPhoto:
+    rng = random_stream(options.seed, "query", number)
     camera = _camera(
         options,
         place,
@@ -163,17 +165,17 @@ def _query_shot(options: CityOptions, place: Place, quarter: str, kind: str, num
         rng=rng,
     )
     session = QUERY_SESSIONS[int(rng.integers(len(QUERY_SESSIONS)))]
-    return _shot(options, "query", kind, quarter, place, camera, session, number)
+    return _plan_photo(options, "query", kind, quarter, place, camera, session, number)
 
 
-def _train_shots(options: CityOptions, places: list[Place]) -> list[Shot]:
+def _train_shots(options: CityOptions, places: list[ViewPoint]) -> list[PlannedPhoto]:
     """At least four shots of each place of the school, each in another session."""
     shots = []
     views = min(max(4, options.views), len(SESSIONS))
     for place in places:
-        order = stream(options.seed, "train", place.number).permutation(len(SESSIONS))
+        order = random_stream(options.seed, "train", place.number).permutation(len(SESSIONS))
         for view in range(views):
-            rng = stream(options.seed, "train", place.number, view)
+            rng = random_stream(options.seed, "train", place.number, view)
             camera = _camera(
                 options,
                 place,
@@ -186,14 +188,14 @@ def _train_shots(options: CityOptions, places: list[Place]) -> list[Shot]:
             number = place.number * views + view
             session = SESSIONS[int(order[view])]
             shots.append(
-                _shot(options, "train", "in_map", "school", place, camera, session, number)
+                _plan_photo(options, "train", "in_map", "school", place, camera, session, number)
             )
     return shots
 
 
 def _camera(
     options: CityOptions,
-    place: Place,
+    place: ViewPoint,
     *,
     along: float,
     across: float,
@@ -221,33 +223,33 @@ def _camera(
     )
 
 
-def _shot(
+def _plan_photo(
     options: CityOptions,
     role: str,
     kind: str,
     quarter: str,
-    place: Place,
+    place: ViewPoint,
     camera: Camera,
-    session: Session,
+    session: CaptureSession,
     number: int,
-) -> Shot:
+) -> PlannedPhoto:
     city = city_name(options)
     folder = {"database": "database", "query": "queries"}.get(role, f"gsv_xs/train/{city}")
     # gsv_xs reads the place from the note; elsewhere the note is the session's name.
     note = f"{place.number:05d}_{city}" if role == "train" else session.name
-    name = PhotoName(
+    name = UtmFileName(
         east=camera.x,
         north=camera.y,
         zone_number=ZONE_NUMBER,
         zone_letter=ZONE_LETTER,
         pano_id=f"{quarter}{place.number:05d}-{session.name}-{number:06d}",
         heading=camera.yaw,
-        captured_at=_moment(session, number),
+        captured_at=_capture_time(session, number),
         note=note,
     ).file_name()
-    return Shot(role, kind, quarter, place.number, camera, session, number, folder, name)
+    return PlannedPhoto(role, kind, quarter, place.number, camera, session, number, folder, name)
 
 
-def _moment(session: Session, number: int) -> datetime:
+def _capture_time(session: CaptureSession, number: int) -> datetime:
     """A drive takes hours: its photos follow each other within the session's day."""
     return session.starts_at + timedelta(seconds=SECONDS_PER_PHOTO * (number % 2000))

@@ -5,9 +5,9 @@ from __future__ import annotations
 from PIL import Image, ImageDraw
 
 from shared.datasets.city.catalogue import Catalogue
-from shared.datasets.city.codes import FLAT, PANES, SOLID
-from shared.datasets.city.house import House, bay_middle
-from shared.datasets.city.openings import darker, px
+from shared.datasets.city.codes import CODE_FLAT, CODE_SOLID, PANE_CODES
+from shared.datasets.city.house import House, bay_centre_column
+from shared.datasets.city.openings import darken, metres_to_pixels
 from shared.datasets.city.walls import Colour
 
 
@@ -15,34 +15,39 @@ def draw_roof(picture: Image.Image, house: House, catalogue: Catalogue, eaves: i
     draw = ImageDraw.Draw(picture)
     width = picture.width
     colour = catalogue.roofs[house.roof_colour]
-    tiles = (*colour, FLAT)
-    ridge = {"mansard": eaves - px(2.3), "gable": eaves - px(2.6)}.get(house.roof, eaves - px(0.7))
+    tiles = (*colour, CODE_FLAT)
+    ridge = {"mansard": eaves - metres_to_pixels(2.3), "gable": eaves - metres_to_pixels(2.6)}.get(
+        house.roof, eaves - metres_to_pixels(0.7)
+    )
     for share in house.chimneys:
         x = int(share * (width - 16))
-        draw.rectangle((x, ridge - px(0.7), x + 13, eaves), fill=(134, 92, 76, SOLID))
         draw.rectangle(
-            (x - 1, ridge - px(0.7), x + 14, ridge - px(0.7) + 3), fill=(96, 88, 84, FLAT)
+            (x, ridge - metres_to_pixels(0.7), x + 13, eaves), fill=(134, 92, 76, CODE_SOLID)
+        )
+        draw.rectangle(
+            (x - 1, ridge - metres_to_pixels(0.7), x + 14, ridge - metres_to_pixels(0.7) + 3),
+            fill=(96, 88, 84, CODE_FLAT),
         )
     if house.roof == "mansard":
-        slope = px(0.5)
+        slope = metres_to_pixels(0.5)
         draw.polygon(
             [(0, eaves), (slope, ridge), (width - slope, ridge), (width, eaves)], fill=tiles
         )
         for y in range(ridge + 3, eaves, 4):
-            draw.line((slope, y, width - slope, y), fill=(*darker(colour, 0.86), FLAT))
+            draw.line((slope, y, width - slope, y), fill=(*darken(colour, 0.86), CODE_FLAT))
         for bay in range(house.bays):
-            x = bay_middle(house, bay)
+            x = bay_centre_column(house, bay)
             draw.rectangle(
-                (x - 12, ridge + 10, x + 12, eaves), fill=(*catalogue.trims[house.trim], SOLID)
+                (x - 12, ridge + 10, x + 12, eaves), fill=(*catalogue.trims[house.trim], CODE_SOLID)
             )
             draw.rectangle(
-                (x - 8, ridge + 15, x + 8, eaves - 3), fill=(66, 80, 92, 1 + bay % PANES)
+                (x - 8, ridge + 15, x + 8, eaves - 3), fill=(66, 80, 92, 1 + bay % PANE_CODES)
             )
             draw.polygon([(x - 15, ridge + 11), (x, ridge + 2), (x + 15, ridge + 11)], fill=tiles)
     elif house.roof == "gable":
         draw.polygon(
             [(0, eaves), (width // 2, ridge), (width, eaves)],
-            fill=(*catalogue.wall_colours[house.wall], SOLID),
+            fill=(*catalogue.wall_colours[house.wall], CODE_SOLID),
         )
         draw.line((0, eaves, width // 2, ridge), fill=tiles, width=7)
         draw.line((width // 2, ridge, width, eaves), fill=tiles, width=7)
@@ -58,12 +63,20 @@ def draw_eaves(
     if house.roof == "gable":
         return
     if house.roof == "parapet":
-        draw.rectangle((0, eaves - px(0.8), width, eaves), fill=(*darker(trim, 0.94), SOLID))
+        draw.rectangle(
+            (0, eaves - metres_to_pixels(0.8), width, eaves), fill=(*darken(trim, 0.94), CODE_SOLID)
+        )
         for x in range(4, width - 6, 14):
-            draw.rectangle((x, eaves - px(0.6), x + 7, eaves - 5), fill=(*darker(trim, 0.7), SOLID))
-        draw.rectangle((0, eaves - px(0.85), width, eaves - px(0.8) + 3), fill=(*trim, FLAT))
+            draw.rectangle(
+                (x, eaves - metres_to_pixels(0.6), x + 7, eaves - 5),
+                fill=(*darken(trim, 0.7), CODE_SOLID),
+            )
+        draw.rectangle(
+            (0, eaves - metres_to_pixels(0.85), width, eaves - metres_to_pixels(0.8) + 3),
+            fill=(*trim, CODE_FLAT),
+        )
         return
-    draw.rectangle((0, eaves - 4, width, eaves + 5), fill=(*trim, SOLID))
-    draw.rectangle((0, eaves + 6, width, eaves + 9), fill=(*darker(trim, 0.5), SOLID))
+    draw.rectangle((0, eaves - 4, width, eaves + 5), fill=(*trim, CODE_SOLID))
+    draw.rectangle((0, eaves + 6, width, eaves + 9), fill=(*darken(trim, 0.5), CODE_SOLID))
     for x in range(3, width, 12):  # brackets
-        draw.rectangle((x, eaves + 6, x + 4, eaves + 11), fill=(*darker(trim, 0.85), SOLID))
+        draw.rectangle((x, eaves + 6, x + 4, eaves + 11), fill=(*darken(trim, 0.85), CODE_SOLID))

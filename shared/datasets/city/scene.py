@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from shared.datasets.city.catalogue import VEHICLE_PAINTS, Catalogue
-from shared.datasets.city.random_streams import stream
-from shared.datasets.city.street_things import Picture
+from shared.datasets.city.random_streams import random_stream
+from shared.datasets.city.street_things import Sprite
 from shared.datasets.city.streets import PAVEMENT_M, Metres, Quarter, Street
 from shared.datasets.city.vehicles import VEHICLE_SHARES
 
@@ -21,7 +21,7 @@ BLADE_REACH_M = 0.85
 
 
 @dataclass(frozen=True, slots=True)
-class Thing:
+class StreetObject:
     """Something that is seen from every side as the same flat picture."""
 
     position: Metres
@@ -42,19 +42,21 @@ class Vehicle:
 
 
 @dataclass(frozen=True, slots=True)
-class Panel:
+class VehiclePanel:
     """A vertical picture in the city that runs left to right as it is seen."""
 
     start: Metres
     direction: Metres
-    picture: Picture
+    picture: Sprite
     key: tuple[str, int]
     mirrored: bool = False
 
 
-def standing_things(quarter: Quarter, street: Street, catalogue: Catalogue) -> list[Thing]:
+def place_street_objects(
+    quarter: Quarter, street: Street, catalogue: Catalogue
+) -> list[StreetObject]:
     """What stands on the street's pavements on every day."""
-    rng = stream(quarter.seed, quarter.name, "standing", street.number)
+    rng = random_stream(quarter.seed, quarter.name, "standing", street.number)
     things = []
     kerb = street.half_width - PAVEMENT_M
     for side in (-1.0, 1.0):
@@ -68,23 +70,23 @@ def standing_things(quarter: Quarter, street: Street, catalogue: Catalogue) -> l
             while along < street.length - 14.0:
                 index = int(rng.integers(len(catalogue.trees["summer"])))
                 if rng.uniform() < 0.85:
-                    things.append(Thing(on_pavement(along, 0.7), "tree", index))
+                    things.append(StreetObject(on_pavement(along, 0.7), "tree", index))
                 along += street.trees * rng.uniform(0.8, 1.25)
         along = 10.0 + rng.uniform(0, 22)
         while along < street.length - 8.0:
-            things.append(Thing(on_pavement(along, 0.35), "lamps", 0))
+            things.append(StreetObject(on_pavement(along, 0.35), "lamps", 0))
             along += rng.uniform(22, 30)
         for kind, count in (("posts", rng.poisson(1.6)), ("boxes", rng.poisson(1.4))):
             for _ in range(int(count)):
                 along = rng.uniform(10, max(11.0, street.length - 10))
                 index = int(rng.integers(len(getattr(catalogue, kind))))
-                things.append(Thing(on_pavement(along, rng.uniform(0.3, 0.6)), kind, index))
+                things.append(StreetObject(on_pavement(along, rng.uniform(0.3, 0.6)), kind, index))
     return things
 
 
-def passing_vehicles(quarter: Quarter, street: Street, day: str) -> list[Vehicle]:
+def place_vehicles(quarter: Quarter, street: Street, day: str) -> list[Vehicle]:
     """The vehicles of one day: parked at both kerbs, and a few on the move."""
-    rng = stream(quarter.seed, quarter.name, "vehicles", street.number, day)
+    rng = random_stream(quarter.seed, quarter.name, "vehicles", street.number, day)
     vehicles = []
     lane = street.half_width - PAVEMENT_M - KERB_CLEARANCE_M
     for side in (-1.0, 1.0):
@@ -116,7 +118,7 @@ def _any_vehicle(rng: np.random.Generator) -> int:
     return shape * len(VEHICLE_PAINTS) + int(rng.integers(len(VEHICLE_PAINTS)))
 
 
-def vehicle_panels(vehicle: Vehicle, catalogue: Catalogue, seen_from: Metres) -> list[Panel]:
+def vehicle_panels(vehicle: Vehicle, catalogue: Catalogue, seen_from: Metres) -> list[VehiclePanel]:
     """The side and the end of the vehicle that are seen from a point."""
     side = catalogue.vehicle_sides[vehicle.index]
     front = catalogue.vehicle_fronts[vehicle.index]
@@ -127,23 +129,23 @@ def vehicle_panels(vehicle: Vehicle, catalogue: Catalogue, seen_from: Metres) ->
     panels = []
     if away @ left > half_width:  # from its left its nose is on the left
         start = vehicle.position + left * half_width + ahead * half_length
-        panels.append(Panel(start, -ahead, side, ("side", vehicle.index)))
+        panels.append(VehiclePanel(start, -ahead, side, ("side", vehicle.index)))
     elif away @ left < -half_width:
         start = vehicle.position - left * half_width - ahead * half_length
-        panels.append(Panel(start, ahead, side, ("side", vehicle.index), mirrored=True))
+        panels.append(VehiclePanel(start, ahead, side, ("side", vehicle.index), mirrored=True))
     screen = catalogue.vehicle_screens[vehicle.index]
     to_front, to_back = (half_length - metres for metres in catalogue.cabins[vehicle.index])
     if away @ ahead > half_length:
         start = vehicle.position + ahead * half_length - left * half_width
-        panels.append(Panel(start, left, front, ("front", vehicle.index)))
+        panels.append(VehiclePanel(start, left, front, ("front", vehicle.index)))
         start = vehicle.position + ahead * to_front - left * half_width
-        panels.append(Panel(start, left, screen, ("screen", vehicle.index)))
+        panels.append(VehiclePanel(start, left, screen, ("screen", vehicle.index)))
     elif away @ ahead < -half_length:
         start = vehicle.position - ahead * half_length + left * half_width
         rear = catalogue.vehicle_rears[vehicle.index]
-        panels.append(Panel(start, -left, rear, ("rear", vehicle.index)))
+        panels.append(VehiclePanel(start, -left, rear, ("rear", vehicle.index)))
         start = vehicle.position + ahead * to_back + left * half_width
-        panels.append(Panel(start, -left, screen, ("screen", vehicle.index)))
+        panels.append(VehiclePanel(start, -left, screen, ("screen", vehicle.index)))
     return panels
 
 

@@ -9,7 +9,7 @@ Rgb = tuple[float, float, float]
 
 
 @dataclass(frozen=True, slots=True)
-class Session:
+class CaptureSession:
     """One drive through the city. Colours are shares of full brightness."""
 
     name: str
@@ -50,7 +50,7 @@ class Session:
     """of the JPEG"""
 
 
-SUMMER = Session(
+SUMMER = CaptureSession(
     name="summer",
     starts_at=datetime(2025, 6, 18, 11, 0, tzinfo=UTC),
     foliage="summer",
@@ -63,7 +63,7 @@ SUMMER = Session(
     haze=(0.78, 0.85, 0.92),
     haze_per_m=0.0012,
 )
-SPRING = Session(
+SPRING = CaptureSession(
     name="spring",
     starts_at=datetime(2025, 4, 9, 8, 30, tzinfo=UTC),
     foliage="spring",
@@ -78,7 +78,7 @@ SPRING = Session(
     gain=(0.98, 1.0, 1.03),
     quality=80,
 )
-AUTUMN = Session(
+AUTUMN = CaptureSession(
     name="autumn",
     starts_at=datetime(2025, 10, 21, 15, 30, tzinfo=UTC),
     foliage="autumn",
@@ -98,7 +98,7 @@ AUTUMN = Session(
     noise=3.5,
     quality=72,
 )
-WINTER = Session(
+WINTER = CaptureSession(
     name="winter",
     starts_at=datetime(2026, 1, 14, 10, 0, tzinfo=UTC),
     foliage="bare",
@@ -119,7 +119,7 @@ WINTER = Session(
     noise=3.5,
     quality=70,
 )
-NIGHT = Session(
+NIGHT = CaptureSession(
     name="night",
     starts_at=datetime(2025, 11, 20, 20, 30, tzinfo=UTC),
     foliage="autumn",
@@ -141,7 +141,7 @@ NIGHT = Session(
     blur=0.5,
     quality=64,
 )
-FOG = Session(
+FOG = CaptureSession(
     name="fog",
     starts_at=datetime(2025, 12, 3, 7, 30, tzinfo=UTC),
     foliage="bare",
@@ -162,7 +162,7 @@ FOG = Session(
     blur=0.4,
     quality=70,
 )
-RAIN = Session(
+RAIN = CaptureSession(
     name="rain",
     starts_at=datetime(2026, 3, 5, 16, 0, tzinfo=UTC),
     foliage="bare",

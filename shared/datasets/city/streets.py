@@ -12,8 +12,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.datasets.city.house import House, arrange
-from shared.datasets.city.random_streams import stream
+from shared.datasets.city.house import House, arrange_house
+from shared.datasets.city.random_streams import random_stream
 
 SPACING_M = (88.0, 132.0)
 """between crossings"""
@@ -49,7 +49,7 @@ class Street:
 
 
 @dataclass(frozen=True, slots=True)
-class Side:
+class FacadeRow:
     """One facade row: the outer side of a block. Seen from the street it runs left to right."""
 
     start: Metres
@@ -70,7 +70,7 @@ class Quarter:
         """`size` streets each way; `origin` is the south-west corner in UTM metres."""
         self.seed = seed
         self.name = name
-        rng = stream(seed, name, "streets")
+        rng = random_stream(seed, name, "streets")
         count = size + 2  # the outermost lines bound the outer blocks and carry no street
         xs = np.concatenate([[0.0], rng.uniform(*SPACING_M, count - 1).cumsum()])
         ys = np.concatenate([[0.0], rng.uniform(*SPACING_M, count - 1).cumsum()])
@@ -112,7 +112,7 @@ class Quarter:
             )
         return streets
 
-    def _build_blocks(self, rng: np.random.Generator, count: int) -> list[Side]:
+    def _build_blocks(self, rng: np.random.Generator, count: int) -> list[FacadeRow]:
         sides = []
         for i in range(count - 1):
             for j in range(count - 1):
@@ -133,12 +133,12 @@ class Quarter:
                     start, end = outline[k], outline[(k + 1) % 4]
                     length = float(np.hypot(*(end - start)))
                     sides.append(
-                        Side(
+                        FacadeRow(
                             start=start,
                             direction=(end - start) / length,
                             length=length,
                             half_width=float(insets[k]),
-                            cuts=_cut(rng, length),
+                            cuts=_cut_plots(rng, length),
                             shopping=float(rng.choice([0.0, 0.25, 0.6])),
                             floors=int(rng.integers(2, 5)),
                         )
@@ -166,8 +166,8 @@ class Quarter:
         if key not in self._houses:
             row = self.sides[side]
             width = float(row.cuts[plot + 1] - row.cuts[plot])
-            rng = stream(self.seed, self.name, "house", side, plot)
-            self._houses[key] = arrange(rng, width, row.shopping, row.floors)
+            rng = random_stream(self.seed, self.name, "house", side, plot)
+            self._houses[key] = arrange_house(rng, width, row.shopping, row.floors)
         return self._houses[key]
 
 
@@ -187,7 +187,7 @@ def _inset(corners: list[Metres], insets: list[float]) -> list[Metres]:
     return outline
 
 
-def _cut(rng: np.random.Generator, length: float) -> Metres:
+def _cut_plots(rng: np.random.Generator, length: float) -> Metres:
     """Plots of PLOT_M that fill the length."""
     widths: list[float] = []
     while sum(widths) < length:

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-LEVELS = 6
+MIP_LEVELS = 6
 """each half as fine as the one before"""
-LEVELS_TOTAL = 1.36
+MIP_SIZE_FACTOR = 1.36
 """pixels of all levels per pixel of the first: 4 / 3, and what rounding up adds"""
 SPARE_PIXELS = 6_000_000
 """more than all trees, vehicles and tiles of a catalogue take together"""
@@ -24,7 +24,7 @@ Packed = NDArray[np.uint32]
 
 
 @dataclass(frozen=True, slots=True)
-class Texture:
+class MipmappedTexture:
     """Where one texture lies: one entry per level."""
 
     offsets: NDArray[np.int64]
@@ -34,27 +34,27 @@ class Texture:
     """rows, which is also the distance between two columns"""
 
 
-class TextureMemory:
+class TextureCache:
     """Textures by key; when it is full it forgets all of them and they are drawn again."""
 
     def __init__(self, capacity: int = 36_000_000) -> None:
         """`capacity` in pixels of 4 bytes; memory is taken as it is used."""
         self.pixels: Packed = np.zeros(capacity, np.uint32)
         self._used = 0
-        self._kept: dict[Hashable, Texture] = {}
+        self._kept: dict[Hashable, MipmappedTexture] = {}
 
-    def make_room(self, textures: Mapping[Hashable, int]) -> None:
+    def reserve(self, textures: Mapping[Hashable, int]) -> None:
         """Forget everything unless the textures, by key with their pixels, fit beside the kept.
 
         Besides these, SPARE_PIXELS stay free for what is met later in the same photo: nothing may
         be forgotten while it is being read.
         """
         missing = sum(pixels for key, pixels in textures.items() if key not in self._kept)
-        if self._used + missing * LEVELS_TOTAL + SPARE_PIXELS > len(self.pixels):
+        if self._used + missing * MIP_SIZE_FACTOR + SPARE_PIXELS > len(self.pixels):
             self._used = 0
             self._kept.clear()
 
-    def get(self, key: Hashable, draw: Callable[[], Image.Image], *, rim: bool) -> Texture:
+    def get(self, key: Hashable, draw: Callable[[], Image.Image], *, rim: bool) -> MipmappedTexture:
         """The texture called `key`, drawn now if it is not kept.
 
         `rim` gives every level a see-through edge of one pixel, for what is seen on all sides.
@@ -63,11 +63,11 @@ class TextureMemory:
             self._kept[key] = self._store(np.asarray(draw()), rim)
         return self._kept[key]
 
-    def _store(self, picture: NDArray[np.uint8], rim: bool) -> Texture:
+    def _store(self, picture: NDArray[np.uint8], rim: bool) -> MipmappedTexture:
         offsets, widths, heights = [], [], []
-        for level in range(LEVELS):
+        for level in range(MIP_LEVELS):
             if level:
-                picture = halve(picture, careful=rim)
+                picture = downsample(picture, careful=rim)
             stored = np.pad(picture, ((1, 1), (1, 1), (0, 0))) if rim else picture
             packed = np.ascontiguousarray(stored.transpose(1, 0, 2)).view(np.uint32).ravel()
             self.pixels[self._used : self._used + len(packed)] = packed
@@ -75,10 +75,10 @@ class TextureMemory:
             heights.append(stored.shape[0])
             widths.append(stored.shape[1])
             self._used += len(packed)
-        return Texture(np.array(offsets), np.array(widths), np.array(heights))
+        return MipmappedTexture(np.array(offsets), np.array(widths), np.array(heights))
 
 
-def halve(picture: NDArray[np.uint8], *, careful: bool) -> NDArray[np.uint8]:
+def downsample(picture: NDArray[np.uint8], *, careful: bool) -> NDArray[np.uint8]:
     """(h, w, 4) -> (ceil(h / 2), ceil(w / 2), 4): mean colours, and one of the four codes.
 
     `careful` leaves see-through pixels out of the mean, as outlines against the sky need it.

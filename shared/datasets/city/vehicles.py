@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 from PIL import Image, ImageDraw
 
-from shared.datasets.city.codes import FLAT, LAMP, SOLID
-from shared.datasets.city.openings import darker
-from shared.datasets.city.street_things import THING_PIXELS_PER_METRE, Picture, thing_px
+from shared.datasets.city.codes import CODE_FLAT, CODE_LAMP, CODE_SOLID
+from shared.datasets.city.openings import darken
+from shared.datasets.city.street_things import OBJECT_PIXELS_PER_METRE, Sprite, object_pixels
 from shared.datasets.city.walls import Colour
 
 
@@ -38,16 +38,16 @@ VEHICLE_SHAPES = (
 )
 
 
-def draw_vehicle_side(shape: VehicleShape, paint: Colour) -> Picture:
+def draw_vehicle_side(shape: VehicleShape, paint: Colour) -> Sprite:
     """The vehicle from its side, nose to the left."""
-    width, tall = thing_px(shape.length), thing_px(shape.height)
+    width, tall = object_pixels(shape.length), object_pixels(shape.height)
     picture = Image.new("RGBA", (width, tall + 2), (0, 0, 0, 0))
     draw = ImageDraw.Draw(picture)
-    low, bonnet = thing_px(0.28), thing_px(shape.bonnet)
-    body, shade = (*paint, SOLID), (*darker(paint, 0.72), SOLID)
+    low, bonnet = object_pixels(0.28), object_pixels(shape.bonnet)
+    body, shade = (*paint, CODE_SOLID), (*darken(paint, 0.72), CODE_SOLID)
     front, back = (int(width * share) for share in shape.cabin)
     lean = int(width * shape.slope)
-    draw.rectangle((2, tall - 4, width - 3, tall + 1), fill=(28, 28, 30, SOLID))  # its shadow
+    draw.rectangle((2, tall - 4, width - 3, tall + 1), fill=(28, 28, 30, CODE_SOLID))  # its shadow
     draw.rounded_rectangle((0, tall - bonnet, width - 1, tall - low), radius=8, fill=body)
     draw.polygon(
         [
@@ -58,10 +58,10 @@ def draw_vehicle_side(shape: VehicleShape, paint: Colour) -> Picture:
         ],
         fill=body,
     )
-    draw.line((front + lean, 1, back - lean, 1), fill=(*darker(paint, 1.2), FLAT), width=3)
-    draw.rectangle((1, tall - low - thing_px(0.22), width - 2, tall - low), fill=shade)
-    sill = tall - bonnet + 1 if shape.bonnet < 2 else tall - thing_px(1.35)
-    head = thing_px(0.12)
+    draw.line((front + lean, 1, back - lean, 1), fill=(*darken(paint, 1.2), CODE_FLAT), width=3)
+    draw.rectangle((1, tall - low - object_pixels(0.22), width - 2, tall - low), fill=shade)
+    sill = tall - bonnet + 1 if shape.bonnet < 2 else tall - object_pixels(1.35)
+    head = object_pixels(0.12)
     inner_front, inner_back = front + max(4, lean // 3), back - max(4, lean // 3)
     for pane in range(shape.windows):
         left = inner_front + pane * (inner_back - inner_front) // shape.windows + 2
@@ -72,17 +72,17 @@ def draw_vehicle_side(shape: VehicleShape, paint: Colour) -> Picture:
             right, upper_right = left + width // 5, left + width // 5
         draw.polygon(
             [(left, sill), (upper_left, head), (upper_right, head), (right, sill)],
-            fill=(52, 62, 72, SOLID),
+            fill=(52, 62, 72, CODE_SOLID),
         )
-        draw.line((upper_left, head + 2, upper_right, head + 2), fill=(120, 134, 144, SOLID))
+        draw.line((upper_left, head + 2, upper_right, head + 2), fill=(120, 134, 144, CODE_SOLID))
     for share in (0.18, 0.80):
-        _wheel(draw, int(width * share), tall - thing_px(0.32), thing_px(0.33))
-    draw.rectangle((1, tall - bonnet + 6, 6, tall - bonnet + 14), fill=(236, 232, 210, LAMP))
+        _wheel(draw, int(width * share), tall - object_pixels(0.32), object_pixels(0.33))
+    draw.rectangle((1, tall - bonnet + 6, 6, tall - bonnet + 14), fill=(236, 232, 210, CODE_LAMP))
     draw.rectangle(
-        (width - 6, tall - bonnet + 6, width - 2, tall - bonnet + 14), fill=(170, 30, 28, LAMP)
+        (width - 6, tall - bonnet + 6, width - 2, tall - bonnet + 14), fill=(170, 30, 28, CODE_LAMP)
     )
     draw.line((width // 2, sill, width // 2, tall - low), fill=shade)
-    return Picture(picture, shape.length, (tall + 2) / THING_PIXELS_PER_METRE)
+    return Sprite(picture, shape.length, (tall + 2) / OBJECT_PIXELS_PER_METRE)
 
 
 def _wheel(draw: ImageDraw.ImageDraw, x: int, y: int, radius: int) -> None:
@@ -93,44 +93,49 @@ def _wheel(draw: ImageDraw.ImageDraw, x: int, y: int, radius: int) -> None:
         (0.2, (60, 60, 62)),
     ):
         r = int(radius * share)
-        draw.ellipse((x - r, y - r, x + r, y + r), fill=(*colour, SOLID))
+        draw.ellipse((x - r, y - r, x + r, y + r), fill=(*colour, CODE_SOLID))
 
 
-def draw_vehicle_end(shape: VehicleShape, paint: Colour, rear: bool) -> Picture:
+def draw_vehicle_end(shape: VehicleShape, paint: Colour, rear: bool) -> Sprite:
     """The body's nose or tail, up to the bonnet."""
-    width, tall = thing_px(shape.width), thing_px(shape.bonnet)
+    width, tall = object_pixels(shape.width), object_pixels(shape.bonnet)
     picture = Image.new("RGBA", (width, tall + 2), (0, 0, 0, 0))
     draw = ImageDraw.Draw(picture)
-    draw.rectangle((4, tall - 12, width - 5, tall + 1), fill=(24, 24, 26, SOLID))
-    draw.rounded_rectangle((0, 0, width - 1, tall - 8), radius=5, fill=(*paint, SOLID))
-    draw.line((4, 0, width - 5, 0), fill=(*darker(paint, 1.2), FLAT), width=2)
+    draw.rectangle((4, tall - 12, width - 5, tall + 1), fill=(24, 24, 26, CODE_SOLID))
+    draw.rounded_rectangle((0, 0, width - 1, tall - 8), radius=5, fill=(*paint, CODE_SOLID))
+    draw.line((4, 0, width - 5, 0), fill=(*darken(paint, 1.2), CODE_FLAT), width=2)
     draw.rectangle(
-        (1, tall - thing_px(0.5), width - 2, tall - 9), fill=(*darker(paint, 0.72), SOLID)
+        (1, tall - object_pixels(0.5), width - 2, tall - 9), fill=(*darken(paint, 0.72), CODE_SOLID)
     )
-    top = 6 if shape.bonnet < 2 else tall - thing_px(0.9)
-    lamp = (170, 30, 28, LAMP) if rear else (238, 234, 212, LAMP)
+    top = 6 if shape.bonnet < 2 else tall - object_pixels(0.9)
+    lamp = (170, 30, 28, CODE_LAMP) if rear else (238, 234, 212, CODE_LAMP)
     for x in (3, width - 15):
         draw.rectangle((x, top, x + 11, top + 7), fill=lamp)
     if not rear:
         grille = (18, top + 1, width - 19, top + 7)
-        draw.rectangle(grille, fill=(*darker(paint, 0.45), SOLID))
-    plate = (width // 2 - 10, tall - thing_px(0.45), width // 2 + 10, tall - thing_px(0.45) + 5)
-    draw.rectangle(plate, fill=(226, 226, 220, SOLID))
-    return Picture(picture, shape.width, (tall + 2) / THING_PIXELS_PER_METRE)
+        draw.rectangle(grille, fill=(*darken(paint, 0.45), CODE_SOLID))
+    plate = (
+        width // 2 - 10,
+        tall - object_pixels(0.45),
+        width // 2 + 10,
+        tall - object_pixels(0.45) + 5,
+    )
+    draw.rectangle(plate, fill=(226, 226, 220, CODE_SOLID))
+    return Sprite(picture, shape.width, (tall + 2) / OBJECT_PIXELS_PER_METRE)
 
 
-def draw_vehicle_screen(shape: VehicleShape, paint: Colour) -> Picture:
+def draw_vehicle_screen(shape: VehicleShape, paint: Colour) -> Sprite:
     """The cabin's front or back above the bonnet; a little lower, so that no gap shows."""
     overlap = 0.14
-    width, tall = thing_px(shape.width), thing_px(shape.height - shape.bonnet + overlap)
+    width, tall = object_pixels(shape.width), object_pixels(shape.height - shape.bonnet + overlap)
     picture = Image.new("RGBA", (width, tall), (0, 0, 0, 0))
     draw = ImageDraw.Draw(picture)
-    lean, hem = width // 11, thing_px(overlap)
+    lean, hem = width // 11, object_pixels(overlap)
     outline = [(1, tall - 1), (lean, 0), (width - 1 - lean, 0), (width - 2, tall - 1)]
-    draw.polygon(outline, fill=(*paint, SOLID))
+    draw.polygon(outline, fill=(*paint, CODE_SOLID))
     if tall > 3 * hem:
         glass = [(7, tall - hem), (lean + 4, 5), (width - 5 - lean, 5), (width - 8, tall - hem)]
-        draw.polygon(glass, fill=(58, 68, 78, SOLID))
-        draw.line((lean + 5, 7, width - 6 - lean, 7), fill=(128, 142, 152, SOLID), width=2)
+        draw.polygon(glass, fill=(58, 68, 78, CODE_SOLID))
+        draw.line((lean + 5, 7, width - 6 - lean, 7), fill=(128, 142, 152, CODE_SOLID), width=2)
     bottom = shape.bonnet - overlap
-    return Picture(picture, shape.width, tall / THING_PIXELS_PER_METRE, bottom)
+    return Sprite(picture, shape.width, tall / OBJECT_PIXELS_PER_METRE, bottom)

@@ -15,10 +15,10 @@ TILE_HEIGHT = 576
 WALL_KINDS = ("plaster", "brick", "stone", "panel", "board", "rustic")
 
 Colour = tuple[int, int, int]
-Grey = NDArray[np.float32]
+GreyImage = NDArray[np.float32]
 
 
-def smooth_noise(rng: np.random.Generator, shape: tuple[int, int], cell: int) -> Grey:
+def smooth_noise(rng: np.random.Generator, shape: tuple[int, int], cell: int) -> GreyImage:
     """(height, width) float32 of about [-1, 1] that varies over `cell` pixels; wraps around."""
     height, width = shape
     coarse = rng.uniform(-1, 1, (max(2, height // cell), max(2, width // cell)))
@@ -66,7 +66,7 @@ def _courses(
     length: int,
     joint: int,
     spread: float,
-) -> Grey:
+) -> GreyImage:
     """Bricks or ashlars in running bond: each with its own lightness, dark joints between."""
     course = rows // height
     shifted = columns + (course % 2) * (length // 2)

@@ -5,28 +5,30 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
-from shared.datasets.layouts.layout import missing_city
+from shared.datasets.layouts.layout import city_missing_error
 from shared.datasets.shots import TrainingPlace
 
-STEP = 10**5
+PLACE_ID_STEP = 10**5
 """between the place numbers of two cities, as GSV-Cities has it"""
 
 CityPhotos = dict[int, list[Path]]
 """the photos of each place of one city, by the city's own number of the place"""
 
 
-def chosen_cities(base: Path, asked: Sequence[str] | None, there: Sequence[str]) -> list[str]:
+def select_cities(
+    base: Path, requested: Sequence[str] | None, available: Sequence[str]
+) -> list[str]:
     """The asked cities as they are written there; doubles count once. NotFound (`city_missing`)."""
-    if asked is None:
-        return list(there)
-    known = {city.lower(): city for city in there}
-    missing = [city for city in asked if city.lower() not in known]
+    if requested is None:
+        return list(available)
+    known = {city.lower(): city for city in available}
+    missing = [city for city in requested if city.lower() not in known]
     if missing:
-        raise missing_city(base, missing, there)
-    return list(dict.fromkeys(known[city.lower()] for city in asked))
+        raise city_missing_error(base, missing, available)
+    return list(dict.fromkeys(known[city.lower()] for city in requested))
 
 
-def numbered(
+def number_places(
     cities: Mapping[str, CityPhotos] | Iterable[tuple[str, CityPhotos]], min_photos: int
 ) -> tuple[TrainingPlace, ...]:
     """The places with enough photos, city after city, each city's by number.
@@ -36,7 +38,7 @@ def numbered(
     """
     named = list(cities.items() if isinstance(cities, Mapping) else cities)
     largest = max((max(photos, default=0) for _, photos in named), default=0)
-    step = STEP
+    step = PLACE_ID_STEP
     while step <= largest:
         step *= 10
     return tuple(

@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from shared.datasets.layouts.layout import PLACEWISE, Listed
-from shared.datasets.shots import Shot
+from shared.datasets.layouts.layout import PLACEWISE_PROTOCOL, ListedSet
+from shared.datasets.shots import DatasetPhoto
 from shared.errors import InvalidRequest, Misconfigured
 
 FIELDS = 8
@@ -24,23 +24,25 @@ QUERY_FOLDERS = ("queries_real", ".", "images", "queries", "../queries_real", ".
 
 class DbStruct:
     name = "dbStruct .mat"
-    protocols = (PLACEWISE,)
+    protocols = (PLACEWISE_PROTOCOL,)
 
     def sets(self, base: Path, prefix: str) -> Mapping[str, str]:
         return {path.stem: path.name for path in sorted(base.glob("*.mat"))}
 
-    def open(self, base: Path, key: str, protocol: str) -> Listed:
+    def open(self, base: Path, key: str, protocol: str) -> ListedSet:
         path = base / key
         fields = list(_struct(path).values())
         if len(fields) < FIELDS:
-            raise _bad(path, f"its dbStruct has {len(fields)} fields, at least {FIELDS} are needed")
+            raise _bad_struct_error(
+                path, f"its dbStruct has {len(fields)} fields, at least {FIELDS} are needed"
+            )
         try:
             radius = float(fields[7])
             database = _shots(base, DATABASE_FOLDERS, fields[1], fields[2])
             queries = _shots(base, QUERY_FOLDERS, fields[3], fields[4])
         except (TypeError, ValueError) as error:
-            raise _bad(path, str(error)) from error
-        return Listed(database, queries, f"radius {radius:g} m")
+            raise _bad_struct_error(path, str(error)) from error
+        return ListedSet(database, queries, f"radius {radius:g} m")
 
 
 def _struct(path: Path) -> dict[str, Any]:
@@ -55,13 +57,13 @@ def _struct(path: Path) -> dict[str, Any]:
     try:
         found = loadmat(path, simplify_cells=True).get("dbStruct")
     except (OSError, ValueError, TypeError, NotImplementedError) as error:
-        raise _bad(path, str(error)) from error
+        raise _bad_struct_error(path, str(error)) from error
     if not isinstance(found, dict):
-        raise _bad(path, "it has no dbStruct")
+        raise _bad_struct_error(path, "it has no dbStruct")
     return found
 
 
-def _shots(base: Path, folders: Sequence[str], names: Any, utm: Any) -> tuple[Shot, ...]:
+def _shots(base: Path, folders: Sequence[str], names: Any, utm: Any) -> tuple[DatasetPhoto, ...]:
     listed = [str(name) for name in np.atleast_1d(names).tolist()]
     metres = np.asarray(utm, np.float64).reshape(2, -1)
     if metres.shape[1] != len(listed):
@@ -70,10 +72,10 @@ def _shots(base: Path, folders: Sequence[str], names: Any, utm: Any) -> tuple[Sh
         (base / name for name in folders if listed and (base / name / listed[0]).is_file()), base
     )
     return tuple(
-        Shot(folder / name, name, easting=east, northing=north)
+        DatasetPhoto(folder / name, name, easting=east, northing=north)
         for name, (east, north) in zip(listed, metres.T.tolist(), strict=True)
     )
 
 
-def _bad(path: Path, fault: str) -> InvalidRequest:
+def _bad_struct_error(path: Path, fault: str) -> InvalidRequest:
     return InvalidRequest("bad_dbstruct", f"{path} can't be read as a dbStruct: {fault}.")

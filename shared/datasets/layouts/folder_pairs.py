@@ -12,14 +12,14 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
-from shared.datasets.layouts.layout import PLACEWISE, RADIUS, Listed, photos_below
-from shared.datasets.layouts.named_photos import located_by_exif, shot_of
-from shared.datasets.shots import Shot
-from shared.datasets.zones import with_utm
+from shared.datasets.layouts.layout import DEFAULT_RULE, PLACEWISE_PROTOCOL, ListedSet, photos_below
+from shared.datasets.layouts.named_photos import add_exif_positions, photo_from_filename
+from shared.datasets.shots import DatasetPhoto
+from shared.datasets.zones import add_utm_positions
 from shared.errors import InvalidRequest
 
 SPLITS = ("train", "val", "test")
-VME = "vme"
+VME_PROTOCOL = "vme"
 """VPR-methods-evaluation's: metres of different zones are compared as if they were of one"""
 
 
@@ -27,41 +27,41 @@ class FolderPairs:
     """`sets` names a pair after its folder and its split."""
 
     name = "database and queries folders"
-    protocols = (PLACEWISE, VME)
+    protocols = (PLACEWISE_PROTOCOL, VME_PROTOCOL)
 
     def sets(self, base: Path, prefix: str) -> Mapping[str, str]:
         found = {f"{prefix}_{split}": split for split in SPLITS if _is_pair(base / split)}
         return {prefix: ".", **found} if _is_pair(base) else found
 
-    def open(self, base: Path, key: str, protocol: str) -> Listed:
+    def open(self, base: Path, key: str, protocol: str) -> ListedSet:
         folder = base / key
         database, queries = (_shots(folder / name, base) for name in ("database", "queries"))
-        if protocol == VME:
+        if protocol == VME_PROTOCOL:
             database, queries = (
                 tuple(replace(shot, zone=None) for shot in shots) for shots in (database, queries)
             )
-        return Listed(database, queries, _natural_rule(database + queries))
+        return ListedSet(database, queries, _natural_rule(database + queries))
 
 
 def _is_pair(folder: Path) -> bool:
     return (folder / "database").is_dir() and (folder / "queries").is_dir()
 
 
-def _natural_rule(shots: tuple[Shot, ...]) -> str:
+def _natural_rule(shots: tuple[DatasetPhoto, ...]) -> str:
     """Photos that nobody has placed on a map may still lie in folders of places."""
     if all(shot.easting is None for shot in shots) and any(shot.place for shot in shots):
         return "place-label"
-    return RADIUS
+    return DEFAULT_RULE
 
 
-def _shots(folder: Path, base: Path) -> tuple[Shot, ...]:
+def _shots(folder: Path, base: Path) -> tuple[DatasetPhoto, ...]:
     shots = [
-        shot_of(path, path.relative_to(base).as_posix(), _place(path, folder))
+        photo_from_filename(path, path.relative_to(base).as_posix(), _place(path, folder))
         for path in _paths(folder)
     ]
     if any(shot.easting is not None for shot in shots):
         return tuple(shots)
-    return with_utm(located_by_exif(shots))
+    return add_utm_positions(add_exif_positions(shots))
 
 
 def _place(path: Path, folder: Path) -> str | None:

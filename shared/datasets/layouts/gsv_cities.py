@@ -9,14 +9,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from shared.datasets.layouts.cities import CityPhotos, chosen_cities, numbered
-from shared.datasets.layouts.tables import read_table, whole_number
+from shared.datasets.layouts.cities import CityPhotos, number_places, select_cities
+from shared.datasets.layouts.tables import parse_integer, read_table
 from shared.datasets.shots import TrainingSet
 
-COLUMNS = ("place_id", "year", "month", "northdeg", "city_id", "lat", "lon", "panoid")
+GSV_CITIES_COLUMNS = ("place_id", "year", "month", "northdeg", "city_id", "lat", "lon", "panoid")
 # A photo's row and its file agree in these; latitude and longitude are left out, because their
 # digits depend on the library that wrote them.
-Key = tuple[int, int, int, int, str]
+PhotoKey = tuple[int, int, int, int, str]
 
 
 class GsvCities:
@@ -29,21 +29,21 @@ class GsvCities:
         return tuple(sorted(table.stem for table in (base / "Dataframes").glob("*.csv")))
 
     def open(self, base: Path, cities: Sequence[str] | None, min_photos: int) -> TrainingSet:
-        chosen = chosen_cities(base, cities, self.cities(base))
-        places = numbered([(city, _photos(base, city)) for city in chosen], min_photos)
+        chosen = select_cities(base, cities, self.cities(base))
+        places = number_places([(city, _photos(base, city)) for city in chosen], min_photos)
         return TrainingSet(base.resolve().name, base, self.name, places)
 
 
 def _photos(base: Path, city: str) -> CityPhotos:
     table = base / "Dataframes" / f"{city}.csv"
-    files: dict[str, dict[Key, Path]] = {}
+    files: dict[str, dict[PhotoKey, Path]] = {}
     photos: CityPhotos = {}
-    for line, row in read_table(table, COLUMNS):
+    for line, row in read_table(table, GSV_CITIES_COLUMNS):
         place, year, month, heading = (
-            whole_number(table, line, row, column)
+            parse_integer(table, line, row, column)
             for column in ("place_id", "year", "month", "northdeg")
         )
-        key: Key = (place, year, month, heading, row["panoid"])
+        key: PhotoKey = (place, year, month, heading, row["panoid"])
         folder = base / "Images" / row["city_id"]
         if row["city_id"] not in files:
             files[row["city_id"]] = _files(folder)
@@ -52,13 +52,13 @@ def _photos(base: Path, city: str) -> CityPhotos:
     return photos
 
 
-def _files(folder: Path) -> dict[Key, Path]:
+def _files(folder: Path) -> dict[PhotoKey, Path]:
     """The photos of the folder by what their rows say of them; none where there is no folder."""
     paths = folder.iterdir() if folder.is_dir() else ()
     return {key: path for path in paths if (key := _key_of(path.name)) is not None}
 
 
-def _key_of(name: str) -> Key | None:
+def _key_of(name: str) -> PhotoKey | None:
     """None for a file that is no photo of this layout. A panorama's name may hold underscores."""
     fields = name.removesuffix(".jpg").split("_", 7)
     if len(fields) != 8:
@@ -70,7 +70,7 @@ def _key_of(name: str) -> Key | None:
     return place, year, month, heading, fields[7]
 
 
-def _file_name(row: dict[str, str], key: Key) -> str:
+def _file_name(row: dict[str, str], key: PhotoKey) -> str:
     place, year, month, heading, panoid = key
     return (
         f"{row['city_id']}_{place:07d}_{year:04d}_{month:02d}_{heading:03d}_"

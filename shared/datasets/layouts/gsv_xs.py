@@ -8,14 +8,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from shared.datasets.layouts.cities import CityPhotos, chosen_cities, numbered
+from shared.datasets.layouts.cities import CityPhotos, number_places, select_cities
 from shared.datasets.layouts.layout import photos_below
-from shared.datasets.layouts.tables import read_table, whole_number
+from shared.datasets.layouts.tables import parse_integer, read_table
 from shared.datasets.shots import TrainingSet
-from shared.datasets.utm_names import spot_of_name
+from shared.datasets.utm_names import parse_utm_file_name
 from shared.errors import InvalidRequest
 
-COLUMNS = ("place_id", "class_name", "filename")
+GSV_XS_COLUMNS = ("place_id", "class_name", "filename")
 
 
 class GsvXs:
@@ -24,15 +24,15 @@ class GsvXs:
     def recognises(self, base: Path) -> bool:
         if any((base / "dataframes" / f"{city}.csv").is_file() for city in _folders(base)):
             return True
-        first = next((path for city in _folders(base) for path in _any(base, city)), None)
+        first = next((path for city in _folders(base) for path in _first_photo(base, city)), None)
         return first is not None and _place_of(first.name) is not None
 
     def cities(self, base: Path) -> tuple[str, ...]:
         return _folders(base)
 
     def open(self, base: Path, cities: Sequence[str] | None, min_photos: int) -> TrainingSet:
-        chosen = chosen_cities(base, cities, self.cities(base))
-        places = numbered([(city, _photos(base, city)) for city in chosen], min_photos)
+        chosen = select_cities(base, cities, self.cities(base))
+        places = number_places([(city, _photos(base, city)) for city in chosen], min_photos)
         return TrainingSet(base.resolve().name, base, self.name, places)
 
 
@@ -50,7 +50,7 @@ def _folders(base: Path) -> tuple[str, ...]:
     )
 
 
-def _any(base: Path, city: str) -> list[Path]:
+def _first_photo(base: Path, city: str) -> list[Path]:
     """The first photo that the folder gives, of which one is enough to see how all are named."""
     found = (p for p in (base / "train" / city).iterdir() if p.name.startswith("@"))
     first = next(found, None)
@@ -62,8 +62,8 @@ def _photos(base: Path, city: str) -> CityPhotos:
     table = base / "dataframes" / f"{city}.csv"
     photos: CityPhotos = {}
     if table.is_file():
-        for line, row in read_table(table, COLUMNS):
-            place = whole_number(table, line, row, "place_id")
+        for line, row in read_table(table, GSV_XS_COLUMNS):
+            place = parse_integer(table, line, row, "place_id")
             photos.setdefault(place, []).append(folder / row["filename"])
         return photos
     for path in photos_below(folder):
@@ -79,6 +79,6 @@ def _photos(base: Path, city: str) -> CityPhotos:
 
 
 def _place_of(name: str) -> int | None:
-    spot = spot_of_name(name)
+    spot = parse_utm_file_name(name)
     number = spot.note.partition("_")[0] if spot else ""
     return int(number) if number.isdecimal() and number.isascii() else None

@@ -7,23 +7,23 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-from shared.datasets.shots import Indices, Shot, TrainingSet
+from shared.datasets.shots import DatasetPhoto, Indices, TrainingSet
 from shared.errors import NotFound
 from shared.photo_formats import PHOTO_SUFFIXES
 
-PLACEWISE = "placewise"
+PLACEWISE_PROTOCOL = "placewise"
 """The protocol of a set that is taken as it lies there: all photos, all queries, safe over zones"""
-RADIUS = "radius 25 m"
+DEFAULT_RULE = "radius 25 m"
 """The rule of nearly all published figures."""
 
 
 @dataclass(frozen=True, slots=True)
-class Listed:
+class ListedSet:
     """An evaluation set as its layout lists it, before a rule has found positives."""
 
-    database: tuple[Shot, ...]
-    queries: tuple[Shot, ...]
-    rule: str = RADIUS
+    database: tuple[DatasetPhoto, ...]
+    queries: tuple[DatasetPhoto, ...]
+    rule: str = DEFAULT_RULE
     """The rule that this set is measured by when none is asked for."""
     positives: tuple[Indices, ...] | None = None
     """By that rule, of a set that brings its own ground truth."""
@@ -66,7 +66,7 @@ class EvaluationLayout(Protocol):
         """
         ...
 
-    def open(self, base: Path, key: str, protocol: str) -> Listed: ...
+    def open(self, base: Path, key: str, protocol: str) -> ListedSet: ...
 
 
 def photos_below(folder: Path) -> list[Path]:
@@ -78,12 +78,12 @@ def photos_below(folder: Path) -> list[Path]:
     )
 
 
-def missing_city(base: Path, missing: Iterable[str], there: Sequence[str]) -> NotFound:
+def city_missing_error(base: Path, missing: Iterable[str], available: Sequence[str]) -> NotFound:
     """The error that names the cities which are not there, and those which are."""
     return NotFound(
         "city_missing",
-        f"{base} has no city {', '.join(missing)}. There are: {', '.join(there) or 'none'}. "
+        f"{base} has no city {', '.join(missing)}. There are: {', '.join(available) or 'none'}. "
         "Name some of these, or download the missing ones.",
         missing=list(missing),
-        there=list(there),
+        there=list(available),
     )

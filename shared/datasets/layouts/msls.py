@@ -17,59 +17,67 @@ from pathlib import Path
 
 import utm
 
-from shared.datasets.layouts.layout import RADIUS, Listed, missing_city
-from shared.datasets.layouts.tables import bad_row, number, read_table, whole_number
-from shared.datasets.shots import Shot
+from shared.datasets.layouts.layout import DEFAULT_RULE, ListedSet, city_missing_error
+from shared.datasets.layouts.tables import bad_row_error, parse_integer, parse_number, read_table
+from shared.datasets.shots import DatasetPhoto
 from shared.errors import InvalidRequest
 
-OFFICIAL = "msls-official"
-VME = "vme"
-CITIES = ("cph", "sf")
+OFFICIAL_PROTOCOL = "msls-official"
+VME_PROTOCOL = "vme"
+VALIDATION_CITIES = ("cph", "sf")
 """of the validation, in the order in which both protocols pool them"""
-SET = "msls_val"
+VALIDATION_SET = "msls_val"
 Row = tuple[int, dict[str, str]]
 
 
 class Msls:
     name = "Mapillary Street-level Sequences"
-    protocols = (OFFICIAL, VME)
+    protocols = (OFFICIAL_PROTOCOL, VME_PROTOCOL)
 
     def sets(self, base: Path, prefix: str) -> Mapping[str, str]:
         for key in (".", "train_val"):
-            if any((base / key / city / "query" / "raw.csv").is_file() for city in CITIES):
-                return {SET: key}
+            if any(
+                (base / key / city / "query" / "raw.csv").is_file() for city in VALIDATION_CITIES
+            ):
+                return {VALIDATION_SET: key}
         return {}
 
-    def open(self, base: Path, key: str, protocol: str) -> Listed:
+    def open(self, base: Path, key: str, protocol: str) -> ListedSet:
         folder = base / key
-        missing = [city for city in CITIES if not (folder / city).is_dir()]
+        missing = [city for city in VALIDATION_CITIES if not (folder / city).is_dir()]
         if missing:
             there = sorted(path.name for path in folder.iterdir() if path.is_dir())
-            raise missing_city(folder, missing, there)
+            raise city_missing_error(folder, missing, there)
         database, queries = (
-            tuple(shot for city in CITIES for shot in _shots(base, folder / city / part, protocol))
+            tuple(
+                shot
+                for city in VALIDATION_CITIES
+                for shot in _shots(base, folder / city / part, protocol)
+            )
             for part in ("database", "query")
         )
-        return Listed(database, queries, RADIUS, drops_queries=protocol == OFFICIAL)
+        return ListedSet(
+            database, queries, DEFAULT_RULE, drops_queries=protocol == OFFICIAL_PROTOCOL
+        )
 
 
-def _shots(base: Path, folder: Path, protocol: str) -> Iterator[Shot]:
+def _shots(base: Path, folder: Path, protocol: str) -> Iterator[DatasetPhoto]:
     raw = folder / "raw.csv"
     rows = list(read_table(raw, ("key", "lon", "lat", "ca", "pano")))
     beside: dict[str, tuple[str, ...]] = {
         "postprocessed.csv": ("key", "easting", "northing"),
         "seq_info.csv": ("key", "sequence_key", "frame_number"),
     }
-    if protocol == OFFICIAL:
+    if protocol == OFFICIAL_PROTOCOL:
         beside["subtask_index.csv"] = ("all",)
     tables = {name: _as_long(folder / name, needed, rows) for name, needed in beside.items()}
     zone = _zone(raw, rows[0]) if rows else ""
     for index, (line, row) in enumerate(rows):
-        if _truth(raw, line, row, "pano"):
+        if _parse_boolean(raw, line, row, "pano"):
             continue
-        if protocol == OFFICIAL:
+        if protocol == OFFICIAL_PROTOCOL:
             table = folder / "subtask_index.csv"
-            if not _truth(table, *tables[table.name][index], "all"):
+            if not _parse_boolean(table, *tables[table.name][index], "all"):
                 continue
         yield _shot(
             base, folder, (line, row), {k: v[index] for k, v in tables.items()}, protocol, zone
@@ -78,13 +86,13 @@ def _shots(base: Path, folder: Path, protocol: str) -> Iterator[Shot]:
 
 def _shot(
     base: Path, folder: Path, raw: Row, beside: Mapping[str, Row], protocol: str, zone: str
-) -> Shot:
+) -> DatasetPhoto:
     table = folder / "raw.csv"
-    latitude, longitude = number(table, *raw, "lat"), number(table, *raw, "lon")
-    if protocol == OFFICIAL:
+    latitude, longitude = parse_number(table, *raw, "lat"), parse_number(table, *raw, "lon")
+    if protocol == OFFICIAL_PROTOCOL:
         metres = folder / "postprocessed.csv"
         easting, northing = (
-            number(metres, *beside[metres.name], column) for column in ("easting", "northing")
+            parse_number(metres, *beside[metres.name], column) for column in ("easting", "northing")
         )
         said_zone: str | None = zone
     else:
@@ -92,7 +100,7 @@ def _shot(
         said_zone = None
     path = folder / "images" / f"{raw[1]['key']}.jpg"
     sequence = folder / "seq_info.csv"
-    return Shot(
+    return DatasetPhoto(
         path,
         path.relative_to(base).as_posix(),
         easting=easting,
@@ -100,8 +108,8 @@ def _shot(
         zone=said_zone,
         latitude=latitude,
         longitude=longitude,
-        heading=number(table, *raw, "ca") % 360 if raw[1]["ca"] else None,
-        frame=whole_number(sequence, *beside[sequence.name], "frame_number"),
+        heading=parse_number(table, *raw, "ca") % 360 if raw[1]["ca"] else None,
+        frame=parse_integer(sequence, *beside[sequence.name], "frame_number"),
         sequence=beside[sequence.name][1]["sequence_key"],
     )
 
@@ -117,21 +125,25 @@ def _as_long(path: Path, needed: tuple[str, ...], rows: list[Row]) -> list[Row]:
         )
     for (line, row), (_, other) in zip(found, rows, strict=True):
         if "key" in row and row["key"] != other["key"]:
-            raise bad_row(path, line, f"its photo is {row['key']}, raw.csv's is {other['key']}")
+            raise bad_row_error(
+                path, line, f"its photo is {row['key']}, raw.csv's is {other['key']}"
+            )
     return found
 
 
-def _truth(path: Path, line: int, row: dict[str, str], column: str) -> bool:
+def _parse_boolean(path: Path, line: int, row: dict[str, str], column: str) -> bool:
     values = {"true": True, "false": False, "1": True, "0": False}
     try:
         return values[row[column].lower()]
     except KeyError:
-        raise bad_row(path, line, f"{column} {row[column]!r} is neither True nor False") from None
+        raise bad_row_error(
+            path, line, f"{column} {row[column]!r} is neither True nor False"
+        ) from None
 
 
 def _zone(path: Path, first: Row) -> str:
     """A city's metres are of one zone, that of its first photo."""
-    latitude, longitude = number(path, *first, "lat"), number(path, *first, "lon")
+    latitude, longitude = parse_number(path, *first, "lat"), parse_number(path, *first, "lon")
     zone = utm.latlon_to_zone_number(latitude, longitude)
     return f"{zone:02d}{utm.latitude_to_zone_letter(latitude)}"
 

@@ -14,47 +14,56 @@ import numpy as np
 
 from shared.datasets.ground_truth_files import read_ground_truth
 from shared.datasets.integer_lists import read_names
-from shared.datasets.layouts.layout import PLACEWISE, RADIUS, Listed
-from shared.datasets.layouts.named_photos import shot_of
-from shared.datasets.shots import Indices, Shot
+from shared.datasets.layouts.layout import DEFAULT_RULE, PLACEWISE_PROTOCOL, ListedSet
+from shared.datasets.layouts.named_photos import photo_from_filename
+from shared.datasets.shots import DatasetPhoto, Indices
 from shared.errors import InvalidRequest
 
-QUERIES_OF = {"_dbImages": "_qImages", "_ref_image_names": "_query_image_names"}
+QUERY_LIST_SUFFIXES = {"_dbImages": "_qImages", "_ref_image_names": "_query_image_names"}
 """the end of a list of queries, by that of its list of the database"""
-TRUTHS = ("_gtImages", "_gt", "_gt_25m", "_ground_truth", "_ground_truth_25m", "_pIdx")
-ASKED = "_qIdx"
+GROUND_TRUTH_SUFFIXES = (
+    "_gtImages",
+    "_gt",
+    "_gt_25m",
+    "_ground_truth",
+    "_ground_truth_25m",
+    "_pIdx",
+)
+QUERY_INDEX_SUFFIX = "_qIdx"
 """of MSLS in gsv-cities: which queries of the list are asked; the ground truth is of these"""
 
 
 class NpyLists:
     name = "npy lists"
-    protocols = (PLACEWISE,)
+    protocols = (PLACEWISE_PROTOCOL,)
 
     def sets(self, base: Path, prefix: str) -> Mapping[str, str]:
         return {
             path.name.removesuffix(f"{end}.npy"): path.name
-            for end in QUERIES_OF
+            for end in QUERY_LIST_SUFFIXES
             for path in sorted(base.glob(f"*{end}.npy"))
             if not path.name.startswith((".", "_"))
         }
 
-    def open(self, base: Path, key: str, protocol: str) -> Listed:
-        end = next(end for end in QUERIES_OF if key.endswith(f"{end}.npy"))
+    def open(self, base: Path, key: str, protocol: str) -> ListedSet:
+        end = next(end for end in QUERY_LIST_SUFFIXES if key.endswith(f"{end}.npy"))
         name = key.removesuffix(f"{end}.npy")
         database = read_names(base / key)
-        queries = _asked(base, name, read_names(_there(base / f"{name}{QUERIES_OF[end]}.npy")))
+        queries = _listed_queries(
+            base, name, read_names(_existing_file(base / f"{name}{QUERY_LIST_SUFFIXES[end]}.npy"))
+        )
         folder = _folder_of(base, database)
-        truth = _truth(base, name)
+        truth = _find_ground_truth(base, name)
         positives: tuple[Indices, ...] | None = None
-        rule = RADIUS
+        rule = DEFAULT_RULE
         if truth is not None:
             rows, said = read_ground_truth(truth, database=database, queries=queries)
             positives, rule = tuple(rows), said or f"given by {truth.name}"
-        return Listed(_shots(folder, database), _shots(folder, queries), rule, positives)
+        return ListedSet(_shots(folder, database), _shots(folder, queries), rule, positives)
 
 
-def _asked(base: Path, name: str, queries: list[str]) -> list[str]:
-    path = base / f"{name}{ASKED}.npy"
+def _listed_queries(base: Path, name: str, queries: list[str]) -> list[str]:
+    path = base / f"{name}{QUERY_INDEX_SUFFIX}.npy"
     if not path.is_file():
         return queries
     try:
@@ -66,12 +75,12 @@ def _asked(base: Path, name: str, queries: list[str]) -> list[str]:
         ) from error
 
 
-def _truth(base: Path, name: str) -> Path | None:
-    paths = (base / f"{name}{end}.npy" for end in TRUTHS)
+def _find_ground_truth(base: Path, name: str) -> Path | None:
+    paths = (base / f"{name}{end}.npy" for end in GROUND_TRUTH_SUFFIXES)
     return next((path for path in paths if path.is_file()), None)
 
 
-def _there(path: Path) -> Path:
+def _existing_file(path: Path) -> Path:
     if not path.is_file():
         raise InvalidRequest("bad_list", f"There is no list of queries {path}.")
     return path
@@ -85,7 +94,7 @@ def _folder_of(base: Path, names: Sequence[str]) -> Path:
     return base
 
 
-def _shots(folder: Path, names: Sequence[str]) -> tuple[Shot, ...]:
+def _shots(folder: Path, names: Sequence[str]) -> tuple[DatasetPhoto, ...]:
     # Joined as paths: a list's names may or may not begin with a slash, and no folder needs to end
     # in one.
-    return tuple(shot_of(folder / name.lstrip("/"), name) for name in names)
+    return tuple(photo_from_filename(folder / name.lstrip("/"), name) for name in names)

@@ -10,29 +10,34 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from shared.datasets.layouts.cities import CityPhotos, chosen_cities, numbered
-from shared.datasets.layouts.layout import PLACEWISE, RADIUS, Listed
-from shared.datasets.layouts.tables import bad_row, read_table
-from shared.datasets.photo_lists import read_list
+from shared.datasets.layouts.cities import CityPhotos, number_places, select_cities
+from shared.datasets.layouts.layout import DEFAULT_RULE, PLACEWISE_PROTOCOL, ListedSet
+from shared.datasets.layouts.tables import bad_row_error, read_table
+from shared.datasets.photo_lists import read_photo_list
 from shared.datasets.shots import TrainingSet
 
 
-class PlainTables:
+class CsvTables:
     name = "CSV tables"
-    protocols = (PLACEWISE,)
+    protocols = (PLACEWISE_PROTOCOL,)
 
     def sets(self, base: Path, prefix: str) -> Mapping[str, str]:
         there = all((base / name).is_file() for name in ("database.csv", "queries.csv"))
         return {prefix: "."} if there else {}
 
-    def open(self, base: Path, key: str, protocol: str) -> Listed:
-        database, queries = read_list(base / "database.csv"), read_list(base / "queries.csv")
+    def open(self, base: Path, key: str, protocol: str) -> ListedSet:
+        database, queries = (
+            read_photo_list(base / "database.csv"),
+            read_photo_list(base / "queries.csv"),
+        )
         placed = any(shot.easting is not None for shot in database + queries)
         labelled = any(shot.place for shot in database + queries)
-        return Listed(database, queries, "place-label" if labelled and not placed else RADIUS)
+        return ListedSet(
+            database, queries, "place-label" if labelled and not placed else DEFAULT_RULE
+        )
 
 
-class TrainingTable:
+class CsvTrainingTable:
     name = "CSV table of places"
 
     def recognises(self, base: Path) -> bool:
@@ -43,8 +48,8 @@ class TrainingTable:
 
     def open(self, base: Path, cities: Sequence[str] | None, min_photos: int) -> TrainingSet:
         by_city = _by_city(base)
-        chosen = chosen_cities(base, cities, sorted(by_city))
-        places = numbered([(city, _numbers(by_city[city])) for city in chosen], min_photos)
+        chosen = select_cities(base, cities, sorted(by_city))
+        places = number_places([(city, _numbers(by_city[city])) for city in chosen], min_photos)
         return TrainingSet(base.resolve().name, base, self.name, places)
 
 
@@ -54,7 +59,7 @@ def _by_city(base: Path) -> dict[str, dict[str, list[Path]]]:
     found: dict[str, dict[str, list[Path]]] = {}
     for line, row in read_table(table, ("path", "place")):
         if not (row["path"].strip() and row["place"].strip()):
-            raise bad_row(table, line, "path and place must be given")
+            raise bad_row_error(table, line, "path and place must be given")
         city = row.get("city", "").strip() or base.resolve().name
         photos = found.setdefault(city, {}).setdefault(row["place"].strip(), [])
         photos.append(base / row["path"].strip())

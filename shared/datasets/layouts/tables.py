@@ -29,29 +29,31 @@ def read_table(path: Path, needed: Sequence[str]) -> Iterator[tuple[int, dict[st
             for row in reader:
                 line = reader.line_num
                 if None in row or None in row.values():
-                    raise bad_row(path, line, f"has not the {len(columns)} cells of the first line")
+                    raise bad_row_error(
+                        path, line, f"has not the {len(columns)} cells of the first line"
+                    )
                 yield line, row
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise InvalidRequest("bad_table", f"Can't read {path}: {error}.") from error
 
 
-def whole_number(path: Path, line: int, row: dict[str, str], column: str) -> int:
+def parse_integer(path: Path, line: int, row: dict[str, str], column: str) -> int:
     """A cell as an integer; `7.0`, as data frames write it, is 7."""
-    value = number(path, line, row, column)
+    value = parse_number(path, line, row, column)
     if value != int(value):
-        raise bad_row(path, line, f"{column} {row[column]!r} is no whole number")
+        raise bad_row_error(path, line, f"{column} {row[column]!r} is no whole number")
     return int(value)
 
 
-def number(path: Path, line: int, row: dict[str, str], column: str) -> float:
+def parse_number(path: Path, line: int, row: dict[str, str], column: str) -> float:
     try:
         value = float(row[column])
         if abs(value) < float("inf"):
             return value
     except ValueError:
         pass
-    raise bad_row(path, line, f"{column} {row[column]!r} is no number")
+    raise bad_row_error(path, line, f"{column} {row[column]!r} is no number")
 
 
-def bad_row(path: Path, line: int, fault: str) -> PlacewiseError:
+def bad_row_error(path: Path, line: int, fault: str) -> PlacewiseError:
     return InvalidRequest("bad_table", f"{path}, line {line}: {fault}.", line=line)

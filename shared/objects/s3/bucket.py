@@ -31,29 +31,40 @@ from shared.settings import Settings
 
 log = logging.getLogger(__name__)
 
-CONNECTIONS = 32  # kept open: the threads that use the store at once in one process
+MAX_CONNECTIONS = 32  # kept open: the threads that use the store at once in one process
 RETRY_SECONDS = 0.2
 
-NO_KEY = {"NoSuchKey"}
-NO_BUCKET = {"NoSuchBucket"}
-WRONG_KEYS = {"InvalidAccessKeyId", "SignatureDoesNotMatch", "ExpiredToken", "InvalidToken"}
-REFUSED = {"AccessDenied", "AllAccessDisabled", "AccountProblem", "MethodNotAllowed"}
-WRONG_REGION = {"AuthorizationHeaderMalformed", "PermanentRedirect", "Redirect"}
-WRONG_CLOCK = {"RequestTimeTooSkewed"}
-CHANGED = {"PreconditionFailed"}
-BUSY = {"SlowDown", "ServiceUnavailable", "Throttling", "ThrottlingException", "RequestTimeout"}
-FULL = {
+NO_SUCH_KEY_CODES = {"NoSuchKey"}
+NO_SUCH_BUCKET_CODES = {"NoSuchBucket"}
+BAD_CREDENTIALS_CODES = {
+    "InvalidAccessKeyId",
+    "SignatureDoesNotMatch",
+    "ExpiredToken",
+    "InvalidToken",
+}
+ACCESS_DENIED_CODES = {"AccessDenied", "AllAccessDisabled", "AccountProblem", "MethodNotAllowed"}
+WRONG_REGION_CODES = {"AuthorizationHeaderMalformed", "PermanentRedirect", "Redirect"}
+CLOCK_SKEW_CODES = {"RequestTimeTooSkewed"}
+PRECONDITION_FAILED_CODES = {"PreconditionFailed"}
+SLOW_DOWN_CODES = {
+    "SlowDown",
+    "ServiceUnavailable",
+    "Throttling",
+    "ThrottlingException",
+    "RequestTimeout",
+}
+STORAGE_FULL_CODES = {
     "InsufficientStorage",
     "QuotaExceeded",
     "XMinioStorageFull",
     "XMinioAdminBucketQuotaExceeded",
 }
-FULL_STATUS = 507
+INSUFFICIENT_STORAGE_STATUS = 507
 BUSY_RETRY_SECONDS = 5
 FULL_RETRY_SECONDS = 60
 
 
-class OneMoreTry(urllib3.Retry):
+class RetryUnlessTimeout(urllib3.Retry):
     """Tries again what was cut off or not accepted, but never what was left without an answer.
 
     A store that is silent was waited for already: a second wait would double the time limit.
@@ -68,7 +79,7 @@ class OneMoreTry(urllib3.Retry):
         _pool: ConnectionPool | None = None,
         _stacktrace: TracebackType | None = None,
     ) -> Self:
-        if error is not None and _is_silence(error):
+        if error is not None and _is_timeout(error):
             raise error
         return super().increment(method, url, response, error, _pool, _stacktrace)
 
@@ -85,7 +96,7 @@ class Bucket:
     """The server as callers reach it."""
 
     @classmethod
-    def of(cls, settings: Settings) -> Bucket:
+    def from_settings(cls, settings: Settings) -> Bucket:
         """The bucket that the settings name; nothing is asked of the server yet.
 
         Raises Misconfigured (`bad_setting`) when S3_ENDPOINT or its keys are not set.
@@ -99,9 +110,9 @@ class Bucket:
         seconds = settings.s3_timeout_seconds
         connections = Connections(
             num_pools=2,
-            maxsize=CONNECTIONS,
+            maxsize=MAX_CONNECTIONS,
             timeout=urllib3.Timeout(connect=seconds, read=seconds),
-            retries=OneMoreTry(
+            retries=RetryUnlessTimeout(
                 total=1,
                 backoff_factor=RETRY_SECONDS,
                 status_forcelist=(500, 502, 503, 504),
@@ -142,10 +153,10 @@ class Bucket:
         try:
             yield
         except S3Error as error:
-            raise self._meaning(error, key) from error
+            raise self._translate_s3_error(error, key) from error
         except (MinioException, HTTPError, ParseError, OSError) as error:
             log.warning("the object store at %s failed: %s", self.endpoint, error)
-            raise self._away(error) from error
+            raise self._unreachable_error(error) from error
 
     def missing(self) -> Unavailable:
         return Unavailable(
@@ -154,23 +165,23 @@ class Bucket:
             "Make it: placewise storage create-bucket.",
         )
 
-    def _meaning(self, error: S3Error, key: str | None) -> PlacewiseError:
+    def _translate_s3_error(self, error: S3Error, key: str | None) -> PlacewiseError:
         code = error.code or ""
-        if code in NO_KEY and key is not None:
+        if code in NO_SUCH_KEY_CODES and key is not None:
             return NotFound("object_not_found", f"The object store has no {key!r}.", key=key)
-        if code in NO_BUCKET:
+        if code in NO_SUCH_BUCKET_CODES:
             return self.missing()
         log.warning("the object store at %s refused: %s", self.endpoint, error)
-        if code in CHANGED:
+        if code in PRECONDITION_FAILED_CODES:
             return Unavailable("object_changed", f"{key!r} was written anew while it was read.")
-        if code in FULL or error.response.status == FULL_STATUS:
+        if code in STORAGE_FULL_CODES or error.response.status == INSUFFICIENT_STORAGE_STATUS:
             return StorageFull(
                 "object_store_full",
                 f"The object store at {self.endpoint} has no room left ({code}). Give it more, or "
                 "delete photos or maps.",
                 retry_after_seconds=FULL_RETRY_SECONDS,
             )
-        if code in BUSY:
+        if code in SLOW_DOWN_CODES:
             return Unavailable(
                 "object_store_busy",
                 f"The object store at {self.endpoint} is asked too much ({code}). Try again.",
@@ -187,7 +198,7 @@ class Bucket:
             f"The object store at {self.endpoint} refuses Placewise ({code}). {advice}",
         )
 
-    def _away(self, error: Exception) -> Unavailable:
+    def _unreachable_error(self, error: Exception) -> Unavailable:
         reason: object = error.reason if isinstance(error, MaxRetryError) else error
         if isinstance(reason, SSLError):
             advice = "Check S3_SECURE: does it speak HTTPS, with a certificate that holds here?"
@@ -202,7 +213,7 @@ class Bucket:
         )
 
 
-def _is_silence(error: Exception) -> bool:
+def _is_timeout(error: Exception) -> bool:
     """Was the time limit reached: while connecting, sending or waiting for an answer?"""
     if isinstance(error, ProtocolError):
         return any(isinstance(cause, TimeoutError) for cause in error.args)
@@ -211,15 +222,15 @@ def _is_silence(error: Exception) -> bool:
 
 def _advice(code: str, bucket: str) -> str | None:
     """What to do about a refusal; None for what is no refusal."""
-    if code in WRONG_KEYS:
+    if code in BAD_CREDENTIALS_CODES:
         return "Check S3_ACCESS_KEY and S3_SECRET_KEY."
-    if code in REFUSED:
+    if code in ACCESS_DENIED_CODES:
         return (
             "Check S3_ACCESS_KEY and S3_SECRET_KEY, and that they may read, write, list and delete "
             f"in the bucket {bucket!r}."
         )
-    if code in WRONG_REGION:
+    if code in WRONG_REGION_CODES:
         return "Set S3_REGION to the region of the bucket."
-    if code in WRONG_CLOCK:
+    if code in CLOCK_SKEW_CODES:
         return "This machine's clock is wrong, or the store's."
     return None

@@ -12,19 +12,19 @@ from shared.objects.s3.bucket import Bucket
 
 log = logging.getLogger(__name__)
 
-ALREADY_OURS = "BucketAlreadyOwnedByYou"
-NO_RULES = {"NotImplemented", "MethodNotAllowed"}
-UNFINISHED_DAYS = 1  # S3's least
+ALREADY_OWNED_CODE = "BucketAlreadyOwnedByYou"
+LIFECYCLE_UNSUPPORTED_CODES = {"NotImplemented", "MethodNotAllowed"}
+ABORT_UPLOADS_AFTER_DAYS = 1  # S3's least
 
 # The parts that killed writers leave can't be seen, and cost room.
-RULES = LifecycleConfig(
+LIFECYCLE_RULES = LifecycleConfig(
     [
         Rule(
             ENABLED,
             rule_id="placewise-unfinished-uploads",
             rule_filter=Filter(prefix=""),
             abort_incomplete_multipart_upload=AbortIncompleteMultipartUpload(
-                days_after_initiation=UNFINISHED_DAYS
+                days_after_initiation=ABORT_UPLOADS_AFTER_DAYS
             ),
         )
     ]
@@ -43,14 +43,14 @@ def create_bucket(bucket: Bucket) -> bool:
             try:
                 client.make_bucket(bucket.name)
             except S3Error as error:
-                if error.code != ALREADY_OURS:
+                if error.code != ALREADY_OWNED_CODE:
                     raise
                 made = False  # by another one, since we looked
         try:
             if client.get_bucket_lifecycle(bucket.name) is None:
-                client.set_bucket_lifecycle(bucket.name, RULES)
+                client.set_bucket_lifecycle(bucket.name, LIFECYCLE_RULES)
         except S3Error as error:
-            if error.code not in NO_RULES:
+            if error.code not in LIFECYCLE_UNSUPPORTED_CODES:
                 raise
             log.warning(
                 "the object store at %s knows no lifecycle rules: what killed processes have sent "

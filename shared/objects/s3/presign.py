@@ -18,7 +18,7 @@ from minio.time import to_amz_date
 from shared.objects.port import PresignedPut
 from shared.objects.s3.bucket import Bucket
 
-UNSIGNED = "UNSIGNED-PAYLOAD"
+UNSIGNED_PAYLOAD = "UNSIGNED-PAYLOAD"
 
 
 def presign_put(
@@ -46,7 +46,7 @@ def presign_put(
         }.items()
     )
     unsigned = SplitResult(url.scheme, url.netloc, url.path, query, "")
-    asked, _ = signer._get_canonical_request_hash("PUT", unsigned, signed, UNSIGNED)
+    asked, _ = signer._get_canonical_request_hash("PUT", unsigned, signed, UNSIGNED_PAYLOAD)
     signature = signer._get_signature(
         signer._get_signing_key(credentials.secret_key, now, region, "s3"),
         signer._get_string_to_sign(now, scope, asked),

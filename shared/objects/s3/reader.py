@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from _typeshed import WriteableBuffer
 
 BUFFER_BYTES = 64 * 1024
-BEHIND_THE_END = "InvalidRange"
+RANGE_NOT_SATISFIABLE_CODE = "InvalidRange"
 
 
 class S3Reader(io.RawIOBase):
@@ -47,7 +47,7 @@ class S3Reader(io.RawIOBase):
         if wanted < 0:
             raise ValueError(f"position {wanted} lies before the object")
         if wanted != self._position:
-            self._let_go()
+            self._release_connection()
         self._position = wanted
         return wanted
 
@@ -62,7 +62,7 @@ class S3Reader(io.RawIOBase):
 
     def close(self) -> None:
         if not self.closed:
-            self._let_go()
+            self._release_connection()
         super().close()
 
     def _read(self, most_bytes: int | None) -> bytes:
@@ -92,7 +92,7 @@ class S3Reader(io.RawIOBase):
                 self._bucket.name, self._key, offset=begin, request_headers=headers
             )
 
-    def _let_go(self) -> None:
+    def _release_connection(self) -> None:
         """Give the connection back, or close it when more would come over it."""
         answer, self._answer = getattr(self, "_answer", None), None
         if answer is None:
@@ -116,7 +116,7 @@ def read_range(bucket: Bucket, key: str, begin: int, size_bytes: int) -> bytes:
         try:
             answer = bucket.client.get_object(bucket.name, key, offset=begin, length=size_bytes)
         except S3Error as error:
-            if error.code != BEHIND_THE_END:
+            if error.code != RANGE_NOT_SATISFIABLE_CODE:
                 raise
             return b""
         try:

@@ -13,10 +13,10 @@ from minio.commonconfig import REPLACE, CopySource
 from minio.error import S3Error
 
 from shared.errors import NotFound, StorageFull, Unavailable
-from shared.objects.folder import MARK
-from shared.objects.keys import TRASH, check_key, is_key
+from shared.objects.folder import OWNER_MARK
+from shared.objects.keys import TRASH, check_key, is_valid_key
 from shared.objects.port import ObjectInfo, PresignedPut
-from shared.objects.s3.bucket import NO_KEY, Bucket
+from shared.objects.s3.bucket import NO_SUCH_KEY_CODES, Bucket
 from shared.objects.s3.presign import presign_put
 from shared.objects.s3.reader import S3Reader, open_object, read_range
 from shared.objects.s3.writer import S3Writer
@@ -25,7 +25,7 @@ log = logging.getLogger(__name__)
 
 T = TypeVar("T")
 
-PROBE = ".placewise-check"  # no object: an upload that is begun and given up
+PROBE_KEY = ".placewise-check"  # no object: an upload that is begun and given up
 
 
 class S3Store:
@@ -65,7 +65,7 @@ class S3Store:
             try:
                 found = client.stat_object(bucket, key)
             except S3Error as error:
-                if error.code not in NO_KEY:
+                if error.code not in NO_SUCH_KEY_CODES:
                     raise
                 # This answer has no body, which would tell a missing bucket from a missing key.
                 if not client.bucket_exists(bucket):
@@ -169,11 +169,11 @@ class S3Store:
             # First of all, because some servers make a missing bucket when it is written to.
             if not client.bucket_exists(bucket):
                 raise self.bucket.missing()
-            upload_id = client._create_multipart_upload(bucket, PROBE, {})
-            client._abort_multipart_upload(bucket, PROBE, upload_id)
+            upload_id = client._create_multipart_upload(bucket, PROBE_KEY, {})
+            client._abort_multipart_upload(bucket, PROBE_KEY, upload_id)
 
 
 def _note(name: str) -> str:
-    if not name.startswith(MARK) or not is_key(name) or "/" in name:
+    if not name.startswith(OWNER_MARK) or not is_valid_key(name) or "/" in name:
         raise ValueError(f"not the name of a note: {name!r}")
     return name

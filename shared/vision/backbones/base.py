@@ -6,7 +6,7 @@ from typing import Any, Protocol
 
 import torch
 
-LEAST_LENGTH = 1e-12  # what is shorter is not scaled up to 1: it has no direction but noise
+MIN_NORM = 1e-12  # what is shorter is not scaled up to 1: it has no direction but noise
 
 
 class Backbone(Protocol):
@@ -42,7 +42,7 @@ class Backbone(Protocol):
         row. (1, 1) where there is one feature of the whole photo."""
 
 
-def unit_features(features: torch.Tensor) -> torch.Tensor:
+def normalise_features(features: torch.Tensor) -> torch.Tensor:
     """(..., width) of any floating type -> float32 of length 1, as `Backbone.features` promises.
 
     Dividing by a length that has overflowed would make zeros, which aggregators take for a patch
@@ -51,7 +51,7 @@ def unit_features(features: torch.Tensor) -> torch.Tensor:
     features = features.float()
     lengths = torch.linalg.vector_norm(features, dim=-1, keepdim=True)
     lengths = torch.where(lengths.isfinite(), lengths, torch.nan)
-    return features / lengths.clamp(min=LEAST_LENGTH)
+    return features / lengths.clamp(min=MIN_NORM)
 
 
 def normalise_pixels(

@@ -25,20 +25,20 @@ from torch.nn import Identity, Linear
 from torch.nn.functional import interpolate
 
 from shared.recipes import FACETS
-from shared.vision.backbones.base import normalise_pixels, unit_features
+from shared.vision.backbones.base import normalise_features, normalise_pixels
 from shared.vision.backbones.dinov2_weights import (
-    WeightsFile,
-    check_fit,
-    find_weights,
+    DinoWeightsFile,
+    check_tensor_shapes,
+    find_or_download_weights,
     hub_repository,
     open_weights,
-    unfit,
+    weights_unfit_error,
 )
 
 PATCH = 14  # pixels
 GRID = 37  # patches along a side of the training's 518 x 518 photos
 INTERPOLATE_OFFSET = 0.1  # Meta's, against rounding of the output's size
-WITHOUT_MEMORY = torch.device("meta")
+META_DEVICE = torch.device("meta")
 MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # ImageNet
 
 
@@ -86,11 +86,11 @@ class Dinov2:
         self.layer = str(layer)
         self.facet: str | None = facet
         self.device = device
-        file = open_weights(find_weights(size, weights), size)
-        self._vit = outline(self._shape, layer, facet)
-        self.fingerprint = fill(self._vit, file, self._shape, size, device)
+        file = open_weights(find_or_download_weights(size, weights), size)
+        self._vit = build_empty_vit(self._shape, layer, facet)
+        self.fingerprint = load_vit_weights(self._vit, file, self._shape, size, device)
         if facet != "token":
-            _keep_one_third(self._vit.blocks[layer].attn, FACETS.index(facet))
+            _slice_qkv(self._vit.blocks[layer].attn, FACETS.index(facet))
         self.card: dict[str, Any] = {
             "network": self._shape.timm_name,
             "source": hub_repository(size) if weights is None else "DINO_WEIGHTS",
@@ -111,7 +111,7 @@ class Dinov2:
         for block in before:
             tokens = block(tokens)
         facet = last(tokens) if self.facet == "token" else last.attn.qkv(last.norm1(tokens))
-        return unit_features(facet[:, 1 + self._shape.registers :])
+        return normalise_features(facet[:, 1 + self._shape.registers :])
 
     def grid(self, height: int, width: int) -> tuple[int, int]:
         return height // PATCH, width // PATCH
@@ -130,12 +130,12 @@ class Dinov2:
         return torch.cat([prefix.expand(len(patches), -1, -1), placed], dim=1)
 
 
-def check_weights(
-    size: str, layer: int, facet: str, file: WeightsFile, *, shape: VitShape | None = None
+def check_dinov2_weights(
+    size: str, layer: int, facet: str, file: DinoWeightsFile, *, shape: VitShape | None = None
 ) -> None:
     """Misconfigured (`weights_unfit`) when loading would refuse the file; reads its index only."""
     shape = shape or SHAPES[size]
-    check_fit(file, _shapes(outline(shape, layer, facet)), size, shape.registers)
+    check_tensor_shapes(file, _shapes(build_empty_vit(shape, layer, facet)), size, shape.registers)
 
 
 def resample_positions(
@@ -159,13 +159,13 @@ def resample_positions(
     return moved.permute(0, 2, 3, 1).flatten(1, 2)
 
 
-def outline(
+def build_empty_vit(
     shape: VitShape,
     layer: int,
     facet: str,
     *,
     with_norm: bool = False,
-    device: torch.device = WITHOUT_MEMORY,
+    device: torch.device = META_DEVICE,
 ) -> Any:
     """timm's network up to where the facet is known, and to the norm after it on demand; without
     memory for its tensors unless a device is given, where they are random.
@@ -196,19 +196,21 @@ def _shapes(vit: Any) -> dict[str, tuple[int, ...]]:
     return {name: tuple(tensor.shape) for name, tensor in vit.state_dict().items()}
 
 
-def weights_fingerprint(size: str, layer: int, facet: str, file: WeightsFile) -> str:
+def dinov2_fingerprint(size: str, layer: int, facet: str, file: DinoWeightsFile) -> str:
     """The `fingerprint` of a network with these weights; reads the file, loads no network.
 
     Misconfigured: `weights_unfit`.
     """
-    vit = outline(SHAPES[size], layer, facet)
+    vit = build_empty_vit(SHAPES[size], layer, facet)
     digest = hashlib.sha256()
     for name, tensor in _tensors(vit, file, SHAPES[size], size):
-        _add(digest, name, tensor)
+        _update_digest(digest, name, tensor)
     return digest.hexdigest()
 
 
-def fill(vit: Any, file: WeightsFile, shape: VitShape, size: str, device: torch.device) -> str:
+def load_vit_weights(
+    vit: Any, file: DinoWeightsFile, shape: VitShape, size: str, device: torch.device
+) -> str:
     """Give the outline its tensors; returns their sha256: name-sorted, as float32 bytes.
 
     Misconfigured: `weights_unfit`.
@@ -216,32 +218,32 @@ def fill(vit: Any, file: WeightsFile, shape: VitShape, size: str, device: torch.
     digest = hashlib.sha256()
     state = {}
     for name, tensor in _tensors(vit, file, shape, size):
-        _add(digest, name, tensor)
+        _update_digest(digest, name, tensor)
         state[name] = tensor.to(device)
     vit.load_state_dict(state, assign=True)
     return digest.hexdigest()
 
 
 def _tensors(
-    vit: Any, file: WeightsFile, shape: VitShape, size: str
+    vit: Any, file: DinoWeightsFile, shape: VitShape, size: str
 ) -> Iterator[tuple[str, torch.Tensor]]:
     """What the outline needs of the file, sorted by name, in float32; checked."""
     wanted = _shapes(vit)
-    check_fit(file, wanted, size, shape.registers)
+    check_tensor_shapes(file, wanted, size, shape.registers)
     for name in sorted(wanted):
         stored = file.read(name)
         if not stored.is_floating_point() or not torch.isfinite(stored).all():
-            raise unfit(file.path, f"{name} is not all finite floats", size)
+            raise weights_unfit_error(file.path, f"{name} is not all finite floats", size)
         # Copied: the file may be changed or taken away while the service runs.
         yield name, torch.empty(stored.shape, dtype=torch.float32).copy_(stored)
 
 
-def _add(digest: Any, name: str, tensor: torch.Tensor) -> None:
+def _update_digest(digest: Any, name: str, tensor: torch.Tensor) -> None:
     digest.update(name.encode())
     digest.update(tensor.numpy().data)
 
 
-def _keep_one_third(attention: Any, third: int) -> None:
+def _slice_qkv(attention: Any, third: int) -> None:
     """Of the joint projection [query; key; value], keep the rows that make one of them."""
     joint: Linear = attention.qkv
     width = joint.in_features

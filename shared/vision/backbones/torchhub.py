@@ -12,44 +12,44 @@ from typing import Any
 import torch
 from torch.nn.functional import normalize
 
-from shared.recipes import MOST_WIDTH
-from shared.torchhub_names import HubEntry
-from shared.vision.backbones.base import normalise_pixels, unit_features
+from shared.recipes import MAX_WIDTH
+from shared.torchhub_names import TorchHubEntry
+from shared.vision.backbones.base import normalise_features, normalise_pixels
 from shared.vision.download import OnProgress
 from shared.vision.torchhub_code import (
-    bring_code,
     code_fingerprint,
-    licence,
+    find_licence,
+    find_or_download_code,
+    ignore_progress,
     load_module,
-    no_progress,
-    unfit,
+    torchhub_unfit_error,
 )
 
-SEED = 20_242
-LEAST_COSINE = 0.999  # of a photo described alone and beside others; kernels differ a little
+PROBE_SEED = 20_242
+MIN_REPEAT_COSINE = 0.999  # of a photo described alone and beside others; kernels differ a little
 
 
-class HubModule:
+class TorchHubBackbone:
     facet: str | None = None
 
     def __init__(
-        self, hub: HubEntry, device: torch.device, *, on_progress: OnProgress = no_progress
+        self, hub: TorchHubEntry, device: torch.device, *, on_progress: OnProgress = ignore_progress
     ) -> None:
         """Load the entry, which executes its code, and let it describe two pictures of noise.
 
         Misconfigured: `weights_missing`, `torchhub_unfit`, `download_corrupt`.
         """
         self._hub = hub
-        folder = bring_code(hub, on_progress)
+        folder = find_or_download_code(hub, on_progress)
         # Before anything is executed: the code may change what lies beside it.
         self.code_fingerprint = code_fingerprint(folder)
         self.name = hub.module
         self.layer = hub.entry
-        self.licence = licence(folder)
+        self.licence = find_licence(folder)
         self.device = device
         module = load_module(hub, folder, on_progress)
         self._module = module.eval().requires_grad_(False).to(device)
-        self.fingerprint, size_bytes = weights_fingerprint(self._module)
+        self.fingerprint, size_bytes = module_fingerprint(self._module)
         self.card: dict[str, Any] = {
             "source": hub.source,
             "entry": hub.entry,
@@ -60,7 +60,7 @@ class HubModule:
 
     @torch.inference_mode()
     def features(self, pixels: torch.Tensor) -> torch.Tensor:
-        return unit_features(self._forward(pixels)).unsqueeze(1)
+        return normalise_features(self._forward(pixels)).unsqueeze(1)
 
     def grid(self, height: int, width: int) -> tuple[int, int]:
         return 1, 1
@@ -74,35 +74,37 @@ class HubModule:
     def _probe(self) -> int:
         """The length of a descriptor, found by describing; `torchhub_unfit` for what is none."""
         hub = self._hub
-        noise = torch.Generator().manual_seed(SEED)
+        noise = torch.Generator().manual_seed(PROBE_SEED)
         shape = (2, hub.height, hub.width, 3)
         photos = torch.randint(0, 256, shape, dtype=torch.uint8, generator=noise)
         try:
             both, alone = self._forward(photos), self._forward(photos[:1])
         except Exception as error:  # whatever the network of others does
             said = (str(error).strip() or type(error).__name__).splitlines()[0]
-            raise unfit(
+            raise torchhub_unfit_error(
                 hub,
                 f"with 2 photos of {hub.height} x {hub.width} pixels it ends with "
                 f"{type(error).__name__}: {said}",
             ) from error
         if not isinstance(both, torch.Tensor) or not both.is_floating_point():
-            raise unfit(hub, f"it makes a {_kind(both)}, not a tensor of floats")
+            raise torchhub_unfit_error(
+                hub, f"it makes a {_value_kind(both)}, not a tensor of floats"
+            )
         if both.ndim != 2 or len(both) != 2 or alone.shape != (1, both.shape[1]):
-            raise unfit(
+            raise torchhub_unfit_error(
                 hub,
                 f"of 2 photos it makes numbers of the shape {tuple(both.shape)}, of one "
                 f"{tuple(alone.shape)}; one descriptor for each is expected: (2, D) and (1, D)",
             )
-        if both.shape[1] > MOST_WIDTH:
-            raise unfit(hub, f"{both.shape[1]} dimensions are more than {MOST_WIDTH}")
+        if both.shape[1] > MAX_WIDTH:
+            raise torchhub_unfit_error(hub, f"{both.shape[1]} dimensions are more than {MAX_WIDTH}")
         if not torch.isfinite(both).all() or not torch.isfinite(alone).all():
-            raise unfit(hub, "its descriptors hold NaN or infinite numbers")
+            raise torchhub_unfit_error(hub, "its descriptors hold NaN or infinite numbers")
         if bool((both.norm(dim=-1) == 0).any()):
-            raise unfit(hub, "its descriptors are zero")
+            raise torchhub_unfit_error(hub, "its descriptors are zero")
         cosine = float(normalize(both[:1].float(), dim=-1) @ normalize(alone[0].float(), dim=-1))
-        if cosine < LEAST_COSINE:
-            raise unfit(
+        if cosine < MIN_REPEAT_COSINE:
+            raise torchhub_unfit_error(
                 hub,
                 "it describes a photo otherwise when another one is beside it (cosine "
                 f"{cosine:.3f}), and which ones are described together is chance here",
@@ -110,7 +112,7 @@ class HubModule:
         return int(both.shape[1])
 
 
-def weights_fingerprint(module: torch.nn.Module) -> tuple[str, int]:
+def module_fingerprint(module: torch.nn.Module) -> tuple[str, int]:
     """sha256 of the module's tensors, name-sorted with type and shape, and their size in bytes."""
     digest, size_bytes = hashlib.sha256(), 0
     state: dict[str, Any] = module.state_dict()
@@ -125,5 +127,5 @@ def weights_fingerprint(module: torch.nn.Module) -> tuple[str, int]:
     return digest.hexdigest(), size_bytes
 
 
-def _kind(value: object) -> str:
+def _value_kind(value: object) -> str:
     return f"tensor of {value.dtype}" if isinstance(value, torch.Tensor) else type(value).__name__

@@ -13,24 +13,24 @@ from typing import Any
 import torch
 
 from shared.errors import Unprocessable
-from shared.recipes import MOST_WIDTH
+from shared.recipes import MAX_WIDTH
 from shared.torchhub_names import IMAGENET_MEAN, IMAGENET_STD
-from shared.vision.backbones.base import normalise_pixels, unit_features
+from shared.vision.backbones.base import normalise_features, normalise_pixels
 from shared.vision.place_models.checkpoint import load_checkpoint
-from shared.vision.place_models.model import PlaceModel
+from shared.vision.place_models.model import VprModel
 from shared.vision.preprocessing import Preprocessing, get_preprocessing
 
-SEED = 20_242
-LEAST_COSINE = 0.999  # of a photo described alone and beside another; kernels differ a little
+PROBE_SEED = 20_242
+MIN_REPEAT_COSINE = 0.999  # of a photo described alone and beside another; kernels differ a little
 
 
-class TrainedModel:
+class TrainedBackbone:
     facet: str | None = None
 
     def __init__(
         self,
         name: str,
-        model: PlaceModel,
+        model: VprModel,
         fingerprint: str,
         device: torch.device,
         *,
@@ -48,7 +48,7 @@ class TrainedModel:
         self._model = model.eval().requires_grad_(False).to(device)
 
     @classmethod
-    def of_checkpoint(cls, name: str, path: Path, device: torch.device) -> TrainedModel:
+    def from_checkpoint(cls, name: str, path: Path, device: torch.device) -> TrainedBackbone:
         """The model in a checkpoint of this machine; raises as `load_checkpoint` and `check`."""
         found = load_checkpoint(path)
         card = {"source": path.name, **found.about}
@@ -74,7 +74,7 @@ class TrainedModel:
 
     @torch.inference_mode()
     def features(self, pixels: torch.Tensor) -> torch.Tensor:
-        return unit_features(self._forward(pixels)).unsqueeze(1)
+        return normalise_features(self._forward(pixels)).unsqueeze(1)
 
     def grid(self, height: int, width: int) -> tuple[int, int]:
         return 1, 1
@@ -90,26 +90,30 @@ class TrainedModel:
         descriptors."""
         for name, tensor in self._model.state_dict().items():
             if tensor.is_floating_point() and not bool(torch.isfinite(tensor).all()):
-                raise _unfit(f"its weights {name} hold NaN or infinite numbers")
-        if self.width > MOST_WIDTH:
-            raise _unfit(f"{self.width} dimensions are more than {MOST_WIDTH}")
-        noise = torch.Generator().manual_seed(SEED)
+                raise _model_unfit_error(f"its weights {name} hold NaN or infinite numbers")
+        if self.width > MAX_WIDTH:
+            raise _model_unfit_error(f"{self.width} dimensions are more than {MAX_WIDTH}")
+        noise = torch.Generator().manual_seed(PROBE_SEED)
         shape = (2, *self.image_size, 3)
         photos = torch.randint(0, 256, shape, dtype=torch.uint8, generator=noise)
         both, alone = self._forward(photos), self._forward(photos[:1])
         if both.shape != (2, self.width) or alone.shape != (1, self.width):
-            raise _unfit(f"of 2 photos it makes numbers of the shape {tuple(both.shape)}")
+            raise _model_unfit_error(
+                f"of 2 photos it makes numbers of the shape {tuple(both.shape)}"
+            )
         if not torch.isfinite(both).all() or not torch.isfinite(alone).all():
-            raise _unfit("its descriptors hold NaN or infinite numbers")
+            raise _model_unfit_error("its descriptors hold NaN or infinite numbers")
         if bool((both.norm(dim=-1) == 0).any()) or torch.equal(both[0], both[1]):
-            raise _unfit("of two different photos its descriptors are zero, or the same")
-        cosine = float(unit_features(both[0]) @ unit_features(alone[0]))
-        if cosine < LEAST_COSINE:
-            raise _unfit(
+            raise _model_unfit_error(
+                "of two different photos its descriptors are zero, or the same"
+            )
+        cosine = float(normalise_features(both[0]) @ normalise_features(alone[0]))
+        if cosine < MIN_REPEAT_COSINE:
+            raise _model_unfit_error(
                 "it describes a photo otherwise when another one is beside it (cosine "
                 f"{cosine:.3f}), and which ones are described together is chance here"
             )
 
 
-def _unfit(fault: str) -> Unprocessable:
+def _model_unfit_error(fault: str) -> Unprocessable:
     return Unprocessable("model_unfit", f"The model can't describe photos: {fault}.")

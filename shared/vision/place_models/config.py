@@ -34,7 +34,7 @@ ALIASES = {
     **{f"dinov2_{size}": f"dinov2_vit{size}14" for size in "sblg"},
 }
 
-AGGREGATORS = {
+VPR_AGGREGATORS = {
     "cosplace": "CosPlace",
     "avg": "AVG",
     "gem": "GeM",
@@ -47,13 +47,13 @@ AGGREGATORS = {
 """By the part of a name, in small letters, that means them."""
 
 NO_FREEZING = -1
-LEAST_STAGE_TO_CROP = 2  # a stem without any stage sees a few pixels
-MOST_PIXELS_A_SIDE = 4096
+MIN_STAGE_TO_CROP = 2  # a stem without any stage sees a few pixels
+MAX_SIDE_PIXELS = 4096
 
-Side = Annotated[int, Field(ge=16, le=MOST_PIXELS_A_SIDE)]
+SidePixels = Annotated[int, Field(ge=16, le=MAX_SIDE_PIXELS)]
 
 
-class ModelConfig(BaseModel):
+class VprModelConfig(BaseModel):
     """A place model in words; `model_dump()` is of plain types.
 
     Names are brought to their canonical form: backbones by any name of STAGES or ALIASES, in
@@ -78,11 +78,11 @@ class ModelConfig(BaseModel):
     agg_config: dict[str, Any] = {}
     """Arguments of the aggregator; what is left out has the published default, and sizes of the
     map are found by the first pass."""
-    image_size: tuple[Side, Side] = (320, 320)
+    image_size: tuple[SidePixels, SidePixels] = (320, 320)
     """Height and width in pixels."""
 
     @classmethod
-    def read(cls, values: Mapping[str, Any]) -> ModelConfig:
+    def parse(cls, values: Mapping[str, Any]) -> VprModelConfig:
         """From a mapping of anything; Unprocessable as above."""
         try:
             return cls.model_validate(dict(values))
@@ -111,28 +111,28 @@ class ModelConfig(BaseModel):
     @field_validator("agg_arch")
     @classmethod
     def _canonical_aggregator(cls, name: str) -> str:
-        for part, canonical in AGGREGATORS.items():
+        for part, canonical in VPR_AGGREGATORS.items():
             if part in name.lower():
                 return canonical
         raise Unprocessable(
             "unknown_aggregator",
-            f"There is no aggregator {name!r}. Known: {', '.join(AGGREGATORS.values())} "
+            f"There is no aggregator {name!r}. Known: {', '.join(VPR_AGGREGATORS.values())} "
             "(agg_arch).",
         )
 
     @model_validator(mode="after")
-    def _layers_exist(self) -> ModelConfig:
+    def _layers_exist(self) -> VprModelConfig:
         count = STAGES[self.backbone_arch]
         if not NO_FREEZING <= self.layers_to_freeze <= count:
             raise _bad(
                 f"layers_to_freeze={self.layers_to_freeze}: {self.backbone_arch} has {count} "
                 f"stages, so it is a number from {NO_FREEZING} (train everything) to {count}."
             )
-        outside = [n for n in self.layers_to_crop if not LEAST_STAGE_TO_CROP <= n <= count]
+        outside = [n for n in self.layers_to_crop if not MIN_STAGE_TO_CROP <= n <= count]
         if outside:
             raise _bad(
                 f"layers_to_crop={list(self.layers_to_crop)}: {self.backbone_arch} has {count} "
-                f"stages; those from {LEAST_STAGE_TO_CROP} to {count} can be cropped."
+                f"stages; those from {MIN_STAGE_TO_CROP} to {count} can be cropped."
             )
         return self
 

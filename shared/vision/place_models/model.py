@@ -8,12 +8,12 @@ import torch
 from torch import nn
 
 from shared.errors import Unprocessable
-from shared.vision.place_models.aggregators import Aggregator, MapShape, build_aggregator
+from shared.vision.place_models.aggregators import Aggregator, FeatureMapShape, build_aggregator
 from shared.vision.place_models.backbones import StagedBackbone, build_backbone
-from shared.vision.place_models.config import ModelConfig
+from shared.vision.place_models.config import VprModelConfig
 
 
-class PlaceModel(nn.Module):
+class VprModel(nn.Module):
     """(B, 3, H, W) float32, normalised by ImageNet's mean and deviation -> (B, D) float32 rows of
     length 1.
 
@@ -21,7 +21,7 @@ class PlaceModel(nn.Module):
     """
 
     def __init__(
-        self, config: ModelConfig, backbone: StagedBackbone, aggregator: Aggregator
+        self, config: VprModelConfig, backbone: StagedBackbone, aggregator: Aggregator
     ) -> None:
         super().__init__()
         self.config = config
@@ -45,7 +45,7 @@ class PlaceModel(nn.Module):
         return rows
 
 
-def build_model(config: ModelConfig, *, weights: Path | None = None) -> PlaceModel:
+def build_vpr_model(config: VprModelConfig, *, weights: Path | None = None) -> VprModel:
     """The model in evaluation mode on the CPU. Its own `config` holds all arguments of the
     aggregator, those that were read off the map and the defaults as well.
 
@@ -60,14 +60,16 @@ def build_model(config: ModelConfig, *, weights: Path | None = None) -> PlaceMod
     with torch.inference_mode():
         maps, token = backbone(torch.zeros(1, 3, *config.image_size))
     _, channels, height, width = maps.shape
-    shape = MapShape(channels, height, width, has_token=token is not None)
+    shape = FeatureMapShape(channels, height, width, has_token=token is not None)
     aggregator, arguments = build_aggregator(config, shape)
     _check_map(aggregator, config, maps, config.image_size)
     complete = config.model_copy(update={"agg_config": arguments})
-    return PlaceModel(complete, backbone, aggregator).eval()
+    return VprModel(complete, backbone, aggregator).eval()
 
 
-def _check_patches(backbone: StagedBackbone, height: int, width: int, config: ModelConfig) -> None:
+def _check_patches(
+    backbone: StagedBackbone, height: int, width: int, config: VprModelConfig
+) -> None:
     side = backbone.patch
     if height % side or width % side:
         nearest = [max(1, round(length / side)) * side for length in (height, width)]
@@ -79,7 +81,7 @@ def _check_patches(backbone: StagedBackbone, height: int, width: int, config: Mo
 
 
 def _check_map(
-    aggregator: Aggregator, config: ModelConfig, maps: torch.Tensor, photo: tuple[int, int]
+    aggregator: Aggregator, config: VprModelConfig, maps: torch.Tensor, photo: tuple[int, int]
 ) -> None:
     reason = aggregator.refusal(*maps.shape[-2:])
     if reason is not None:

@@ -23,24 +23,24 @@ from safetensors.torch import save
 
 from shared.errors import PlacewiseError, Unavailable
 from shared.vision.place_models.checkpoint import Checkpoint
-from shared.vision.place_models.config import ModelConfig
-from shared.vision.place_models.model import PlaceModel, build_model
+from shared.vision.place_models.config import VprModelConfig
+from shared.vision.place_models.model import VprModel, build_vpr_model
 
-METADATA = "placewise_model"
-FORMAT = 1
+METADATA_KEY = "placewise_model"
+MODEL_FILE_FORMAT = 1
 
 
 @dataclass(frozen=True, slots=True)
 class ModelFile:
-    model: PlaceModel
+    model: VprModel
     """On the CPU, in evaluation mode, without gradients."""
     fingerprint: str
 
 
-def encode_model(checkpoint: Checkpoint) -> bytes:
+def encode_model_file(checkpoint: Checkpoint) -> bytes:
     """The file's bytes; the same for the same configuration and weights."""
     about = {
-        "format": FORMAT,
+        "format": MODEL_FILE_FORMAT,
         "config": checkpoint.config.model_dump(mode="json"),
         "fingerprint": checkpoint.fingerprint,
     }
@@ -49,10 +49,10 @@ def encode_model(checkpoint: Checkpoint) -> bytes:
         name: tensor.detach().clone(memory_format=torch.contiguous_format)
         for name, tensor in checkpoint.model.state_dict().items()
     }
-    return save(tensors, {METADATA: json.dumps(about, sort_keys=True)})
+    return save(tensors, {METADATA_KEY: json.dumps(about, sort_keys=True)})
 
 
-def read_model(path: Path) -> ModelFile:
+def read_model_file(path: Path) -> ModelFile:
     """The model in a file whose hash was checked.
 
     Unavailable (`model_unreadable`): this release does not know the format, or no longer builds
@@ -60,13 +60,13 @@ def read_model(path: Path) -> ModelFile:
     """
     try:
         with safe_open(path, framework="pt") as file:
-            about = json.loads((file.metadata() or {})[METADATA])
-            if about["format"] != FORMAT:
-                raise _unreadable(path, f"its format is {about['format']}, not {FORMAT}")
+            about = json.loads((file.metadata() or {})[METADATA_KEY])
+            if about["format"] != MODEL_FILE_FORMAT:
+                raise _unreadable(path, f"its format is {about['format']}, not {MODEL_FILE_FORMAT}")
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-        config = ModelConfig.read({**about["config"], "pretrained": False})
+        config = VprModelConfig.parse({**about["config"], "pretrained": False})
         with torch.device("meta"):
-            model = build_model(config)
+            model = build_vpr_model(config)
         model.load_state_dict(tensors, assign=True)
     except (SafetensorError, KeyError, TypeError, ValueError, RuntimeError) as error:
         raise _unreadable(path, str(error) or type(error).__name__) from error

@@ -13,10 +13,10 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-from shared.vision.place_models.config import NO_FREEZING, ModelConfig
+from shared.vision.place_models.config import NO_FREEZING, VprModelConfig
 
-TRAINED_AT = (320, 320)  # pixels
-MODEL_ARGUMENTS = ("backbone_arch", "pretrained", "layers_to_freeze", "layers_to_crop", "agg_arch",
+GSV_IMAGE_SIZE = (320, 320)  # pixels
+GSV_MODEL_ARGUMENTS = ("backbone_arch", "pretrained", "layers_to_freeze", "layers_to_crop", "agg_arch",
                    "agg_config")  # fmt: skip
 
 _RENAMED = (
@@ -34,24 +34,24 @@ _RENAMED = (
 )
 
 
-def is_predecessors(parameters: Mapping[str, Any]) -> bool:
+def is_gsv_checkpoint(parameters: Mapping[str, Any]) -> bool:
     """Whether these hyperparameters are those of one of its checkpoints."""
     return {"backbone_arch", "agg_arch"} <= parameters.keys()
 
 
-def read_config(parameters: Mapping[str, Any]) -> ModelConfig:
+def read_gsv_config(parameters: Mapping[str, Any]) -> VprModelConfig:
     """Unprocessable as `ModelConfig.read`. (Its `layers_to_freeze` froze nothing.)"""
-    said = {name: parameters[name] for name in MODEL_ARGUMENTS if name in parameters}
-    found = ModelConfig.read({**said, "pretrained": False, "layers_to_freeze": NO_FREEZING})
+    said = {name: parameters[name] for name in GSV_MODEL_ARGUMENTS if name in parameters}
+    found = VprModelConfig.parse({**said, "pretrained": False, "layers_to_freeze": NO_FREEZING})
     sides = [found.agg_config.get(name) for name in ("in_h", "in_w")]
     if found.agg_arch != "MixVPR" or not all(isinstance(side, int) for side in sides):
-        return found.model_copy(update={"image_size": TRAINED_AT})
+        return found.model_copy(update={"image_size": GSV_IMAGE_SIZE})
     stride = 2 ** (found.stages + 1)  # of a ResNet, the only networks that it had
     size = [side * stride for side in sides if side is not None]
-    return ModelConfig.read({**found.model_dump(), "image_size": size})
+    return VprModelConfig.parse({**found.model_dump(), "image_size": size})
 
 
-def rename(tensor: str) -> str:
+def rename_gsv_tensor(tensor: str) -> str:
     """The name in `PlaceModel.state_dict()` of one of its tensors; as it was, if there is none."""
     for theirs, ours in _RENAMED:
         renamed, hits = re.subn(f"^{theirs}", ours, tensor)

@@ -60,7 +60,7 @@ class S3Server:
 
     def bucket(self, name: str, **changed: Any) -> Bucket:
         """A bucket of that name, which need not be there."""
-        return Bucket.of(Settings(**{**self.variables(name), **changed}))
+        return Bucket.from_settings(Settings(**{**self.variables(name), **changed}))
 
     def new_bucket(self) -> Bucket:
         """A fresh one."""

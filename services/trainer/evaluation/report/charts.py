@@ -42,12 +42,12 @@ class Series:
     """else points with their labels beside them"""
 
 
-def shares(label: str) -> Axis:
+def percent_axis(label: str) -> Axis:
     """An axis from 0 to 100 %."""
     return Axis(label, 0.0, 1.0, (0, 0.25, 0.5, 0.75, 1.0), percent=True)
 
 
-def chart(title: str, x: Axis, y: Axis, series: Sequence[Series]) -> str:
+def line_chart(title: str, x: Axis, y: Axis, series: Sequence[Series]) -> str:
     """One `<svg>`; values beyond an axis' ends are drawn at its end."""
     parts = [
         f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{escape(title)}">',

@@ -8,19 +8,19 @@ from dataclasses import dataclass
 from html import escape
 from typing import Any
 
-from services.trainer.evaluation.bootstrap import Difference
-from services.trainer.evaluation.measure import Measured
+from services.trainer.evaluation.bootstrap import PairedDifference
+from services.trainer.evaluation.measure import RetrievalMetrics
 from services.trainer.evaluation.pareto import pareto_front
-from services.trainer.evaluation.report.charts import Axis, Series, chart, shares
+from services.trainer.evaluation.report.charts import Axis, Series, line_chart, percent_axis
 from services.trainer.evaluation.report.style import STYLE
 from shared.datasets.sets import EvaluationSet
 
 
 @dataclass(frozen=True, slots=True)
-class Compared:
+class ComparedExtractor:
     name: str
-    measured: Measured
-    difference: Difference | None
+    measured: RetrievalMetrics
+    difference: PairedDifference | None
     """of R@1 to the first one's; None for the first"""
     dimension: int
     bytes_a_photo: int
@@ -30,7 +30,7 @@ class Compared:
 
     @property
     def recall_at_1(self) -> float:
-        return self.measured.recalls.of_all[1]
+        return self.measured.recalls.recall_all[1]
 
     @property
     def milliseconds(self) -> float:
@@ -62,8 +62,8 @@ class Compared:
         }
 
 
-def comparison_page(asked: EvaluationSet, compared: Sequence[Compared]) -> str:
-    ks = list(compared[0].measured.recalls.of_all)
+def render_comparison(evaluation_set: EvaluationSet, compared: Sequence[ComparedExtractor]) -> str:
+    ks = list(compared[0].measured.recalls.recall_all)
     heads = [
         "",
         *(f"R@{k}" for k in ks),
@@ -72,23 +72,25 @@ def comparison_page(asked: EvaluationSet, compared: Sequence[Compared]) -> str:
         "bytes a photo",
         "R@1 less the first's",
     ]
-    rows = "".join(_row(one) for one in compared)
+    rows = "".join(_table_row(one) for one in compared)
     charts = [
-        _costs(
+        _cost_chart(
             "What the size buys", "bytes a photo", compared, [c.bytes_a_photo for c in compared]
         ),
-        _costs("What the time buys", "ms a photo", compared, [c.milliseconds for c in compared]),
+        _cost_chart(
+            "What the time buys", "ms a photo", compared, [c.milliseconds for c in compared]
+        ),
     ]
     drawn = "".join(f"<figure>{one}</figure>" for one in charts if one)
     clusters = compared[0].measured.clusters
-    title = f"Descriptors on {asked.name}"
+    title = f"Descriptors on {evaluation_set.name}"
     return (
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
         f"<title>{escape(title)}</title><style>{STYLE}</style></head><body>"
-        f"<h1>{escape(title)}</h1><p>{len(asked.database)} database photos, {len(asked.queries)} "
-        f"queries; right: {escape(asked.rule)}; protocol {escape(asked.protocol)}; fingerprint "
-        f"<code>{asked.fingerprint}</code>.</p>"
+        f"<h1>{escape(title)}</h1><p>{len(evaluation_set.database)} database photos, {len(evaluation_set.queries)} "
+        f"queries; right: {escape(evaluation_set.rule)}; protocol {escape(evaluation_set.protocol)}; fingerprint "
+        f"<code>{evaluation_set.fingerprint}</code>.</p>"
         f"<div class='wide'><table><tr>{''.join(f'<th>{h}</th>' for h in heads)}</tr>{rows}</table>"
         f'</div><p class="note">Intervals: a bootstrap over {clusters.count} {clusters.kind}; the '
         "differences are paired, query by query. Time: network and aggregation, measured when the "
@@ -97,8 +99,8 @@ def comparison_page(asked: EvaluationSet, compared: Sequence[Compared]) -> str:
     )
 
 
-def _row(one: Compared) -> str:
-    shown = [f"{100 * share:.1f}" for share in one.measured.recalls.of_all.values()]
+def _table_row(one: ComparedExtractor) -> str:
+    shown = [f"{100 * share:.1f}" for share in one.measured.recalls.recall_all.values()]
     interval = one.measured.recall_intervals
     shown.append(
         f"{100 * interval[0].low:.1f} to {100 * interval[0].high:.1f}" if interval else "-"
@@ -109,24 +111,24 @@ def _row(one: Compared) -> str:
     return f"<tr><th>{escape(one.name)}</th>{cells}</tr>"
 
 
-def _costs(
-    title: str, label: str, compared: Sequence[Compared], prices: Sequence[float]
+def _cost_chart(
+    title: str, label: str, compared: Sequence[ComparedExtractor], costs: Sequence[float]
 ) -> str | None:
     """R@1 over a price, both on one chart, the front joined; None where no price is known."""
     worths = [one.recall_at_1 for one in compared]
-    known = [price for price in prices if price > 0]  # NaN is not
+    known = [price for price in costs if price > 0]  # NaN is not
     if not known:
         return None
     low = 10 ** math.floor(math.log10(min(known)))
     high = 10 ** math.ceil(math.log10(max(known) * 1.0001))
     steps = round(math.log10(high / low))
     x = Axis(label, low, high, [low * 10**step for step in range(steps + 1)], log=True)
-    front = pareto_front(prices, worths)
-    joined = sorted((p, w) for p, w, on in zip(prices, worths, front, strict=True) if on)
+    front = pareto_front(costs, worths)
+    joined = sorted((p, w) for p, w, on in zip(costs, worths, front, strict=True) if on)
     series = [Series("not beaten in both", joined)]
     series += [
         Series(one.name, [(price, worth)], line=False)
-        for one, price, worth in zip(compared, prices, worths, strict=True)
+        for one, price, worth in zip(compared, costs, worths, strict=True)
         if price > 0
     ]
-    return chart(title, x, shares("R@1"), series)
+    return line_chart(title, x, percent_axis("R@1"), series)

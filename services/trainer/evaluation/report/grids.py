@@ -9,20 +9,22 @@ from pathlib import Path
 
 import numpy as np
 
-from services.trainer.evaluation.result import Result
-from shared.datasets.sets import Shot
+from services.trainer.evaluation.result import EvaluationResult
+from shared.datasets.sets import DatasetPhoto
 from shared.errors import Unprocessable
-from shared.vision.decode import decode
+from shared.vision.decode import decode_photo
 from shared.vision.preprocessing import get_preprocessing
 
-ACROSS = 5  # database photos of a row
+COLUMNS_SHOWN = 5  # database photos of a row
 MAX_PIXELS = 200_000_000
-_SMALL = get_preprocessing("square32")  # the thumbnail is what is wanted
+_THUMBNAIL_PREPROCESSING = get_preprocessing("square32")  # the thumbnail is what is wanted
 
 
-def grids(result: Result, most: int, *, only_wrong: bool) -> list[tuple[str, str]]:
+def retrieval_grids(
+    result: EvaluationResult, max_rows: int, *, only_wrong: bool
+) -> list[tuple[str, str]]:
     """Headings with tables: the wrong ones of highest score, the right ones of lowest; at most
-    `most` rows each."""
+    `max_rows` rows each."""
     first = result.measured.hits[:, 0]
     findable = np.array([len(found) > 0 for found in result.asked.positives])
     sure = result.ranked.scores[:, 0] if result.has_scores else np.zeros(len(first))
@@ -36,27 +38,30 @@ def grids(result: Result, most: int, *, only_wrong: bool) -> list[tuple[str, str
     if not only_wrong:
         kinds.append((f"Right{least_sure}", [q for q in order[::-1] if first[q]]))
     return [
-        (f"{heading}: {min(most, len(found))} of {len(found)}", grid(result, found[:most]))
+        (
+            f"{heading}: {min(max_rows, len(found))} of {len(found)}",
+            retrieval_grid(result, found[:max_rows]),
+        )
         for heading, found in kinds
         if found
     ]
 
 
-def grid(result: Result, queries: Sequence[int]) -> str:
+def retrieval_grid(result: EvaluationResult, queries: Sequence[int]) -> str:
     """One table with a row for each of the queries."""
-    shown = min(ACROSS, result.measured.depth)
+    shown = min(COLUMNS_SHOWN, result.measured.depth)
     with_right = any(not result.measured.hits[q, :shown].any() for q in queries)
     heads = ["query", *(f"{rank + 1}" for rank in range(shown))]
     if with_right:
         heads.append("a right one")
-    rows = "".join(_row(result, int(query), shown, with_right) for query in queries)
+    rows = "".join(_grid_row(result, int(query), shown, with_right) for query in queries)
     named = "".join(f"<th>{head}</th>" for head in heads)
     return f'<div class="wide"><table class="grid"><tr>{named}</tr>{rows}</table></div>'
 
 
-def _row(result: Result, query: int, shown: int, with_right: bool) -> str:
+def _grid_row(result: EvaluationResult, query: int, shown: int, with_right: bool) -> str:
     shot = result.asked.queries[query]
-    cells = [_cell(shot, shot.name, "query", "")]
+    cells = [_grid_cell(shot, shot.name, "query", "")]
     scores, metres = result.scores, result.measured.metres
     for rank in range(shown):
         said = []
@@ -66,39 +71,39 @@ def _row(result: Result, query: int, shown: int, with_right: bool) -> str:
             said.append(f"{metres[query, rank]:.0f} m")
         kind = "right" if result.measured.hits[query, rank] else "wrong"
         match = result.match(query, rank)
-        cells.append(_cell(match, result.match_name(query, rank), kind, ", ".join(said)))
+        cells.append(_grid_cell(match, result.match_name(query, rank), kind, ", ".join(said)))
     positives = result.asked.positives[query]
     if with_right and not result.measured.hits[query, :shown].any() and len(positives):
         number = int(positives[0])
         there = result.asked.database[number] if result.asked.database else None
-        cells.append(_cell(there, there.name if there else str(number), "right missed", ""))
+        cells.append(_grid_cell(there, there.name if there else str(number), "right missed", ""))
     elif with_right:
         cells.append("<td></td>")
     return f"<tr>{''.join(cells)}</tr>"
 
 
-def _cell(shot: Shot | None, name: str, kind: str, said: str) -> str:
-    address = _photo(shot.path) if shot else None
+def _grid_cell(shot: DatasetPhoto | None, name: str, kind: str, caption: str) -> str:
+    address = _thumbnail_data_uri(shot.path) if shot else None
     seen = (
         f'<img class="{kind}" src="{address}" alt="{escape(name)}" loading="lazy">'
         if address
         else f'<span class="none {kind}">no photo</span>'
     )
     word = {"query": "", "right": "right", "wrong": "wrong"}.get(kind, "not found")
-    below = " · ".join(part for part in (word, said) if part)
-    named = f'<small title="{escape(name)}">{escape(_short(name))}</small>'
+    below = " · ".join(part for part in (word, caption) if part)
+    named = f'<small title="{escape(name)}">{escape(_shorten(name))}</small>'
     return f"<td>{seen}{named}<small>{escape(below)}</small></td>"
 
 
-def _photo(path: Path) -> str | None:
+def _thumbnail_data_uri(path: Path) -> str | None:
     """The photo as a small JPEG in a data URI; None where there is none to be seen, which the cell
     then says."""
     try:
-        thumbnail = decode(path.read_bytes(), _SMALL, MAX_PIXELS).thumbnail
+        thumbnail = decode_photo(path.read_bytes(), _THUMBNAIL_PREPROCESSING, MAX_PIXELS).thumbnail
     except (OSError, Unprocessable):
         return None
     return "data:image/jpeg;base64," + base64.b64encode(thumbnail).decode()
 
 
-def _short(name: str, characters: int = 34) -> str:
+def _shorten(name: str, characters: int = 34) -> str:
     return name if len(name) <= characters else "…" + name[1 - characters :]

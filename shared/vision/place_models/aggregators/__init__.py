@@ -9,21 +9,21 @@ from typing import Any, get_type_hints
 from pydantic import ConfigDict, ValidationError, create_model
 
 from shared.errors import Unprocessable
-from shared.vision.place_models.aggregators.base import Aggregator, MapShape
+from shared.vision.place_models.aggregators.base import Aggregator, FeatureMapShape
 from shared.vision.place_models.aggregators.boq import BoQ
 from shared.vision.place_models.aggregators.convap import ConvAP
 from shared.vision.place_models.aggregators.cosplace import CosPlace
 from shared.vision.place_models.aggregators.mixvpr import MixVPR
 from shared.vision.place_models.aggregators.netvlad import NetVLAD
-from shared.vision.place_models.aggregators.pooling import Average, GeM
+from shared.vision.place_models.aggregators.pooling import AveragePooling, GeM
 from shared.vision.place_models.aggregators.salad import SALAD
-from shared.vision.place_models.config import ModelConfig
+from shared.vision.place_models.config import VprModelConfig
 
-__all__ = ["Aggregator", "MapShape", "build_aggregator"]
+__all__ = ["Aggregator", "FeatureMapShape", "build_aggregator"]
 
-_CLASSES: dict[str, type[Aggregator]] = {
+_AGGREGATORS: dict[str, type[Aggregator]] = {
     "CosPlace": CosPlace,
-    "AVG": Average,
+    "AVG": AveragePooling,
     "GeM": GeM,
     "ConvAP": ConvAP,
     "MixVPR": MixVPR,
@@ -33,13 +33,15 @@ _CLASSES: dict[str, type[Aggregator]] = {
 }
 
 
-def build_aggregator(config: ModelConfig, shape: MapShape) -> tuple[Aggregator, dict[str, Any]]:
+def build_aggregator(
+    config: VprModelConfig, shape: FeatureMapShape
+) -> tuple[Aggregator, dict[str, Any]]:
     """The aggregator for maps of `shape`, and all of its arguments.
 
     Raises Unprocessable: `bad_agg_config` (an argument that it does not have, of a wrong type, or
     another size than the map's), `image_size_unfit`.
     """
-    kind = _CLASSES[config.agg_arch]
+    kind = _AGGREGATORS[config.agg_arch]
     found = {name: getattr(shape, field) for name, field in kind.inferred.items()}
     for name, size in found.items():
         given = config.agg_config.get(name, size)
@@ -56,7 +58,7 @@ def build_aggregator(config: ModelConfig, shape: MapShape) -> tuple[Aggregator, 
 
 
 def _checked(
-    config: ModelConfig, kind: type[Aggregator], given: Mapping[str, Any]
+    config: VprModelConfig, kind: type[Aggregator], given: Mapping[str, Any]
 ) -> dict[str, Any]:
     """All arguments of `kind`, with its defaults; of the types that its signature says."""
     hints = get_type_hints(kind.__init__, include_extras=True)
@@ -77,5 +79,5 @@ def _checked(
         raise _bad(config, f"{name}={given.get(name)!r}: {first['msg']}") from error
 
 
-def _bad(config: ModelConfig, reason: str) -> Unprocessable:
+def _bad(config: VprModelConfig, reason: str) -> Unprocessable:
     return Unprocessable("bad_agg_config", f"agg_config of {config.agg_arch}: {reason}")

@@ -15,7 +15,7 @@ Layers = Annotated[int, Field(ge=1, le=64)]
 Positive = Annotated[float, Field(gt=0, le=1000)]
 
 
-class MapShape(NamedTuple):
+class FeatureMapShape(NamedTuple):
     """The size of a backbone's map of one photo."""
 
     channels: int
@@ -42,6 +42,6 @@ class Aggregator(nn.Module):
         return None
 
 
-def unit_rows(values: torch.Tensor) -> torch.Tensor:
+def normalise_rows(values: torch.Tensor) -> torch.Tensor:
     """(B, ...) of any floating type -> (B, D) float32, each row divided by its length."""
     return normalize(values.flatten(1).float(), dim=-1)

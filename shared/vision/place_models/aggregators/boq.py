@@ -19,18 +19,18 @@ import torch
 from pydantic import Field
 from torch import nn
 
-from shared.vision.place_models.aggregators.base import Aggregator, Layers, Size, unit_rows
+from shared.vision.place_models.aggregators.base import Aggregator, Layers, Size, normalise_rows
 
 HEAD_WIDTH = 64  # channels of one attention head
-WIDENING = 4  # of an encoder layer's MLP
+FEEDFORWARD_FACTOR = 4  # of an encoder layer's MLP
 
 
-class Block(nn.Module):
+class BoqBlock(nn.Module):
     def __init__(self, width: int, queries: int) -> None:
         super().__init__()
         heads = width // HEAD_WIDTH
         self.encoder = nn.TransformerEncoderLayer(
-            width, heads, dim_feedforward=WIDENING * width, dropout=0.0, batch_first=True
+            width, heads, dim_feedforward=FEEDFORWARD_FACTOR * width, dropout=0.0, batch_first=True
         )
         self.queries = nn.Parameter(torch.randn(1, queries, width))
         self.among_queries = nn.MultiheadAttention(width, heads, batch_first=True)
@@ -63,7 +63,7 @@ class BoQ(Aggregator):
         super().__init__(proj_channels * row_dim)
         self.project = nn.Conv2d(in_channels, proj_channels, kernel_size=3, padding=1)
         self.norm = nn.LayerNorm(proj_channels)
-        self.blocks = nn.ModuleList(Block(proj_channels, num_queries) for _ in range(num_layers))
+        self.blocks = nn.ModuleList(BoqBlock(proj_channels, num_queries) for _ in range(num_layers))
         self.rows = nn.Linear(num_layers * num_queries, row_dim)
 
     def forward(self, maps: torch.Tensor) -> torch.Tensor:
@@ -72,4 +72,4 @@ class BoQ(Aggregator):
         for block in self.blocks:
             x, out = block(x)
             found.append(out)
-        return unit_rows(self.rows(torch.cat(found, dim=1).transpose(1, 2)))
+        return normalise_rows(self.rows(torch.cat(found, dim=1).transpose(1, 2)))

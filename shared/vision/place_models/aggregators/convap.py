@@ -12,7 +12,7 @@ from typing import ClassVar
 import torch
 from torch import nn
 
-from shared.vision.place_models.aggregators.base import Aggregator, Size, unit_rows
+from shared.vision.place_models.aggregators.base import Aggregator, Size, normalise_rows
 
 
 class ConvAP(Aggregator):
@@ -31,4 +31,4 @@ class ConvAP(Aggregator):
         self.cells = nn.AdaptiveAvgPool2d((s1, s2))
 
     def forward(self, maps: torch.Tensor) -> torch.Tensor:
-        return unit_rows(self.cells(self.channels(maps)))
+        return normalise_rows(self.cells(self.channels(maps)))

@@ -13,8 +13,12 @@ import torch
 from torch import nn
 from torch.nn.functional import normalize
 
-from shared.vision.place_models.aggregators.base import Aggregator, Size, unit_rows
-from shared.vision.place_models.aggregators.pooling import GEM_EPS, GEM_POWER, GeneralisedMean
+from shared.vision.place_models.aggregators.base import Aggregator, Size, normalise_rows
+from shared.vision.place_models.aggregators.pooling import (
+    GEM_EPS,
+    GEM_POWER,
+    GeneralizedMeanPooling,
+)
 
 
 class CosPlace(Aggregator):
@@ -22,8 +26,8 @@ class CosPlace(Aggregator):
 
     def __init__(self, in_dim: Size, out_dim: Size = 512) -> None:
         super().__init__(out_dim)
-        self.pool = GeneralisedMean(GEM_POWER, GEM_EPS)
+        self.pool = GeneralizedMeanPooling(GEM_POWER, GEM_EPS)
         self.linear = nn.Linear(in_dim, out_dim)
 
     def forward(self, maps: torch.Tensor) -> torch.Tensor:
-        return unit_rows(self.linear(self.pool(normalize(maps, dim=1))))
+        return normalise_rows(self.linear(self.pool(normalize(maps, dim=1))))

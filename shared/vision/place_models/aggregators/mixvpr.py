@@ -22,11 +22,11 @@ from shared.vision.place_models.aggregators.base import (
     Layers,
     Positive,
     Size,
-    unit_rows,
+    normalise_rows,
 )
 
 
-class Mixer(nn.Module):
+class FeatureMixer(nn.Module):
     def __init__(self, positions: int, hidden: int) -> None:
         super().__init__()
         self.norm = nn.LayerNorm(positions)
@@ -58,14 +58,14 @@ class MixVPR(Aggregator):
         self.size = (in_h, in_w)
         positions = in_h * in_w
         hidden = max(1, int(positions * mlp_ratio))
-        self.mixers = nn.Sequential(*(Mixer(positions, hidden) for _ in range(mix_depth)))
+        self.mixers = nn.Sequential(*(FeatureMixer(positions, hidden) for _ in range(mix_depth)))
         self.channels = nn.Linear(in_channels, out_channels)
         self.rows = nn.Linear(positions, out_rows)
 
     def forward(self, maps: torch.Tensor) -> torch.Tensor:
         mixed = self.mixers(maps.flatten(2))  # (B, C, hw)
         narrowed = self.channels(mixed.transpose(1, 2)).transpose(1, 2)
-        return unit_rows(self.rows(narrowed))
+        return normalise_rows(self.rows(narrowed))
 
     def refusal(self, height: int, width: int) -> str | None:
         if (height, width) == self.size:

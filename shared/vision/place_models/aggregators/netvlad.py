@@ -20,7 +20,7 @@ import torch
 from torch import nn
 from torch.nn.functional import normalize
 
-from shared.vision.place_models.aggregators.base import Aggregator, Positive, Size, unit_rows
+from shared.vision.place_models.aggregators.base import Aggregator, Positive, Size, normalise_rows
 
 
 class NetVLAD(Aggregator):
@@ -39,4 +39,4 @@ class NetVLAD(Aggregator):
         # Sums apart, so that no (B, hw, K, C) is needed.
         sums = shares.transpose(1, 2) @ features
         residuals = sums - shares.sum(dim=1).unsqueeze(-1) * self.centres
-        return unit_rows(normalize(residuals, dim=-1))
+        return normalise_rows(normalize(residuals, dim=-1))

@@ -14,20 +14,20 @@ from typing import ClassVar
 import torch
 from torch import nn
 
-from shared.vision.place_models.aggregators.base import Aggregator, Positive, Size, unit_rows
+from shared.vision.place_models.aggregators.base import Aggregator, Positive, Size, normalise_rows
 
 GEM_POWER = 3.0
 GEM_EPS = 1e-6
 
 
-class Average(Aggregator):
+class AveragePooling(Aggregator):
     inferred: ClassVar = {"in_channels": "channels"}
 
     def __init__(self, in_channels: Size) -> None:
         super().__init__(in_channels)
 
     def forward(self, maps: torch.Tensor) -> torch.Tensor:
-        return unit_rows(maps.mean(dim=(-2, -1)))
+        return normalise_rows(maps.mean(dim=(-2, -1)))
 
 
 class GeM(Aggregator):
@@ -35,13 +35,13 @@ class GeM(Aggregator):
 
     def __init__(self, in_channels: Size, p: Positive = GEM_POWER, eps: Positive = GEM_EPS) -> None:
         super().__init__(in_channels)
-        self.pool = GeneralisedMean(p, eps)
+        self.pool = GeneralizedMeanPooling(p, eps)
 
     def forward(self, maps: torch.Tensor) -> torch.Tensor:
-        return unit_rows(self.pool(maps))
+        return normalise_rows(self.pool(maps))
 
 
-class GeneralisedMean(nn.Module):
+class GeneralizedMeanPooling(nn.Module):
     """(B, C, h, w) -> (B, C) float32, not normalised."""
 
     def __init__(self, p: float, eps: float) -> None:

@@ -23,10 +23,10 @@ from pydantic import Field
 from torch import nn
 from torch.nn.functional import normalize
 
-from shared.vision.place_models.aggregators.base import Aggregator, Size, unit_rows
+from shared.vision.place_models.aggregators.base import Aggregator, Size, normalise_rows
 
-HIDDEN = 512  # channels between the two layers of each MLP
-ITERATIONS = 3  # of Sinkhorn's algorithm
+HIDDEN_WIDTH = 512  # channels between the two layers of each MLP
+SINKHORN_ITERATIONS = 3  # of Sinkhorn's algorithm
 DUSTBIN_SCORE = 1.0  # to begin with
 
 Share = Annotated[float, Field(ge=0, lt=1)]
@@ -49,19 +49,19 @@ class SALAD(Aggregator):
         self.features = _at_each_position(in_channels, cluster_dim, dropout)
         self.scores = _at_each_position(in_channels, num_clusters, dropout)
         self.token = nn.Sequential(
-            nn.Linear(in_channels, HIDDEN), nn.ReLU(), nn.Linear(HIDDEN, token_dim)
+            nn.Linear(in_channels, HIDDEN_WIDTH), nn.ReLU(), nn.Linear(HIDDEN_WIDTH, token_dim)
         )
         self.dustbin = nn.Parameter(torch.tensor(DUSTBIN_SCORE))
 
     def forward(self, maps: torch.Tensor, token: torch.Tensor | None) -> torch.Tensor:
         features = self.features(maps).flatten(2).float()  # (B, cluster_dim, hw)
         scores = self.scores(maps).flatten(2).float()  # (B, K, hw)
-        plan = transport(scores, self.dustbin)
+        plan = optimal_transport(scores, self.dustbin)
         clusters = normalize(plan @ features.transpose(1, 2), dim=-1)  # (B, K, cluster_dim)
         if token is None:
             token = maps.mean(dim=(-2, -1))
         whole = normalize(self.token(token).float(), dim=-1)
-        return unit_rows(torch.cat([whole, clusters.flatten(1)], dim=1))
+        return normalise_rows(torch.cat([whole, clusters.flatten(1)], dim=1))
 
     def refusal(self, height: int, width: int) -> str | None:
         if height * width > self.num_clusters:
@@ -72,7 +72,7 @@ class SALAD(Aggregator):
         )
 
 
-def transport(scores: torch.Tensor, dustbin: torch.Tensor) -> torch.Tensor:
+def optimal_transport(scores: torch.Tensor, dustbin: torch.Tensor) -> torch.Tensor:
     """(B, K, n) float32 scores, a number -> (B, K, n): how much of feature i goes to cluster k.
 
     Sinkhorn and Knopp's algorithm on logarithms, with the masses 1 of a cluster, n - K of the
@@ -83,7 +83,7 @@ def transport(scores: torch.Tensor, dustbin: torch.Tensor) -> torch.Tensor:
     room = scores.new_zeros(clusters + 1)
     room[-1] = math.log(positions - clusters)
     of_feature = scores.new_zeros(batch, 1, positions)
-    for _ in range(ITERATIONS):
+    for _ in range(SINKHORN_ITERATIONS):
         of_cluster = room.view(1, -1, 1) - (extended + of_feature).logsumexp(dim=2, keepdim=True)
         of_feature = -(extended + of_cluster).logsumexp(dim=1, keepdim=True)
     return (extended + of_cluster + of_feature).exp()[:, :clusters]
@@ -91,8 +91,8 @@ def transport(scores: torch.Tensor, dustbin: torch.Tensor) -> torch.Tensor:
 
 def _at_each_position(channels: int, out: int, dropout: float) -> nn.Sequential:
     return nn.Sequential(
-        nn.Conv2d(channels, HIDDEN, kernel_size=1),
+        nn.Conv2d(channels, HIDDEN_WIDTH, kernel_size=1),
         nn.Dropout(dropout),
         nn.ReLU(),
-        nn.Conv2d(HIDDEN, out, kernel_size=1),
+        nn.Conv2d(HIDDEN_WIDTH, out, kernel_size=1),
     )

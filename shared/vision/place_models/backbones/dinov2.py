@@ -16,25 +16,25 @@ from shared.vision.backbones.dinov2 import (
     PATCH,
     SHAPES,
     VitShape,
-    fill,
-    outline,
+    build_empty_vit,
+    load_vit_weights,
     resample_positions,
 )
-from shared.vision.backbones.dinov2_weights import find_weights, open_weights
-from shared.vision.place_models.backbones.staged import Features, StagedBackbone
+from shared.vision.backbones.dinov2_weights import find_or_download_weights, open_weights
+from shared.vision.place_models.backbones.staged import FeatureMaps, StagedBackbone
 
 
-class Dinov2(StagedBackbone):
+class Dinov2Backbone(StagedBackbone):
     patch: ClassVar[int] = PATCH
 
-    def forward(self, photos: torch.Tensor) -> Features:
+    def forward(self, photos: torch.Tensor) -> FeatureMaps:
         rows, columns = photos.shape[-2] // PATCH, photos.shape[-1] // PATCH
         tokens = self._run(photos)
         maps = tokens[:, 1:].transpose(1, 2).reshape(len(tokens), -1, rows, columns)
-        return Features(maps, tokens[:, 0])
+        return FeatureMaps(maps, tokens[:, 0])
 
 
-class Tokens(nn.Module):
+class VitTokens(nn.Module):
     """(B, 3, H, W) -> (B, 1 + patches, width): the class token, and patches row by row."""
 
     def __init__(self, vit: Any) -> None:
@@ -52,7 +52,7 @@ class Tokens(nn.Module):
         return torch.cat([first.expand(len(photos), -1, -1), patches], dim=1)
 
 
-def dinov2(
+def build_dinov2(
     name: str, pretrained: bool, weights: Path | None, *, shape: VitShape | None = None
 ) -> StagedBackbone:
     """`weights`: a file in Meta's or timm's naming, None for timm's on the hub. `shape` is that of
@@ -60,11 +60,17 @@ def dinov2(
     size = name.removeprefix("dinov2_")
     shape = shape or SHAPES[size]
     if pretrained:
-        vit = outline(shape, shape.depth - 1, "token", with_norm=True)
-        fill(vit, open_weights(find_weights(size, weights), size), shape, size, torch.device("cpu"))
+        vit = build_empty_vit(shape, shape.depth - 1, "token", with_norm=True)
+        load_vit_weights(
+            vit,
+            open_weights(find_or_download_weights(size, weights), size),
+            shape,
+            size,
+            torch.device("cpu"),
+        )
     else:
-        vit = outline(
+        vit = build_empty_vit(
             shape, shape.depth - 1, "token", with_norm=True, device=torch.get_default_device()
         )
     vit.requires_grad_(True)
-    return Dinov2(Tokens(vit), list(vit.blocks), vit.norm)
+    return Dinov2Backbone(VitTokens(vit), list(vit.blocks), vit.norm)

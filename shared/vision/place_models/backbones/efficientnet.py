@@ -16,20 +16,20 @@ from shared.vision.backbones.dinov2 import MEAN as IMAGENET_MEAN
 from shared.vision.backbones.dinov2 import STD as IMAGENET_STD
 from shared.vision.backbones.efficientnet_lite0 import MEAN, STD, published_network
 from shared.vision.place_models.backbones.pretrained import (
-    fill,
-    given_file,
+    check_weights_file,
+    load_state,
+    load_torchvision_network,
     read_tensors,
-    torchvision_network,
 )
 from shared.vision.place_models.backbones.staged import StagedBackbone
 
 
-def efficientnet_b0(name: str, pretrained: bool, weights: Path | None) -> StagedBackbone:
-    stem, *stages = torchvision_network(name, pretrained, weights).features
+def build_efficientnet_b0(name: str, pretrained: bool, weights: Path | None) -> StagedBackbone:
+    stem, *stages = load_torchvision_network(name, pretrained, weights).features
     return StagedBackbone(stem, stages)
 
 
-def efficientnet_lite0(name: str, pretrained: bool, weights: Path | None) -> StagedBackbone:
+def build_efficientnet_lite0(name: str, pretrained: bool, weights: Path | None) -> StagedBackbone:
     """Published weights come with the package of the embedded default, or from a file in timm's
     naming."""
     import timm  # takes seconds, which not every command need pay
@@ -41,7 +41,7 @@ def efficientnet_lite0(name: str, pretrained: bool, weights: Path | None) -> Sta
         network = published_network()
     else:
         network = timm.create_model("tf_efficientnet_lite0", pretrained=False)
-        fill(network, read_tensors(given_file(weights, name), name), weights, name)
+        load_state(network, read_tensors(check_weights_file(weights, name), name), weights, name)
     stem = nn.Sequential(Renormalise(), network.conv_stem, network.bn1)
     return StagedBackbone(stem, [*network.blocks, nn.Sequential(network.conv_head, network.bn2)])
 

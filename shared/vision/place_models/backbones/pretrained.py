@@ -12,11 +12,11 @@ import httpx2
 import torch
 
 from shared.errors import Misconfigured
-from shared.vision.download import download
-from shared.vision.tensor_files import UNREADABLE, first_line, load_tensors
+from shared.vision.download import download_file
+from shared.vision.tensor_files import TENSOR_READ_ERRORS, first_error_line, load_tensors
 
 
-def torchvision_network(name: str, pretrained: bool, weights: Path | None) -> Any:
+def load_torchvision_network(name: str, pretrained: bool, weights: Path | None) -> Any:
     """The network `torchvision.models.NAME`; without `pretrained` its tensors are random.
 
     `weights`: a `.pth` or `.safetensors` in torchvision's naming instead of its own IMAGENET1K_V1,
@@ -28,29 +28,29 @@ def torchvision_network(name: str, pretrained: bool, weights: Path | None) -> An
     network = models.get_model(name, weights=None)
     if pretrained:
         url = models.get_model_weights(name)["IMAGENET1K_V1"].url
-        path = find_torchvision_weights(name, url, weights)
-        fill(network, read_tensors(path, name), path, name)
+        path = find_or_download_torchvision_weights(name, url, weights)
+        load_state(network, read_tensors(path, name), path, name)
     return network
 
 
-def find_torchvision_weights(name: str, url: str, given: Path | None) -> Path:
+def find_or_download_torchvision_weights(name: str, url: str, given: Path | None) -> Path:
     """The file of the weights, downloaded to torch.hub's cache if need be."""
     if given is not None:
-        return given_file(given, name)
+        return check_weights_file(given, name)
     filename = url.rpartition("/")[2]
     cached = Path(torch.hub.get_dir(), "checkpoints", filename)
     if not cached.exists():
         # By torchvision's custom the name ends with the beginning of the hash.
         sha256 = cached.stem.rpartition("-")[2]
         try:
-            download(url, cached, sha256=sha256)
+            download_file(url, cached, sha256=sha256)
         except (OSError, httpx2.HTTPError) as error:
-            reason = f"{url} can't be downloaded: {first_line(error)}."
-            raise _missing(name, url, reason) from error
+            reason = f"{url} can't be downloaded: {first_error_line(error)}."
+            raise _pretrained_missing_error(name, url, reason) from error
     return cached
 
 
-def given_file(path: Path, name: str) -> Path:
+def check_weights_file(path: Path, name: str) -> Path:
     """`path`, if it is a file; else Misconfigured (`weights_missing`)."""
     if not path.is_file():
         what = "is not a file" if path.exists() else "does not exist"
@@ -74,15 +74,15 @@ def read_tensors(path: Path, name: str) -> dict[str, torch.Tensor]:
         if begin[8:] == b"{":
             return load_file(path)
         state = load_tensors(path)
-    except UNREADABLE as error:
-        reason = f"it can't be read as a file of tensors: {first_line(error)}"
-        raise unfit(path, name, reason) from error
+    except TENSOR_READ_ERRORS as error:
+        reason = f"it can't be read as a file of tensors: {first_error_line(error)}"
+        raise pretrained_unfit_error(path, name, reason) from error
     if not isinstance(state, dict) or not all(isinstance(v, torch.Tensor) for v in state.values()):
-        raise unfit(path, name, "it holds something else than named tensors")
+        raise pretrained_unfit_error(path, name, "it holds something else than named tensors")
     return state
 
 
-def fill(network: Any, state: dict[str, torch.Tensor], path: Path, name: str) -> None:
+def load_state(network: Any, state: dict[str, torch.Tensor], path: Path, name: str) -> None:
     """Give the network its tensors; Misconfigured (`weights_unfit`) where they don't fit."""
     own: dict[str, torch.Tensor] = network.state_dict()
     # Files of old releases count no batches, and nothing depends on that count.
@@ -96,15 +96,15 @@ def fill(network: Any, state: dict[str, torch.Tensor], path: Path, name: str) ->
     ]
     if faults:
         more = f" and {len(faults) - 1} faults more" if len(faults) > 1 else ""
-        raise unfit(path, name, f"it has {faults[0]}{more}")
+        raise pretrained_unfit_error(path, name, f"it has {faults[0]}{more}")
     network.load_state_dict(state)
 
 
-def unfit(path: Path, name: str, reason: str) -> Misconfigured:
+def pretrained_unfit_error(path: Path, name: str, reason: str) -> Misconfigured:
     return Misconfigured("weights_unfit", f"The weights {path} can't be used for {name}: {reason}.")
 
 
-def _missing(name: str, url: str, reason: str) -> Misconfigured:
+def _pretrained_missing_error(name: str, url: str, reason: str) -> Misconfigured:
     folder = Path(torch.hub.get_dir(), "checkpoints")
     return Misconfigured(
         "weights_missing",

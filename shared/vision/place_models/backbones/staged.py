@@ -9,7 +9,7 @@ import torch
 from torch import nn
 
 
-class Features(NamedTuple):
+class FeatureMaps(NamedTuple):
     """What a backbone makes of a batch of photos."""
 
     maps: torch.Tensor
@@ -34,8 +34,8 @@ class StagedBackbone(nn.Module):
         self.norm = nn.Identity() if norm is None else norm
         self._frozen: list[nn.Module] = []
 
-    def forward(self, photos: torch.Tensor) -> Features:
-        return Features(self._run(photos))
+    def forward(self, photos: torch.Tensor) -> FeatureMaps:
+        return FeatureMaps(self._run(photos))
 
     def _run(self, photos: torch.Tensor) -> torch.Tensor:
         found: torch.Tensor = self.stem(photos)

@@ -7,13 +7,13 @@ from pathlib import Path
 import torch
 from torch import nn
 
-from shared.vision.place_models.backbones.pretrained import torchvision_network
-from shared.vision.place_models.backbones.staged import Features, StagedBackbone
+from shared.vision.place_models.backbones.pretrained import load_torchvision_network
+from shared.vision.place_models.backbones.staged import FeatureMaps, StagedBackbone
 
 
-class Swin(StagedBackbone):
-    def forward(self, photos: torch.Tensor) -> Features:
-        return Features(self._run(photos).permute(0, 3, 1, 2))  # channels come last in it
+class SwinBackbone(StagedBackbone):
+    def forward(self, photos: torch.Tensor) -> FeatureMaps:
+        return FeatureMaps(self._run(photos).permute(0, 3, 1, 2))  # channels come last in it
 
     def crop(self, count: int) -> None:
         """The last norm belongs to the last stage and goes with it."""
@@ -22,10 +22,10 @@ class Swin(StagedBackbone):
         super().crop(count)
 
 
-def swin(name: str, pretrained: bool, weights: Path | None) -> StagedBackbone:
-    network = torchvision_network(name, pretrained, weights)
+def build_swin(name: str, pretrained: bool, weights: Path | None) -> StagedBackbone:
+    network = load_torchvision_network(name, pretrained, weights)
     stem, first, *later = network.features
     merged = [
         nn.Sequential(merge, blocks) for merge, blocks in zip(later[::2], later[1::2], strict=True)
     ]
-    return Swin(stem, [first, *merged], network.norm)
+    return SwinBackbone(stem, [first, *merged], network.norm)
