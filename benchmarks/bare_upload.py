@@ -14,9 +14,9 @@ import uvicorn
 from fastapi import FastAPI, UploadFile
 from starlette.concurrency import run_in_threadpool
 
+from shared.config.settings import Settings
 from shared.ids import new_id
-from shared.objects.s3 import Bucket
-from shared.settings import Settings
+from shared.storage.s3 import Bucket
 
 
 def create_app(bucket: Bucket) -> FastAPI:

@@ -6,6 +6,10 @@ Half of the city's queries are uploaded as labelled queries, so that the map lea
 mean; the other half it has never seen: they are asked as a user's photos, and what is printed of
 them is what a user would get. Every figure is of a generated place: not comparable with published
 figures.
+
+Asking as a user does, with photos whose place is known, and what the answers were worth.
+
+A picture of queries and what was found: each query above its best match.
 """
 
 from __future__ import annotations
@@ -13,25 +17,176 @@ from __future__ import annotations
 import argparse
 import os
 import tempfile
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from statistics import median
 from typing import TYPE_CHECKING
 
-from benchmarks.asked import QueryOutcome, query_with_photo, summarise_outcomes
-from benchmarks.picture import draw_outcomes
-from shared.client import Client
-from shared.datasets.city.plan import CityOptions, make_plan
-from shared.datasets.city.write import NOT_COMPARABLE, write_city
+from PIL import Image, ImageDraw, ImageFont
+
+from services.cli.ingest.geotags import LocalPhoto
+from shared.client import Client, Json
+from shared.evaluation.calibration import auroc, expected_calibration_error, recall_at_precision
+from shared.evaluation.place_evidence import PhotoLocation, distance_between_m
+from shared.synthetic_city.plan import CityOptions, make_plan
+from shared.synthetic_city.write import NOT_COMPARABLE, write_city
 
 if TYPE_CHECKING:
     from rich.progress import Progress
+
+
+CORRECT_WITHIN_M = 25.0
+
+
+@dataclass(frozen=True, slots=True)
+class QueryOutcome:
+    """One query photo, its truth and its answer."""
+
+    query: Path
+    in_map: bool
+    best: str
+    """File name of the most similar photo."""
+    best_is_correct: bool
+    estimate: Json
+    error_m: float | None
+    """From the truth to the estimate; None where it gave no place."""
+
+    @property
+    def right(self) -> bool:
+        return self.error_m is not None and self.error_m <= CORRECT_WITHIN_M
+
+
+def query_with_photo(
+    client: Client, query: LocalPhoto, database: Sequence[LocalPhoto]
+) -> QueryOutcome:
+    """Ask with a photo that is not stored, and compare the answer with what its name says."""
+    truth = _location(query.fields)
+    answer = client.similar_to_file(query.path, top_k=1)
+    best, estimate = answer["similar_images"][0], answer["estimate"]
+    return QueryOutcome(
+        query=query.path,
+        in_map=any(_is_near(truth, _location(photo.fields)) for photo in database),
+        best=best["original_filename"],
+        best_is_correct=_is_near(truth, _location(best)),
+        estimate=estimate,
+        error_m=distance_between_m(truth, _location(estimate)),
+    )
+
+
+def summarise_outcomes(outcomes: Sequence[QueryOutcome]) -> Json:
+    """Recall, false accepts and the confidence's figures; the latter None while uncalibrated."""
+    here = [a for a in outcomes if a.in_map]
+    outside = [a for a in outcomes if not a.in_map]
+    accepted = [a for a in outcomes if a.estimate["in_map"]]
+    errors = [a.error_m for a in outcomes if a.right and a.error_m is not None]
+    said = [a.estimate["confidence"] for a in outcomes]
+    # Without a place no estimate is right; the best photo then stands for what was found.
+    right = [a.right or (a.estimate["in_map"] is False and a.best_is_correct) for a in outcomes]
+    known = None not in said
+    return {
+        "queries": len(outcomes),
+        "out_of_map": len(outside),
+        "R@1": _ratio(sum(a.best_is_correct for a in here), len(here)),
+        "right_of_accepted": _ratio(sum(a.right for a in accepted), len(accepted)),
+        "accepted_in_map": _ratio(sum(bool(a.estimate["in_map"]) for a in here), len(here)),
+        "false_accepts": _ratio(sum(bool(a.estimate["in_map"]) for a in outside), len(outside)),
+        "median_error_m": median(errors) if errors else None,
+        "calibration_error": expected_calibration_error(said, right) if known else None,
+        "auroc": auroc(said, right) if known else None,
+        "recall_at_99_precision": recall_at_precision(said, right, len(here)) if known else None,
+    }
+
+
+def _location(fields: Json) -> PhotoLocation:
+    latitude, longitude = fields.get("latitude"), fields.get("longitude")
+    if latitude is None or longitude is None:
+        return PhotoLocation(None, None, None)
+    return PhotoLocation(float(latitude), float(longitude), None)
+
+
+def _is_near(one: PhotoLocation, other: PhotoLocation) -> bool:
+    away = distance_between_m(one, other)
+    return away is not None and away <= CORRECT_WITHIN_M
+
+
+def _ratio(part: int, whole: int) -> float | None:
+    return part / whole if whole else None
+
+
+COLUMNS = 6
+CELL = (240, 180)
+CAPTION = 22
+EDGE = 4
+GAP = 16
+CORRECT_COLOUR, WRONG_COLOUR, OUT_OF_MAP_COLOUR = (46, 160, 67), (207, 60, 50), (150, 150, 150)
+
+
+def draw_outcomes(outcomes: Sequence[QueryOutcome], database: Path, target: Path) -> None:
+    """Write a JPEG: queries in the upper rows, under each its most similar photo, framed green
+    where it shows the place, red where not, grey where the answer was "not in this map"."""
+    chosen = _choose_outcomes(outcomes)
+    width = COLUMNS * (CELL[0] + GAP) + GAP
+    block = 2 * CELL[1] + 2 * CAPTION + 2 * GAP
+    rows = -(-len(chosen) // COLUMNS)
+    sheet = Image.new("RGB", (width, rows * block + GAP), "white")
+    pen = ImageDraw.Draw(sheet)
+    font = ImageFont.load_default(size=14)
+    for number, answer in enumerate(chosen):
+        left = GAP + number % COLUMNS * (CELL[0] + GAP)
+        top = GAP + number // COLUMNS * block
+        frame = OUT_OF_MAP_COLOUR if answer.estimate["in_map"] is False else WRONG_COLOUR
+        frame = CORRECT_COLOUR if answer.best_is_correct and frame == WRONG_COLOUR else frame
+        _paste(sheet, answer.query, left, top)
+        pen.text((left, top + CELL[1] + 2), "asked", fill="black", font=font)
+        below = top + CELL[1] + CAPTION
+        right, bottom = left + CELL[0], below + CELL[1]
+        pen.rectangle((left - EDGE, below - EDGE, right + EDGE, bottom + EDGE), frame)
+        _paste(sheet, database / answer.best, left, below)
+        pen.text((left, below + CELL[1] + EDGE), _caption(answer), fill=frame, font=font)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    sheet.save(target, quality=85)
+
+
+def _choose_outcomes(outcomes: Sequence[QueryOutcome]) -> list[QueryOutcome]:
+    """Two rows: mostly what it was sure of and right, then where it was wrong, then strangers."""
+    given = [a for a in outcomes if a.estimate["in_map"]]
+    right = [a for a in given if a.best_is_correct]
+    wrong = [a for a in given if not a.best_is_correct]
+    refused = [a for a in outcomes if a.estimate["in_map"] is False]
+    strangers = [a for a in refused if not a.in_map]
+    missed = [a for a in refused if a.in_map]
+    return [
+        *_evenly_spaced(right, COLUMNS + 1),
+        *_evenly_spaced(wrong, 1),
+        *_evenly_spaced(missed, 1),
+        *_evenly_spaced(strangers, 3),
+    ][: 2 * COLUMNS]
+
+
+def _evenly_spaced(found: Sequence[QueryOutcome], count: int) -> list[QueryOutcome]:
+    step = max(1, len(found) // count) if count else 1
+    return list(found[::step][:count])
+
+
+def _caption(answer: QueryOutcome) -> str:
+    if answer.estimate["in_map"] is False:
+        return "not in this map" + (" (it is)" if answer.in_map else "")
+    sure = answer.estimate["confidence"]
+    error = f"{answer.error_m:.0f} m off" if answer.error_m is not None else "no place"
+    return error if sure is None else f"{error}, {sure:.0%} sure"
+
+
+def _paste(sheet: Image.Image, path: Path, left: int, top: int) -> None:
+    with Image.open(path) as photo:
+        sheet.paste(photo.convert("RGB").resize(CELL, Image.Resampling.BICUBIC), (left, top))
 
 
 def main() -> None:
     # As the command does before torch is loaded; see services/cli/__init__.py.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     options = _arguments()
-    from services.cli.connect import connect
+    from services.cli.client import connect
     from services.cli.output import progress_bar
 
     with tempfile.TemporaryDirectory() as folder, progress_bar() as progress:
@@ -78,10 +233,10 @@ def _draw_city(options: argparse.Namespace, city: Path, progress: Progress) -> N
 
 def _run_demo(client: Client, city: Path, progress: Progress) -> list[QueryOutcome]:
     """Index, evaluate, fit, evaluate, ask; prints recall before and after the fit."""
-    from services.cli.photo_places import find_photos
-    from services.cli.upload_many import upload_photos
-    from services.cli.vocabulary import fit_and_wait
-    from services.cli.wait import wait_for_job
+    from services.cli.client import wait_for_job
+    from services.cli.descriptors.vocabulary import fit_and_wait
+    from services.cli.ingest.geotags import find_photos
+    from services.cli.ingest.upload import upload_photos
 
     database = find_photos(city / "database", None, None)
     queries = find_photos(city / "queries", None, None)

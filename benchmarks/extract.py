@@ -3,11 +3,25 @@
 JPEG bytes go in, rows come out; both ways take the same photos in turn, so that whatever else the
 machine does meets both; on a CPU that has other work their CPU time tells more. The ceiling is the
 rate of large matrix products in the same precision.
+
+Extractors to measure: with the weights that are here, or with random ones where there are none.
+
+Random weights take the same time and memory, and say how far two ways of computing are apart. What
+they find means nothing.
+
+AnyLoc as its authors publish it, written from the description in their paper and code: what
+`bench extract` compares with.
+
+One photo after the other, float32, the whole network although a hook takes the features in its
+middle, and VLAD in a loop over the clusters with every residual in memory. On a CPU attention is
+written out, as in Meta's code there; on a GPU it is fused, as with xFormers. Photos are decoded and
+brought to size as ours, so that both make the same descriptor.
 """
 
 from __future__ import annotations
 
 import contextlib
+import io
 import os
 import statistics
 import tempfile
@@ -16,29 +30,143 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import psutil
 import torch
 from numpy.typing import NDArray
+from PIL import Image
 from torch.nn.attention import SDPBackend, sdpa_kernel
+from torch.nn.functional import normalize
 from torch.utils.flop_counter import FlopCounterMode
 
-from benchmarks.networks import BenchmarkedExtractor, fit_or_load_centres
-from benchmarks.reference_anyloc import ReferenceAnyLoc
+from benchmarks.load_generator import make_jpegs
 from benchmarks.report import Report
-from benchmarks.traffic import make_jpegs
-from services.extractor.decoding import DecoderPool
-from shared.errors import PlacewiseError
-from shared.vision.extractors import Extractor
-from shared.vision.precision import Precision, autocast, choose_precision
-from shared.vision.resample import Pixels
-from shared.vision.vocabulary import ClusterCentres
+from services.cli.environment import read_settings
+from services.extractor.decoder_pool import DecoderPool
+from shared.config.settings import Settings
+from shared.descriptors.backbones.dinov2 import SHAPES, Dinov2
+from shared.descriptors.backbones.dinov2_weights import find_local_weights
+from shared.descriptors.extractor import Extractor, choose_device
+from shared.descriptors.inference import Precision, autocast, choose_precision
+from shared.descriptors.patches import fit_vocabulary
+from shared.descriptors.vocabulary import ClusterCentres
+from shared.errors import Misconfigured, PlacewiseError
+from shared.extractor_config.configs import FACETS, ExtractorConfig
+from shared.imaging.preprocessing import Pixels, get_preprocessing
 from tests.support.fit_memory import memory_bytes
+from tests.support.vit import random_weights, save
 
 if TYPE_CHECKING:
     from rich.progress import Progress
+
+
+@dataclass(frozen=True, slots=True)
+class BenchmarkedExtractor:
+    """What is measured, and with which weights."""
+
+    recipe: ExtractorConfig
+    device: torch.device
+    settings: Settings
+    dino_weights: Path | None
+    random: bool
+
+    @classmethod
+    def of(cls, extractor: str, device: str, folder: Path) -> BenchmarkedExtractor:
+        """`folder` takes random weights, where there are no others. Raises Misconfigured for an
+        extractor or a device that can't be had.
+        """
+        settings = read_settings()
+        recipe = settings.recipe(extractor)
+        weights, random = settings.dino_weights, False
+        if recipe.depth is not None:
+            size = recipe.backbone.removeprefix("dinov2-")
+            try:
+                weights = find_local_weights(size, weights)
+            except Misconfigured as error:
+                if error.code != "weights_missing":
+                    raise
+                weights = save(random_weights(SHAPES[size]), folder / f"{size}.safetensors")
+                random = True
+        return cls(recipe, choose_device(device), settings, weights, random)
+
+    def load(self, precision: Precision) -> Extractor:
+        return Extractor(
+            self.recipe, self.device, precision=precision, dino_weights=self.dino_weights
+        )
+
+    @property
+    def title(self) -> str:
+        name = (
+            torch.cuda.get_device_name(self.device)
+            if self.device.type == "cuda"
+            else f"{torch.get_num_threads()} CPU threads"
+        )
+        return f"{self.recipe.name}{', random weights' if self.random else ''}, {name}"
+
+
+def fit_or_load_centres(extractor: Extractor, photos: list[Pixels]) -> ClusterCentres | None:
+    """The shipped ones, or learnt from the photos where some are needed and none are shipped."""
+    if not extractor.recipe.needs_vocabulary:
+        return None
+    shipped = extractor.shipped_vocabulary()
+    if shipped is not None:
+        return shipped[0]
+    clusters = extractor.recipe.clusters
+    return fit_vocabulary(extractor, [photos], len(photos), clusters=clusters, seed=0).centres
+
+
+class ReferenceAnyLoc:
+    def __init__(self, measured: BenchmarkedExtractor, centres: NDArray[np.float32]) -> None:
+        """(K, width) centres. The recipe is one of the `anyloc-` ones, with hard VLAD."""
+        recipe, device = measured.recipe, measured.device
+        assert recipe.layer is not None
+        assert recipe.preprocessing is not None
+        size = recipe.backbone.removeprefix("dinov2-")
+        self._device = device
+        self._preprocessing = get_preprocessing(recipe.preprocessing)
+        self._centres = torch.from_numpy(centres).to(device)
+        whole = SHAPES[size].depth - 1
+        self._network = Dinov2(size, whole, "token", device, measured.dino_weights)
+        self._third = None if recipe.facet == "token" else FACETS.index(recipe.facet or "value")
+        blocks: Any = self._network._vit.blocks
+        for block in blocks:
+            block.attn.fused_attn = device.type == "cuda"
+        hooked = blocks[recipe.layer]
+        (hooked if self._third is None else hooked.attn.qkv).register_forward_hook(self._keep)
+        self._kept = torch.empty(0)
+
+    def describe(self, photos: Sequence[bytes]) -> NDArray[np.float32]:
+        """JPEGs -> (n, K * width), rows of length 1."""
+        return np.stack([self._describe(photo) for photo in photos])
+
+    @torch.inference_mode()
+    def _describe(self, photo: bytes) -> NDArray[np.float32]:
+        with Image.open(io.BytesIO(photo)) as image:
+            pixels = self._preprocessing.apply(image.convert("RGB"))
+        with autocast("float32", self._device):
+            self._network.features(torch.from_numpy(np.array(pixels))[None])
+            found = self._kept[0, 1:]
+            if self._third is not None:
+                found = found.chunk(3, dim=-1)[self._third]
+            row: NDArray[np.float32] = vlad_in_loops(normalize(found, dim=-1), self._centres)
+        return row
+
+    def _keep(self, _module: Any, _arguments: Any, output: torch.Tensor) -> None:
+        self._kept = output
+
+
+def vlad_in_loops(features: torch.Tensor, centres: torch.Tensor) -> NDArray[np.float32]:
+    """(patches, width) unit features, (K, width) -> (K * width) of length 1."""
+    labels = (features @ normalize(centres, dim=-1).T).argmax(dim=-1).cpu()
+    residuals = features[:, None] - centres[None]  # (patches, K, width)
+    blocks = torch.zeros_like(centres)
+    for cluster in set(labels.tolist()):
+        blocks[cluster] = normalize(residuals[labels == cluster, cluster].sum(dim=0), dim=0)
+    row: NDArray[np.float32] = normalize(blocks.flatten(), dim=0).cpu().numpy()
+    return row
+
 
 TARGET_SPEEDUP = 2.0
 SIZE, SIZE_BYTES = (1024, 768), 100_000

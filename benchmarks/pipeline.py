@@ -18,14 +18,13 @@ import numpy as np
 import torch
 from sqlalchemy import select
 
-from benchmarks.described import wait_for_jobs
 from benchmarks.fleet import Fleet, Servers, ServiceProcess, start_servers
+from benchmarks.load_generator import make_jpegs, multipart_form, upload_all, wait_for_jobs
 from benchmarks.report import Report
-from benchmarks.traffic import make_jpegs, multipart_form, upload_all
 from shared.catalog.maps import Map
-from shared.recipes import get_extractor_config
-from shared.search_http import HttpSearchClient
-from shared.vision.extractors import Extractor
+from shared.descriptors.extractor import Extractor
+from shared.extractor_config.configs import get_extractor_config
+from shared.search_api.client import HttpSearchClient
 from tests.support.servers.daemon import free_ports
 
 if TYPE_CHECKING:
@@ -96,8 +95,11 @@ def _measure_cpu(
     _upload_and_wait(fleet, made, 2 * batch, lambda left: None)  # models, decoders, connections
     before, servers_before = fleet.cpu_seconds(), fleet.server_cpu_seconds()
     _upload_and_wait(
-        fleet, made, photos, lambda left: progress.update(bar, completed=photos - left)
-    )  # type: ignore[arg-type]
+        fleet,
+        made,
+        photos,
+        lambda left: progress.update(bar, completed=photos - left),  # type: ignore[arg-type]
+    )
     after, servers_after = fleet.cpu_seconds(), fleet.server_cpu_seconds()
     assert not fleet.crashed, fleet.logs()
     ours = {

@@ -17,15 +17,15 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 
-from benchmarks.networks import BenchmarkedExtractor, fit_or_load_centres
+from benchmarks.extract import BenchmarkedExtractor, fit_or_load_centres
 from benchmarks.report import Report
-from shared.datasets.city.plan import CityOptions, PlannedPhoto, make_plan
-from shared.datasets.city.write import write_city
-from shared.datasets.recall import positives_within, rank_by_similarity, recall_at_k
-from shared.vision.extractors import Extractor
-from shared.vision.precision import PRECISIONS, Precision
-from shared.vision.resample import Pixels
-from shared.vision.vocabulary import ClusterCentres
+from shared.descriptors.extractor import Extractor
+from shared.descriptors.inference import PRECISIONS, Precision
+from shared.descriptors.vocabulary import ClusterCentres
+from shared.evaluation.recall import positives_within, rank_by_similarity, recall_at_k
+from shared.imaging.preprocessing import Pixels
+from shared.synthetic_city.plan import CityOptions, PlannedPhoto, make_plan
+from shared.synthetic_city.write import write_city
 
 if TYPE_CHECKING:
     from rich.progress import Progress

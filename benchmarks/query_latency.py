@@ -19,15 +19,20 @@ from uuid import UUID
 
 from sqlalchemy import func, insert, select
 
-from benchmarks.described import wait_for_jobs
 from benchmarks.fleet import Fleet, start_servers
+from benchmarks.load_generator import (
+    HttpCaller,
+    make_jpegs,
+    multipart_form,
+    upload_all,
+    wait_for_jobs,
+)
 from benchmarks.report import LatencySummary, Report
-from benchmarks.traffic import HttpCaller, make_jpegs, multipart_form, upload_all
 from shared.catalog.chunks import Chunk
+from shared.catalog.jobs import UNFINISHED_STATES
 from shared.catalog.photos import Photo
 from shared.ids import new_id
 from shared.jobs import Job, JobKind, JobState, Priority
-from shared.jobs.table import UNFINISHED_STATES
 
 if TYPE_CHECKING:
     from rich.progress import Progress

@@ -22,17 +22,15 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from benchmarks.report import Report
-from shared.datasets.city.plan import CityOptions, PlannedPhoto, make_plan
-from shared.datasets.city.write import write_city
-from shared.datasets.recall import positives_within, rank_by_similarity, recall_at_k
-from shared.recipes import EXTRACTOR_CONFIGS
-from shared.vision.extractors import Extractor, choose_device
-from shared.vision.fit_photos import fit_vocabulary
-from shared.vision.local_features import LocalFeatures
-from shared.vision.matching import rerank_score
-from shared.vision.patches import sample_photos
-from shared.vision.resample import Pixels
-from shared.vision.vlad import vlad
+from shared.descriptors.aggregation import vlad
+from shared.descriptors.extractor import Extractor, choose_device
+from shared.descriptors.patches import fit_vocabulary, sample_photos
+from shared.descriptors.reranking import LocalFeatures, rerank_score
+from shared.evaluation.recall import positives_within, rank_by_similarity, recall_at_k
+from shared.extractor_config.configs import EXTRACTOR_CONFIGS
+from shared.imaging.preprocessing import Pixels
+from shared.synthetic_city.plan import CityOptions, PlannedPhoto, make_plan
+from shared.synthetic_city.write import write_city
 from tests.e2e.test_real_photos import TRUE_MATCH
 
 if TYPE_CHECKING:

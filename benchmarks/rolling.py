@@ -20,10 +20,16 @@ from uuid import UUID
 
 from sqlalchemy import select
 
-from benchmarks.described import wait_for_jobs
 from benchmarks.fleet import Fleet, Servers, start_servers
+from benchmarks.load_generator import (
+    CONTENT_TYPE,
+    HttpCaller,
+    HttpResponse,
+    make_jpegs,
+    multipart_form,
+    wait_for_jobs,
+)
 from benchmarks.report import Report
-from benchmarks.traffic import CONTENT_TYPE, HttpCaller, HttpResponse, make_jpegs, multipart_form
 from shared.catalog.chunks import Descriptor
 
 if TYPE_CHECKING:

@@ -12,10 +12,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from uuid import UUID
 
-from benchmarks.described import count_descriptions, load_jobs, wait_for_jobs
 from benchmarks.fleet import Fleet, ServiceProcess, start_servers
+from benchmarks.load_generator import (
+    count_descriptions,
+    load_jobs,
+    make_jpegs,
+    multipart_form,
+    upload_all,
+    wait_for_jobs,
+)
 from benchmarks.report import Report
-from benchmarks.traffic import make_jpegs, multipart_form, upload_all
 
 if TYPE_CHECKING:
     from rich.progress import Progress

@@ -27,11 +27,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
+from benchmarks.load_generator import BOUNDARY, CONTENT_TYPE, make_jpegs, multipart_form
 from benchmarks.report import LatencySummary, Report
-from benchmarks.traffic import BOUNDARY, CONTENT_TYPE, make_jpegs, multipart_form
 from shared.client import Client
+from shared.config.embedded_home import RunningServer, find_running_server
 from shared.errors import Unavailable
-from shared.home import RunningServer, find_running_server
 
 if TYPE_CHECKING:
     from rich.progress import Progress

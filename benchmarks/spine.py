@@ -20,8 +20,8 @@ from PIL import Image
 
 from benchmarks.report import Report
 from shared.client import Client, Json
+from shared.config.embedded_home import RunningServer, find_running_server
 from shared.errors import Unavailable
-from shared.home import RunningServer, find_running_server
 
 if TYPE_CHECKING:
     from rich.progress import Progress

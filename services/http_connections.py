@@ -28,9 +28,9 @@ from typing import Any, Self, cast
 import h11
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
+from shared.config.settings import Settings
 from shared.errors import PlacewiseError, RequestTimeout, TooManyRequests, Unavailable
-from shared.problems import CLOSED_WITH
-from shared.settings import Settings
+from shared.http.problem_details import CLOSED_WITH
 
 log = logging.getLogger(__name__)
 

@@ -26,34 +26,37 @@ from prometheus_client import CollectorRegistry
 
 from services.extractor.worker import ExtractorWorker
 from services.gateway.app import create_app
-from services.gateway.context import GatewayContext
-from services.gateway.keys import ApiKeyAuthenticator, Authenticator, LocalhostAuthenticator
+from services.gateway.authentication import (
+    ApiKeyAuthenticator,
+    Authenticator,
+    LocalhostAuthenticator,
+)
+from services.gateway.dependencies import GatewayContext
 from services.http_server import http_server, listen, reachable_url, stop_on_signals
-from services.parts import start_service_thread
 from services.search.metrics import MeteredSearch
-from services.search.presence import WorkerHeartbeat
+from services.search.service import WorkerHeartbeat
 from services.search.worker import SearchWorker
+from services.service_threads import start_service_thread
 from services.steward.batches.worker import BatchWorker
-from services.steward.evaluate import EvaluationWorker
-from services.steward.loop import Scheduler
+from services.steward.evaluation_worker import EvaluationWorker
 from services.steward.metrics import StewardMetrics
-from services.steward.queue import release_expired_leases
-from services.steward.webhooks.deliver import WebhookDispatcher
-from shared.api_keys import Scope, generate_local_key, hash_api_key, is_loopback
-from shared.catalog.connections import TransactionTimeouts
+from services.steward.scheduler import Scheduler
+from services.steward.tasks.maintenance import release_expired_leases
+from services.steward.webhooks import WebhookDispatcher
+from shared.catalog.api_keys import create_api_key, has_admin_key
+from shared.catalog.file_checks import sqlite_file
 from shared.catalog.installation import check_before_new_catalog, open_installation_store
-from shared.catalog.keys import create_api_key, has_admin_key
 from shared.catalog.maps import get_or_create_default_map
-from shared.catalog.open_catalog import open_catalog
+from shared.catalog.processes import delete_dead_search_workers
 from shared.catalog.schema import migrate
-from shared.catalog.search_workers import delete_dead_search_workers
-from shared.catalog.session import Catalog
-from shared.catalog.unusable import sqlite_file
-from shared.disk_reserve import DiskReserve
+from shared.catalog.session import Catalog, TransactionTimeouts
+from shared.catalog.tables import open_catalog
+from shared.config.embedded_home import announce_server, lock_home
+from shared.config.settings import Settings
 from shared.errors import Misconfigured
-from shared.home import announce_server, lock_home
 from shared.jobs import InProcessWakeups
-from shared.settings import Settings
+from shared.security.api_keys import Scope, generate_local_key, hash_api_key, is_loopback
+from shared.storage.disk_space import DiskReserve
 from shared.telemetry.metrics_server import serve_metrics
 
 log = logging.getLogger(__name__)

@@ -13,8 +13,8 @@ from sqlalchemy.engine import make_url
 
 from shared.catalog.schema import migrate
 from shared.catalog.session import Catalog
-from shared.objects import FolderStore
-from shared.settings import Settings
+from shared.config.settings import Settings
+from shared.storage import FolderStore
 from tests.support.servers import (
     PostgresServer,
     RedisServer,

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any, cast
 
 from services.gateway.app import create_app
-from services.gateway.context import GatewayContext
-from services.gateway.keys import LocalhostAuthenticator
-from shared.settings import Settings
+from services.gateway.authentication import LocalhostAuthenticator
+from services.gateway.dependencies import GatewayContext
+from shared.config.settings import Settings
 
 PAGE = Path(__file__).parents[1] / "docs" / "api-calls.md"
 HEAD = """# Every call

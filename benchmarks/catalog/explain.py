@@ -10,7 +10,7 @@ from typing import Any
 
 from sqlalchemy import event
 
-from shared.catalog.metadata_search import MAX_COUNTED_MATCHES
+from shared.catalog.photo_search import MAX_COUNTED_MATCHES
 from shared.catalog.session import Catalog
 
 EXPLAINABLE = re.compile(r"\s*(SELECT|WITH|UPDATE|DELETE|INSERT)\b", re.IGNORECASE)

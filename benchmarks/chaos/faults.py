@@ -11,8 +11,7 @@ from dataclasses import dataclass
 from redis import Redis
 
 from benchmarks.fleet import Fleet
-from benchmarks.fleet.doubler import MessageDuplicator
-from benchmarks.fleet.proxy import ProxyMode
+from benchmarks.fleet.fault_injection import MessageDuplicator, ProxyMode
 from tests.support.servers.handle import Handle
 
 # From beginning to end these have another idea of the time of day, by so many seconds.

@@ -8,8 +8,7 @@ The benchmarks and the fault suite run on it. It needs a checkout with the dev e
 are those of the tests.
 """
 
-from benchmarks.fleet.fleet import Fleet
-from benchmarks.fleet.servers import Servers, start_servers
+from benchmarks.fleet.fleet import Fleet, Servers, start_servers
 from benchmarks.fleet.service import ServiceProcess
 
 __all__ = ["Fleet", "Servers", "ServiceProcess", "start_servers"]

@@ -1,4 +1,7 @@
-"""Every service of a Placewise, started on real servers and kept alive."""
+"""Every service of a Placewise, started on real servers and kept alive.
+
+The real servers that a fleet runs on: PostgreSQL, Redis and an S3 store, nobody else's.
+"""
 
 from __future__ import annotations
 
@@ -6,19 +9,96 @@ import contextlib
 import itertools
 import threading
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
+from urllib.parse import urlsplit
 
-from benchmarks.fleet.servers import Servers
+from sqlalchemy.engine import make_url
+
+from benchmarks.fleet.fault_injection import FaultProxy
 from benchmarks.fleet.service import ServiceProcess
 from shared.catalog.schema import migrate
 from shared.catalog.session import Catalog
-from shared.objects import ObjectStore
-from shared.objects.s3 import S3Store
+from shared.storage import ObjectStore
+from shared.storage.s3 import S3Store
 from tests.support.processes import PLACEWISE
 from tests.support.server import SERVICES_KEY, environment
+from tests.support.servers import (
+    PostgresServer,
+    RedisServer,
+    S3Server,
+    start_postgres,
+    start_redis,
+    start_s3,
+)
 from tests.support.servers.daemon import free_ports
+from tests.support.servers.handle import Handle
+
+
+@dataclass(frozen=True, slots=True)
+class Servers:
+    """Started, and each may be killed. Services reach them through proxies, which can fail."""
+
+    postgres: PostgresServer
+    redis: RedisServer
+    s3: S3Server
+    postgres_proxy: FaultProxy
+    redis_proxy: FaultProxy
+    s3_proxy: FaultProxy
+
+    @property
+    def processes(self) -> dict[str, Handle]:
+        """The servers themselves by name."""
+        found = {
+            "PostgreSQL": self.postgres.process,
+            "Redis": self.redis.process,
+            "the S3 store": self.s3.process,
+        }
+        return {name: process for name, process in found.items() if process is not None}
+
+    def proxied_database(self, url: str) -> str:
+        """The URL of a database of `postgres` as the services see it."""
+        proxied = make_url(url).set(port=self.postgres_proxy.port)
+        return proxied.render_as_string(hide_password=False)
+
+    @property
+    def proxied_redis_url(self) -> str:
+        """Redis as the services see it."""
+        proxied = make_url(self.redis.url).set(port=self.redis_proxy.port)
+        return proxied.render_as_string(hide_password=False)
+
+    @property
+    def proxied_s3(self) -> S3Server:
+        """The store as the services see it."""
+        return S3Server(
+            f"127.0.0.1:{self.s3_proxy.port}",
+            self.s3.access_key,
+            self.s3.secret_key,
+            self.s3.secure,
+            self.s3.process,
+        )
+
+
+@contextlib.contextmanager
+def start_servers() -> Iterator[Servers]:
+    """All three, until the block ends."""
+    with (
+        start_postgres(own=True) as postgres,
+        start_redis(own=True) as redis,
+        start_s3(own=True) as s3,
+        _proxy(postgres.admin.port) as postgres_proxy,
+        _proxy(urlsplit(redis.url).port) as redis_proxy,
+        _proxy(urlsplit(f"//{s3.endpoint}").port) as s3_proxy,
+    ):
+        yield Servers(postgres, redis, s3, postgres_proxy, redis_proxy, s3_proxy)
+
+
+def _proxy(target: int | None) -> FaultProxy:
+    assert target is not None, "servers of our own have a port"
+    return FaultProxy(free_ports(1)[0], target)
+
 
 S3_TIMEOUT_SECONDS = 2.0  # so that a silent store is noticed within a fault
 POLL_SECONDS = 0.2
@@ -27,7 +107,7 @@ POLL_SECONDS = 0.2
 class Fleet:
     """`gateway-0..`, `extractor-0..`, `search-SHARD-REPLICA` and `steward-0..` by name.
 
-    Settings are those of `shared.settings`; the tiny test extractor unless they say otherwise.
+    Settings are those of `shared.config.settings`; the tiny test extractor unless they say otherwise.
     """
 
     def __init__(

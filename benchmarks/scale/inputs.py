@@ -44,7 +44,7 @@ class Inputs:
     # Photos.
     photo_bytes: float = _assumed(500_000, "B", "an original of about two megapixels")
     thumbnail_bytes: float = _measured(
-        12_000, "B", "40 drawn photos as `shared/vision/decode.py` shrinks them, 2026-11-21"
+        12_000, "B", "40 drawn photos as `shared/imaging/decode.py` shrinks them, 2026-11-21"
     )
     new_share_a_month: float = _assumed(0.02, "", "of the photos; they replace nothing")
     fill_days: float = _assumed(7, "days", "in which all photos are described at first")
@@ -74,7 +74,7 @@ class Inputs:
     hash_bytes_per_second: float = _measured(1.2e9, "B/s", f"SHA-256 of a chunk: {HERE}")
     chunk_list_us: float = _measured(38, "us", f"a chunk's row read from SQLite: {HERE}")
     generations_held: float = _built(
-        2, "", "services/search/follow.py: the active one, and one that is built beside it"
+        2, "", "services/search/catalog_sync.py: the active one, and one that is built beside it"
     )
     search_seconds: float = _assumed(1.0, "s", "longest scan of a shard")
     scans_at_once: float = _assumed(

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 from benchmarks.scale.inputs import Inputs, Width
 from benchmarks.scale.plan import SLOT_ROWS, chunk_row_bytes
-from shared.search_http.port import MAX_CONCURRENT_CALLS
-from shared.settings import Settings
+from shared.config.settings import Settings
+from shared.search_api.client import MAX_CONCURRENT_CALLS
 
 LOADING_SECONDS = 600.0
 STEWARD_SILENT_SECONDS = 900.0  # deploy/k8s: after which it is started again
-CHANGE_SECONDS = 0.5  # services/steward/loop.py, "advance model changes"
+CHANGE_SECONDS = 0.5  # services/steward/scheduler.py, "advance model changes"
 STATEMENT_SECONDS = float(Settings.model_fields["database_work_seconds"].default)
 FOLLOW_SECONDS = float(Settings.model_fields["search_follow_seconds"].default)
 

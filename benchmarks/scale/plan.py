@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from benchmarks.scale.inputs import Inputs, Width
-from shared.chunks import encode_rows
-from shared.settings import Settings
+from shared.config.settings import Settings
+from shared.storage.chunks import encode_rows
 
 MONTH_HOURS = 730.0
 DAY_SECONDS = 86_400.0
@@ -276,7 +276,7 @@ class Plan:
 
 
 def chunk_row_bytes(dimension: int) -> float:
-    """In the object store, for one photo: what `shared/chunks.py` writes for a full slot."""
+    """In the object store, for one photo: what `shared/storage/chunks.py` writes for a full slot."""
     rows = np.zeros((2, dimension), np.float32)
     data = encode_rows(rows)
     header = len(data) - rows.nbytes

@@ -17,9 +17,9 @@ from sqlalchemy import insert
 from threadpoolctl import threadpool_limits
 
 from benchmarks.report import Report
-from services.search.loaded_chunk import LoadedChunk
+from services.search.chunk_loader import LoadedChunk
+from services.search.dense_scan import scan_top_k
 from services.search.photo_columns import PhotoColumns
-from services.search.scan import scan_top_k
 from shared.catalog.chunks import Chunk, list_live_chunks
 from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.maps import create_map

@@ -13,13 +13,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from benchmarks.report import Report
-from benchmarks.search.cold import measure_cold_cache
-from benchmarks.search.comparison import report_comparison
+from benchmarks.search.cold_cache import measure_cold_cache
+from benchmarks.search.comparison import compare_methods, report_comparison
 from benchmarks.search.growth import measure_growth
 from benchmarks.search.load import measure_load
-from benchmarks.search.places import SyntheticCity
-from benchmarks.search.turns import compare_methods
-from benchmarks.search.world import CHUNK_ROWS, create_synthetic_map, required_memory_bytes
+from benchmarks.search.synthetic_map import (
+    CHUNK_ROWS,
+    SyntheticCity,
+    create_synthetic_map,
+    required_memory_bytes,
+)
 
 if TYPE_CHECKING:
     from rich.progress import Progress

@@ -11,10 +11,10 @@ from rich.progress import Progress
 from rich.table import Table
 
 from benchmarks.report import Report
-from benchmarks.search.memory import MemoryBandwidth
-from services.search.cascade import SignCodeBlocks, SignCodedQuery, scan_first_level
+from benchmarks.search.memory_traffic import MemoryBandwidth
+from services.search.sign_code_search import SignCodeBlocks, SignCodedQuery, scan_first_level
 from shared.codes.rotation import get_rotation
-from shared.codes.signs import level_ends
+from shared.codes.sign_codes import level_ends
 
 DIMENSION = 98_304
 MEASURED_SIZES = (100_000, 1_000_000)

@@ -24,13 +24,12 @@ from pydantic import ValidationError
 from rich.progress import Progress
 
 from benchmarks.fleet.service import ServiceProcess
+from benchmarks.load_generator import HttpCaller
 from benchmarks.report import LatencySummary, Report
-from benchmarks.search.oracle import BruteForce, Ranking, same_ranking
-from benchmarks.search.places import SyntheticCity
-from benchmarks.search.world import SyntheticMap
-from benchmarks.traffic import HttpCaller
-from shared.chunks import Rows
-from shared.search_protocol import SearchResponse
+from benchmarks.search.methods import BruteForce, Ranking, same_ranking
+from benchmarks.search.synthetic_map import SyntheticCity, SyntheticMap
+from shared.search_api.protocol import SearchResponse
+from shared.storage.chunks import Rows
 from tests.support.server import environment
 from tests.support.servers.daemon import free_ports
 

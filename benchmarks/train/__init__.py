@@ -11,8 +11,8 @@ import torch
 from benchmarks.report import Report
 from benchmarks.train.learning import measure_grid, measure_learning
 from benchmarks.train.throughput import measure_throughput
-from services.trainer.configuration import build_arguments
-from services.trainer.device import resolve_device
+from services.trainer.arguments import build_arguments
+from services.trainer.resolve import resolve_device
 
 if TYPE_CHECKING:
     from rich.progress import Progress

@@ -14,26 +14,23 @@ import numpy as np
 from rich.table import Table
 
 from services.trainer import run
-from services.trainer.configuration import build_arguments
-from services.trainer.device import Device
-from services.trainer.display import NullDisplay
-from services.trainer.evaluation.bootstrap import paired_differences
-from services.trainer.evaluation.clusters import cluster_queries
-from services.trainer.evaluation.describe_model import ModelDescriber
-from services.trainer.evaluation.hits import compute_hits
-from services.trainer.evaluation.recalls import evaluate_recall
-from services.trainer.grid import RunFunctions, run_grid
-from services.trainer.grid_plan import GridPlan, PlannedRun
+from services.trainer.arguments import build_arguments
+from services.trainer.checkpointing import seed_everything
+from services.trainer.grid import GridPlan, PlannedRun, RunFunctions, run_grid
 from services.trainer.leaderboard import leaderboard
-from services.trainer.make_model import make_model
-from services.trainer.random_state import seed_everything
-from services.trainer.stop import StopRequest
-from shared.datasets.city.plan import CityOptions, make_plan
-from shared.datasets.city.write import write_city
-from shared.datasets.sets import open_evaluation_set
-from shared.datasets.shots import EvaluationSet
-from shared.vision.place_models.checkpoint import load_checkpoint
-from shared.vision.place_models.model import VprModel
+from services.trainer.model_describer import ModelDescriber
+from services.trainer.module import make_model
+from services.trainer.resolve import Device
+from services.trainer.run_control import NullDisplay, StopRequest
+from shared.datasets.dataset import EvaluationSet
+from shared.datasets.open_dataset import open_evaluation_set
+from shared.descriptors.vpr_models.checkpoint import load_checkpoint
+from shared.descriptors.vpr_models.model import VprModel
+from shared.evaluation.bootstrap import cluster_queries, paired_differences
+from shared.evaluation.ranking import evaluate_recall
+from shared.evaluation.retrieval_metrics import compute_hits
+from shared.synthetic_city.plan import CityOptions, make_plan
+from shared.synthetic_city.write import write_city
 
 if TYPE_CHECKING:
     from rich.progress import Progress

@@ -11,18 +11,21 @@ import numpy as np
 import torch
 from PIL import Image
 
-from services.trainer.augment import apply_randaugment, to_tensor
-from services.trainer.batches import PlaceDataset, ResumableDataLoader
-from services.trainer.configuration import build_arguments
-from services.trainer.device import Device
-from services.trainer.display import NullDisplay
+from services.trainer.arguments import build_arguments
+from services.trainer.data import (
+    PlaceBatchSampler,
+    PlaceDataset,
+    ResumableDataLoader,
+    apply_randaugment,
+    to_tensor,
+)
 from services.trainer.losses import make_loss
-from services.trainer.make_model import make_model
 from services.trainer.miners import make_miner
-from services.trainer.optimise import make_optimizer
-from services.trainer.sampling import PlaceBatchSampler
-from shared.datasets.shots import TrainingPlace
-from shared.vision.decode_small import decode_resized
+from services.trainer.module import make_model, make_optimizer
+from services.trainer.resolve import Device
+from services.trainer.run_control import NullDisplay
+from shared.datasets.dataset import TrainingPlace
+from shared.imaging.decode import decode_resized
 
 if TYPE_CHECKING:
     from rich.progress import Progress

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from shared.errors import InvalidRequest
-from shared.recipes import (
+from shared.extractor_config.configs import (
     EXTRACTOR_AGGREGATORS,
     EXTRACTOR_CONFIGS,
     FACETS,

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
-from services.cli.connect import connect
+from services.cli.client import connect, wait_for_job
 from services.cli.extractor_options import PreprocessingOption, extractor_name
 from services.cli.output import (
     JsonOption,
@@ -19,7 +19,6 @@ from services.cli.output import (
     progress_bar,
     report_errors,
 )
-from services.cli.wait import wait_for_job
 from shared.client import Json
 from shared.errors import Conflict
 

@@ -1,4 +1,7 @@
-"""What a command prints: tables and progress for people, JSON for programs, errors for both."""
+"""What a command prints: tables and progress for people, JSON for programs, errors for both.
+
+Files that are there when they are whole.
+"""
 
 from __future__ import annotations
 
@@ -8,20 +11,14 @@ import os
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, BinaryIO
 
 import typer
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TextColumn,
-    TimeElapsedColumn,
-)
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from shared.errors import PlacewiseError
+from shared.errors import InvalidRequest, Misconfigured, PlacewiseError
 
 # Progress and messages go to stderr: stdout is the answer, and can be piped.
 err_console = Console(stderr=True, highlight=False)
@@ -78,7 +75,7 @@ def _database_problem(error: Exception) -> PlacewiseError | None:
     """The explanation of a failure of the catalog; None for every other error."""
     if "sqlalchemy" not in sys.modules:
         return None
-    from shared.catalog.away import to_unavailable  # most commands do without a database
+    from shared.catalog.database_errors import to_unavailable  # most commands do without a database
 
     return to_unavailable(error)
 
@@ -113,3 +110,37 @@ def print_failures(report: dict[str, Any], *words: str) -> None:
                 f"[red]{word}[/red] {escape(item['path'] + name)}: {escape(item['reason'])}",
                 soft_wrap=True,
             )
+
+
+@contextlib.contextmanager
+def atomic_write(out: Path) -> Iterator[BinaryIO]:
+    """A file that takes its name when the block has ended well; else nothing is left of it.
+
+    Raises Misconfigured (`out_unwritable`).
+    """
+    partial = out.with_name(f".{out.name}.{os.getpid()}.partial")
+    try:
+        with partial.open("w+b") as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        partial.replace(out)
+    except OSError as error:
+        raise Misconfigured(
+            "out_unwritable", f"{printable_path(out)} can't be written: {error.strerror}."
+        ) from error
+    finally:
+        # Where even the folder is missing, there is nothing to take away.
+        with contextlib.suppress(OSError):
+            partial.unlink(missing_ok=True)
+
+
+def check_output_path(out: Path, suffix: str, what: str) -> None:
+    """InvalidRequest (`bad_out`) unless `out` ends in `suffix` and its folder is there.
+
+    Asked before the minutes that it takes to make `what` ("a vocabulary", say).
+    """
+    if out.suffix != suffix:
+        raise InvalidRequest("bad_out", f"{printable_path(out)}: {what}'s file ends in {suffix}.")
+    if not out.parent.is_dir():
+        raise InvalidRequest("bad_out", f"There is no folder {printable_path(out.parent)}.")

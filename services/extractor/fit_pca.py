@@ -2,7 +2,7 @@
 
     plan      which photos' rows, and how they are cut      -> plan.json
     gather    the next few of these rows                    -> rows-*.f32
-    reduce    steps of `shared.vision.pca_fit`              -> fit.npz, part-*.npz
+    reduce    steps of `shared.descriptors.pca_fit`              -> fit.npz, part-*.npz
 
 The names are objects under `work/<job>/`. Nothing of a fit is kept in the worker's memory. The
 longest step finds the variances of the sample: some seconds where it has 2,000 rows.
@@ -17,31 +17,36 @@ from uuid import UUID
 import numpy as np
 from sqlalchemy import select
 
-from services.extractor.loaded import DescriptorPipeline, ModelRegistry
-from services.extractor.new_generation import checkpoint_and_release, start_whitened_generation
-from services.extractor.slices import FIT_PROGRESS_UNITS, run_fit_steps, time_slice
-from services.extractor.stored_rows import read_stored_rows
+from services.extractor.checkpointed_steps import (
+    FIT_PROGRESS_UNITS,
+    checkpoint_and_release,
+    run_fit_steps,
+    start_whitened_generation,
+    time_slice,
+)
+from services.extractor.model_registry import DescriptorPipeline, ModelRegistry
+from services.extractor.prepare import read_stored_rows
 from shared.catalog.chunks import Descriptor
 from shared.catalog.generations import Generation
 from shared.catalog.photos import Photo, PhotoRole
 from shared.catalog.session import Catalog
-from shared.catalog.vocabularies import Vocabulary
-from shared.catalog.whitenings import get_pca_source_generation
-from shared.errors import Conflict
-from shared.jobs import Job
-from shared.objects import ObjectStore
-from shared.objects.keys import job_work_key
-from shared.vision.pca import PcaProjection
-from shared.vision.pca_file import PcaWhiteningFile
-from shared.vision.pca_fit import PcaBlock, PcaFit, check_pca_fittable
-from shared.vision.pca_rows import (
+from shared.catalog.vocabularies import Vocabulary, get_pca_source_generation
+from shared.descriptors.pca_fit import (
+    PcaBlock,
+    PcaFit,
     StoredColumns,
     block_count,
     block_width,
+    check_pca_fittable,
     sample_rows,
     sample_size,
     usable_rows,
 )
+from shared.descriptors.pca_whitening import PcaProjection, PcaWhiteningFile
+from shared.errors import Conflict
+from shared.jobs import Job
+from shared.storage import ObjectStore
+from shared.storage.keys import job_work_key
 
 READ_BATCH_BYTES = 16_000_000  # of rows that are read together
 SEED = 0

@@ -1,10 +1,16 @@
-"""What Prometheus reads of an extractor. One process, one registry: children only decode."""
+"""What Prometheus reads of an extractor. One process, one registry: children only decode.
+
+What one drain of the extractor's worker did.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import time
+from collections import defaultdict
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from typing import Any
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
 from prometheus_client.core import GaugeMetricFamily
@@ -12,8 +18,8 @@ from prometheus_client.metrics_core import Metric
 from prometheus_client.registry import Collector
 
 from services.extractor.publish import PublishResult
+from shared.descriptors.inference import gpu_memory
 from shared.jobs import JobKind
-from shared.vision.device_memory import gpu_memory
 
 METRIC_PREFIX = "placewise_extractor"
 BATCH_SIZE_BUCKETS = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1024)
@@ -132,3 +138,42 @@ class _DeviceMemoryCollector(Collector):
             total.add_metric([device.name], device.total_bytes)
         yield used
         yield total
+
+
+@dataclass(slots=True)
+class DrainStats:
+    """What one drain did: this is what the operator sees."""
+
+    maps: set[str] = field(default_factory=set)
+    claimed: int = 0
+    succeeded: int = 0
+    failed: int = 0
+    seconds: defaultdict[str, float] = field(default_factory=lambda: defaultdict(float))
+    interrupted: bool = False
+    """It ended before the work did."""
+
+    def merge(self, other: DrainStats) -> None:
+        """Count what another one has counted, too."""
+        self.maps |= other.maps
+        self.claimed += other.claimed
+        self.succeeded += other.succeeded
+        self.failed += other.failed
+        for stage, took in other.seconds.items():
+            self.seconds[stage] += took
+
+    def add_batch(self, outcome: PublishResult, seconds: dict[str, float]) -> None:
+        """Count what a batch came to, and the time of its stages."""
+        self.succeeded += outcome.succeeded
+        self.failed += outcome.failed
+        for stage, took in seconds.items():
+            self.seconds[stage] += took
+
+    def as_dict(self) -> dict[str, Any]:
+        """For logs and for Flower."""
+        return {
+            "maps": sorted(self.maps),
+            "claimed": self.claimed,
+            "succeeded": self.succeeded,
+            "failed": self.failed,
+            "seconds": {stage: round(took, 3) for stage, took in self.seconds.items()},
+        }

@@ -21,14 +21,14 @@ from shared.catalog.generations import GenerationState, lock_generation
 from shared.catalog.maps import increment_map_version, lock_map
 from shared.catalog.photos import get_live_photos
 from shared.catalog.session import Catalog
-from shared.chunks import Rows, encode_rows, write_chunk
 from shared.ids import new_id
 from shared.jobs import JobKind
-from shared.jobs.finish import cancel_job, fail_job, release_job, succeed_job
 from shared.jobs.leases import lock_leased_jobs
-from shared.jobs.on_behalf import distinct_request_ids
-from shared.objects import ObjectStore
-from shared.objects.keys import query_vector_key
+from shared.jobs.trace_context import distinct_request_ids
+from shared.jobs.transitions import cancel_job, fail_job, release_job, succeed_job
+from shared.storage import ObjectStore
+from shared.storage.chunks import Rows, encode_rows, write_chunk
+from shared.storage.keys import query_vector_key
 
 log = logging.getLogger(__name__)
 

@@ -17,17 +17,16 @@ from celery import signals
 from prometheus_client import CollectorRegistry
 from sqlalchemy.exc import SQLAlchemyError
 
-from services.extractor.drain_result import DrainStats
-from services.extractor.setbacks import UNAVAILABLE_RETRY_SECONDS
+from services.extractor.failures import UNAVAILABLE_RETRY_SECONDS
+from services.extractor.metrics import DrainStats
 from services.extractor.worker import ExtractorWorker
-from shared.catalog.away import OutageLog
+from shared.catalog.database_errors import OutageLog
 from shared.catalog.session import Catalog
-from shared.heartbeat import Heartbeat
-from shared.jobs.celery_app import DRAIN_TASK, create_celery_app
-from shared.jobs.celery_hints import CeleryWakeups
-from shared.jobs.hints import WakeupQueue
-from shared.objects import ObjectStore
-from shared.settings import Settings
+from shared.config.settings import Settings
+from shared.jobs.celery_wakeups import DRAIN_TASK, CeleryWakeups, create_celery_app
+from shared.jobs.wakeups import WakeupQueue
+from shared.storage import ObjectStore
+from shared.telemetry.heartbeat import Heartbeat
 from shared.telemetry.metrics_server import serve_metrics
 
 log = logging.getLogger(__name__)

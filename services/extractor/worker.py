@@ -31,30 +31,27 @@ from prometheus_client import CollectorRegistry
 from sqlalchemy.exc import SQLAlchemyError
 
 from services.extractor.added_models import AddedModelLoader
-from services.extractor.compare import ComparisonRunner, PreparedComparison
-from services.extractor.decoding import DecoderPool
-from services.extractor.describe import describe_batch
-from services.extractor.drain_result import DrainStats
-from services.extractor.loaded import ModelRegistry
-from services.extractor.metrics import ExtractorMetrics
-from services.extractor.model_change import ModelChangeRunner
-from services.extractor.prepare import DescribeBatch, prepare_batch
+from services.extractor.comparison import ComparisonRunner, PreparedComparison
+from services.extractor.decoder_pool import DecoderPool
+from services.extractor.failures import UNAVAILABLE_RETRY_SECONDS, JobFailureHandler
+from services.extractor.generation_resolver import reindex_outdated_generations, resolve_generation
+from services.extractor.metrics import DrainStats, ExtractorMetrics
+from services.extractor.model_changes import ModelChangeRunner
+from services.extractor.model_registry import ModelRegistry
+from services.extractor.prepare import DescribeBatch, describe_batch, prepare_batch
 from services.extractor.publish import PublishResult, publish
-from services.extractor.renew import reindex_outdated_generations
-from services.extractor.setbacks import UNAVAILABLE_RETRY_SECONDS, JobFailureHandler
-from services.extractor.target import resolve_generation
-from shared.catalog.away import OutageLog
+from shared.catalog.database_errors import OutageLog
+from shared.catalog.jobs import EXTRACTOR_JOBS, MODEL_CHANGE_JOBS, JobKind
 from shared.catalog.session import Catalog
-from shared.chunks import Rows
+from shared.config.settings import Settings
 from shared.errors import PlacewiseError
-from shared.heartbeat import Heartbeat
 from shared.jobs import InProcessWakeups, Job, Priority, claim_jobs, maintain_lease, mark_started
 from shared.jobs.claim import has_claimable_jobs
 from shared.jobs.leases import get_lease_token
-from shared.jobs.on_behalf import job_trace_context
-from shared.jobs.table import EXTRACTOR_JOBS, MODEL_CHANGE_JOBS, JobKind
-from shared.objects import ObjectStore
-from shared.settings import Settings
+from shared.jobs.trace_context import job_trace_context
+from shared.storage import ObjectStore
+from shared.storage.chunks import Rows
+from shared.telemetry.heartbeat import Heartbeat
 
 log = logging.getLogger(__name__)
 

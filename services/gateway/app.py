@@ -5,40 +5,47 @@ from __future__ import annotations
 from fastapi import Depends, FastAPI
 from fastapi.middleware.cors import CORSMiddleware
 
-from services.call_log import RequestLogMiddleware
-from services.gateway import (
+from services.gateway import metrics
+from services.gateway.admission import AdmissionControl
+from services.gateway.authentication import READ, AuthenticationMiddleware, check_declared_scopes
+from services.gateway.dependencies import (
+    API_PREFIX,
+    GatewayContext,
+    reject_unknown_query_parameters,
+)
+from services.gateway.idempotency import IdempotentReplay, replay_response
+from services.gateway.metrics import GatewayMetrics
+from services.gateway.middleware import (
+    BodySizeLimitMiddleware,
+    ExceptionHandlerMiddleware,
+    SecurityHeadersMiddleware,
+)
+from services.gateway.rate_limits import RateLimiter, RateLimitMiddleware
+from services.gateway.routes import (
     batches,
-    console,
-    direct_upload,
     evaluations,
     export,
-    figures,
     health,
-    history,
     jobs,
-    key_calls,
+    keys,
     maps,
-    metrics,
     model_changes,
     models,
     photos,
+    presigned_uploads,
     similarity,
-    upload,
-    webhook_calls,
-    word_weights,
+    stats,
+    uploads,
+    webhooks,
 )
-from services.gateway.answer_headers import SecurityHeadersMiddleware
-from services.gateway.body_limit import BodySizeLimitMiddleware
-from services.gateway.context import API_PREFIX, GatewayContext
-from services.gateway.key_check import READ, AuthenticationMiddleware, check_declared_scopes
-from services.gateway.last_resort import ExceptionHandlerMiddleware
-from services.gateway.metrics import GatewayMetrics
-from services.gateway.once import IdempotentReplay, replay_response
-from services.gateway.parameters import reject_unknown_query_parameters
-from services.gateway.quotas import RateLimiter, RateLimitMiddleware
-from services.gateway.room import AdmissionControl
-from shared.intake.photo_quota import PhotoQuota
-from shared.problems import AUTHENTICATION_RESPONSES, PROBLEM_RESPONSES, install_exception_handlers
+from services.gateway.web_page import create_web_page_router
+from services.request_log import RequestLogMiddleware
+from shared.http.problem_details import (
+    AUTHENTICATION_RESPONSES,
+    PROBLEM_RESPONSES,
+    install_exception_handlers,
+)
+from shared.ingest.store_photo import PhotoQuota
 
 DESCRIPTION = """Photo in, place out. Upload geotagged photos, poll their jobs, and ask which known
 place a photo shows. Every error is an RFC 9457 problem with a stable `code`."""
@@ -62,19 +69,19 @@ def create_app(gateway: GatewayContext) -> FastAPI:
         version=health.VERSION,
         description=DESCRIPTION,
         responses=PROBLEM_RESPONSES,
-        docs_url=None,  # console.py has pages that need no other server
+        docs_url=None,  # web_page.py serves them without another server
         redoc_url=None,
     )
     app.state.gateway = gateway
-    app.state.room = AdmissionControl(gateway.catalog, gateway.settings)
-    app.state.quotas = RateLimiter(gateway.settings)
+    app.state.admission = AdmissionControl(gateway.catalog, gateway.settings)
+    app.state.rate_limiter = RateLimiter(gateway.settings)
     app.state.photo_quota = PhotoQuota(gateway.catalog)
-    figures_of_calls = GatewayMetrics(gateway, app.state.room)
-    # The last one added is the first one asked.
+    gateway_metrics = GatewayMetrics(gateway, app.state.admission)
+    # Starlette calls the middleware that was added last first.
     app.add_middleware(
         BodySizeLimitMiddleware, exempt_paths={f"{API_PREFIX}{batches.BATCH_UPLOAD_PATH}"}
     )
-    app.add_middleware(RateLimitMiddleware, limiter=app.state.quotas)
+    app.add_middleware(RateLimitMiddleware, limiter=app.state.rate_limiter)
     app.add_middleware(AuthenticationMiddleware, authenticator=gateway.authenticator)
     app.add_middleware(ExceptionHandlerMiddleware)
     if gateway.settings.allowed_origins:
@@ -88,28 +95,26 @@ def create_app(gateway: GatewayContext) -> FastAPI:
     app.add_middleware(SecurityHeadersMiddleware, settings=gateway.settings)
     app.add_middleware(
         RequestLogMiddleware,
-        on_start=figures_of_calls.on_request_start,
-        on_end=figures_of_calls.on_request_end,
+        on_start=gateway_metrics.on_request_start,
+        on_end=gateway_metrics.on_request_end,
     )
     install_exception_handlers(app)
     app.add_exception_handler(IdempotentReplay, replay_response)
     for module in (
         maps,
-        upload,
+        uploads,
         batches,
-        direct_upload,
+        presigned_uploads,
         jobs,
         similarity,
         photos,
         model_changes,
         models,
         evaluations,
-        word_weights,
         export,
-        history,
-        figures,
-        key_calls,
-        webhook_calls,
+        stats,
+        keys,
+        webhooks,
         health,
     ):
         check_declared_scopes(module.router)
@@ -121,5 +126,5 @@ def create_app(gateway: GatewayContext) -> FastAPI:
         )
     app.include_router(health.probe_router)
     app.include_router(metrics.router, responses=AUTHENTICATION_RESPONSES, dependencies=[READ])
-    app.include_router(console.create_web_page_router(gateway.settings))
+    app.include_router(create_web_page_router(gateway.settings))
     return app

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 
 from fastapi import Request
 
-from services.gateway.key_check import get_caller
+from services.gateway.authentication import get_caller
 from services.http_connections import address_group
 from shared.errors import TooManyRequests
 

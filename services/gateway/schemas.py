@@ -11,12 +11,12 @@ from uuid import UUID
 from fastapi import Response
 from pydantic import BaseModel, ConfigDict, Field
 
-from services.gateway.context import API_PREFIX, DEFAULT_MAP
+from services.gateway.dependencies import API_PREFIX, DEFAULT_MAP
 from shared.catalog.generations import Generation, GenerationState
+from shared.catalog.jobs import QUERY_JOBS
 from shared.catalog.photos import Photo, PhotoRole
 from shared.catalog.vocabularies import Vocabulary, VocabularyOrigin
 from shared.jobs import Job, JobKind, JobState
-from shared.jobs.table import QUERY_JOBS
 
 
 class ResponseModel(BaseModel):

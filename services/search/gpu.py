@@ -1,7 +1,7 @@
 """Scores of all rows at once by matrix products on a GPU, each within a bound of the exact one.
 
 A generation's rows lie in the device's memory, as float16 where they fit and as int8 codes
-(`shared.codes.int8`) where only those do. One product gives every row's score to within a bound;
+(`shared.codes.int8_codes`) where only those do. One product gives every row's score to within a bound;
 rows that may be among the best are compared exactly on the CPU, from their float32 rows. So the
 answers are those of the CPU.
 
@@ -34,9 +34,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from services.search.bounded import Candidates
-from services.search.loaded_chunk import LoadedChunk
-from shared.codes.int8 import INT8_MAX, Int8Query
+from services.search.chunk_loader import LoadedChunk
+from services.search.int8_search import Candidates
+from shared.codes.int8_codes import INT8_MAX, Int8Query
 from shared.codes.rotation import get_rotation
 
 FLOAT16, INT8 = "float16", "int8"

@@ -14,7 +14,7 @@ from numba import types
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-from shared.codes.compiled import REORDERED_FASTMATH, numba_jit
+from shared.codes.jit import REORDERED_FASTMATH, numba_jit
 
 EXCLUDED_DISTANCE = 65_535  # more than any distance
 INT32_SAFE_TERMS = 1024  # so many products of a byte and 15 bits add up to less than 2^31

@@ -12,8 +12,8 @@ from prometheus_client.registry import Collector
 
 from services.search.worker import SearchWorker
 from shared.errors import PlacewiseError
-from shared.search_protocol import SearchRequest, SearchResponse, SearchStatus
-from shared.telemetry.traces import span
+from shared.search_api.protocol import SearchRequest, SearchResponse, SearchStatus
+from shared.telemetry.tracing import span
 
 # From a small map in memory to a scan of a full shard, and to the longest wait for a version.
 LATENCY_BUCKETS_SECONDS = (

@@ -11,15 +11,15 @@ from uuid import UUID
 import numpy as np
 from numpy.typing import NDArray
 
-from services.search.loaded_chunk import LoadedChunk
+from services.search.chunk_loader import LoadedChunk
 from services.search.photo_columns import JoinedColumns
-from shared.search_protocol import IndexPart, LoadedGeneration
+from shared.search_api.protocol import IndexPart, LoadedGeneration
 
 if TYPE_CHECKING:  # numba takes a while to load, and small maps need no codes
-    from services.search.blocks import RowBlocks
-    from services.search.bounded import Int8Blocks
-    from services.search.cascade import SignCodeBlocks
+    from services.search.exact_rerank import RowBlocks
     from services.search.gpu import GpuSnapshot
+    from services.search.int8_search import Int8Blocks
+    from services.search.sign_code_search import SignCodeBlocks
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,20 +84,20 @@ class Snapshot:
     @cached_property
     def sign_code_blocks(self) -> SignCodeBlocks:
         """Where the sign codes and rows of a coded snapshot lie."""
-        from services.search.cascade import SignCodeBlocks
+        from services.search.sign_code_search import SignCodeBlocks
 
         return SignCodeBlocks.of(self.chunks)
 
     @cached_property
     def int8_blocks(self) -> Int8Blocks:
         """Where the int8 codes and rows of a bounded snapshot lie."""
-        from services.search.bounded import Int8Blocks
+        from services.search.int8_search import Int8Blocks
 
         return Int8Blocks.of(self.chunks)
 
     @cached_property
     def row_blocks(self) -> RowBlocks:
         """Where the rows lie."""
-        from services.search.blocks import RowBlocks
+        from services.search.exact_rerank import RowBlocks
 
         return RowBlocks.of(self.chunks)

@@ -1,10 +1,18 @@
-"""The search port in one process: snapshots swapped atomically, queries on whichever is current."""
+"""The search port in one process: snapshots swapped atomically, queries on whichever is current.
+
+The descriptor that a query refers to: in memory, or one row read from the object store.
+
+The row may lie in a chunk of another shard, in a chunk that was merged into another since, or
+under `queries/`. The few rows that were read last are kept: the gateway asks for more hits of one
+query, and evaluations come back to the same photos.
+"""
 
 from __future__ import annotations
 
 import logging
 import threading
 import time
+from collections import OrderedDict
 from collections.abc import Collection
 from typing import TYPE_CHECKING
 from uuid import UUID
@@ -12,44 +20,108 @@ from uuid import UUID
 import numpy as np
 from sqlalchemy.exc import SQLAlchemyError
 
-from services.search.answer import (
+from services.search.catalog_sync import (
+    SYNCED_STATES,
+    ReplicationLagTracker,
+    read_generation_versions,
+    sync_snapshot,
+    with_int8_codes,
+)
+from services.search.chunk_loader import remove_stale_folders
+from services.search.executor import (
     SearchOptions,
     execute_query,
     execute_weighted_query,
     needs_int8_codes,
 )
-from services.search.device import GpuResidency, open_search_device
-from services.search.follow import (
-    SYNCED_STATES,
-    read_generation_versions,
-    sync_snapshot,
-    with_int8_codes,
-)
-from services.search.lag import ReplicationLagTracker
-from services.search.load import remove_stale_folders
-from services.search.make_int8 import Int8CodeBuilder
-from services.search.memory import MemoryBudget
-from services.search.query_row import QueryRowReader, query_expired_error
-from services.search.select import build_row_mask
+from services.search.int8_builder import Int8CodeBuilder
+from services.search.photo_columns import build_row_mask
+from services.search.query_batcher import QueryBatcher
+from services.search.residency import GpuResidency, MemoryBudget, open_search_device
 from services.search.snapshot import Snapshot
-from services.search.together import QueryBatcher
-from shared.catalog.away import OutageLog
+from shared.catalog.database_errors import OutageLog
 from shared.catalog.generations import GenerationState
 from shared.catalog.session import Catalog
-from shared.chunks import Row
-from shared.errors import InvalidRequest, Unavailable
-from shared.objects import ObjectStore
-from shared.read_retries import ReadRetries
-from shared.search_protocol import NONE, Mode, SearchRequest, SearchResponse, SearchStatus
-from shared.settings import Settings
-from shared.shards import SINGLE_SHARD, Shard
-from shared.word_weights.learn import apply_word_weights
+from shared.config.settings import Settings
+from shared.config.shards import SINGLE_SHARD, Shard
+from shared.errors import Gone, InvalidRequest, NotFound, Unavailable
+from shared.search_api.protocol import NONE, Mode, SearchRequest, SearchResponse, SearchStatus
+from shared.storage import ObjectStore
+from shared.storage.chunks import Row, read_row, rows_are_valid
+from shared.storage.keys import QUERIES
+from shared.storage.read_retries import ReadRetries
+from shared.word_weights.weights import apply_word_weights
 
 if TYPE_CHECKING:
     from services.search.gpu import GpuDevice
-    from shared.codes.int8 import Int8Codes
+    from shared.codes.int8_codes import Int8Codes
+
 
 log = logging.getLogger(__name__)
+
+CACHED_ROWS = 64  # 25 MB at 98,304 dimensions
+
+
+class QueryRowReader:
+    """Reads query rows; thread-safe."""
+
+    def __init__(self, store: ObjectStore) -> None:
+        self._store = store
+        self._lock = threading.Lock()
+        self._cache: OrderedDict[tuple[str, int], Row] = OrderedDict()
+
+    def read_query(self, snapshot: Snapshot, request: SearchRequest) -> Row:
+        """The (dimension,) row. Gone (`query_expired_error`) when it is no longer kept, Unavailable
+        (`chunk_unreadable`) when it is damaged."""
+        loaded = snapshot.by_key.get(request.object_key)
+        if request.object_key in snapshot.missing:
+            raise _unreadable_error(request.object_key)
+        if loaded is None:
+            return self._read_cached(request.object_key, request.row)
+        if request.row >= len(loaded.rows):
+            raise query_expired_error(f"row {request.row} of {request.object_key}")
+        row: Row = loaded.rows[request.row]
+        return row
+
+    def _read_cached(self, object_key: str, row: int) -> Row:
+        at = (object_key, row)
+        with self._lock:
+            kept = self._cache.get(at)
+            if kept is not None:
+                self._cache.move_to_end(at)
+                return kept
+        try:
+            found = read_row(self._store, object_key, row)
+        except NotFound:
+            raise query_expired_error(f"descriptor {object_key}") from None
+        except IndexError:
+            raise query_expired_error(f"row {row} of {object_key}") from None
+        except ValueError as error:
+            raise _unreadable_error(object_key) from error
+        if object_key.startswith(QUERIES):
+            return found  # not kept: it goes with its object, after QUERY_TTL_SECONDS
+        if not rows_are_valid(found[np.newaxis]).all():
+            raise _unreadable_error(object_key)
+        with self._lock:
+            self._cache[at] = found
+            while len(self._cache) > CACHED_ROWS:
+                self._cache.popitem(last=False)
+        return found
+
+
+def query_expired_error(what: str) -> Gone:
+    """What a query needs is no longer kept."""
+    return Gone("query_expired", f"The {what} is no longer kept. Ask with the photo again.")
+
+
+def _unreadable_error(object_key: str) -> Unavailable:
+    return Unavailable(
+        "chunk_unreadable",
+        f"The descriptor in {object_key} can't be read: the object is missing or damaged. "
+        "Ask with the photo itself, or restore the object from a backup.",
+        object_key=object_key,
+    )
+
 
 VERSION_POLL_SECONDS = 0.01
 FILE_CHECK_SECONDS = 5.0  # between two looks at whether mapped files were changed

@@ -11,8 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from services.trainer.grid import RunOutcome, RunState
-from services.trainer.grid_plan import GridPlan
+from services.trainer.grid import GridPlan, RunOutcome, RunState
 
 SETTING_COLUMNS = ("agg_arch", "loss_name", "miner_name")
 SHOWN_KS = (1, 5)

@@ -3,11 +3,13 @@
 All are pytorch-metric-learning's. Two of them compute here what the library computes, by other
 sums: with the hundreds of thousands of triplets that a miner may find in 400 photos, the library's
 own take gigabytes.
+
+Losses and miners are chosen by name.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -17,7 +19,22 @@ from pytorch_metric_learning.utils import loss_and_miner_utils
 from torch import nn
 from torch.nn.functional import softplus
 
-from services.trainer.names import match_name
+from shared.errors import Unprocessable
+
+
+def match_name(name: str, known: Sequence[str], *, suffix: str, argument: str) -> str:
+    """The one of `known` that `name` means, in capitals or not, with or without the suffix.
+
+    Unprocessable: `unknown_loss` or `unknown_miner`, by the suffix; it lists the known ones.
+    """
+    wanted = name.strip().lower().removesuffix(suffix.lower())
+    for candidate in known:
+        if candidate.lower().removesuffix(suffix.lower()) == wanted:
+            return candidate
+    raise Unprocessable(
+        f"unknown_{suffix.lower()}",
+        f"There is no {suffix.lower()} {name!r}. Known: {', '.join(known)} ({argument}).",
+    )
 
 
 class AngularLoss(losses.AngularLoss):  # type: ignore[misc]

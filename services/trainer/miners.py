@@ -17,7 +17,7 @@ from pytorch_metric_learning.losses import FastAPLoss
 from pytorch_metric_learning.utils import loss_and_miner_utils
 from torch import nn
 
-from services.trainer.names import match_name
+from services.trainer.losses import match_name
 
 NO_MINER = "none"
 MAX_BLOCK_VALUES = 1 << 22  # 16 MB of float32

@@ -1,55 +1,112 @@
-"""One run of `placewise train`, from its arguments to its summary."""
+"""One run of `placewise train`, from its arguments to its summary.
+
+Lightning's part of a run: its trainer, as quiet and as repeatable as a run wants it.
+"""
 
 from __future__ import annotations
 
 import json
+import logging
 import shlex
+import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import lightning
 import torch
+from lightning.pytorch.loggers import Logger
 
-from services.trainer.arguments import TrainingArguments
-from services.trainer.batches import PlaceDataset, ResumableDataLoader
-from services.trainer.configuration import save_yaml, to_plain_dict
-from services.trainer.device import Device
-from services.trainer.display import Display
-from services.trainer.fit import fit
-from services.trainer.history import EpochRecord, TrainingHistory
-from services.trainer.keep import TopKCheckpoints, copy_checkpoint
-from services.trainer.learner import MetricLearningModule
-from services.trainer.loggers import make_loggers
-from services.trainer.make_model import make_model
-from services.trainer.open_data import (
+from services.trainer.arguments import TrainingArguments, save_yaml, to_plain_dict
+from services.trainer.callbacks import (
+    TrainingCallback,
+    Validator,
+    flatten_recalls,
+    is_validation_epoch,
+    record_epoch,
+)
+from services.trainer.checkpointing import TopKCheckpoints, copy_checkpoint, seed_everything
+from services.trainer.data import PlaceBatchSampler, PlaceDataset, ResumableDataLoader
+from services.trainer.dataset_selection import (
     EvaluationSets,
     select_evaluation_sets,
     select_training_set,
     summarise_training_set,
 )
-from services.trainer.random_state import seed_everything
+from services.trainer.module import MetricLearningModule, make_model
+from services.trainer.resolve import (
+    Device,
+    check_environment,
+    make_checkpoints,
+    make_loggers,
+    portable_arguments,
+    resolve_arguments,
+)
+from services.trainer.run_control import Display, RunStopped, StopRequest
 from services.trainer.run_folder import (
     CONFIG_FILE,
     METRICS_FILE,
+    EpochRecord,
+    TrainingHistory,
     create_run_folder,
     find_run,
     load_resumed_arguments,
 )
-from services.trainer.sampling import PlaceBatchSampler
-from services.trainer.settle import (
-    check_environment,
-    make_checkpoints,
-    portable_arguments,
-    resolve_arguments,
-)
-from services.trainer.stop import RunStopped, StopRequest
 from services.trainer.summary import build_summary, print_data_sets
-from services.trainer.validation import Validator, flatten_recalls
-from services.trainer.watch import TrainingCallback, is_validation_epoch, record_epoch
-from shared.datasets.shots import TrainingSet
+from shared.datasets.dataset import TrainingSet
+from shared.descriptors.vpr_models.checkpoint import load_checkpoint
+from shared.descriptors.vpr_models.model import VprModel
 from shared.errors import Conflict, InvalidRequest
-from shared.vision.place_models.checkpoint import load_checkpoint
-from shared.vision.place_models.model import VprModel
+
+
+def fit(
+    module: MetricLearningModule,
+    batches: ResumableDataLoader,
+    callback: TrainingCallback,
+    arguments: TrainingArguments,
+    device: Device,
+    folder: Path,
+    loggers: Sequence[Logger],
+    resume_from: Path | None,
+) -> None:
+    """Learn until the arguments' end, from the beginning or from a checkpoint with the full state.
+
+    Validation and checkpoints are the watch's, not Lightning's. Raises RunStopped and what steps
+    raise.
+    """
+    # Its tips and its advice on numbers of workers are not what a run's user asked for.
+    logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", module=r"lightning\.")
+        trainer = lightning.Trainer(
+            accelerator=device.accelerator,
+            devices=device.devices,
+            precision=_precision(device),
+            max_epochs=arguments.max_epochs,
+            log_every_n_steps=arguments.log_every_n_steps,
+            logger=list(loggers) or False,
+            callbacks=[callback],
+            default_root_dir=folder,
+            enable_checkpointing=False,
+            enable_progress_bar=False,
+            enable_model_summary=False,
+            limit_val_batches=0,
+            num_sanity_val_steps=0,
+            use_distributed_sampler=False,
+        )
+        module.train()
+        trainer.fit(
+            module,
+            batches,
+            ckpt_path=resume_from,
+            weights_only=True if resume_from is not None else None,
+        )
+
+
+def _precision(device: Device) -> Any:
+    return device.precision
+
 
 Json = dict[str, Any]
 

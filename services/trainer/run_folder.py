@@ -5,19 +5,22 @@ history.json      what was measured so far
 metrics.json      the summary at the end
 checkpoints/      the best ones, and last.ckpt
 csv/  tensorboard/
+
+What a run has come to so far, beside its checkpoints: `history.json`.
 """
 
 from __future__ import annotations
 
+import json
 import os
+from dataclasses import asdict, dataclass, field
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from services.trainer.arguments import TrainingArguments
-from services.trainer.checkpoint_names import format_folder, safe_filename
-from services.trainer.configuration import build_arguments, load_yaml, to_plain_dict
-from shared.errors import Conflict, Misconfigured, NotFound
+from services.trainer.arguments import TrainingArguments, build_arguments, load_yaml, to_plain_dict
+from services.trainer.checkpointing import format_folder, safe_filename
+from shared.errors import Conflict, Misconfigured, NotFound, Unprocessable
 
 CHECKPOINTS_FOLDER = "checkpoints"
 CONFIG_FILE = "config.yaml"
@@ -110,3 +113,57 @@ def _make_folder(folder: Path, *, exist_ok: bool) -> Path:
     if not os.access(folder, os.W_OK):
         raise Misconfigured("out_unwritable", f"The run's folder {folder} can't be written.")
     return folder.resolve()
+
+
+HISTORY_FILE = "history.json"
+
+
+@dataclass
+class EpochRecord:
+    number: int
+    """from 0"""
+    step: int
+    """after it"""
+    loss: float
+    """of the last step"""
+    figures: dict[str, float]
+    """SET/R1 ...: shares from 0 to 1"""
+
+
+@dataclass
+class TrainingHistory:
+    """Grows with the run; saved when a checkpoint is."""
+
+    training_set: dict[str, Any]
+    epochs: list[EpochRecord] = field(default_factory=list)
+    """those that were measured"""
+    best: list[tuple[float, str]] = field(default_factory=list)
+    """score and file name of the best checkpoints, the best first"""
+    bad_photos: dict[str, str] = field(default_factory=dict)
+    """path -> why it does not decode"""
+    images: int = 0
+    """that were learned from"""
+    seconds: float = 0.0
+    """spent on steps, validation left out"""
+    seconds_waited: float = 0.0
+    """of them, for photos to be read"""
+
+    def save(self, folder: Path) -> None:
+        path = folder / HISTORY_FILE
+        partial = path.with_name(f"{HISTORY_FILE}.partial")
+        partial.write_text(json.dumps(asdict(self), indent=1) + "\n")
+        partial.replace(path)
+
+    @classmethod
+    def load(cls, folder: Path) -> TrainingHistory:
+        """Unprocessable (`run_unreadable`) where the folder's file can't be read."""
+        try:
+            stored = json.loads((folder / HISTORY_FILE).read_text())
+            stored["epochs"] = [EpochRecord(**epoch) for epoch in stored["epochs"]]
+            stored["best"] = [(score, name) for score, name in stored["best"]]
+            return cls(**stored)
+        except (OSError, ValueError, TypeError, KeyError) as error:
+            raise Unprocessable(
+                "run_unreadable",
+                f"{folder / HISTORY_FILE} can't be read: {error}. Begin a new run.",
+            ) from error

@@ -12,16 +12,14 @@ import lightning
 import pytorch_metric_learning
 import torch
 
-from services.trainer.arguments import TrainingArguments
-from services.trainer.configuration import to_plain_dict
-from services.trainer.display import Display
-from services.trainer.evaluation.recalls import Recalls
-from services.trainer.history import TrainingHistory
-from services.trainer.keep import TopKCheckpoints
-from services.trainer.open_data import EvaluationSets, summarise_evaluation_set
-from services.trainer.run_folder import CONFIG_FILE
-from shared.datasets.shots import TrainingSet
-from shared.vision.place_models.checkpoint import load_checkpoint
+from services.trainer.arguments import TrainingArguments, to_plain_dict
+from services.trainer.checkpointing import TopKCheckpoints
+from services.trainer.dataset_selection import EvaluationSets, summarise_evaluation_set
+from services.trainer.run_control import Display
+from services.trainer.run_folder import CONFIG_FILE, TrainingHistory
+from shared.datasets.dataset import TrainingSet
+from shared.descriptors.vpr_models.checkpoint import load_checkpoint
+from shared.evaluation.ranking import Recalls
 
 Json = dict[str, Any]
 

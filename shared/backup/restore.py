@@ -13,19 +13,26 @@ from uuid import UUID
 from sqlalchemy import delete, select, text
 from sqlalchemy.orm import Session
 
-from shared.backup.copy_objects import copy_object, hash_object, list_backup_objects
-from shared.backup.folder import BackupFolder, BackupManifest
-from shared.backup.rows import NOT_RESTORED_TABLES, BackupProgress, backup_tables, load_rows
-from shared.catalog.connections import NO_TIMEOUTS
+from shared.backup.folder import (
+    NOT_RESTORED_TABLES,
+    BackupFolder,
+    BackupManifest,
+    BackupProgress,
+    backup_tables,
+    copy_object,
+    hash_object,
+    list_backup_objects,
+    load_rows,
+)
 from shared.catalog.installation import get_or_create_installation
+from shared.catalog.jobs import MODEL_CHANGE_JOBS, QUERY_JOBS, UNFINISHED_STATES, Job
 from shared.catalog.maps import DEFAULT_MAP, Map
-from shared.catalog.search_workers import RegisteredSearchWorker
-from shared.catalog.session import Catalog
+from shared.catalog.processes import RegisteredSearchWorker
+from shared.catalog.session import NO_TIMEOUTS, Catalog
 from shared.errors import Conflict, Misconfigured, NotFound
-from shared.jobs.finish import cancel_job, release_job
 from shared.jobs.model_changes import cancel_model_change
-from shared.jobs.table import MODEL_CHANGE_JOBS, QUERY_JOBS, UNFINISHED_STATES, Job
-from shared.objects import ObjectStore
+from shared.jobs.transitions import cancel_job, release_job
+from shared.storage import ObjectStore
 
 MAX_NAMES_IN_ERROR = 5
 

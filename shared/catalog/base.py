@@ -2,17 +2,22 @@
 
 Leases and ages are decided by the database's clock alone, so that a worker whose clock is wrong
 can neither steal a lease nor keep one: `db_now()` and `db_now_plus(seconds)` are SQL, not Python.
+
+Marks rows that the journal in the object store has to be told of (`shared.journal`).
+
+Rows of the catalog as JSON values, the same from SQLite and PostgreSQL.
 """
 
 from __future__ import annotations
 
 from datetime import UTC, datetime
 from typing import Any
+from uuid import UUID
 
-from sqlalchemy import JSON, DateTime, Dialect, Index, MetaData
+from sqlalchemy import JSON, BigInteger, Column, DateTime, Dialect, Index, MetaData, Uuid, text
 from sqlalchemy.dialects.postgresql import ARRAY, JSONB
 from sqlalchemy.ext.compiler import compiles
-from sqlalchemy.orm import DeclarativeBase
+from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 from sqlalchemy.sql.elements import ColumnElement
 from sqlalchemy.sql.functions import FunctionElement
 from sqlalchemy.types import Boolean, Float, Text, TypeDecorator
@@ -180,3 +185,41 @@ def _distance_sqlite(element: db_distance_m, compiler: Any, **kw: Any) -> str:
 def affected_rows(result: Any) -> int:
     """How many rows an UPDATE or DELETE touched."""
     return int(result.rowcount)
+
+
+class Journaled:
+    """Mixin of tables whose rows are written to the journal.
+
+    Every INSERT and UPDATE that goes through SQLAlchemy raises `revision`, in the same transaction.
+    A row whose `revision` differs from `journaled_revision` is pending.
+    """
+
+    revision: Mapped[int] = mapped_column(
+        BigInteger, default=1, server_default="1", onupdate=text("revision + 1")
+    )
+    journaled_revision: Mapped[int] = mapped_column(BigInteger, default=0, server_default="0")
+
+
+def is_journaled(table: type[Journaled]) -> Condition:
+    """True for rows whose present state is in the journal."""
+    return table.revision == table.journaled_revision
+
+
+def to_json(value: Any) -> Any:
+    """A column's value as JSON can hold it: UUIDs and times become text."""
+    if isinstance(value, UUID):
+        return str(value)
+    if isinstance(value, datetime):
+        return value.isoformat()
+    return value
+
+
+def from_json(column: Column[Any], value: Any) -> Any:
+    """The value of `column` that `to_json` was given."""
+    if value is None:
+        return None
+    if isinstance(column.type, Uuid):
+        return UUID(value)
+    if isinstance(column.type, UtcDateTime):
+        return datetime.fromisoformat(value)
+    return value

@@ -1,7 +1,9 @@
-"""Generations: one complete set of descriptors of a map, made by one extractor spec.
+r"""Generations: one complete set of descriptors of a map, made by one extractor spec.
 
 BUILDING --complete, loaded by search--> ACTIVE --another is switched in--> RETIRED --grace--> gone
-   \\--its job is cancelled or fails--> ABANDONED --grace--> gone
+   \--its job is cancelled or fails--> ABANDONED --grace--> gone
+
+Evaluations: how often the right place came first, measured on a generation of a live map.
 """
 
 from __future__ import annotations
@@ -11,11 +13,10 @@ from enum import StrEnum
 from typing import Any
 from uuid import UUID
 
-from sqlalchemy import BigInteger, ForeignKey, Index, Integer, String, Uuid, select
+from sqlalchemy import BigInteger, Boolean, ForeignKey, Index, Integer, String, Uuid, select
 from sqlalchemy.orm import Mapped, Session, mapped_column
 
-from shared.catalog.base import Base, JsonValue, UtcDateTime, db_now
-from shared.catalog.journaled import Journaled
+from shared.catalog.base import Base, Journaled, JsonValue, UtcDateTime, db_now
 from shared.errors import NotFound
 from shared.ids import new_id
 
@@ -30,7 +31,7 @@ class GenerationState(StrEnum):
 class Generation(Journaled, Base):
     """`spec` is everything that decides a descriptor's value; rows of two specs never mix.
 
-    `calibration` is what its evaluations have learnt of its scores (`shared.estimate`),
+    `calibration` is what its evaluations have learnt of its scores (`shared.evaluation`),
     `word_weights` what the map's places have taught of its words (`shared.word_weights.record`).
     New chunks go into `open_slot`, which holds `open_slot_rows` rows so far.
     """
@@ -136,4 +137,44 @@ def list_generations(session: Session, map_id: UUID) -> list[Generation]:
         session.scalars(
             select(Generation).where(Generation.map_id == map_id).order_by(Generation.id.desc())
         )
+    )
+
+
+class Evaluation(Base):
+    """The figures of one evaluation. `searchable` is how many photos could be found then."""
+
+    __tablename__ = "evaluations"
+
+    id: Mapped[UUID] = mapped_column(Uuid, primary_key=True, default=new_id)
+    map_id: Mapped[UUID] = mapped_column(Uuid, ForeignKey("maps.id"))
+    generation_id: Mapped[UUID] = mapped_column(Uuid, ForeignKey("generations.id"))
+    automatic: Mapped[bool] = mapped_column(Boolean, default=False)
+    searchable: Mapped[int] = mapped_column(Integer)
+    labelled_queries: Mapped[int] = mapped_column(Integer)
+    figures: Mapped[dict[str, Any]] = mapped_column(JsonValue)
+    evaluated_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())
+
+    __table_args__ = (
+        Index("ix_evaluations_map_id", "map_id", "id"),
+        Index("ix_evaluations_generation", "generation_id", "id"),
+    )
+
+
+def list_evaluations(
+    session: Session, map_id: UUID, limit: int, before: UUID | None = None
+) -> list[Evaluation]:
+    """Newest first, up to `limit`, older than `before`."""
+    wanted = select(Evaluation).where(Evaluation.map_id == map_id)
+    if before is not None:
+        wanted = wanted.where(Evaluation.id < before)
+    return list(session.scalars(wanted.order_by(Evaluation.id.desc()).limit(limit)))
+
+
+def latest_evaluation(session: Session, generation_id: UUID) -> Evaluation | None:
+    """The generation's newest one."""
+    return session.scalar(
+        select(Evaluation)
+        .where(Evaluation.generation_id == generation_id)
+        .order_by(Evaluation.id.desc())
+        .limit(1)
     )

@@ -1,7 +1,7 @@
 """The installation: which Placewise this catalog is, and where its objects lie.
 
 Every object belongs to one catalog: what it does not know is collected as an orphan. So the store
-carries the catalog's id (`shared.objects.store_owner`), and the catalog remembers its bucket. A
+carries the catalog's id (`shared.storage.ownership`), and the catalog remembers its bucket. A
 restored backup of the catalog has the id in it, and so finds the store to be its own.
 """
 
@@ -20,14 +20,13 @@ from shared.catalog.chunks import Chunk
 from shared.catalog.models import Model
 from shared.catalog.photos import Photo
 from shared.catalog.session import Catalog
-from shared.catalog.vocabularies import Vocabulary
-from shared.catalog.whitenings import StoredWhitening
+from shared.catalog.vocabularies import StoredWhitening, Vocabulary
+from shared.config.settings import Settings
 from shared.ids import new_id
-from shared.objects import OwnedStore
-from shared.objects.folder import OWNER_MARK
-from shared.objects.open_store import open_store
-from shared.objects.store_owner import Place, check_free, claim_store, place_of
-from shared.settings import Settings
+from shared.storage import OwnedStore
+from shared.storage.folder import OWNER_MARK
+from shared.storage.open_store import open_store
+from shared.storage.ownership import Place, check_free, claim_store, place_of
 
 SAMPLE_KEYS = 20  # of each table
 REBUILDING = -1  # of `Installation.journal_sequence`

@@ -19,12 +19,11 @@ from alembic.script import ScriptDirectory
 from sqlalchemy import inspect, text
 from sqlalchemy.exc import DBAPIError, SQLAlchemyError
 
-from shared.catalog.away import get_sqlstate, to_unavailable
-from shared.catalog.connections import TransactionTimeouts
-from shared.catalog.session import Catalog
-from shared.catalog.unusable import check_pages, opening
+from shared.catalog.database_errors import get_sqlstate, to_unavailable
+from shared.catalog.file_checks import check_pages, opening
+from shared.catalog.session import Catalog, TransactionTimeouts
+from shared.config.private_files import FILE_MODE, make_private_folder
 from shared.errors import Misconfigured, PlacewiseError, Unavailable
-from shared.private_files import FILE_MODE, make_private_folder
 
 log = logging.getLogger(__name__)
 

@@ -1,43 +1,72 @@
-"""Every table, imported: what Alembic compares the database with."""
+"""Every table, imported: what Alembic compares the database with.
 
+Which releases understand the schema that is there; one row, written by migrations.
+
+The catalog that the settings name, with every table known.
+"""
+
+from __future__ import annotations
+
+from sqlalchemy import String
+from sqlalchemy.orm import Mapped, mapped_column
+
+# A foreign key may lead to a table whose module the service itself never needs.
+import shared.catalog.tables  # noqa: F401
+from shared.catalog.api_keys import ApiKey
+from shared.catalog.base import Base
+from shared.catalog.batch_items import BatchItem
 from shared.catalog.chunks import Chunk, Descriptor
-from shared.catalog.direct_uploads import PresignedUpload
-from shared.catalog.evaluations import Evaluation
-from shared.catalog.figures import CachedMapStatistics
-from shared.catalog.generations import Generation
+from shared.catalog.generations import Evaluation, Generation
 from shared.catalog.idempotency import IdempotencyRecord
 from shared.catalog.installation import Installation
-from shared.catalog.keys import ApiKey
-from shared.catalog.live_processes import RegisteredProcess
-from shared.catalog.maps import Map
+from shared.catalog.jobs import Job
+from shared.catalog.maps import CachedMapStatistics, Map, Search
 from shared.catalog.models import Model
-from shared.catalog.photos import Photo
-from shared.catalog.schema_compatibility import SchemaCompatibility
-from shared.catalog.search_workers import RegisteredSearchWorker
-from shared.catalog.searches import Search
-from shared.catalog.vocabularies import Vocabulary
+from shared.catalog.photos import Photo, PresignedUpload
+from shared.catalog.processes import RegisteredProcess, RegisteredSearchWorker
+from shared.catalog.session import Catalog, PoolConfig, TransactionTimeouts
+from shared.catalog.vocabularies import StoredWhitening, Vocabulary
 from shared.catalog.webhooks import Delivery, Webhook
-from shared.catalog.whitenings import StoredWhitening
-from shared.jobs.batches import BatchItem
-from shared.jobs.table import Job
+from shared.config.settings import Settings
+
+
+class SchemaCompatibility(Base):
+    """`understood_from`: the oldest revision whose release works with the schema as it is now."""
+
+    __tablename__ = "schema_compatibility"
+
+    understood_from: Mapped[str] = mapped_column(String(32), primary_key=True)
+
+
+def open_catalog(
+    settings: Settings, service: str, limits: TransactionTimeouts | None = None
+) -> Catalog:
+    """The catalog that the settings name, for a service of this name; `limits` are those of
+    background work unless given."""
+    return Catalog(
+        settings.catalog_url(),
+        PoolConfig.from_settings(settings, service),
+        TransactionTimeouts.for_background(settings) if limits is None else limits,
+    )
+
 
 __all__ = [
     "ApiKey",
     "BatchItem",
+    "CachedMapStatistics",
     "Chunk",
     "Delivery",
     "Descriptor",
-    "PresignedUpload",
     "Evaluation",
     "Generation",
+    "IdempotencyRecord",
     "Installation",
     "Job",
-    "IdempotencyRecord",
-    "RegisteredProcess",
     "Map",
-    "CachedMapStatistics",
     "Model",
     "Photo",
+    "PresignedUpload",
+    "RegisteredProcess",
     "RegisteredSearchWorker",
     "SchemaCompatibility",
     "Search",

@@ -9,8 +9,7 @@ from sqlalchemy import func, select, update
 from sqlalchemy.orm import Session
 
 from shared.catalog.base import Condition, db_now, db_now_plus
-from shared.ids import new_id
-from shared.jobs.table import (
+from shared.catalog.jobs import (
     EXTRACTOR_JOBS,
     SINGLE_CLAIM_JOBS,
     Job,
@@ -19,6 +18,7 @@ from shared.jobs.table import (
     claimable_condition,
     select_locked_job_ids,
 )
+from shared.ids import new_id
 
 
 def claim_jobs(

@@ -13,14 +13,13 @@ from sqlalchemy import select, update
 from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.orm import Session
 
-from shared.catalog.away import OutageLog
 from shared.catalog.base import affected_rows, db_now, db_now_plus
+from shared.catalog.batch_items import has_batch_items
+from shared.catalog.database_errors import OutageLog
+from shared.catalog.jobs import Job, select_locked_job_ids
 from shared.catalog.session import Catalog
-from shared.jobs.batches import has_batch_items
-from shared.jobs.cancel_batch import cancel_batch_items
-from shared.jobs.finish import fail_job, release_job
 from shared.jobs.model_changes import abandon_generation
-from shared.jobs.table import Job, select_locked_job_ids
+from shared.jobs.transitions import cancel_batch_items, fail_job, release_job
 
 log = logging.getLogger(__name__)
 

@@ -26,11 +26,7 @@ from shared.catalog.generations import (
     active_generation,
     lock_generation,
 )
-from shared.catalog.maps import increment_map_version, lock_map
-from shared.errors import Conflict
-from shared.ids import new_id
-from shared.jobs.finish import cancel_job, cancel_jobs, release_job, wake_waiting_jobs
-from shared.jobs.table import (
+from shared.catalog.jobs import (
     MODEL_CHANGE_JOBS,
     UNFINISHED_STATES,
     Job,
@@ -38,6 +34,10 @@ from shared.jobs.table import (
     Priority,
     WaitingFor,
 )
+from shared.catalog.maps import increment_map_version, lock_map
+from shared.errors import Conflict
+from shared.ids import new_id
+from shared.jobs.transitions import cancel_job, cancel_jobs, release_job, wake_waiting_jobs
 
 
 def start_model_change(

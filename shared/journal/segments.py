@@ -1,4 +1,6 @@
-"""Journal segments: gzip files of JSON lines in the object store. Knows no database.
+"""Which tables the journal holds, and their rows as lines.
+
+Journal segments: gzip files of JSON lines in the object store. Knows no database.
 
 ```
 journal/<first>-<last>-<uuid>.jsonl.gz     sequence numbers of 12 digits
@@ -22,10 +24,18 @@ from datetime import datetime
 from typing import Any
 from uuid import UUID
 
+from sqlalchemy import RowMapping, Table
+
+from shared.catalog.base import Journaled, from_json, to_json
+from shared.catalog.generations import Generation
+from shared.catalog.maps import Map
+from shared.catalog.models import Model
+from shared.catalog.photos import Photo
+from shared.catalog.vocabularies import StoredWhitening, Vocabulary
 from shared.errors import NotFound, Unavailable
 from shared.ids import new_id
-from shared.objects import ObjectStore
-from shared.objects.keys import JOURNAL
+from shared.storage import ObjectStore
+from shared.storage.keys import JOURNAL
 
 log = logging.getLogger(__name__)
 
@@ -160,3 +170,46 @@ def merge_segments(store: ObjectStore, segments: list[Segment]) -> None:
     put_segment(store, first, last, installation_id, (line.encode() for line in states))
     for segment in merged:
         store.delete(segment.key)
+
+
+# Each after those that its foreign keys lead to.
+TABLES: dict[str, type[Journaled]] = {
+    "models": Model,
+    "maps": Map,
+    "vocabularies": Vocabulary,
+    "whitenings": StoredWhitening,
+    "generations": Generation,
+    "photos": Photo,
+}
+
+# Of the catalog's own bookkeeping: they mean nothing in another one.
+LEFT_OUT = {
+    "photos": {"job_id", "changed_version"},
+    "maps": {"version"},
+    "generations": {"open_slot", "open_slot_rows", "complete_version", "complete_at"},
+}
+MARKS = {"revision", "journaled_revision"}
+
+
+def table_of(name: str) -> Table:
+    """The table; KeyError for one that the journal does not hold."""
+    table = TABLES[name].__table__  # type: ignore[attr-defined]
+    assert isinstance(table, Table)
+    return table
+
+
+def line_of(name: str, row: RowMapping) -> Line:
+    """The row's present state."""
+    left_out = MARKS | LEFT_OUT.get(name, set())
+    values = {key: to_json(value) for key, value in row.items() if key not in left_out}
+    return Line(name, row["id"], row["revision"], values)
+
+
+def columns_of(line: Line) -> dict[str, Any]:
+    """The row's columns, by name, without the marks; columns that this release does not know are
+    left out."""
+    table = table_of(line.table)
+    known = {c.name: c for c in table.columns}
+    return {
+        name: from_json(known[name], value) for name, value in line.row.items() if name in known
+    }

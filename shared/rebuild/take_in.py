@@ -1,4 +1,6 @@
-"""Everything that the store holds and the catalog does not know, into the catalog.
+"""Making an empty catalog the owner of a store that another catalog has filled.
+
+Everything that the store holds and the catalog does not know, into the catalog.
 
 Each step looks at what the catalog has already, and commits a little at a time: a run that was
 killed is repeated. Of two states of one row the higher revision counts, and a deletion always.
@@ -12,24 +14,84 @@ from dataclasses import dataclass, field
 from functools import partial
 from uuid import UUID
 
-from sqlalchemy import exists, func, insert, select, update
+from sqlalchemy import delete, exists, func, insert, select, update
 from sqlalchemy.orm import Session
 
+from shared.backup.folder import backup_tables
+from shared.catalog.api_keys import ApiKey
 from shared.catalog.base import Condition
 from shared.catalog.chunks import Descriptor
 from shared.catalog.generations import Generation, GenerationState
-from shared.catalog.installation import get_or_create_installation
-from shared.catalog.maps import Map
+from shared.catalog.installation import (
+    REBUILDING,
+    Installation,
+    adopt_store,
+    get_or_create_installation,
+)
+from shared.catalog.jobs import Job, JobKind, Priority
+from shared.catalog.maps import DEFAULT_MAP, CachedMapStatistics, Map
+from shared.catalog.models import Model
 from shared.catalog.photos import Photo
 from shared.catalog.session import Catalog
+from shared.config.settings import Settings
+from shared.errors import Conflict, Unavailable
 from shared.ids import new_id
-from shared.jobs.table import Job, JobKind, Priority
-from shared.objects import ObjectStore
-from shared.rebuild.chunks import take_in_chunks
-from shared.rebuild.originals import take_in_originals
-from shared.rebuild.rows import RowsTakenIn, take_in_rows
-from shared.rebuild.states import AT_ONCE, LastStates, Progress
-from shared.settings import Settings
+from shared.journal.segments import list_segments, read_segment
+from shared.rebuild.objects import take_in_chunks, take_in_originals
+from shared.rebuild.rows import AT_ONCE, LastStates, Progress, RowsTakenIn, take_in_rows
+from shared.storage import ObjectStore, OwnedStore
+from shared.storage.ownership import read_owner
+
+# What a first start, or an interrupted rebuild, may have left.
+MAY_HAVE_ROWS = {
+    table.__tablename__ for table in (ApiKey, Installation, Map, CachedMapStatistics, Model)
+}
+
+
+def begin_rebuild(catalog: Catalog, store: OwnedStore) -> None:
+    """Note that a rebuild is under way, and take over the id that the store is marked with.
+
+    Raises Conflict (`catalog_not_empty`) unless the catalog is empty, or a rebuild of it was
+    interrupted.
+    """
+    mark = read_owner(store)
+    owner = UUID(mark) if mark else _writer_of_journal(store)
+    with catalog.write() as session:
+        installation = get_or_create_installation(session)
+        if installation.journal_sequence != REBUILDING:
+            _check_empty(session)
+            session.execute(delete(CachedMapStatistics))
+            session.execute(delete(Map))
+            installation.journal_sequence = REBUILDING
+        if owner is not None:
+            installation.id = owner
+    adopt_store(catalog, store)
+
+
+def _check_empty(session: Session) -> None:
+    filled = [
+        table.name
+        for table in backup_tables()
+        if table.name not in MAY_HAVE_ROWS
+        and session.execute(select(table).limit(1)).first() is not None
+    ]
+    if filled or any(name != DEFAULT_MAP for name in session.scalars(select(Map.name))):
+        raise Conflict(
+            "catalog_not_empty",
+            "Only an empty catalog is rebuilt, and this one holds "
+            f"{', '.join(filled) or 'maps'}. `placewise verify --repair` brings what is missing "
+            "into it; or give a new database (DATABASE_URL), or move catalog.sqlite away.",
+        )
+
+
+def _writer_of_journal(store: ObjectStore) -> UUID | None:
+    for segment in reversed(list_segments(store)):
+        try:
+            return read_segment(store, segment.key).installation_id
+        except Unavailable as error:
+            if error.code != "journal_damaged":
+                raise
+    return None
 
 
 @dataclass(slots=True)

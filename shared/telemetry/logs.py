@@ -15,9 +15,8 @@ import re
 from datetime import UTC, datetime
 from typing import Any
 
-from shared.settings import Settings
-from shared.telemetry.request_id import current_request_id
-from shared.telemetry.traces import current_trace_id
+from shared.config.settings import Settings
+from shared.telemetry.tracing import current_request_id, current_trace_id
 
 TEXT_FORMAT = "%(asctime)s %(levelname)s %(name)s: %(message)s"
 OWN_LOGGERS = ("services", "shared")

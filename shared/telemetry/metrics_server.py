@@ -8,8 +8,8 @@ from collections.abc import Iterator
 
 from prometheus_client import CollectorRegistry, start_http_server
 
+from shared.config.settings import Settings
 from shared.errors import Misconfigured
-from shared.settings import Settings
 
 log = logging.getLogger(__name__)
 

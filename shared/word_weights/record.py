@@ -7,8 +7,8 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict
 
-from shared.estimate.calibration import Calibration
-from shared.word_weights.pairs import PairSource
+from shared.evaluation.calibration import Calibration
+from shared.word_weights.training_pairs import PairSource
 
 
 class Outcome(StrEnum):

@@ -16,12 +16,12 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 
-from services.extractor.decoding import DecoderPool
+from services.extractor.decoder_pool import DecoderPool
+from shared.config.settings import Settings
+from shared.descriptors.extractor import Extractor
+from shared.descriptors.vocabulary import ClusterCentres
 from shared.errors import PlacewiseError
-from shared.recipes import get_extractor_config
-from shared.settings import Settings
-from shared.vision.extractors import Extractor
-from shared.vision.vocabulary import ClusterCentres
+from shared.extractor_config.configs import get_extractor_config
 from tests.support.photos import encoded, photo_bytes, turned_photo
 
 Row = NDArray[np.float32]

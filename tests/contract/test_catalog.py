@@ -31,8 +31,8 @@ from shared.catalog.maps import (
     get_or_create_default_map,
     increment_map_version,
 )
-from shared.catalog.metadata_search import MetadataFilter, search_photos
 from shared.catalog.models import Model, get_or_create_model
+from shared.catalog.photo_search import MetadataFilter, search_photos
 from shared.catalog.photos import (
     Photo,
     count_live_photos,
@@ -44,7 +44,7 @@ from shared.catalog.photos import (
 from shared.catalog.session import Catalog
 from shared.errors import NotFound
 from shared.ids import new_id
-from shared.photo_filter import PhotoFilter
+from shared.search_api.photo_filter import PhotoFilter
 from tests.support.catalog_rows import add_generation, add_job, add_map, add_photo, delete
 
 MOMENT = datetime(2024, 5, 6, 7, 8, 9, 123456, tzinfo=UTC)

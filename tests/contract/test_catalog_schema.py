@@ -34,8 +34,8 @@ def test_migrations_lead_to_the_tables_that_the_code_describes(catalog: Catalog)
 OPEN = """
 import json
 from shared.catalog.base import Base
-from shared.catalog.open_catalog import open_catalog
-from shared.settings import Settings
+from shared.catalog.tables import open_catalog
+from shared.config.settings import Settings
 open_catalog(Settings(), "a service").close()
 print(json.dumps(sorted(Base.metadata.tables)))
 """

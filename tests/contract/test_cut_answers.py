@@ -6,9 +6,9 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from benchmarks.fleet.proxy import FaultProxy, ProxyMode
+from benchmarks.fleet.fault_injection import FaultProxy, ProxyMode
 from shared.errors import PlacewiseError
-from shared.objects.s3 import S3Store
+from shared.storage.s3 import S3Store
 from tests.support.servers import start_moto
 from tests.support.servers.daemon import free_ports
 from tests.support.servers.s3 import S3Server

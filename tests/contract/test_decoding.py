@@ -17,12 +17,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from services.extractor.decoding import MAX_DECODE_ATTEMPTS, DecoderPool
+from services.extractor.decoder_pool import MAX_DECODE_ATTEMPTS, DecoderPool
+from shared.config.settings import Settings
 from shared.errors import PlacewiseError, Unavailable, Unprocessable
-from shared.settings import Settings
-from shared.vision.decode import DecodedPhoto
-from shared.vision.preprocessing import Preprocessing, get_preprocessing
-from shared.vision.resample import Pixels
+from shared.imaging.decode import DecodedPhoto
+from shared.imaging.preprocessing import Pixels, Preprocessing, get_preprocessing
 from tests.support.photos import photo_bytes
 
 SQUARE = get_preprocessing("square32")
@@ -168,7 +167,7 @@ def test_pool_that_broke_is_made_anew(pool: DecoderPool) -> None:
 def test_children_import_little_and_know_their_limit(pool: DecoderPool) -> None:
     pool.decode([GOOD], SQUARE)
     modules = in_child(pool, "sorted(__import__('sys').modules)")
-    assert "shared.vision.decode" in modules, "the question went to another process"
+    assert "shared.imaging.decode" in modules, "the question went to another process"
     assert {"torch", "torchvision", "timm", "pydantic", "sqlalchemy"}.isdisjoint(modules)
     resource = "__import__('resource')"
     limit = in_child(pool, f"{resource}.getrlimit({resource}.RLIMIT_AS)")

@@ -16,14 +16,14 @@ import torch
 from typer.testing import CliRunner
 
 from services.cli.main import build_app
-from shared.recipes import get_extractor_config
-from shared.vision.backbones.dinov2 import SHAPES, Dinov2
-from shared.vision.backbones.tiny import TinyBackbone
-from shared.vision.decode import decode_photo
-from shared.vision.extractors import Extractor
-from shared.vision.preprocessing import get_preprocessing
-from shared.vision.vlad import soft_vlad
-from shared.vision.vocabulary import parse_centres
+from shared.descriptors.aggregation import soft_vlad
+from shared.descriptors.backbones.dinov2 import SHAPES, Dinov2
+from shared.descriptors.backbones.synthetic import TinyBackbone
+from shared.descriptors.extractor import Extractor
+from shared.descriptors.vocabulary import parse_centres
+from shared.extractor_config.configs import get_extractor_config
+from shared.imaging.decode import decode_photo
+from shared.imaging.preprocessing import get_preprocessing
 from tests.support.photos import encoded, photo_image
 from tests.support.vit import random_weights, save
 

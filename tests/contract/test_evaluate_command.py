@@ -15,19 +15,19 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
-from services.cli.describe_sets import ExtractorDescriber
+from services.cli.evaluation.describers import ExtractorDescriber
 from services.cli.main import build_app
-from services.trainer.evaluation.describe_model import ModelDescriber
-from shared.datasets.city.plan import CityOptions, make_plan
-from shared.datasets.city.write import write_city
-from shared.datasets.recall import rank_by_similarity, recall_at_k
-from shared.datasets.sets import EvaluationSet, open_evaluation_set
-from shared.recipes import get_extractor_config
-from shared.vision.decode import decode_photo
-from shared.vision.extractors import Extractor
-from shared.vision.place_models.checkpoint import checkpoint_state
-from shared.vision.place_models.config import VprModelConfig
-from shared.vision.place_models.model import build_vpr_model
+from services.trainer.model_describer import ModelDescriber
+from shared.datasets.open_dataset import EvaluationSet, open_evaluation_set
+from shared.descriptors.extractor import Extractor
+from shared.descriptors.vpr_models.checkpoint import checkpoint_state
+from shared.descriptors.vpr_models.config import VprModelConfig
+from shared.descriptors.vpr_models.model import build_vpr_model
+from shared.evaluation.recall import rank_by_similarity, recall_at_k
+from shared.extractor_config.configs import get_extractor_config
+from shared.imaging.decode import decode_photo
+from shared.synthetic_city.plan import CityOptions, make_plan
+from shared.synthetic_city.write import write_city
 
 CPU = torch.device("cpu")
 

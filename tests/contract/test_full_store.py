@@ -14,17 +14,17 @@ from sqlalchemy import func, select
 from starlette.testclient import TestClient
 
 from services.gateway.app import create_app
-from services.gateway.context import GatewayContext
-from services.gateway.keys import LocalhostAuthenticator
+from services.gateway.authentication import LocalhostAuthenticator
+from services.gateway.dependencies import GatewayContext
 from services.search.worker import SearchWorker
 from shared.catalog.maps import get_or_create_default_map
 from shared.catalog.photos import Photo
 from shared.catalog.session import Catalog
+from shared.config.settings import Settings
 from shared.errors import StorageFull, Unavailable
 from shared.jobs import InProcessWakeups, Job
-from shared.objects import FolderStore
-from shared.objects.s3 import S3Store
-from shared.settings import Settings
+from shared.storage import FolderStore
+from shared.storage.s3 import S3Store
 from tests.support.photos import photo_bytes
 from tests.support.problems import problem
 from tests.support.servers import S3Server
@@ -169,7 +169,7 @@ def test_a_disk_that_fills_up_while_it_syncs_is_full_too(
     def full(_: int) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr("shared.objects.folder.os.fsync", full)
+    monkeypatch.setattr("shared.storage.folder.os.fsync", full)
     with pytest.raises(StorageFull):
         store.put("originals/a", b"some")
     assert store.head("originals/a") is None

@@ -10,8 +10,8 @@ from uuid import UUID
 import pytest
 from sqlalchemy import func, select, update
 
-from services.steward import retention
-from services.steward.retention import delete_expired_idempotency_keys
+from services.steward.tasks import maintenance as retention
+from services.steward.tasks.maintenance import delete_expired_idempotency_keys
 from shared.catalog.base import db_now_plus
 from shared.catalog.idempotency import (
     IdempotencyRecord,

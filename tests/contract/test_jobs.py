@@ -16,6 +16,7 @@ from sqlalchemy.exc import OperationalError
 
 from shared.catalog.base import db_now, db_now_plus
 from shared.catalog.generations import Generation, GenerationState
+from shared.catalog.jobs import MODEL_CHANGE_JOBS, Priority, WaitingFor, get_job, list_jobs
 from shared.catalog.schema import migrate
 from shared.catalog.session import Catalog
 from shared.errors import Conflict, NotFound, Unprocessable
@@ -31,14 +32,6 @@ from shared.jobs import (
     mark_started,
     reclaim_expired_leases,
 )
-from shared.jobs.finish import (
-    cancel_job,
-    fail_job,
-    release_job,
-    requeue_job,
-    retry_job,
-    succeed_job,
-)
 from shared.jobs.leases import lock_leased_jobs
 from shared.jobs.model_changes import (
     cancel_model_change,
@@ -47,7 +40,14 @@ from shared.jobs.model_changes import (
     start_model_change,
     wake_vocabulary_waiters,
 )
-from shared.jobs.table import MODEL_CHANGE_JOBS, Priority, WaitingFor, get_job, list_jobs
+from shared.jobs.transitions import (
+    cancel_job,
+    fail_job,
+    release_job,
+    requeue_job,
+    retry_job,
+    succeed_job,
+)
 from tests.support.catalog_rows import (
     add_generation,
     add_job,

@@ -18,11 +18,10 @@ from shared.catalog.session import Catalog
 from shared.errors import Unavailable
 from shared.ids import new_id
 from shared.journal import outbox, segments
-from shared.journal.lag import catalog_lag
-from shared.journal.outbox import write_journal
+from shared.journal.outbox import catalog_lag, write_journal
 from shared.journal.segments import Line, last_states, list_segments, read_segment
-from shared.objects import FolderStore, ObjectStore
-from shared.objects.s3 import S3Store
+from shared.storage import FolderStore, ObjectStore
+from shared.storage.s3 import S3Store
 from tests.support.catalog_rows import add_map, add_photo
 from tests.support.catalog_rows import delete as delete_photo
 from tests.support.servers import S3Server

@@ -1,4 +1,4 @@
-"""What every object store promises (`shared.objects.port`), and what only the folder does.
+"""What every object store promises (`shared.storage.protocol`), and what only the folder does.
 
 What only a bucket does is in `test_s3_store`.
 """
@@ -19,10 +19,10 @@ from typing import Any
 import pytest
 
 from shared.errors import NotFound, StorageFull, Unavailable
-from shared.objects import FolderStore, ObjectStore, OwnedStore
-from shared.objects.folder import OWNER_MARK
-from shared.objects.keys import trash_key
-from shared.objects.s3 import S3Store
+from shared.storage import FolderStore, ObjectStore, OwnedStore
+from shared.storage.folder import OWNER_MARK
+from shared.storage.keys import trash_key
+from shared.storage.s3 import S3Store
 from tests.support.servers import S3Server, start_moto
 
 MEGABYTE = 1_000_000
@@ -436,7 +436,7 @@ class TestFolderStore(ObjectStoreContract):
         def usage(_: Path) -> object:
             return SimpleNamespace(free=10_000 - 1000 * len(keys_of(store, "trash/")))
 
-        monkeypatch.setattr("shared.objects.folder.shutil.disk_usage", usage)
+        monkeypatch.setattr("shared.storage.folder.shutil.disk_usage", usage)
         assert store.free_trash(7000) == 0
         assert store.free_trash(8500) == 2
         assert keys_of(store) == ["originals/b", trash_key("originals/a", days[-1])]

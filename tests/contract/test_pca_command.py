@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 from typer.testing import CliRunner
 
 from services.cli.main import build_app
-from shared.vision.pca import PcaProjection
-from shared.vision.pca_file import decode_whitening
-from shared.vision.pca_fit import fit_pca
+from shared.descriptors.pca_fit import fit_pca
+from shared.descriptors.pca_whitening import PcaProjection, decode_whitening
 from tests.support.photos import photo_bytes
 
 PHOTOS = 9

@@ -10,19 +10,13 @@ from hypothesis import strategies as some
 from sqlalchemy import delete, select
 
 from services.search.photo_columns import PhotoColumns
-from services.search.select import build_row_mask as select_rows
-from shared.catalog.metadata_search import MetadataFilter, filter_conditions, search_photos
+from services.search.photo_columns import build_row_mask as select_rows
+from shared.catalog.photo_search import MetadataFilter, filter_conditions, search_photos
 from shared.catalog.photos import Photo, PhotoFilterValues, PhotoRole
 from shared.catalog.session import Catalog
-from shared.photo_filter import Box, Circle, PhotoFilter
+from shared.search_api.photo_filter import Box, Circle, PhotoFilter
 from tests.support.catalog_rows import add_map, add_photo
-from tests.support.photo_filters import (
-    HALF_EARTH_M,
-    IDS,
-    passes,
-    photo_facts,
-    photo_filters,
-)
+from tests.support.photo_filters import HALF_EARTH_M, IDS, passes, photo_facts, photo_filters
 
 FILTERS = 25  # asked of each population of photos
 

@@ -10,8 +10,8 @@ import pytest
 import urllib3
 
 from shared.errors import NotFound
-from shared.objects import PresignedPut
-from shared.objects.s3 import S3Store
+from shared.storage import PresignedPut
+from shared.storage.s3 import S3Store
 from tests.support.servers import S3Server, start_moto
 
 DATA = os.urandom(100_000)

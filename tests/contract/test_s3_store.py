@@ -16,14 +16,14 @@ from minio.lifecycleconfig import LifecycleConfig
 from typer.testing import CliRunner
 from urllib3.exceptions import ProtocolError
 
-from services.cli import storage
-from services.cli.server_checks import check_object_store
+from services.cli.operations import storage
+from services.cli.operations.deployment_checks import check_object_store
+from shared.config.settings import Settings
 from shared.errors import Misconfigured, Unavailable
-from shared.objects import FolderStore, ObjectStore
-from shared.objects.open_store import open_store
-from shared.objects.s3 import Bucket, S3Store, create_bucket
-from shared.objects.s3.writer import PART_BYTES
-from shared.settings import Settings
+from shared.storage import FolderStore, ObjectStore
+from shared.storage.open_store import open_store
+from shared.storage.s3 import Bucket, S3Store, create_bucket
+from shared.storage.s3.streams import PART_BYTES
 from tests.support.clock import clock_off_by
 from tests.support.servers import S3Server
 
@@ -299,8 +299,8 @@ def test_the_client_needs_its_settings(settings: Settings) -> None:
 USE = """
 from datetime import UTC, datetime
 from shared.errors import NotFound
-from shared.objects.s3 import Bucket, S3Store
-from shared.settings import Settings
+from shared.storage.s3 import Bucket, S3Store
+from shared.config.settings import Settings
 store = S3Store(Bucket.of(Settings()))
 assert store.head("never") is None
 store.put("a", b"x")

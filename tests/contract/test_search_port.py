@@ -1,4 +1,4 @@
-"""What every search tier promises (`shared.search_protocol`): exact, current, honest about gaps."""
+"""What every search tier promises (`shared.search_api.protocol`): exact, current, honest about gaps."""
 
 from __future__ import annotations
 
@@ -29,14 +29,13 @@ from hypothesis.stateful import (
 )
 from numpy.typing import NDArray
 
-from services.search import answer, gpu
+from services.search import executor as answer
+from services.search import gpu
 from services.search import worker as worker_module
-from services.search.load import ChunkLoader
-from services.search.loaded_chunk import StoredChunk
+from services.search.chunk_loader import ChunkLoader, StoredChunk
 from services.search.metrics import MeteredSearch
 from services.search.worker import SearchWorker
-from services.steward.compact import merge_slot
-from shared import read_retries
+from services.steward.tasks.compaction import merge_slot
 from shared.catalog.chunks import Chunk, Descriptor, list_live_chunks
 from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.maps import Map, increment_map_version, lock_map
@@ -44,15 +43,15 @@ from shared.catalog.models import get_or_create_model
 from shared.catalog.photos import Photo, PhotoRole, mark_photo_deleted
 from shared.catalog.schema import migrate
 from shared.catalog.session import Catalog
-from shared.chunks import decode_rows, encode_rows, manifest_key, write_chunk
-from shared.codes.int8 import Int8Codes
+from shared.codes.int8_codes import Int8Codes
+from shared.config.settings import Settings
+from shared.config.shards import SINGLE_SHARD
 from shared.errors import Gone, InvalidRequest, Unavailable
 from shared.ids import new_id
-from shared.objects import FolderStore, ObjectStore
-from shared.photo_filter import Box, Circle, PhotoFilter
-from shared.search_protocol import Mode, SearchBackend, SearchRequest, SearchResponse
-from shared.settings import Settings
-from shared.shards import SINGLE_SHARD
+from shared.search_api.photo_filter import Box, Circle, PhotoFilter
+from shared.search_api.protocol import Mode, SearchBackend, SearchRequest, SearchResponse
+from shared.storage import FolderStore, ObjectStore, read_retries
+from shared.storage.chunks import decode_rows, encode_rows, manifest_key, write_chunk
 from tests.support.codes import always_by_codes, always_by_int8, int8_on_demand
 from tests.support.search_tier import SearchTier
 

@@ -21,7 +21,7 @@ from redis.exceptions import RedisError
 from sqlalchemy.engine import make_url
 
 from shared.errors import Unavailable
-from shared.objects.s3 import S3Store
+from shared.storage.s3 import S3Store
 from tests.support.servers import (
     PostgresServer,
     RedisServer,

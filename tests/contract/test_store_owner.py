@@ -22,14 +22,14 @@ from shared.catalog.installation import (
 from shared.catalog.maps import Map
 from shared.catalog.photos import Photo
 from shared.catalog.session import Catalog
+from shared.config.settings import Settings
 from shared.errors import Misconfigured
 from shared.ids import new_id
-from shared.objects import ObjectStore, OwnedStore
-from shared.objects.folder import OWNER_MARK, FolderStore
-from shared.objects.open_store import open_store
-from shared.objects.s3 import Bucket, S3Store
-from shared.objects.store_owner import read_owner
-from shared.settings import Settings
+from shared.storage import ObjectStore, OwnedStore
+from shared.storage.folder import OWNER_MARK, FolderStore
+from shared.storage.open_store import open_store
+from shared.storage.ownership import read_owner
+from shared.storage.s3 import Bucket, S3Store
 from tests.support.catalog_rows import add_map, upload
 from tests.support.servers import PostgresServer, S3Server
 

@@ -13,10 +13,14 @@ from sqlalchemy.exc import DBAPIError, IntegrityError, OperationalError
 from sqlalchemy.exc import TimeoutError as PoolTimeout
 from sqlalchemy.orm import Session
 
-from shared.catalog.away import to_unavailable
-from shared.catalog.connections import PoolConfig, TransactionTimeouts
+from shared.catalog.database_errors import to_unavailable
 from shared.catalog.maps import Map, lock_map
-from shared.catalog.session import MAX_TRANSACTION_ATTEMPTS, Catalog
+from shared.catalog.session import (
+    MAX_TRANSACTION_ATTEMPTS,
+    Catalog,
+    PoolConfig,
+    TransactionTimeouts,
+)
 from tests.support.catalog_rows import add_map
 from tests.support.servers import PostgresServer
 

@@ -15,18 +15,18 @@ from sqlalchemy.exc import OperationalError
 from starlette.testclient import TestClient
 
 from services.gateway.app import create_app
-from services.gateway.context import GatewayContext
-from services.gateway.keys import LocalhostAuthenticator
+from services.gateway.authentication import LocalhostAuthenticator
+from services.gateway.dependencies import GatewayContext
 from services.search.worker import SearchWorker
-from shared.catalog.away import to_unavailable
+from shared.catalog.database_errors import to_unavailable
+from shared.catalog.file_checks import check_pages
 from shared.catalog.maps import get_or_create_default_map
 from shared.catalog.schema import migrate
 from shared.catalog.session import Catalog
-from shared.catalog.unusable import check_pages
+from shared.config.settings import Settings
 from shared.errors import Misconfigured, StorageFull
 from shared.jobs import InProcessWakeups
-from shared.objects import FolderStore
-from shared.settings import Settings
+from shared.storage import FolderStore
 from tests.support.problems import problem
 from tests.support.server import environment, run_command
 
@@ -99,7 +99,7 @@ def test_a_file_that_may_not_be_written_is_named(
     file: Path, catalog: Catalog, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its permissions are not changed: to root they mean nothing."""
-    monkeypatch.setattr("shared.catalog.unusable.os.access", lambda path, mode: False)
+    monkeypatch.setattr("shared.catalog.file_checks.os.access", lambda path, mode: False)
     with pytest.raises(Misconfigured, match="permissions") as caught:
         migrate(catalog)
     assert (caught.value.code, str(file) in caught.value.detail) == ("catalog_unreadable", True)
@@ -195,7 +195,7 @@ def test_a_full_disk_at_the_start_is_said_with_the_free_bytes(
 
     event.listen(catalog.engine, "begin", full)
     usage = shutil._ntuple_diskusage(100, 100, 0)
-    monkeypatch.setattr("shared.catalog.unusable.shutil.disk_usage", lambda folder: usage)
+    monkeypatch.setattr("shared.catalog.file_checks.shutil.disk_usage", lambda folder: usage)
     with pytest.raises(Misconfigured, match="Make room") as caught:
         migrate(catalog)
     assert caught.value.code == "disk_full"

@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from services.http_server import SHUTDOWN_GRACE_SECONDS
-from shared.settings import Settings
+from shared.config.settings import Settings
 from tests.deploy.composition import (
     EMBEDDED,
     PROFILES,

@@ -17,19 +17,19 @@ ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 EXTRAS = {
     "embedded": ["services.standalone"],
-    "extractor": ["services.extractor.service", "shared.vision.shipped_vocabulary"],
+    "extractor": ["services.extractor.service", "tools.make_shipped_vocabulary"],
     "flower": ["flower", "celery"],
-    "gateway": ["services.gateway.app", "services.gateway.keys", "services.http_server"],
-    "search": ["services.search.server"],
+    "gateway": ["services.gateway.app", "services.gateway.authentication", "services.http_server"],
+    "search": ["services.search.service"],
     "steward": [
-        "services.steward.loop",
-        "services.steward.evaluate",
-        "services.steward.webhooks.deliver",
+        "services.steward.scheduler",
+        "services.steward.evaluation_worker",
+        "services.steward.webhooks",
     ],
 }
 # What every image's command imports, whatever service it runs.
-COMMAND = ["services.cli.main", "shared.catalog.installation", "shared.heartbeat"]
-HINTS = ["shared.jobs.celery_app", "shared.jobs.celery_hints"]
+COMMAND = ["services.cli.main", "shared.catalog.installation", "shared.telemetry.heartbeat"]
+HINTS = ["shared.jobs.celery_wakeups", "shared.jobs.celery_wakeups"]
 NEEDED_BY_HINTS = {"extractor", "gateway", "steward"}
 
 # Refuses what is installed here and would not be in the image.

@@ -12,11 +12,10 @@ import httpx2
 import pytest
 
 from shared.catalog.session import Catalog
-from shared.jobs.celery_app import DRAIN_TASK, create_celery_app
-from shared.jobs.celery_hints import CeleryWakeups
-from shared.jobs.hints import WakeupQueue
-from shared.objects import FolderStore
-from shared.settings import Settings
+from shared.config.settings import Settings
+from shared.jobs.celery_wakeups import DRAIN_TASK, CeleryWakeups, create_celery_app
+from shared.jobs.wakeups import WakeupQueue
+from shared.storage import FolderStore
 from tests.deploy.composition import SERVICES, make_env, services, variables
 from tests.deploy.machine import Machine
 from tests.support.catalog_rows import add_map, upload

@@ -11,13 +11,13 @@ from pathlib import Path
 
 from services.extractor.worker import ExtractorWorker
 from shared.catalog.session import Catalog
-from shared.heartbeat import Heartbeat, seconds_since_heartbeat
-from shared.objects import FolderStore
-from shared.settings import Settings
+from shared.config.settings import Settings
+from shared.storage import FolderStore
+from shared.telemetry.heartbeat import Heartbeat, seconds_since_heartbeat
 
 
 def check(file: Path, seconds: float) -> int:
-    command = [sys.executable, "-m", "shared.heartbeat", str(file), str(seconds)]
+    command = [sys.executable, "-m", "shared.telemetry.heartbeat", str(file), str(seconds)]
     return subprocess.run(command, capture_output=True, check=False).returncode
 
 

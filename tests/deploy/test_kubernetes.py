@@ -16,10 +16,10 @@ import yaml
 from sqlalchemy import text, update
 
 from services.http_server import SHUTDOWN_GRACE_SECONDS
+from shared.catalog.jobs import EXTRACTOR_JOBS, STEWARD_JOBS, WaitingFor
 from shared.catalog.session import Catalog
+from shared.config.settings import Settings
 from shared.jobs import Job, JobState
-from shared.jobs.table import EXTRACTOR_JOBS, STEWARD_JOBS, WaitingFor
-from shared.settings import Settings
 from tests.deploy.composition import ROOT, SERVICES, services
 from tests.support.catalog_rows import add_map
 from tests.support.servers import PostgresServer

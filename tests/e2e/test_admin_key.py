@@ -13,8 +13,8 @@ import httpx2
 import pytest
 
 from shared.client import Client
+from shared.config.embedded_home import server_address_file
 from shared.errors import Unauthorized
-from shared.home import server_address_file
 from tests.support.photos import photo_bytes
 from tests.support.problems import problem
 from tests.support.server import ServerProcess, environment, run_command

@@ -17,7 +17,7 @@ import pytest
 import placewise
 from shared.client import Client
 from shared.errors import InvalidRequest
-from shared.objects.s3 import S3Store
+from shared.storage.s3 import S3Store
 from tests.e2e.test_separate_services import Deployment, until
 from tests.support.archives import PACKED, tar_of, zip_of
 from tests.support.photos import photo_bytes

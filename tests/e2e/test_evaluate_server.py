@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from shared.datasets.city.plan import CityOptions, make_plan
-from shared.datasets.city.write import write_city
-from shared.home import server_address_file
+from shared.config.embedded_home import server_address_file
+from shared.synthetic_city.plan import CityOptions, make_plan
+from shared.synthetic_city.write import write_city
 from tests.support.server import ServerProcess, environment, run_command
 
 

@@ -6,7 +6,7 @@ import json
 import time
 from pathlib import Path
 
-from shared.vision.backbones.dinov2 import SHAPES
+from shared.descriptors.backbones.dinov2 import SHAPES
 from tests.support.files_server import files_server
 from tests.support.processes import PLACEWISE, start
 from tests.support.server import environment, run_command

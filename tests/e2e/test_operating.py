@@ -90,7 +90,7 @@ def test_every_line_of_the_log_is_json_and_the_id_of_an_upload_is_in_several(
     # What `placewise serve` says to its user at the start is no log.
     assert len(lines) > len(text) / 2
     loggers = {line["logger"] for line in lines if "an-id-of-mine" in json.dumps(line)}
-    assert loggers >= {"services.call_log", "services.extractor.publish"}
+    assert loggers >= {"services.request_log", "services.extractor.publish"}
 
 
 def test_what_is_not_there_can_neither_be_backed_up_nor_verified(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 import httpx2
 import pytest
 
-from shared.home import server_address_file
+from shared.config.embedded_home import server_address_file
 from tests.support.photos import photo_bytes
 from tests.support.problems import problem
 from tests.support.server import ServerProcess, environment, run_command

@@ -11,7 +11,7 @@ import pytest
 import urllib3
 
 from shared.client import Client
-from shared.objects.s3 import Bucket, S3Store
+from shared.storage.s3 import Bucket, S3Store
 from tests.support.photos import photo_bytes
 from tests.support.problems import problem
 from tests.support.server import ServerProcess, environment, run_command

@@ -17,10 +17,10 @@ import pytest
 from shared.catalog.chunks import find_descriptor
 from shared.catalog.generations import active_generation
 from shared.catalog.maps import get_map
-from shared.catalog.search_workers import RegisteredSearchWorker
+from shared.catalog.processes import RegisteredSearchWorker
 from shared.catalog.session import Catalog
-from shared.search_http import HttpSearchClient
-from shared.search_protocol import SearchRequest, SearchResponse
+from shared.search_api.client import HttpSearchClient
+from shared.search_api.protocol import SearchRequest, SearchResponse
 from tests.support.photos import photo_bytes
 from tests.support.processes import PLACEWISE, Process, start
 from tests.support.server import START_SECONDS, ServerProcess, environment, run_command

@@ -10,8 +10,8 @@ import pytest
 import urllib3
 
 from shared.client import Client
+from shared.config.embedded_home import server_address_file
 from shared.errors import PlacewiseError
-from shared.home import server_address_file
 from tests.support.photos import photo_bytes
 from tests.support.server import ServerProcess
 from tests.support.servers import S3Server

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from PIL import Image
 
-from shared.datasets.utm_names import upload_fields_of_file_name, utm_position_of_file_name
+from shared.datasets.utm_filenames import upload_fields_of_file_name, utm_position_of_file_name
 from tests.support.server import environment, run_command
 
 SMALL = ("--places", "12", "--queries", "10", "--size", "96x72")

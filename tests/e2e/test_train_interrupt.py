@@ -10,8 +10,7 @@ import pytest
 import torch
 
 from services.trainer import run
-from services.trainer.display import NullDisplay
-from services.trainer.stop import StopRequest
+from services.trainer.run_control import NullDisplay, StopRequest
 from tests.support.processes import INHERITED, PLACEWISE, start
 from tests.support.tiny_places import write_tiny_places
 from tests.support.train_runs import assert_same_weights, told, train

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from shared.vision.vocabulary_file import VocabularyFile, read_vocabulary
+from shared.descriptors.vocabulary_file import VocabularyFile, read_vocabulary
 from tests.support.photos import photo_bytes
 from tests.support.server import ServerProcess, environment, run_command
 

@@ -17,24 +17,23 @@ from starlette.testclient import TestClient
 
 from services.extractor.worker import ExtractorWorker
 from services.gateway.app import create_app
-from services.gateway.context import GatewayContext
-from services.gateway.keys import LocalhostAuthenticator
-from services.parts import start_service_thread
-from services.search.presence import WorkerHeartbeat
+from services.gateway.authentication import LocalhostAuthenticator
+from services.gateway.dependencies import GatewayContext
+from services.search.service import WorkerHeartbeat
 from services.search.worker import SearchWorker
-from services.steward.evaluate import EvaluationWorker
-from services.steward.loop import Scheduler
+from services.service_threads import start_service_thread
+from services.steward.evaluation_worker import EvaluationWorker
+from services.steward.scheduler import Scheduler
 from shared.catalog.chunks import Descriptor, find_descriptor
-from shared.catalog.connections import PoolConfig, TransactionTimeouts
 from shared.catalog.generations import active_generation
 from shared.catalog.maps import get_map, get_or_create_default_map, lock_map
 from shared.catalog.photos import Photo
 from shared.catalog.schema import migrate
-from shared.catalog.session import Catalog
+from shared.catalog.session import Catalog, PoolConfig, TransactionTimeouts
+from shared.config.settings import Settings
 from shared.jobs import InProcessWakeups
-from shared.objects import FolderStore
-from shared.search_protocol import SearchRequest
-from shared.settings import Settings
+from shared.search_api.protocol import SearchRequest
+from shared.storage import FolderStore
 from tests.support.photos import photo_bytes
 from tests.support.servers import PostgresServer, start_postgres
 

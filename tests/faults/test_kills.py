@@ -12,9 +12,9 @@ from uuid import UUID
 import httpx2
 import psutil
 
-from benchmarks.chaos.audit import check_invariants, count_unfinished_jobs
+from benchmarks.chaos.run import check_invariants, count_unfinished_jobs
 from shared.catalog.session import Catalog
-from shared.objects import FolderStore
+from shared.storage import FolderStore
 from tests.support.photos import photo_bytes
 from tests.support.server import ServerProcess
 from tests.support.servers.daemon import has_ended

@@ -17,10 +17,10 @@ from typing import Any
 
 import pytest
 
-from shared.objects import OwnedStore
-from shared.objects.keys import JOURNAL, ORIGINALS, TRASH, key_before_trash
-from shared.objects.open_store import open_store
-from shared.settings import Settings
+from shared.config.settings import Settings
+from shared.storage import OwnedStore
+from shared.storage.keys import JOURNAL, ORIGINALS, TRASH, key_before_trash
+from shared.storage.open_store import open_store
 from tests.support.metrics import read
 from tests.support.photos import photo_bytes
 from tests.support.server import ServerProcess, environment, run_command

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from shared.errors import Unavailable
-from shared.objects.s3 import S3Store
+from shared.storage.s3 import S3Store
 from tests.contract.test_s3_store import CALLS
 from tests.support.servers import S3Server, start_s3
 

@@ -7,9 +7,9 @@ from uuid import UUID
 
 from sqlalchemy import func, select
 
-from services.steward.model_changes import advance_model_changes
+from services.steward.tasks.model_changes import advance_model_changes
+from shared.catalog.maps import Search
 from shared.catalog.photos import Photo
-from shared.catalog.searches import Search
 from shared.jobs import InProcessWakeups, Job
 from tests.integration.gateway import Service
 

@@ -11,15 +11,15 @@ import pytest
 import torch
 
 from services.extractor import worker as worker_module
-from services.extractor.decoding import DecoderPool
+from services.extractor.decoder_pool import DecoderPool
 from services.extractor.worker import ExtractorWorker
 from shared.catalog.maps import get_or_create_default_map
 from shared.catalog.session import Catalog
+from shared.config.settings import Settings
 from shared.errors import PlacewiseError
-from shared.objects import FolderStore
-from shared.settings import Settings
-from shared.vision.decode import DecodedPhoto
-from shared.vision.preprocessing import Preprocessing
+from shared.imaging.decode import DecodedPhoto
+from shared.imaging.preprocessing import Preprocessing
+from shared.storage import FolderStore
 from tests.integration.door import Door
 from tests.integration.gateway import Service
 from tests.integration.workplace import Workplace

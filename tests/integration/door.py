@@ -8,15 +8,15 @@ import httpx2
 from starlette.testclient import TestClient
 
 from services.gateway.app import create_app
-from services.gateway.context import GatewayContext
-from services.gateway.keys import ApiKeyAuthenticator
+from services.gateway.authentication import ApiKeyAuthenticator
+from services.gateway.dependencies import GatewayContext
 from services.search.worker import SearchWorker
-from shared.api_keys import hash_api_key
 from shared.catalog.maps import get_or_create_default_map
 from shared.catalog.session import Catalog
+from shared.config.settings import Settings
 from shared.jobs import InProcessWakeups
-from shared.objects import FolderStore
-from shared.settings import Settings
+from shared.security.api_keys import hash_api_key
+from shared.storage import FolderStore
 from tests.support.photos import photo_bytes
 
 ADMIN = "the-key-of-the-admin-0123"

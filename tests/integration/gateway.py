@@ -11,13 +11,13 @@ from starlette.testclient import TestClient
 
 from services.extractor.worker import ExtractorWorker
 from services.gateway.app import create_app
-from services.gateway.context import GatewayContext
-from services.gateway.keys import LocalhostAuthenticator
+from services.gateway.authentication import LocalhostAuthenticator
+from services.gateway.dependencies import GatewayContext
 from services.search.worker import SearchWorker
 from shared.catalog.session import Catalog
+from shared.config.settings import Settings
 from shared.jobs import InProcessWakeups
-from shared.objects import OwnedStore
-from shared.settings import Settings
+from shared.storage import OwnedStore
 from tests.support.photos import photo_bytes
 
 API = "/api/v1"

@@ -13,16 +13,15 @@ import pytest
 import torch
 from sqlalchemy import select, update
 
-from services.extractor import new_generation as new_generation_module
-from services.steward.collect import collect_job_files, collect_orphans
-from services.steward.model_changes import advance_model_changes
-from shared.catalog.added_models import remove_model
+from services.extractor import checkpointed_steps as new_generation_module
+from services.steward.tasks.garbage_collection import collect_job_files, collect_orphans
+from services.steward.tasks.model_changes import advance_model_changes
 from shared.catalog.generations import Generation, active_generation
 from shared.catalog.maps import get_map
-from shared.catalog.models import Model
+from shared.catalog.models import Model, remove_model
+from shared.descriptors.backbones.torchhub import module_fingerprint
 from shared.jobs import InProcessWakeups, JobKind
-from shared.objects.keys import CHECKPOINTS, MODELS
-from shared.vision.backbones.torchhub import module_fingerprint
+from shared.storage.keys import CHECKPOINTS, MODELS
 from tests.integration.gateway import Service
 from tests.integration.workplace import same
 from tests.support.catalog_rows import end_pauses, stored_rows
@@ -417,7 +416,7 @@ def test_a_model_that_is_removed_at_the_last_moment_begins_no_generation(
         real(*arguments)
 
     monkeypatch.setattr(
-        "services.extractor.take_vocabulary.start_generation_with_stored_vocabulary", remove_first
+        "services.extractor.model_changes.start_generation_with_stored_vocabulary", remove_first
     )
     failed(walks, switch(walks, extractor="gsv:walks"), "model_missing")
     assert active(walks).id == before

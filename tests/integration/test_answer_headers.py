@@ -8,14 +8,14 @@ import pytest
 from starlette.testclient import TestClient
 
 from services.gateway.app import create_app
-from services.gateway.context import GatewayContext
-from services.gateway.keys import LocalhostAuthenticator
+from services.gateway.authentication import LocalhostAuthenticator
+from services.gateway.dependencies import GatewayContext
 from services.search.worker import SearchWorker
 from shared.catalog.maps import get_or_create_default_map
 from shared.catalog.session import Catalog
+from shared.config.settings import Settings
 from shared.jobs import InProcessWakeups
-from shared.objects import FolderStore
-from shared.settings import Settings
+from shared.storage import FolderStore
 from tests.integration.door import Door
 from tests.support.problems import problem
 

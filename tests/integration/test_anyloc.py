@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from shared.catalog.jobs import WaitingFor
+from shared.config.settings import Settings
 from shared.jobs import JobState
-from shared.jobs.table import WaitingFor
-from shared.settings import Settings
 from tests.integration.workplace import Workplace
 from tests.support.catalog_rows import set_columns
 from tests.support.photos import photo_bytes
@@ -37,7 +37,7 @@ def settings(weights: Path) -> Settings:
 def test_photos_wait_for_weights_then_for_a_vocabulary_and_a_fit_makes_them_searchable(
     workplace_of: Callable[[str], Workplace], weights: Path
 ) -> None:
-    from shared.vision.backbones.dinov2 import SHAPES
+    from shared.descriptors.backbones.dinov2 import SHAPES
 
     workplace = workplace_of(EXTRACTOR)
     (photo,) = workplace.upload(1)

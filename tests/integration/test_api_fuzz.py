@@ -27,8 +27,8 @@ from schemathesis.specs.openapi.checks import (
 
 from services.extractor.worker import ExtractorWorker
 from shared.catalog.session import Catalog
-from shared.objects import FolderStore
-from shared.settings import Settings
+from shared.config.settings import Settings
+from shared.storage import FolderStore
 from tests.integration.door import ADMIN, Door
 
 pytestmark = pytest.mark.parametrize("catalog", ["sqlite"], indirect=True)
@@ -164,7 +164,7 @@ def test_the_fuzz_would_find_a_fault(fuzzed: Door, monkeypatch: pytest.MonkeyPat
     def broken(*args: Any) -> Any:
         raise ZeroDivisionError
 
-    monkeypatch.setattr("services.gateway.maps.list_maps", broken, raising=False)
+    monkeypatch.setattr("services.gateway.routes.maps.list_maps", broken, raising=False)
     operation = described(fuzzed)["/api/v1/maps"]["GET"]
     run = hypothesis.given(case=operation.as_strategy())(
         lambda case: case.call_and_validate(headers=KEY, checks=PROMISED)

@@ -7,13 +7,13 @@ from uuid import UUID
 import pytest
 from sqlalchemy import delete, update
 
-from benchmarks.chaos.audit import InvariantViolations, check_invariants
+from benchmarks.chaos.run import InvariantViolations, check_invariants
 from shared.catalog.chunks import Chunk, Descriptor
 from shared.catalog.photos import Photo
 from shared.catalog.session import Catalog
-from shared.chunks import manifest_key
 from shared.jobs import JobState
-from shared.objects import FolderStore
+from shared.storage import FolderStore
+from shared.storage.chunks import manifest_key
 from tests.support.catalog_rows import add_chunk, add_generation, add_job, add_map, add_photo
 
 Found = dict[str, UUID]

@@ -13,20 +13,21 @@ import pytest
 from sqlalchemy import select
 
 from services.extractor.worker import ExtractorWorker
-from shared.backup import copy_objects, make, rows
-from shared.backup.folder import BackupFolder, open_backup
-from shared.backup.make import create_backup
+from shared.backup import create as make
+from shared.backup import folder as copy_objects
+from shared.backup import folder as rows
+from shared.backup.create import create_backup
+from shared.backup.folder import BackupFolder, backup_tables, open_backup
 from shared.backup.restore import RestoreResult, restore_backup
-from shared.backup.rows import backup_tables
 from shared.catalog.chunks import Chunk
 from shared.catalog.installation import get_or_create_installation
+from shared.catalog.jobs import Job, JobState
 from shared.catalog.photos import Photo
 from shared.catalog.session import Catalog
+from shared.config.settings import Settings
 from shared.errors import Conflict, Misconfigured
-from shared.integrity.check import verify_store
-from shared.jobs.table import Job, JobState
-from shared.objects import FolderStore
-from shared.settings import Settings
+from shared.integrity.verify import verify_store
+from shared.storage import FolderStore
 from tests.integration.gateway import Service
 from tests.support.catalog_rows import read_job, take
 from tests.support.photos import photo_bytes
@@ -147,7 +148,7 @@ def test_a_backup_taken_again_copies_only_what_is_new_and_forgets_what_is_gone(
         taken.append(info.key)
         return copy_objects.back_up_object(store, folder, info)
 
-    monkeypatch.setattr("shared.backup.make.back_up_object", noted)
+    monkeypatch.setattr("shared.backup.create.back_up_object", noted)
     assert backed_up().objects
     assert taken == []
     with service.catalog.read() as session:
@@ -191,7 +192,7 @@ def test_what_comes_or_goes_while_a_backup_is_taken_is_in_it_or_not_named_by_it(
         return copy_rest(*arguments)
 
     copy_all, copy_rest = make._copy_all, make._copy_missing
-    monkeypatch.setattr("shared.backup.make.dump_rows", meanwhile)
+    monkeypatch.setattr("shared.backup.create.dump_rows", meanwhile)
     monkeypatch.setattr(make, "_copy_all", before)
     monkeypatch.setattr(make, "_copy_missing", after)
     about = backed_up()

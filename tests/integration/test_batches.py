@@ -14,24 +14,24 @@ import pytest
 from sqlalchemy import func, select
 
 from services.extractor.worker import ExtractorWorker
-from services.gateway.batches import validate_prefix
-from services.steward.batches import bring_in as bring_in_module
+from services.gateway.routes.batches import validate_prefix
+from services.steward.batches import worker as bring_in_module
 from services.steward.batches import worker as worker_module
 from services.steward.batches.worker import BatchWorker, resume_batches
-from services.steward.collect import collect_job_files, collect_orphans
-from services.steward.delete_maps import purge_deleted_maps
+from services.steward.tasks.delete_maps import purge_deleted_maps
+from services.steward.tasks.garbage_collection import collect_job_files, collect_orphans
+from shared.catalog.batch_items import BatchItem
 from shared.catalog.maps import get_or_create_default_map
 from shared.catalog.photos import Photo
 from shared.catalog.session import Catalog
+from shared.config.settings import Settings
 from shared.errors import StorageFull, Unavailable, Unprocessable
-from shared.intake import incoming as incoming_module
-from shared.intake import store_photo as store_photo_module
+from shared.ingest import store_photo as store_photo_module
+from shared.ingest import validation as incoming_module
 from shared.jobs import InProcessWakeups, Job, JobKind, JobState, reclaim_expired_leases
-from shared.jobs.batches import BatchItem
-from shared.objects import FolderStore, ObjectStore, OwnedStore
-from shared.objects.keys import ARCHIVES, TRASH
-from shared.objects.s3 import S3Store
-from shared.settings import Settings
+from shared.storage import FolderStore, ObjectStore, OwnedStore
+from shared.storage.keys import ARCHIVES, TRASH
+from shared.storage.s3 import S3Store
 from tests.integration.gateway import Service
 from tests.support.archives import PACKED, tar_of, zip_of
 from tests.support.catalog_rows import end_pauses, expire_lease, read_job
@@ -820,7 +820,7 @@ def test_a_batch_waits_while_the_disk_is_full_and_goes_on_by_itself(
 ) -> None:
     job_id = batches.start(archive=zip_of(files(1, 2)))
     free = SimpleNamespace(free=batches.settings.min_free_bytes - 1)
-    monkeypatch.setattr("shared.disk_space.shutil.disk_usage", lambda folder: free)
+    monkeypatch.setattr("shared.storage.disk_space.shutil.disk_usage", lambda folder: free)
     assert batches.work()
     for _ in range(2):
         resume_batches(batches.catalog, batches.settings)

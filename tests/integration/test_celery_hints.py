@@ -13,15 +13,19 @@ import pytest
 from redis import Redis
 from sqlalchemy import func, select
 
-from services.steward.queue import resend_hints
+from services.steward.tasks.maintenance import resend_hints
 from shared.catalog.session import Catalog
+from shared.config.settings import Settings
 from shared.errors import Misconfigured
 from shared.jobs import Job, JobState
-from shared.jobs.celery_app import DRAIN_TASK, create_celery_app
-from shared.jobs.celery_hints import MAX_PENDING_WAKEUPS, CeleryWakeups
-from shared.jobs.hints import WakeupQueue
-from shared.objects import FolderStore
-from shared.settings import Settings
+from shared.jobs.celery_wakeups import (
+    DRAIN_TASK,
+    MAX_PENDING_WAKEUPS,
+    CeleryWakeups,
+    create_celery_app,
+)
+from shared.jobs.wakeups import WakeupQueue
+from shared.storage import FolderStore
 from tests.support.catalog_rows import add_map, ask, upload
 from tests.support.photos import photo_bytes
 from tests.support.processes import PLACEWISE, start

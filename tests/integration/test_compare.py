@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from sqlalchemy import select
 
-from services.extractor import stored_rows
-from services.extractor.compare import ComparisonRunner, PreparedComparison
+from services.extractor import prepare as stored_rows
+from services.extractor.comparison import ComparisonRunner, PreparedComparison
 from services.extractor.worker import ExtractorWorker
-from services.steward.collect import (
+from services.steward.tasks.garbage_collection import (
     collect_ended_generations,
     collect_orphans,
     collect_queries,
@@ -21,13 +21,13 @@ from services.steward.collect import (
 from shared.catalog.chunks import find_descriptor_rows
 from shared.catalog.maps import get_or_create_default_map
 from shared.catalog.session import Catalog
-from shared.chunks import Row, read_row
-from shared.comparison import CompareResult
+from shared.config.settings import Settings
 from shared.ids import new_id
 from shared.jobs import Job, JobKind, reclaim_expired_leases
-from shared.objects import FolderStore, ObjectStore
-from shared.objects.keys import comparison_key, query_key
-from shared.settings import Settings
+from shared.search_api.comparison import CompareResult
+from shared.storage import FolderStore, ObjectStore
+from shared.storage.chunks import Row, read_row
+from shared.storage.keys import comparison_key, query_key
 from tests.integration.comparisons import (
     CLOSELY,
     begun,

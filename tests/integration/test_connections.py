@@ -21,16 +21,11 @@ from fastapi import FastAPI, Request
 from fastapi.responses import StreamingResponse
 
 from services import http_connections
-from services.call_log import RequestLogMiddleware, RequestRecord
-from services.http_connections import (
-    ConnectionLimits,
-    Connections,
-    Reason,
-    address_group,
-)
+from services.http_connections import ConnectionLimits, Connections, Reason, address_group
 from services.http_server import http_server, listen
-from shared.problems import CLIENT_GONE, install_exception_handlers
-from shared.settings import Settings
+from services.request_log import RequestLogMiddleware, RequestRecord
+from shared.config.settings import Settings
+from shared.http.problem_details import CLIENT_GONE, install_exception_handlers
 
 LONG = 30.0
 ASK = b"GET /whoami HTTP/1.1\r\nHost: localhost\r\n\r\n"

@@ -11,15 +11,13 @@ import pytest
 from sqlalchemy import event, func, select
 from sqlalchemy.exc import OperationalError
 
-from shared import read_retries
 from shared.catalog.chunks import Chunk
-from shared.catalog.searches import Search
-from shared.integrity.check import verify_store
-from shared.integrity.repair import repair_descriptors
+from shared.catalog.maps import Search
+from shared.config.shards import SINGLE_SHARD
+from shared.integrity.verify import repair_descriptors, verify_store
 from shared.jobs import InProcessWakeups
-from shared.objects import FolderStore, ObjectStore
-from shared.objects.s3 import S3Store
-from shared.shards import SINGLE_SHARD
+from shared.storage import FolderStore, ObjectStore, read_retries
+from shared.storage.s3 import S3Store
 from tests.integration.gateway import Service
 from tests.support.problems import problem
 from tests.support.servers import S3Server

@@ -15,17 +15,16 @@ import urllib3
 from sqlalchemy import func, select, update
 
 from services.extractor.worker import ExtractorWorker
-from services.steward.collect import collect_direct_uploads, collect_orphans
-from services.steward.delete_maps import purge_deleted_maps
+from services.steward.tasks.delete_maps import purge_deleted_maps
+from services.steward.tasks.garbage_collection import collect_direct_uploads, collect_orphans
 from shared.catalog.base import db_now_plus
-from shared.catalog.direct_uploads import PresignedUpload
-from shared.catalog.photos import Photo
+from shared.catalog.photos import Photo, PresignedUpload
 from shared.catalog.session import Catalog
-from shared.intake.photo_header import read_photo_header
-from shared.objects import FolderStore
-from shared.objects.keys import TRASH
-from shared.objects.s3 import S3Store
-from shared.settings import Settings
+from shared.config.settings import Settings
+from shared.imaging.photo_header import read_photo_header
+from shared.storage import FolderStore
+from shared.storage.keys import TRASH
+from shared.storage.s3 import S3Store
 from tests.integration.gateway import Service
 from tests.support.photos import photo_bytes
 from tests.support.problems import field_refused, problem
@@ -240,7 +239,7 @@ def test_what_is_no_photo_is_refused_and_leaves_no_original(
 ) -> None:
     if code == "too_many_pixels":
         monkeypatch.setattr(
-            "services.gateway.direct_upload.read_photo_header",
+            "services.gateway.routes.presigned_uploads.read_photo_header",
             lambda file, _: read_photo_header(file, 100),
         )
     upload = presign(service, sent)

@@ -10,21 +10,23 @@ from typing import Any
 import pytest
 from sqlalchemy import update
 
-from services.cli import server_checks
-from services.cli.server_checks import check_object_store, check_postgres, check_redis
-from services.cli.service_checks import (
+from services.cli.operations import deployment_checks as server_checks
+from services.cli.operations.deployment_checks import (
     check_gateway,
+    check_object_store,
+    check_postgres,
     check_processes,
+    check_redis,
     check_search,
     check_steward,
 )
 from shared.catalog.base import db_now_plus
-from shared.catalog.live_processes import RegisteredProcess, list_processes, process_heartbeat
+from shared.catalog.processes import RegisteredProcess, list_processes, process_heartbeat
 from shared.catalog.session import Catalog
+from shared.config.settings import Settings
+from shared.config.shards import Shard
 from shared.errors import Misconfigured, PlacewiseError, Unavailable
-from shared.objects import FolderStore
-from shared.settings import Settings
-from shared.shards import Shard
+from shared.storage import FolderStore
 from tests.support.catalog_rows import add_job, add_map, set_columns, take
 from tests.support.search_tier import SearchServer
 from tests.support.servers import PostgresServer, RedisServer

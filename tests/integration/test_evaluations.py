@@ -11,24 +11,22 @@ from uuid import UUID
 import pytest
 import sqlalchemy as sql
 
-from services.steward import asked as asked_module
-from services.steward.auto_evaluate import evaluate_changed_maps
-from services.steward.collect import collect_superseded_chunks
-from services.steward.compact import merge_slot
+from services.steward import evaluation_worker as asked_module
+from services.steward.tasks.auto_evaluation import evaluate_changed_maps
+from services.steward.tasks.compaction import merge_slot
+from services.steward.tasks.garbage_collection import collect_superseded_chunks
 from shared.catalog.base import db_now
 from shared.catalog.chunks import Descriptor
-from shared.catalog.evaluations import Evaluation
-from shared.catalog.generations import Generation, GenerationState
-from shared.catalog.maps import get_map, increment_map_version, lock_map
+from shared.catalog.generations import Evaluation, Generation, GenerationState
+from shared.catalog.jobs import get_job
+from shared.catalog.maps import Search, get_map, increment_map_version, lock_map
 from shared.catalog.photos import Photo, PhotoRole
-from shared.catalog.searches import Search
 from shared.catalog.session import Catalog
 from shared.errors import Unavailable
 from shared.jobs import JobKind, JobState, reclaim_expired_leases
-from shared.jobs.finish import cancel_job, fail_job, retry_job
-from shared.jobs.table import get_job
-from shared.objects import FolderStore
-from shared.search_protocol import SearchRequest, SearchResponse, SearchStatus
+from shared.jobs.transitions import cancel_job, fail_job, retry_job
+from shared.search_api.protocol import SearchRequest, SearchResponse, SearchStatus
+from shared.storage import FolderStore
 from tests.integration.gateway import Service
 from tests.integration.town import Seen, Town, Watched, metres_north
 from tests.support.catalog_rows import (

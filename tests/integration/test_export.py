@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from shared.catalog.chunks import list_live_chunks, list_live_rows
 from shared.catalog.generations import Generation
-from shared.chunks import read_chunk
 from shared.ids import new_id
+from shared.storage.chunks import read_chunk
 from tests.integration.gateway import Service
 from tests.support.problems import problem
 

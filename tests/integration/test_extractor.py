@@ -20,28 +20,27 @@ from sqlalchemy.exc import OperationalError
 
 from services.extractor import publish as publish_module
 from services.extractor import worker as worker_module
-from services.extractor.model_change import ModelChangeRunner
-from services.extractor.target import resolve_generation
+from services.extractor.generation_resolver import resolve_generation
+from services.extractor.model_changes import ModelChangeRunner
 from services.extractor.worker import ExtractorWorker
-from services.steward.collect import collect_orphans
-from services.steward.model_changes import auto_fit_vocabularies
-from services.steward.queue import release_expired_leases
+from services.steward.tasks.garbage_collection import collect_orphans
+from services.steward.tasks.maintenance import release_expired_leases
+from services.steward.tasks.model_changes import auto_fit_vocabularies
 from shared.catalog.chunks import Chunk, Descriptor, list_live_chunks
 from shared.catalog.generations import Generation, GenerationState
+from shared.catalog.jobs import WaitingFor
 from shared.catalog.maps import Map
 from shared.catalog.photos import Photo, mark_photo_deleted
-from shared.chunks import decode_rows, manifest_key
+from shared.descriptors.backbones.synthetic import TinyBackbone
+from shared.descriptors.extractor import Extractor
+from shared.descriptors.vocabulary import decode_centres
+from shared.imaging.decode import decode_photo
+from shared.imaging.preprocessing import Pixels, get_preprocessing
 from shared.jobs import Job, JobKind, JobState, claim_jobs
-from shared.jobs.finish import requeue_job
-from shared.jobs.table import WaitingFor
-from shared.objects import FolderStore
-from shared.objects.keys import query_vector_key, thumbnail_key
-from shared.vision.backbones.tiny import TinyBackbone
-from shared.vision.decode import decode_photo
-from shared.vision.extractors import Extractor
-from shared.vision.preprocessing import get_preprocessing
-from shared.vision.resample import Pixels
-from shared.vision.vocabulary import decode_centres
+from shared.jobs.transitions import requeue_job
+from shared.storage import FolderStore
+from shared.storage.chunks import decode_rows, manifest_key
+from shared.storage.keys import query_vector_key, thumbnail_key
 from tests.integration.workplace import Workplace, expected_row, same
 from tests.support.catalog_rows import end_pauses, expire_lease, set_columns, states
 from tests.support.photos import encoded, photo_bytes, photo_image

@@ -11,9 +11,8 @@ import httpx2
 import pytest
 from redis import Redis
 
-from benchmarks.fleet.doubler import MessageDuplicator
-from benchmarks.fleet.proxy import FaultProxy, ProxyMode
-from shared.jobs.hints import WakeupQueue
+from benchmarks.fleet.fault_injection import FaultProxy, MessageDuplicator, ProxyMode
+from shared.jobs.wakeups import WakeupQueue
 from tests.support.servers import start_redis
 from tests.support.servers.daemon import free_ports
 

@@ -12,16 +12,17 @@ import pytest
 from sqlalchemy import func, select, update
 
 from services.extractor.worker import ExtractorWorker
-from services.gateway import model_changes, once
+from services.gateway import idempotency as once
+from services.gateway.routes import model_changes
 from shared.catalog.base import db_now_plus
 from shared.catalog.idempotency import IdempotencyRecord
 from shared.catalog.photos import Photo
 from shared.catalog.session import Catalog
+from shared.config.settings import Settings
 from shared.errors import Unavailable
-from shared.intake.photo_header import read_photo_header
+from shared.imaging.photo_header import read_photo_header
 from shared.jobs import Job
-from shared.objects import FolderStore
-from shared.settings import Settings
+from shared.storage import FolderStore
 from tests.integration.door import Door
 from tests.integration.gateway import Service
 from tests.support.photos import near_copy, photo_bytes
@@ -227,7 +228,7 @@ def test_a_failure_of_ours_is_not_kept(
         raise Unavailable("object_store_unavailable", "Away.")
 
     with monkeypatch.context() as broken:
-        broken.setattr("shared.intake.incoming.read_photo_header", away)
+        broken.setattr("shared.ingest.validation.read_photo_header", away)
         problem(upload(service, photo_bytes(1)), 503, "object_store_unavailable")
         broken.setattr(model_changes, "has_live_photo", away)
         problem(call_fit(service, headers=keyed("fit")), 503, "object_store_unavailable")
@@ -249,7 +250,7 @@ def test_a_call_under_way_is_told_to_come_again(service: Service, store: FolderS
 
     service.let_threads_call()
     with pytest.MonkeyPatch.context() as patch, ThreadPoolExecutor(1) as pool:
-        patch.setattr("shared.intake.incoming.read_photo_header", slowly)
+        patch.setattr("shared.ingest.validation.read_photo_header", slowly)
         first = pool.submit(upload, service, photo_bytes(1))
         assert reached.wait(timeout=30)
         try:

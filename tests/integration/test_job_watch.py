@@ -9,8 +9,8 @@ from uuid import UUID
 import pytest
 from sqlalchemy.exc import OperationalError
 
-from services.gateway import job_watch
-from services.gateway.job_watch import Change, JobNotifier, Mark
+from services.gateway import dependencies as job_watch
+from services.gateway.dependencies import Change, JobNotifier, Mark
 from shared.catalog.schema import migrate
 from shared.catalog.session import Catalog
 from shared.ids import new_id

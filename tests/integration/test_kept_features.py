@@ -6,26 +6,18 @@ from uuid import UUID
 
 import pytest
 
-from services.steward.collect import (
+from services.steward.tasks.delete_maps import purge_deleted_maps
+from services.steward.tasks.garbage_collection import (
     collect_deleted_photos,
     collect_ended_generations,
     collect_orphans,
 )
-from services.steward.delete_maps import purge_deleted_maps
 from shared.catalog.generations import active_generation
 from shared.catalog.maps import get_map
+from shared.config.settings import Settings
 from shared.ids import new_id
-from shared.objects.keys import local_features_key
-from shared.settings import Settings
-from tests.integration.comparisons import (
-    column,
-    compared,
-    fit,
-    ids,
-    kept,
-    lose_bytes,
-    plain,
-)
+from shared.storage.keys import local_features_key
+from tests.integration.comparisons import column, compared, fit, ids, kept, lose_bytes, plain
 from tests.integration.gateway import Service
 from tests.support.photos import photo_bytes
 
@@ -117,7 +109,7 @@ def test_full_store_keeps_nothing_and_compares_all_the_same(
     service: Service, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from shared.errors import StorageFull
-    from shared.objects import FolderStore
+    from shared.storage import FolderStore
 
     real = FolderStore.put
 

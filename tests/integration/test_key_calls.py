@@ -10,11 +10,11 @@ import pytest
 from sqlalchemy import select, update
 from starlette.datastructures import Headers
 
-from services.gateway.keys import ApiKeyAuthenticator
-from shared.api_keys import hash_api_key
-from shared.catalog.keys import ApiKey
+from services.gateway.authentication import ApiKeyAuthenticator
+from shared.catalog.api_keys import ApiKey
 from shared.catalog.photos import Photo
-from shared.objects import FolderStore
+from shared.security.api_keys import hash_api_key
+from shared.storage import FolderStore
 from tests.integration.door import ADMIN, Door
 from tests.support.photos import photo_bytes
 from tests.support.problems import problem

@@ -8,14 +8,14 @@ from uuid import UUID
 import pytest
 from sqlalchemy import select
 
-from services.extractor.fit_vocabulary import VocabularyFitJob
-from services.steward.compact import merge_small_chunks
-from services.steward.model_changes import auto_fit_vocabularies
+from services.extractor.model_changes import VocabularyFitJob
+from services.steward.tasks.compaction import merge_small_chunks
+from services.steward.tasks.model_changes import auto_fit_vocabularies
 from shared.catalog.maps import increment_map_version, lock_map
 from shared.catalog.photos import Photo, PhotoRole
+from shared.descriptors.extractor import Extractor
 from shared.jobs import Job, JobKind, JobState
-from shared.objects.keys import job_work_key
-from shared.vision.extractors import Extractor
+from shared.storage.keys import job_work_key
 from tests.integration.gateway import Service
 from tests.integration.workplace import FIT, Workplace
 from tests.support.photos import near_copy, photo_bytes

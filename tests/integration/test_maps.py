@@ -14,34 +14,32 @@ import numpy as np
 import pytest
 from sqlalchemy import func, select
 
-from services.extractor.loaded import ModelRegistry
+from services.extractor.generation_resolver import reindex_outdated_generations
+from services.extractor.model_registry import ModelRegistry
 from services.extractor.publish import publish
-from services.extractor.renew import reindex_outdated_generations
-from services.gateway import upload as upload_module
-from services.steward import delete_maps as delete_maps_module
-from services.steward.collect import collect_orphans
-from services.steward.compact import merge_small_chunks
-from services.steward.delete_maps import purge_deleted_maps
-from services.steward.evaluate import EvaluationWorker
-from services.steward.model_changes import advance_model_changes
+from services.gateway.routes import uploads as upload_module
+from services.steward.evaluation_worker import EvaluationWorker
+from services.steward.tasks import delete_maps as delete_maps_module
+from services.steward.tasks.compaction import merge_small_chunks
+from services.steward.tasks.delete_maps import purge_deleted_maps
+from services.steward.tasks.garbage_collection import collect_orphans
+from services.steward.tasks.model_changes import advance_model_changes
 from shared.catalog.base import Base, db_now_plus
+from shared.catalog.batch_items import BatchItem
 from shared.catalog.chunks import Chunk, Descriptor
-from shared.catalog.direct_uploads import PresignedUpload
-from shared.catalog.figures import cache_map_statistics
 from shared.catalog.generations import Generation
 from shared.catalog.installation import Installation
-from shared.catalog.maps import Map
+from shared.catalog.maps import Map, cache_map_statistics
 from shared.catalog.models import Model
-from shared.catalog.photos import Photo
-from shared.catalog.schema_compatibility import SchemaCompatibility
-from shared.catalog.search_workers import RegisteredSearchWorker
+from shared.catalog.photos import Photo, PresignedUpload
+from shared.catalog.processes import RegisteredSearchWorker
 from shared.catalog.session import Catalog
-from shared.intake.store_photo import store_photo
+from shared.catalog.tables import SchemaCompatibility
+from shared.config.settings import Settings
+from shared.ingest.store_photo import store_photo
 from shared.jobs import InProcessWakeups, Job, JobKind, JobState
-from shared.jobs.batches import BatchItem
-from shared.objects import FolderStore
-from shared.objects.keys import JOURNAL, TRASH
-from shared.settings import Settings
+from shared.storage import FolderStore
+from shared.storage.keys import JOURNAL, TRASH
 from tests.integration.gateway import Service
 from tests.support.added import none_added
 from tests.support.catalog_rows import add_job, add_photo, read_job

@@ -15,19 +15,19 @@ from prometheus_client import CollectorRegistry
 
 from services.extractor.metrics import ExtractorMetrics
 from services.gateway.app import create_app
-from services.gateway.context import GatewayContext
-from services.gateway.keys import LocalhostAuthenticator
-from services.gateway.queue_look import count_jobs
+from services.gateway.authentication import LocalhostAuthenticator
+from services.gateway.dependencies import GatewayContext
+from services.gateway.metrics import count_jobs
 from services.search.metrics import MeteredSearch
 from services.search.worker import SearchWorker
-from services.steward.loop import Scheduler
 from services.steward.metrics import StewardMetrics
+from services.steward.scheduler import Scheduler
+from shared.catalog.jobs import JobKind, WaitingFor
 from shared.catalog.session import Catalog
+from shared.config.settings import Settings
 from shared.errors import Misconfigured
 from shared.jobs import InProcessWakeups, JobState
-from shared.jobs.table import JobKind, WaitingFor
-from shared.objects import FolderStore
-from shared.settings import Settings
+from shared.storage import FolderStore
 from shared.telemetry.metrics_server import serve_metrics
 from tests.integration.gateway import Service
 from tests.integration.workplace import Workplace

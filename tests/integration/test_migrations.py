@@ -14,10 +14,9 @@ from sqlalchemy import MetaData, Table, func, select, text
 
 from shared.catalog import schema
 from shared.catalog.base import db_now
-from shared.catalog.connections import PoolConfig, TransactionTimeouts
 from shared.catalog.photos import Photo
 from shared.catalog.schema import check_schema, migrate, wait_for_schema
-from shared.catalog.session import Catalog
+from shared.catalog.session import Catalog, PoolConfig, TransactionTimeouts
 from shared.errors import Misconfigured, Unavailable
 from shared.ids import new_id
 from tests.support.catalog_rows import made_up_photo

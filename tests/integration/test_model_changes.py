@@ -16,22 +16,21 @@ import pytest
 from numpy.typing import NDArray
 from sqlalchemy import select
 
-from services.extractor import slices
-from services.extractor.fit_vocabulary import VocabularyFitJob
-from services.extractor.model_change import ModelChangeRunner
+from services.extractor import checkpointed_steps as slices
+from services.extractor.model_changes import ModelChangeRunner, VocabularyFitJob
 from services.extractor.worker import ExtractorWorker
-from services.steward.collect import collect_model_change_files
+from services.steward.tasks.garbage_collection import collect_model_change_files
 from shared.catalog.generations import GenerationState
+from shared.catalog.jobs import WaitingFor
 from shared.catalog.maps import Map
 from shared.catalog.photos import Photo
+from shared.descriptors.extractor import Extractor
+from shared.descriptors.vocabulary import decode_centres
+from shared.descriptors.vocabulary_fit import PATCHES_PER_CLUSTER
 from shared.errors import Conflict
 from shared.jobs import Job, JobKind, JobState
-from shared.jobs.finish import cancel_job, requeue_job, retry_job
-from shared.jobs.table import WaitingFor
-from shared.objects.keys import new_vocabulary_key
-from shared.vision.extractors import Extractor
-from shared.vision.fit import PATCHES_PER_CLUSTER
-from shared.vision.vocabulary import decode_centres
+from shared.jobs.transitions import cancel_job, requeue_job, retry_job
+from shared.storage.keys import new_vocabulary_key
 from tests.integration.workplace import FIT, Workplace, expected_row, same
 from tests.support.photos import photo_bytes
 

@@ -11,10 +11,10 @@ import pytest
 
 from services.extractor.publish import publish
 from services.extractor.worker import ExtractorWorker
-from services.steward.queue import release_expired_leases
+from services.steward.tasks.maintenance import release_expired_leases
+from shared.descriptors.extractor import Extractor
 from shared.jobs import JobState
-from shared.objects import FolderStore
-from shared.vision.extractors import Extractor
+from shared.storage import FolderStore
 from tests.integration.workplace import Workplace, expected_row, same
 from tests.support.catalog_rows import set_columns
 from tests.support.photos import photo_bytes

@@ -13,27 +13,28 @@ import numpy as np
 import pytest
 import torch
 
-from services.extractor import fit_pca, slices, stored_rows
-from services.extractor.loaded import ModelRegistry
-from services.extractor.model_change import ModelChangeRunner
-from services.extractor.renew import reindex_outdated_generations
+from services.extractor import checkpointed_steps as slices
+from services.extractor import fit_pca
+from services.extractor import prepare as stored_rows
+from services.extractor.generation_resolver import reindex_outdated_generations
+from services.extractor.model_changes import ModelChangeRunner
+from services.extractor.model_registry import ModelRegistry
 from services.extractor.worker import ExtractorWorker
-from services.steward.collect import collect_orphans, collect_whitenings
-from services.steward.delete_maps import purge_deleted_maps
+from services.steward.tasks.delete_maps import purge_deleted_maps
+from services.steward.tasks.garbage_collection import collect_orphans, collect_whitenings
 from shared.catalog.generations import Generation
+from shared.catalog.jobs import WaitingFor
 from shared.catalog.maps import Map, mark_map_deleted
 from shared.catalog.photos import Photo, PhotoRole
-from shared.catalog.whitenings import StoredWhitening
-from shared.chunks import Rows, decode_rows, read_row
+from shared.catalog.vocabularies import StoredWhitening
+from shared.descriptors import extractor as extractors
+from shared.descriptors.pca_fit import fit_pca as fit_whitening
+from shared.descriptors.pca_whitening import PcaProjection, PcaWhitening, decode_whitening
+from shared.descriptors.vocabulary import decode_centres
 from shared.errors import NotFound
 from shared.jobs import Job, JobKind, JobState
-from shared.jobs.table import WaitingFor
-from shared.objects.keys import WHITENINGS, WORK, query_vector_key
-from shared.vision import extractors
-from shared.vision.pca import PcaProjection, PcaWhitening
-from shared.vision.pca_file import decode_whitening
-from shared.vision.pca_fit import fit_pca as fit_whitening
-from shared.vision.vocabulary import decode_centres
+from shared.storage.chunks import Rows, decode_rows, read_row
+from shared.storage.keys import WHITENINGS, WORK, query_vector_key
 from tests.integration.conftest import LentDecoders
 from tests.integration.workplace import Workplace, expected_row, same
 from tests.support.added import none_added

@@ -8,10 +8,10 @@ from uuid import uuid4
 import httpx2
 import pytest
 
-from services.steward.model_changes import advance_model_changes
+from services.steward.tasks.model_changes import advance_model_changes
 from shared.catalog.vocabularies import Vocabulary
+from shared.descriptors.vocabulary_file import decode_vocabulary
 from shared.jobs import InProcessWakeups
-from shared.vision.vocabulary_file import decode_vocabulary
 from tests.integration.gateway import Service
 from tests.support.problems import field_refused, problem
 

@@ -9,15 +9,15 @@ from uuid import UUID
 import pytest
 import torch
 
-from services.extractor.loaded import ModelRegistry
-from services.extractor.renew import reindex_outdated_generations
+from services.extractor.generation_resolver import reindex_outdated_generations
+from services.extractor.model_registry import ModelRegistry
 from services.extractor.worker import ExtractorWorker
 from shared.catalog.generations import Generation
+from shared.descriptors.extractor import Extractor
+from shared.descriptors.inference import Precision
+from shared.extractor_config.configs import get_extractor_config
+from shared.imaging.decode import decode_photo
 from shared.jobs import JobKind, JobState
-from shared.recipes import get_extractor_config
-from shared.vision.decode import decode_photo
-from shared.vision.extractors import Extractor
-from shared.vision.precision import Precision
 from tests.integration.workplace import Workplace, same
 from tests.support.photos import photo_bytes
 

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from benchmarks.catalog.calls import KNOWN_FULL_SCANS, run_all_calls
+from benchmarks.catalog.command import KNOWN_FULL_SCANS, run_all_calls
 from benchmarks.catalog.explain import Explainer
 from benchmarks.catalog.fill import fill_catalog
-from shared.catalog.connections import PoolConfig, TransactionTimeouts
-from shared.catalog.session import Catalog
+from shared.catalog.session import Catalog, PoolConfig, TransactionTimeouts
 from tests.support.servers import PostgresServer
 
 # The first map has more rows than any statement may read: one that reads it all stands out.

@@ -13,17 +13,17 @@ import pytest
 from pydantic import SecretStr
 from sqlalchemy import func, select
 
-from services.gateway import quotas as quotas_module
-from services.gateway import upload as upload_module
+from services.gateway import rate_limits as quotas_module
+from services.gateway.routes import uploads as upload_module
 from services.steward.batches.worker import BatchWorker
 from shared.catalog.photos import Photo
 from shared.catalog.session import Catalog
-from shared.intake import incoming as incoming_module
-from shared.intake import photo_quota
-from shared.intake.incoming import ValidatedPhoto
+from shared.config.settings import Settings
+from shared.ingest import store_photo as photo_quota
+from shared.ingest import validation as incoming_module
+from shared.ingest.validation import ValidatedPhoto
 from shared.jobs import InProcessWakeups
-from shared.objects import FolderStore
-from shared.settings import Settings
+from shared.storage import FolderStore
 from tests.integration.door import ADMIN, Door
 from tests.support.archives import zip_of
 from tests.support.photos import photo_bytes

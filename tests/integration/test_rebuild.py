@@ -10,33 +10,35 @@ from uuid import UUID, uuid4
 import pytest
 from sqlalchemy import delete, func, insert, select
 
-from services.steward import journal
-from services.steward.collect import CollectionHeld, collect_deleted_photos, collect_orphans
-from services.steward.compact import merge_small_chunks
-from services.steward.delete_maps import purge_deleted_maps
-from services.steward.model_changes import advance_model_changes
+from services.steward.tasks import journal
+from services.steward.tasks.compaction import merge_small_chunks
+from services.steward.tasks.delete_maps import purge_deleted_maps
+from services.steward.tasks.garbage_collection import (
+    CollectionHeld,
+    collect_deleted_photos,
+    collect_orphans,
+)
+from services.steward.tasks.model_changes import advance_model_changes
 from shared.catalog.base import Base
 from shared.catalog.chunks import Chunk, Descriptor
 from shared.catalog.generations import Generation
 from shared.catalog.installation import Installation, get_or_create_installation
+from shared.catalog.jobs import Job
 from shared.catalog.maps import get_or_create_default_map
 from shared.catalog.photos import Photo
-from shared.catalog.schema_compatibility import SchemaCompatibility
 from shared.catalog.session import Catalog
-from shared.chunks import manifest_key
+from shared.catalog.tables import SchemaCompatibility
+from shared.config.settings import Settings
 from shared.errors import Conflict, StorageFull
-from shared.integrity.check import verify_store
+from shared.integrity.verify import verify_store
 from shared.jobs import InProcessWakeups
-from shared.jobs.table import Job
-from shared.journal.lag import catalog_lag
-from shared.journal.outbox import write_journal
+from shared.journal.outbox import catalog_lag, write_journal
 from shared.journal.segments import list_segments
-from shared.objects import FolderStore
-from shared.objects.keys import JOURNAL, ORIGINALS
 from shared.rebuild import take_in as take_in_module
-from shared.rebuild.begin import begin_rebuild
-from shared.rebuild.take_in import TakenIn, take_in
-from shared.settings import Settings
+from shared.rebuild.take_in import TakenIn, begin_rebuild, take_in
+from shared.storage import FolderStore
+from shared.storage.chunks import manifest_key
+from shared.storage.keys import JOURNAL, ORIGINALS
 from tests.integration.gateway import Service
 from tests.support.photos import photo_bytes
 

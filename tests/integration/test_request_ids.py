@@ -14,13 +14,13 @@ from opentelemetry.sdk.trace.export.in_memory_span_exporter import InMemorySpanE
 from sqlalchemy import select
 
 from services.steward.batches.worker import BatchWorker
+from shared.catalog.batch_items import BatchItem
 from shared.catalog.chunks import Chunk
+from shared.catalog.jobs import Job, JobKind
+from shared.config.settings import Settings
 from shared.errors import Misconfigured
 from shared.jobs import InProcessWakeups
-from shared.jobs.batches import BatchItem
-from shared.jobs.table import Job, JobKind
-from shared.settings import Settings
-from shared.telemetry.traces import configure_tracing
+from shared.telemetry.tracing import configure_tracing
 from tests.integration.gateway import Service
 from tests.support.archives import zip_of
 from tests.support.photos import photo_bytes
@@ -82,7 +82,7 @@ def test_photos_of_a_batch_carry_the_id_of_its_call(service: Service) -> None:
 def test_an_unforeseen_error_answers_with_the_id_and_logs_it(
     service: Service, log: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("services.gateway.jobs.list_jobs", lambda *_: 1 / 0)
+    monkeypatch.setattr("services.gateway.routes.jobs.list_jobs", lambda *_: 1 / 0)
     answer = service("GET", "/jobs", headers={"X-Request-ID": ID})
     assert (answer.status_code, answer.json()["request_id"]) == (500, ID)
     failed = [line for line in log.records if line.getMessage() == "GET /api/v1/jobs: 500"]
@@ -127,7 +127,7 @@ def test_a_trace_leads_from_the_call_to_the_transaction_that_makes_it_searchable
 def test_traces_without_their_packages_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("OTEL_EXPORTER_OTLP_ENDPOINT", "http://127.0.0.1:4318")
     monkeypatch.setitem(sys.modules, "opentelemetry", None)
-    monkeypatch.delitem(sys.modules, "shared.telemetry.opentelemetry_tracer", raising=False)
+    monkeypatch.delitem(sys.modules, "shared.telemetry.otlp", raising=False)
     with pytest.raises(Misconfigured, match="extra `otel`") as caught:
         configure_tracing(Settings(), "gateway")
     assert caught.value.code == "otel_missing"

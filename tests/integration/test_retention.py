@@ -9,11 +9,10 @@ from uuid import UUID
 import pytest
 from sqlalchemy import select, update
 
-from services.steward import retention as retention_module
-from services.steward.retention import delete_old_jobs, delete_old_searches
+from services.steward.tasks import maintenance as retention_module
+from services.steward.tasks.maintenance import delete_old_jobs, delete_old_searches
 from shared.catalog.base import db_now_plus
-from shared.catalog.maps import get_map
-from shared.catalog.searches import Search
+from shared.catalog.maps import Search, get_map
 from shared.catalog.session import Catalog
 from shared.jobs import Job, JobKind, JobState
 from tests.integration.gateway import Service

@@ -12,20 +12,20 @@ import pytest
 from fastapi import Request
 
 from services.extractor.worker import ExtractorWorker
-from services.gateway import room as room_module
-from services.gateway.keys import Caller
-from services.gateway.room import MAX_RETRY_SECONDS, AdmissionControl, UploadKind
-from shared.api_keys import ALL_SCOPES
+from services.gateway import admission as room_module
+from services.gateway.admission import MAX_RETRY_SECONDS, AdmissionControl, UploadKind
+from services.gateway.authentication import Caller
 from shared.catalog.base import db_now_plus
+from shared.catalog.jobs import Priority
 from shared.catalog.maps import get_map
 from shared.catalog.session import Catalog
+from shared.config.settings import Settings
 from shared.errors import TooManyRequests
 from shared.ids import new_id
 from shared.jobs import Job, JobKind, JobState
-from shared.jobs.table import Priority
-from shared.jobs.waiting import THROUGHPUT_WINDOW_SECONDS, measure_queue_depth
-from shared.objects import FolderStore
-from shared.settings import Settings
+from shared.jobs.queue_depth import THROUGHPUT_WINDOW_SECONDS, measure_queue_depth
+from shared.security.api_keys import ALL_SCOPES
+from shared.storage import FolderStore
 from tests.integration.gateway import Service
 from tests.support.catalog_rows import add_job, add_map
 from tests.support.photos import near_copy, photo_bytes
@@ -241,7 +241,7 @@ def test_a_full_disk_takes_no_photo_and_answers_all_else(
     (photo,) = service.indexed(1)
     before = {info.key for info in store.list("")}
     free = SimpleNamespace(free=GIGABYTE - 1)
-    monkeypatch.setattr("shared.disk_space.shutil.disk_usage", lambda folder: free)
+    monkeypatch.setattr("shared.storage.disk_space.shutil.disk_usage", lambda folder: free)
     for path in ("/upload", "/vocabularies/import"):
         answer = service("POST", path, files={"file": photo_bytes(2)})
         body = problem(answer, 507, "disk_full")
@@ -274,7 +274,7 @@ def test_the_disk_of_the_originals_counts_too_and_no_disk_where_nothing_lies(
         asked.append(str(folder))
         return SimpleNamespace(free=5 if "photos" in str(folder) else 9)
 
-    monkeypatch.setattr("shared.disk_space.shutil.disk_usage", usage)
+    monkeypatch.setattr("shared.storage.disk_space.shutil.disk_usage", usage)
     photos = settings.placewise_home.parent / "photos"
     photos.mkdir()
     elsewhere = settings.model_copy(update={"upload_dir": photos})

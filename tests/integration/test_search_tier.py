@@ -14,22 +14,22 @@ import pytest
 from starlette.testclient import TestClient
 
 from services.gateway.app import create_app
-from services.gateway.context import GatewayContext
-from services.gateway.keys import LocalhostAuthenticator
-from services.search import app as search_app
-from services.steward.located import GeotaggedPhoto
-from services.steward.measure import MapEvaluation
+from services.gateway.authentication import LocalhostAuthenticator
+from services.gateway.dependencies import GatewayContext
+from services.search import service as search_app
+from services.steward.evaluation_search import GeotaggedPhoto
+from services.steward.map_evaluation import MapEvaluation
 from shared.catalog.chunks import Chunk, Descriptor
 from shared.catalog.generations import Generation
 from shared.catalog.session import Catalog
-from shared.chunks import decode_rows, encode_rows
+from shared.config.settings import Settings
 from shared.errors import Unavailable
-from shared.estimate.places import PhotoLocation
+from shared.evaluation.place_evidence import PhotoLocation
 from shared.jobs import InProcessWakeups
-from shared.objects import FolderStore
-from shared.photo_filter import PhotoFilter
-from shared.search_protocol import SearchRequest, SearchResponse
-from shared.settings import Settings
+from shared.search_api.photo_filter import PhotoFilter
+from shared.search_api.protocol import SearchRequest, SearchResponse
+from shared.storage import FolderStore
+from shared.storage.chunks import decode_rows, encode_rows
 from tests.contract.test_search_port import SmallMap, assert_answers, unit_rows
 from tests.support.search_tier import SearchServer, SearchTier
 

@@ -13,26 +13,25 @@ from uuid import UUID
 import pytest
 from sqlalchemy import select, update
 
-from services.search.presence import WorkerHeartbeat
+from services.search.service import WorkerHeartbeat
 from services.search.worker import SearchWorker
-from services.steward import mend_generations as mend_generations_module
-from services.steward import search_workers
-from services.steward.mend_generations import mend_generations
-from services.steward.search_workers import SLOW_LOAD_SECONDS, remove_dead_search_workers
-from shared import read_retries
+from services.steward.tasks import generation_repair as mend_generations_module
+from services.steward.tasks import model_changes as search_workers
+from services.steward.tasks.generation_repair import mend_generations
+from services.steward.tasks.model_changes import SLOW_LOAD_SECONDS, remove_dead_search_workers
 from shared.catalog.base import db_now, db_now_plus
 from shared.catalog.generations import Generation, GenerationState
+from shared.catalog.jobs import WaitingFor
 from shared.catalog.maps import Map
-from shared.catalog.search_workers import SEARCH_WORKER_TIMEOUT_SECONDS, RegisteredSearchWorker
+from shared.catalog.processes import SEARCH_WORKER_TIMEOUT_SECONDS, RegisteredSearchWorker
 from shared.catalog.session import Catalog
-from shared.chunks import encode_rows
+from shared.config.settings import Settings
+from shared.config.shards import Shard
 from shared.jobs import JobState
-from shared.jobs.table import WaitingFor
-from shared.objects import FolderStore
-from shared.objects.keys import QUERIES
-from shared.search_protocol import SearchRequest
-from shared.settings import Settings
-from shared.shards import Shard
+from shared.search_api.protocol import SearchRequest
+from shared.storage import FolderStore, read_retries
+from shared.storage.chunks import encode_rows
+from shared.storage.keys import QUERIES
 from tests.integration.workplace import Workplace
 from tests.support.photos import photo_bytes
 
@@ -353,8 +352,8 @@ def test_a_worker_tells_that_it_lives_and_what_it_has_loaded(
 def test_a_running_worker_keeps_its_entry_fresh_and_removes_it_in_the_end(
     register: Register, catalog: Catalog, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("services.search.presence.CHANGE_POLL_SECONDS", 0.01)
-    monkeypatch.setattr("services.search.presence.HEARTBEAT_SECONDS", 0.02)
+    monkeypatch.setattr("services.search.service.CHANGE_POLL_SECONDS", 0.01)
+    monkeypatch.setattr("services.search.service.HEARTBEAT_SECONDS", 0.02)
     worker = register("worker")
     stop = threading.Event()
     running = threading.Thread(target=worker.presence.run, args=(stop,))

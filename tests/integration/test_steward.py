@@ -14,9 +14,12 @@ import pytest
 from prometheus_client import CollectorRegistry
 from sqlalchemy import func, select, update
 
-from services.steward import collect as collect_module
-from services.steward import compact as compact_module
-from services.steward.collect import (
+from services.steward.metrics import StewardMetrics
+from services.steward.scheduler import PeriodicTask, Scheduler
+from services.steward.tasks import compaction as compact_module
+from services.steward.tasks import garbage_collection as collect_module
+from services.steward.tasks.compaction import merge_slot, merge_small_chunks
+from services.steward.tasks.garbage_collection import (
     CollectionHeld,
     collect_deleted_photos,
     collect_ended_generations,
@@ -27,26 +30,22 @@ from services.steward.collect import (
     collect_superseded_chunks,
     empty_expired_trash,
 )
-from services.steward.compact import merge_slot, merge_small_chunks
-from services.steward.loop import PeriodicTask, Scheduler
-from services.steward.metrics import StewardMetrics
-from services.steward.queue import resend_hints
+from services.steward.tasks.maintenance import resend_hints
 from shared.catalog.base import db_now_plus
 from shared.catalog.chunks import Chunk, Descriptor, count_searchable, list_live_chunks
-from shared.catalog.direct_uploads import PresignedUpload
 from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.idempotency import IdempotencyRecord, RequestIdentity, claim_idempotency_key
 from shared.catalog.installation import REBUILDING, get_or_create_installation
 from shared.catalog.maps import Map
-from shared.catalog.photos import Photo, get_photo
+from shared.catalog.photos import Photo, PresignedUpload, get_photo
 from shared.catalog.session import Catalog
 from shared.catalog.vocabularies import Vocabulary, VocabularyOrigin
-from shared.chunks import read_chunk, write_chunk
+from shared.config.settings import Settings
 from shared.ids import new_id
 from shared.jobs import InProcessWakeups, Job, JobKind, JobState
-from shared.objects import FolderStore
-from shared.objects.collection_hold import Hold, HoldReason, read_hold, write_hold
-from shared.objects.keys import (
+from shared.storage import FolderStore
+from shared.storage.chunks import read_chunk, write_chunk
+from shared.storage.keys import (
     TRASH,
     incoming_key,
     job_work_key,
@@ -57,9 +56,8 @@ from shared.objects.keys import (
     query_vector_key,
     thumbnail_key,
 )
-from shared.objects.trash import TrashSize, restore_trash
-from shared.read_retries import ReadRetries
-from shared.settings import Settings
+from shared.storage.read_retries import ReadRetries
+from shared.storage.trash import Hold, HoldReason, TrashSize, read_hold, restore_trash, write_hold
 from tests.integration.workplace import same
 from tests.support.catalog_rows import (
     add_chunk,
@@ -325,7 +323,7 @@ def test_a_corrupt_chunk_is_not_read_with_every_round_of_merging(
     assert merge_small_chunks(house.catalog, house.store, 2, retries) == 0
     house.store.put(broken, whole)
     assert merge_small_chunks(house.catalog, house.store, 2, retries) == 0, "its pause is not over"
-    monkeypatch.setattr("shared.read_retries.time.monotonic", lambda: float("inf"))
+    monkeypatch.setattr("shared.storage.read_retries.time.monotonic", lambda: float("inf"))
     assert merge_small_chunks(house.catalog, house.store, 2, retries) == 1
 
 

@@ -14,11 +14,10 @@ from typer.testing import CliRunner
 
 from services.cli.main import build_app
 from services.trainer import run
-from services.trainer.configuration import build_arguments, load_yaml
-from services.trainer.display import NullDisplay
-from services.trainer.stop import RunStopped, StopRequest
+from services.trainer.arguments import build_arguments, load_yaml
+from services.trainer.run_control import NullDisplay, RunStopped, StopRequest
+from shared.descriptors.vpr_models.checkpoint import load_checkpoint
 from shared.errors import Conflict, InvalidRequest, NotFound, PlacewiseError, Unprocessable
-from shared.vision.place_models.checkpoint import load_checkpoint
 from tests.support.tiny_places import CITY, write_tiny_places
 from tests.support.train_runs import assert_same_weights, told, train, weights
 

@@ -6,16 +6,15 @@ from pathlib import Path
 
 from benchmarks.train.learning import measure_gain
 from services.trainer import run
-from services.trainer.configuration import build_arguments
-from services.trainer.device import resolve_device
-from services.trainer.display import NullDisplay
-from services.trainer.make_model import make_model
-from services.trainer.random_state import seed_everything
-from services.trainer.stop import StopRequest
-from shared.datasets.city.plan import CityOptions, make_plan
-from shared.datasets.city.write import write_city
-from shared.datasets.sets import open_evaluation_set
-from shared.vision.place_models.checkpoint import load_checkpoint
+from services.trainer.arguments import build_arguments
+from services.trainer.checkpointing import seed_everything
+from services.trainer.module import make_model
+from services.trainer.resolve import resolve_device
+from services.trainer.run_control import NullDisplay, StopRequest
+from shared.datasets.open_dataset import open_evaluation_set
+from shared.descriptors.vpr_models.checkpoint import load_checkpoint
+from shared.synthetic_city.plan import CityOptions, make_plan
+from shared.synthetic_city.write import write_city
 
 SIDE = 64
 EPOCHS = 6

@@ -9,7 +9,7 @@ from typing import Any
 
 import httpx2
 
-from services.steward.model_changes import advance_model_changes
+from services.steward.tasks.model_changes import advance_model_changes
 from shared.jobs import InProcessWakeups
 from tests.integration.gateway import API, Service
 from tests.support.photos import photo_bytes

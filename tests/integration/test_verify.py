@@ -11,11 +11,9 @@ from sqlalchemy import delete, func, select
 from shared.catalog.base import Base
 from shared.catalog.chunks import Chunk, Descriptor
 from shared.catalog.photos import Photo
-from shared.chunks import manifest_key
-from shared.integrity.check import verify_store
-from shared.integrity.repair import repair_descriptors
-from shared.integrity.report import IntegrityReport
+from shared.integrity.verify import IntegrityReport, repair_descriptors, verify_store
 from shared.jobs import InProcessWakeups
+from shared.storage.chunks import manifest_key
 from tests.integration.gateway import Service
 from tests.integration.workplace import Workplace
 

@@ -10,14 +10,13 @@ import numpy as np
 import pytest
 
 from shared.catalog.vocabularies import Vocabulary
+from shared.descriptors.extractor import Extractor, choose_device
+from shared.descriptors.vocabulary import decode_centres, encode_centres, parse_centres
+from shared.descriptors.vocabulary_file import Provenance, VocabularyFile, feature_provenance
+from shared.extractor_config.configs import get_extractor_config
+from shared.imaging import preprocessing
 from shared.jobs import JobKind, JobState
-from shared.objects.keys import new_vocabulary_key
-from shared.recipes import get_extractor_config
-from shared.vision import preprocessing
-from shared.vision.extractors import Extractor, choose_device
-from shared.vision.provenance import Provenance, feature_provenance
-from shared.vision.vocabulary import decode_centres, encode_centres, parse_centres
-from shared.vision.vocabulary_file import VocabularyFile
+from shared.storage.keys import new_vocabulary_key
 from tests.integration.workplace import FIT, Workplace
 
 WIDTH = 16  # of the tiny backbone's local features

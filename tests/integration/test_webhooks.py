@@ -17,9 +17,9 @@ import pytest
 from sqlalchemy import update
 
 from services.extractor.worker import ExtractorWorker
+from services.steward import webhooks as send_module
 from services.steward.batches.worker import BatchWorker
-from services.steward.webhooks import send as send_module
-from services.steward.webhooks.deliver import (
+from services.steward.webhooks import (
     MAX_IN_FLIGHT,
     RETRY_DELAYS_SECONDS,
     WebhookDispatcher,
@@ -28,10 +28,10 @@ from services.steward.webhooks.deliver import (
 from shared.catalog.base import db_now
 from shared.catalog.session import Catalog
 from shared.catalog.webhooks import Delivery, EventKind, Webhook, enqueue_event
+from shared.config.settings import Settings
 from shared.jobs import InProcessWakeups, Job, JobState
-from shared.objects import FolderStore
-from shared.settings import Settings
-from shared.webhook_address import WebhookTarget, parse_webhook_url
+from shared.security.webhook_targets import WebhookTarget, parse_webhook_url
+from shared.storage import FolderStore
 from tests.integration.door import ADMIN, Door
 from tests.integration.workplace import Workplace
 from tests.support.archives import zip_of

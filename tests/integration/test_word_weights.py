@@ -13,20 +13,20 @@ import pytest
 from numpy.typing import NDArray
 
 from services.search.worker import SearchWorker
-from services.steward import auto_evaluate
-from services.steward import teach as teach_module
-from services.steward.auto_evaluate import evaluate_changed_maps
-from services.steward.collect import collect_superseded_chunks
-from services.steward.compact import merge_slot
-from services.steward.evaluate import EvaluationWorker
+from services.steward import word_weights as teach_module
+from services.steward.evaluation_worker import EvaluationWorker
+from services.steward.tasks import auto_evaluation as auto_evaluate
+from services.steward.tasks.auto_evaluation import evaluate_changed_maps
+from services.steward.tasks.compaction import merge_slot
+from services.steward.tasks.garbage_collection import collect_superseded_chunks
 from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.maps import get_map
 from shared.catalog.session import Catalog
 from shared.catalog.vocabularies import VocabularyOrigin, add_vocabulary
+from shared.config.settings import Settings
 from shared.ids import new_id
 from shared.jobs import Job, JobKind, JobState, Priority
-from shared.objects import ObjectStore
-from shared.settings import Settings
+from shared.storage import ObjectStore
 from shared.word_weights.record import Outcome, WordWeights, parse_word_weights
 from tests.integration.gateway import Service
 from tests.support.catalog_rows import add_chunk, add_generation, add_photo, read_job

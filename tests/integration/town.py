@@ -17,16 +17,15 @@ import numpy as np
 from sqlalchemy import select
 
 from services.search.worker import SearchWorker
-from services.steward.evaluate import EvaluationWorker
-from shared.catalog.evaluations import Evaluation
-from shared.catalog.generations import Generation
+from services.steward.evaluation_worker import EvaluationWorker
+from shared.catalog.generations import Evaluation, Generation
 from shared.catalog.maps import DEFAULT_MAP
 from shared.catalog.session import Catalog
+from shared.config.settings import Settings
 from shared.ids import new_id
 from shared.jobs import Job, JobKind, Priority
-from shared.objects import FolderStore
-from shared.search_protocol import SearchBackend, SearchRequest, SearchResponse, SearchStatus
-from shared.settings import Settings
+from shared.search_api.protocol import SearchBackend, SearchRequest, SearchResponse, SearchStatus
+from shared.storage import FolderStore
 from tests.support.catalog_rows import add_chunk, add_generation, add_map, add_photo, read_job
 
 Seen = tuple[float, dict[str, Any]]

@@ -13,25 +13,25 @@ import numpy as np
 import torch
 from sqlalchemy import select
 
-from services.extractor.drain_result import DrainStats
+from services.extractor.metrics import DrainStats
 from services.extractor.worker import ExtractorWorker
-from services.steward.model_changes import advance_model_changes
+from services.steward.tasks.model_changes import advance_model_changes
 from shared.catalog.chunks import count_searchable
 from shared.catalog.generations import Generation, active_generation, building_generation
+from shared.catalog.jobs import UNFINISHED_STATES, get_job
 from shared.catalog.photos import Photo
 from shared.catalog.session import Catalog
 from shared.catalog.vocabularies import Vocabulary
-from shared.chunks import Rows
+from shared.config.settings import Settings
+from shared.descriptors.extractor import Extractor
+from shared.descriptors.vocabulary import ClusterCentres
+from shared.extractor_config.configs import get_extractor_config
+from shared.imaging.decode import decode_photo
 from shared.jobs import InProcessWakeups, Job, JobKind, JobState, reclaim_expired_leases
 from shared.jobs.model_changes import cancel_model_change, start_model_change
-from shared.jobs.table import UNFINISHED_STATES, get_job
-from shared.objects import FolderStore
-from shared.objects.keys import TRASH
-from shared.recipes import get_extractor_config
-from shared.settings import Settings
-from shared.vision.decode import decode_photo
-from shared.vision.extractors import Extractor
-from shared.vision.vocabulary import ClusterCentres
+from shared.storage import FolderStore
+from shared.storage.chunks import Rows
+from shared.storage.keys import TRASH
 from tests.support.catalog_rows import ask, delete, read_job, set_columns, stored_rows, upload
 from tests.support.photos import photo_bytes
 

@@ -9,13 +9,13 @@ from typing import Any
 
 import torch
 
-from shared.chunks import Rows
-from shared.vision.backbones.base import normalise_pixels
-from shared.vision.decode import decode_photo
-from shared.vision.place_models.checkpoint import checkpoint_state
-from shared.vision.place_models.config import VprModelConfig
-from shared.vision.place_models.model import VprModel, build_vpr_model
-from shared.vision.preprocessing import get_preprocessing
+from shared.descriptors.backbones import normalise_pixels
+from shared.descriptors.vpr_models.checkpoint import checkpoint_state
+from shared.descriptors.vpr_models.config import VprModelConfig
+from shared.descriptors.vpr_models.model import VprModel, build_vpr_model
+from shared.imaging.decode import decode_photo
+from shared.imaging.preprocessing import get_preprocessing
+from shared.storage.chunks import Rows
 
 SIDES = (48, 64)  # pixels
 MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)

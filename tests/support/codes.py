@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from services.search import answer, follow
+from services.search import catalog_sync as follow
+from services.search import executor as answer
 
 
 def always_by_codes(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from shared.datasets.utm_names import UtmFileName
+from shared.datasets.utm_filenames import UtmFileName
 
 
 def utm_name(east: float, north: float, note: str = "", heading: float | None = None) -> str:

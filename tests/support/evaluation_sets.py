@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from shared.datasets.sets import EvaluationSet
+from shared.datasets.open_dataset import EvaluationSet
 from shared.errors import PlacewiseError
 from tests.support.data_sets import utm_name, write_photos
 

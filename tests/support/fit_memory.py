@@ -15,9 +15,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from shared.recipes import get_extractor_config
-from shared.vision.extractors import Extractor
-from shared.vision.fit_photos import fit_vocabulary
+from shared.descriptors.extractor import Extractor
+from shared.descriptors.patches import fit_vocabulary
+from shared.extractor_config.configs import get_extractor_config
 from tests.support.points import clustered_points
 
 WIDTH = 384

@@ -22,24 +22,24 @@ from typing import Any
 from sqlalchemy.orm import configure_mappers
 
 import services.cli
-from shared.settings import Settings
+from shared.config.settings import Settings
 
 # Beside the command's own modules: what they import when they run. A module that is missing here is
 # imported by each process that needs it.
 MODULES = (
-    "services.cli.describe_files",
-    "services.cli.fit_folder",
+    "services.cli.descriptors.local_extractor",
+    "services.cli.descriptors.local_fit",
     "services.extractor.service",
     "services.gateway.app",
-    "services.search.server",
+    "services.search.service",
     "services.standalone",
     "services.steward.batches.worker",
-    "services.steward.evaluate",
-    "services.steward.loop",
-    "shared.jobs.celery_hints",
-    "shared.objects.open_store",
-    "shared.vision.extractors",
-    "shared.vision.vocabulary_file",
+    "services.steward.evaluation_worker",
+    "services.steward.scheduler",
+    "shared.jobs.celery_wakeups",
+    "shared.storage.open_store",
+    "shared.descriptors.extractor",
+    "shared.descriptors.vocabulary_file",
     # What libraries import at their first use.
     "PIL.JpegImagePlugin",
     "anyio._backends._asyncio",

@@ -11,7 +11,7 @@ from hypothesis import strategies as some
 
 from shared.catalog.photos import PhotoFilterValues, PhotoRole
 from shared.geodesy import flush_to_zero
-from shared.photo_filter import Box, Circle, PhotoFilter
+from shared.search_api.photo_filter import Box, Circle, PhotoFilter
 
 RADIUS_M = 6_371_008.8
 HALF_EARTH_M = math.pi * RADIUS_M

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch.nn.functional import normalize
 
-from shared.vision.kmeans import KMeansPass, KMeansPlusPlus
+from shared.descriptors.kmeans import KMeansPass, KMeansPlusPlus
 
 
 def unit_points(seed: int, count: int, width: int) -> torch.Tensor:

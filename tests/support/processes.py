@@ -18,7 +18,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any, Protocol
 
-from shared.settings import Settings
+from shared.config.settings import Settings
 
 PLACEWISE = str(Path(sys.executable).with_name("placewise"))
 REPOSITORY = Path(__file__).parents[2]

@@ -10,14 +10,14 @@ import numpy as np
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from services.search import answer as answer_module
-from services.search.answer import SCORE_DECIMALS, SearchOptions, SearchResult
-from services.search.loaded_chunk import LoadedChunk
+from services.search import executor as answer_module
+from services.search.chunk_loader import LoadedChunk
+from services.search.executor import SCORE_DECIMALS, SearchOptions, SearchResult
 from services.search.photo_columns import PhotoColumns
+from services.search.query_batcher import QueryBatcher
 from services.search.snapshot import Snapshot
-from services.search.together import QueryBatcher
-from shared.codes.int8 import int8_codes
-from shared.codes.signs import encode_signs
+from shared.codes.int8_codes import int8_codes
+from shared.codes.sign_codes import encode_signs
 from shared.ids import new_id
 from tests.support.photo_facts import facts_of
 

@@ -13,13 +13,13 @@ import uvicorn
 
 from services.http_connections import ConnectionLimits, Connections
 from services.http_server import http_server, listen, reachable_url
-from services.search.app import create_search_app
+from services.search.service import create_search_app
 from services.search.worker import SearchWorker
 from shared.catalog.session import Catalog
-from shared.objects import ObjectStore
-from shared.search_http import HttpSearchClient
-from shared.settings import Settings
-from shared.shards import Shard
+from shared.config.settings import Settings
+from shared.config.shards import Shard
+from shared.search_api.client import HttpSearchClient
+from shared.storage import ObjectStore
 
 START_SECONDS = 20.0
 

@@ -16,7 +16,7 @@ from typing import Any, Self
 import httpx2
 import psutil
 
-from shared.home import server_address_file
+from shared.config.embedded_home import server_address_file
 from tests.support.processes import INHERITED, PLACEWISE, Process, start
 
 SERVICES_KEY = "the-admin-key-of-the-tests"  # separate services want one, on loopback too

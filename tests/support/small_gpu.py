@@ -7,9 +7,9 @@ from typing import Any
 import pytest
 import torch
 
-from shared.vision.decode import decode_photo
-from shared.vision.extractors import Extractor
-from shared.vision.preprocessing import get_preprocessing
+from shared.descriptors.extractor import Extractor
+from shared.imaging.decode import decode_photo
+from shared.imaging.preprocessing import get_preprocessing
 from tests.support.photos import photo_bytes
 
 

@@ -8,9 +8,8 @@ from typing import Any
 import torch
 
 from services.trainer import run
-from services.trainer.configuration import build_arguments
-from services.trainer.display import NullDisplay
-from services.trainer.stop import StopRequest
+from services.trainer.arguments import build_arguments
+from services.trainer.run_control import NullDisplay, StopRequest
 
 Json = dict[str, Any]
 

@@ -1,5 +1,5 @@
 """Vision transformers with random weights, and a plain forward pass that shares no code with
-timm or with `shared.vision`: what the DINOv2 backbone is held to.
+timm or with `shared.descriptors`: what the DINOv2 backbone is held to.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from safetensors.torch import save_file
 
-from shared.vision.backbones.dinov2 import VitShape
+from shared.descriptors.backbones.dinov2 import VitShape
 
 Weights = dict[str, torch.Tensor]
 

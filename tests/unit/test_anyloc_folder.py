@@ -9,8 +9,12 @@ from typing import Any
 
 import pytest
 
-from services.cli.anyloc_database import AnylocRow, read_anyloc_rows
-from services.cli.anyloc_folder import AnylocFolder, read_anyloc_folder
+from services.cli.ingest.anyloc_reader import (
+    AnylocFolder,
+    AnylocRow,
+    read_anyloc_folder,
+    read_anyloc_rows,
+)
 from shared.errors import InvalidRequest
 from tests.support.anyloc import AnylocHouse
 

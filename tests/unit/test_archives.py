@@ -16,12 +16,11 @@ from typing import Any
 import pytest
 
 from services.steward.archives import ArchiveLimits, ArchiveMember, open_archive
-from services.steward.archives.member import MemberKind
-from services.steward.archives.ranged import open_buffered
+from services.steward.archives.archive import MemberKind, open_buffered
 from services.steward.archives.zip_archive import ZipArchive
-from shared.archive_formats import ArchiveFormat, detect_archive_format
 from shared.errors import Gone, PlacewiseError
-from shared.objects import FolderStore
+from shared.imaging.file_formats import ArchiveFormat, detect_archive_format
+from shared.storage import FolderStore
 from tests.support.archives import PACKED, tar_of, tar_with, zip_of
 
 LIMITS = ArchiveLimits(members=100, unpacked_bytes=50_000_000)

@@ -7,10 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from shared.datasets.audit import SuspectLabel, find_suspect_labels
-from shared.datasets.ground_truth import find_positives
-from shared.datasets.rules import parse_rule
-from shared.datasets.shots import DatasetPhoto, EvaluationSet
+from shared.datasets.check import SuspectLabel, find_suspect_labels
+from shared.datasets.dataset import DatasetPhoto, EvaluationSet
+from shared.datasets.ground_truth import find_positives, parse_rule
 from shared.errors import InvalidRequest
 
 

@@ -10,10 +10,10 @@ from torch.nn.functional import normalize
 from typer.testing import CliRunner
 
 from benchmarks import extract, precision
-from benchmarks.reference_anyloc import vlad_in_loops
+from benchmarks.extract import vlad_in_loops
 from benchmarks.report import Report
 from services.cli.bench import app
-from shared.vision.vlad import vlad
+from shared.descriptors.aggregation import vlad
 
 runner = CliRunner()
 

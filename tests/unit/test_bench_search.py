@@ -15,19 +15,34 @@ from typer.testing import CliRunner
 
 from benchmarks.report import Report
 from benchmarks.search import measure
-from benchmarks.search.comparison import MATCHED_CASE, report_comparison
+from benchmarks.search.comparison import (
+    MATCHED_CASE,
+    compare_methods,
+    load_worker,
+    report_comparison,
+)
 from benchmarks.search.growth import measure_growth
 from benchmarks.search.load import LoadOutcome, SearchObservation, count_wrong_answers
-from benchmarks.search.memory import count_bytes_read
-from benchmarks.search.methods import BenchmarkQuery, PlacewiseSearch
-from benchmarks.search.oracle import BruteForce, Ranking, same_photos, same_ranking
-from benchmarks.search.places import BLOCKS, SyntheticCity
-from benchmarks.search.turns import compare_methods, load_worker
-from benchmarks.search.world import SyntheticMap, create_synthetic_map, required_memory_bytes
+from benchmarks.search.memory_traffic import count_bytes_read
+from benchmarks.search.methods import (
+    BenchmarkQuery,
+    BruteForce,
+    PlacewiseSearch,
+    Ranking,
+    same_photos,
+    same_ranking,
+)
+from benchmarks.search.synthetic_map import (
+    BLOCKS,
+    SyntheticCity,
+    SyntheticMap,
+    create_synthetic_map,
+    required_memory_bytes,
+)
 from services.cli.bench import app
-from services.search import follow
-from shared.chunks import Rows
-from shared.search_protocol import SearchHit, SearchResponse
+from services.search import catalog_sync as follow
+from shared.search_api.protocol import SearchHit, SearchResponse
+from shared.storage.chunks import Rows
 
 IDS = [UUID(int=number + 1) for number in range(6)]
 

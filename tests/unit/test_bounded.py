@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from services.search import answer as answer_module
-from services.search.answer import SearchOptions, int8_codes_pay_off, needs_int8_codes
+from services.search import executor as answer_module
+from services.search.executor import SearchOptions, int8_codes_pay_off, needs_int8_codes
 from shared.ids import new_id
-from shared.search_protocol import Mode
+from shared.search_api.protocol import Mode
 from tests.support.search_rows import (
     Case,
     answer,
@@ -83,7 +83,7 @@ def test_query_of_any_length_gives_the_same_answer() -> None:
 
 def test_rows_further_apart_than_a_look_are_all_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
     """Pieces of the scan end anywhere in the chunks."""
-    from services.search import bounded
+    from services.search import int8_search as bounded
 
     monkeypatch.setattr(bounded, "BUDGET_CHECK_BYTES", 7 * DIMENSION)
     rows = places(4, 100, DIMENSION)

@@ -10,16 +10,17 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 
-from services.search import answer as answer_module
-from services.search import cascade, kernels
-from services.search.answer import SearchOptions, SearchResult
-from services.search.cascade import scan_first_level
-from services.search.loaded_chunk import LoadedChunk
+from services.search import executor as answer_module
+from services.search import kernels
+from services.search import sign_code_search as cascade
+from services.search.chunk_loader import LoadedChunk
+from services.search.executor import SearchOptions, SearchResult
+from services.search.query_batcher import QueryBatcher
+from services.search.sign_code_search import scan_first_level
 from services.search.snapshot import Snapshot
-from services.search.together import QueryBatcher
-from shared.codes.signs import encode_signs
+from shared.codes.sign_codes import encode_signs
 from shared.ids import new_id
-from shared.search_protocol import Mode
+from shared.search_api.protocol import Mode
 from tests.support.search_rows import (
     Case,
     answer,

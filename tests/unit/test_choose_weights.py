@@ -6,14 +6,14 @@ from typing import Any
 
 import pytest
 
-from services.gateway.choose_weights import select_ranking_weights
+from services.gateway.similarity_search import select_ranking_weights
 from shared.catalog.generations import Generation
-from shared.estimate.calibration import Calibration
+from shared.config.settings import Settings
+from shared.evaluation.calibration import Calibration
 from shared.ids import new_id
-from shared.search_protocol import SearchHit
-from shared.settings import Settings
-from shared.word_weights.pairs import PairSource
+from shared.search_api.protocol import SearchHit
 from shared.word_weights.record import Outcome, WordWeights
+from shared.word_weights.training_pairs import PairSource
 
 PLAIN = SearchHit(photo_id=new_id(), score=0.5)
 WEIGHTED = SearchHit(photo_id=new_id(), score=0.5, weighted_score=0.7)

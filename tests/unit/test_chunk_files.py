@@ -15,17 +15,23 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-import shared.codes.stored
-from services.search.load import ChunkLoader, hold_in_memory, memory_parts, remove_stale_folders
-from services.search.loaded_chunk import LoadedChunk, StoredChunk
-from services.search.memory import MemoryBudget, allocate_parts
+import shared.codes.serialization
+from services.search.chunk_loader import (
+    ChunkLoader,
+    LoadedChunk,
+    StoredChunk,
+    hold_in_memory,
+    memory_parts,
+    remove_stale_folders,
+)
 from services.search.photo_columns import PhotoColumns
+from services.search.residency import MemoryBudget, allocate_parts
 from shared.catalog.chunks import Chunk
-from shared.chunks import CODED_BYTES, codes_key, delete_chunk, write_chunk
-from shared.codes.signs import encode_signs
+from shared.codes.sign_codes import encode_signs
 from shared.errors import Unavailable
 from shared.ids import new_id
-from shared.objects import FolderStore
+from shared.storage import FolderStore
+from shared.storage.chunks import CODED_BYTES, codes_key, delete_chunk, write_chunk
 
 DIMENSION = 7168
 MANY = CODED_BYTES // (4 * DIMENSION) + 1
@@ -189,7 +195,7 @@ def test_codes_that_lie_beside_a_chunk_are_not_made_again(
 ) -> None:
     rows = unit_rows(MANY)
     chunk = written(store, rows)
-    monkeypatch.delattr(shared.codes.stored, "sign_codes")
+    monkeypatch.delattr(shared.codes.serialization, "sign_codes")
     loader = ChunkLoader(store, folder)
     codes = loader.load_sign_codes(chunk.object_key, loader.load_rows(chunk))
     for level, expected in zip(codes.levels, encode_signs(rows).levels, strict=True):
@@ -205,7 +211,7 @@ def test_codes_that_are_missing_are_made_once(
         loader = ChunkLoader(store, folder)
         codes = loader.load_sign_codes(chunk.object_key, loader.load_rows(chunk))
         np.testing.assert_array_equal(codes.levels[0], encode_signs(rows).levels[0])
-        monkeypatch.delattr(shared.codes.stored, "sign_codes", raising=False)
+        monkeypatch.delattr(shared.codes.serialization, "sign_codes", raising=False)
 
 
 @pytest.mark.parametrize("where", ["beside the chunk", "kept here"])

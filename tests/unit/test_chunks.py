@@ -15,7 +15,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from shared.chunks import (
+from shared.errors import NotFound, Unavailable
+from shared.ids import new_id
+from shared.storage import FolderStore
+from shared.storage.chunks import (
     HEADER_READ_BYTES,
     WrittenChunk,
     chunk_key,
@@ -28,9 +31,6 @@ from shared.chunks import (
     rows_are_valid,
     write_chunk,
 )
-from shared.errors import NotFound, Unavailable
-from shared.ids import new_id
-from shared.objects import FolderStore
 
 GENERATION, CHUNK = new_id(), new_id()
 

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from shared.datasets.city import write
-from shared.datasets.city.plan import CityOptions, make_plan
-from shared.datasets.city.training_files import TrainingLayoutName, with_training_layout
-from shared.datasets.sets import open_training_set
+from shared.datasets.open_dataset import open_training_set
 from shared.errors import Conflict
+from shared.synthetic_city import write
+from shared.synthetic_city.plan import CityOptions, make_plan
+from shared.synthetic_city.write import TrainingLayoutName, with_training_layout
 
 PLAN = make_plan(CityOptions(2, 4, 4, 1, 2, 0.25, 64, 64))
 

@@ -9,14 +9,18 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from shared.datasets.city.camera import Camera, cast_rays
-from shared.datasets.city.canvas import SUPERSAMPLING, RenderBuffers
-from shared.datasets.city.catalogue import Catalogue, make_catalogue
-from shared.datasets.city.plan import CityOptions, CityPlan, PlannedPhoto, make_plan
-from shared.datasets.city.render import QuarterRenderer
-from shared.datasets.city.sessions import NIGHT, SESSIONS, SUMMER
-from shared.datasets.city.streets import Quarter
-from shared.datasets.city.texture_memory import TextureCache
+from shared.synthetic_city.camera import (
+    SUPERSAMPLING,
+    Camera,
+    RenderBuffers,
+    TextureCache,
+    cast_rays,
+)
+from shared.synthetic_city.catalogue import Catalogue, make_catalogue
+from shared.synthetic_city.plan import CityOptions, CityPlan, PlannedPhoto, make_plan
+from shared.synthetic_city.render import QuarterRenderer
+from shared.synthetic_city.sessions import NIGHT, SESSIONS, SUMMER
+from shared.synthetic_city.streets import Quarter
 
 OPTIONS = CityOptions(
     places=60, views=4, queries=80, seed=3, catalogue_seed=1, out_of_map=0.25, width=96, height=72

@@ -7,9 +7,9 @@ from collections import Counter, defaultdict
 import numpy as np
 import pytest
 
-from shared.datasets.city.plan import CityOptions, CityPlan, PlannedPhoto, make_plan
-from shared.datasets.recall import positives_within
-from shared.datasets.utm_names import upload_fields_of_file_name, utm_position_of_file_name
+from shared.datasets.utm_filenames import upload_fields_of_file_name, utm_position_of_file_name
+from shared.evaluation.recall import positives_within
+from shared.synthetic_city.plan import CityOptions, CityPlan, PlannedPhoto, make_plan
 
 OPTIONS = CityOptions(
     places=150, views=4, queries=120, seed=5, catalogue_seed=0, out_of_map=0.2, width=64, height=64

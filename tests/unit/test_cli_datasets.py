@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from services.cli.datasets.commands import app
 from services.cli.datasets.synth import parse_size
-from shared.datasets.city.write import NOT_COMPARABLE
+from shared.synthetic_city.write import NOT_COMPARABLE
 
 
 @pytest.mark.parametrize("text", ["320x240", "64x64", "1920x1080"])

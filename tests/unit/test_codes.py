@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from services.search.cascade import hamming_deviation
+from services.search.sign_code_search import hamming_deviation
 from shared.codes.rotation import get_rotation
-from shared.codes.signs import WORD_BITS, SignCodes, encode_signs, level_words, pack_signs
-from shared.codes.stored import decode_sign_codes, encode_sign_codes
+from shared.codes.serialization import decode_sign_codes, encode_sign_codes
+from shared.codes.sign_codes import WORD_BITS, SignCodes, encode_signs, level_words, pack_signs
 
 ANYLOC = 98_304
 

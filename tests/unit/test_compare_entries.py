@@ -6,9 +6,9 @@ import math
 
 import pytest
 
-from services.cli.compare_extractors import ComparisonEntry, parse_entries
-from services.trainer.evaluation.pareto import pareto_front
+from services.cli.evaluation.compare_extractors import ComparisonEntry, parse_entries
 from shared.errors import InvalidRequest
+from shared.evaluation.report.comparison import pareto_front
 
 
 def test_commas_separate_extractors_and_their_options() -> None:

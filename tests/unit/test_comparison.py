@@ -6,9 +6,9 @@ from typing import Any
 
 import pytest
 
-from shared.comparison import check_explainable, check_rerankable
 from shared.errors import Unprocessable
-from shared.recipes import get_extractor_config
+from shared.extractor_config.configs import get_extractor_config
+from shared.search_api.comparison import check_explainable, check_rerankable
 
 HUB = "torchhub:/models/mine:my_entry"
 VITB = "anyloc-vitb14"

@@ -12,10 +12,10 @@ from fastapi import FastAPI
 from pydantic import ValidationError
 from starlette.testclient import TestClient
 
-from services.console import PAGE_FOLDER
-from services.gateway.console import create_web_page_router
-from shared.problems import install_exception_handlers
-from shared.settings import Settings
+from services.gateway.web_page import create_web_page_router
+from services.web import PAGE_FOLDER
+from shared.config.settings import Settings
+from shared.http.problem_details import install_exception_handlers
 
 TILES = "https://tiles.example.org/{z}/{x}/{y}.png"
 HTML = {"Accept": "text/html,*/*"}

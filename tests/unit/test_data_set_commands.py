@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from services.cli.datasets.commands import app
-from shared.datasets.sets import open_evaluation_set
+from shared.datasets.open_dataset import open_evaluation_set
 from tests.support.data_sets import save_lists, save_names, utm_name, write_csv, write_photos
 
 

@@ -15,9 +15,9 @@ from PIL import Image
 from PIL.ExifTags import GPS, IFD, Base
 
 from shared.errors import Unprocessable
-from shared.photo_formats import detect_media_type
-from shared.vision.decode import THUMBNAIL_PIXELS, decode_photo
-from shared.vision.preprocessing import get_preprocessing
+from shared.imaging.decode import THUMBNAIL_PIXELS, decode_photo
+from shared.imaging.file_formats import detect_media_type
+from shared.imaging.preprocessing import get_preprocessing
 from tests.support.photos import encoded, photo_bytes, photo_image, turned_photo
 
 SQUARE = get_preprocessing("square32")

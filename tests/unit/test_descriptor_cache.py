@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from services.trainer.evaluation.cache import CachedDescriber
 from shared.errors import Unprocessable
+from shared.evaluation.descriptor_cache import CachedDescriber
 
 MUCH = 10**9
 

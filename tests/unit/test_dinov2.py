@@ -14,8 +14,8 @@ import torch
 from numpy.typing import NDArray
 from torch.nn.modules.module import register_module_forward_hook
 
-from shared.recipes import EXTRACTOR_CONFIGS, FACETS
-from shared.vision.backbones.dinov2 import SHAPES, Dinov2, VitShape, resample_positions
+from shared.descriptors.backbones.dinov2 import SHAPES, Dinov2, VitShape, resample_positions
+from shared.extractor_config.configs import EXTRACTOR_CONFIGS, FACETS
 from tests.support.vit import (
     PLAIN,
     SIDE,

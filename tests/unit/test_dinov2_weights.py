@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import torch
 
+from shared.descriptors.backbones.dinov2 import Dinov2, VitShape
+from shared.descriptors.extractor import Extractor
 from shared.errors import Misconfigured
-from shared.recipes import get_extractor_config
-from shared.vision.backbones.dinov2 import Dinov2, VitShape
-from shared.vision.extractors import Extractor
+from shared.extractor_config.configs import get_extractor_config
 from tests.support.vit import (
     PLAIN,
     SWIGLU,

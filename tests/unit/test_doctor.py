@@ -9,14 +9,13 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from services.cli import extractor_checks
-from services.cli.extractor_checks import check_device, check_extractor, check_memory
-from shared import machine
+from services.cli.operations import doctor as extractor_checks
+from services.cli.operations.doctor import check_device, check_extractor, check_memory
+from shared.config import settings as machine
+from shared.config.settings import Settings, memory_limit_bytes
+from shared.descriptors.backbones import dinov2
+from shared.descriptors.backbones.dinov2 import SHAPES
 from shared.errors import Misconfigured
-from shared.machine import memory_limit_bytes
-from shared.settings import Settings
-from shared.vision.backbones import dinov2
-from shared.vision.backbones.dinov2 import SHAPES
 from tests.support.hub import COMMIT, write_hub
 from tests.support.vit import random_weights, save
 
@@ -92,7 +91,7 @@ def test_an_entry_of_torch_hub_is_tried_and_never_downloaded(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
-    monkeypatch.setattr("shared.vision.torchhub_code.GITHUB", "unreachable")
+    monkeypatch.setattr("shared.descriptors.backbones.torchhub.GITHUB", "unreachable")
     missing = f"torchhub:somebody/places@{COMMIT}:colours"
     with pytest.raises(Misconfigured, match="its code is not here") as caught:
         check_extractor(settings_with(monkeypatch, EXTRACTOR=missing))

@@ -10,9 +10,9 @@ import httpx2
 import numpy as np
 import pytest
 
+from shared.descriptors import weight_files as download_module
+from shared.descriptors.weight_files import MAX_DOWNLOAD_ATTEMPTS, download_file
 from shared.errors import Misconfigured
-from shared.vision import download as download_module
-from shared.vision.download import MAX_DOWNLOAD_ATTEMPTS, download_file
 from tests.support.files_server import FilesServer, files_server
 
 CONTENT = np.random.default_rng(0).bytes(5_000_000)

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from services.gateway.estimate import estimate_place, locate_hits
 from services.gateway.schemas import EstimateResponse
+from services.gateway.similarity_search import estimate_place, locate_hits
 from shared.catalog.photos import Photo
-from shared.estimate.calibration import (
+from shared.evaluation.calibration import (
     FALSE_ACCEPT_RATE,
     MIN_IMPOSTORS,
     Calibration,
@@ -21,9 +21,16 @@ from shared.estimate.calibration import (
     fit_confidence,
     fit_threshold,
 )
-from shared.estimate.evidence import PlaceEvidence, RankedPhoto, compute_evidence, estimate_location
-from shared.estimate.places import PhotoLocation, is_different_place, is_same_place
-from shared.search_protocol import SearchHit
+from shared.evaluation.place_evidence import (
+    PhotoLocation,
+    PlaceEvidence,
+    RankedPhoto,
+    compute_evidence,
+    estimate_location,
+    is_different_place,
+    is_same_place,
+)
+from shared.search_api.protocol import SearchHit
 
 RADIUS_M = 25.0
 DEGREE_M = 111_195.0  # of latitude, on the sphere

@@ -9,12 +9,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as some
 
-from shared.estimate.calibration import cross_validate, fit_confidence, fit_threshold
-from shared.estimate.evidence import PlaceEvidence
-from shared.estimate.figures import auroc, expected_calibration_error, recall_at_precision
-from shared.estimate.places import (
+from shared.evaluation.calibration import (
+    auroc,
+    cross_validate,
+    expected_calibration_error,
+    fit_confidence,
+    fit_threshold,
+    recall_at_precision,
+)
+from shared.evaluation.place_evidence import (
     DIFFERENT_PLACE_M,
     PhotoLocation,
+    PlaceEvidence,
     distance_between_m,
     is_different_place,
     is_same_place,

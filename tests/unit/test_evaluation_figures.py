@@ -10,21 +10,25 @@ from typing import Any
 import numpy as np
 import pytest
 
-from services.trainer.evaluation.average_precision import average_precisions
-from services.trainer.evaluation.bootstrap import (
+from shared.datasets.open_dataset import DatasetPhoto
+from shared.evaluation.bootstrap import (
     MIN_CLUSTERS,
     bootstrap_intervals,
+    cluster_queries,
     paired_differences,
+    singleton_clusters,
 )
-from services.trainer.evaluation.calibration import calibrate_scores
-from services.trainer.evaluation.clusters import cluster_queries, singleton_clusters
-from services.trainer.evaluation.distance_error import distance_error
-from services.trainer.evaluation.hits import compute_hits, hits_at_k
-from services.trainer.evaluation.measure import compute_metrics
-from services.trainer.evaluation.metres import match_distances
-from services.trainer.evaluation.precision_recall import precision_recall
-from services.trainer.evaluation.recalls import compute_recalls
-from shared.datasets.sets import DatasetPhoto
+from shared.evaluation.ranking import compute_recalls
+from shared.evaluation.retrieval_metrics import (
+    average_precisions,
+    calibrate_scores,
+    compute_hits,
+    compute_metrics,
+    distance_error,
+    hits_at_k,
+    match_distances,
+    precision_recall,
+)
 
 
 def indices(*rows: list[int]) -> list[np.ndarray[Any, np.dtype[np.int64]]]:

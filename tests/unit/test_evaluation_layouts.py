@@ -12,7 +12,7 @@ from PIL import Image
 from PIL.ExifTags import GPS, IFD
 from scipy.io import savemat
 
-from shared.datasets.sets import evaluation_set_names, open_evaluation_set
+from shared.datasets.open_dataset import evaluation_set_names, open_evaluation_set
 from shared.errors import InvalidRequest, NotFound
 from tests.support.data_sets import utm_name, write_csv, write_photo, write_photos
 from tests.support.evaluation_sets import code_of, names, pair, rows

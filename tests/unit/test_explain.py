@@ -13,12 +13,15 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch.nn.functional import normalize
 
-from shared.recipes import EXTRACTOR_CONFIGS, ExtractorConfig
-from shared.vision.explain import explain_similarities
-from shared.vision.overlay import NEGATIVE_COLOUR, POSITIVE_COLOUR, draw_overlay
-from shared.vision.pooling import average_pooling
-from shared.vision.vlad import soft_vlad, vlad
-from shared.vision.vocabulary import ClusterCentres, parse_centres
+from shared.descriptors.aggregation import average_pooling, soft_vlad, vlad
+from shared.descriptors.explanation import (
+    NEGATIVE_COLOUR,
+    POSITIVE_COLOUR,
+    draw_overlay,
+    explain_similarities,
+)
+from shared.descriptors.vocabulary import ClusterCentres, parse_centres
+from shared.extractor_config.configs import EXTRACTOR_CONFIGS, ExtractorConfig
 
 WIDTH, PATCHES, CLUSTERS = 24, 60, 7
 VLAD = EXTRACTOR_CONFIGS["test-tiny-vlad"]

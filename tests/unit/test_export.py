@@ -13,9 +13,7 @@ import numpy as np
 import pytest
 from rich.progress import Progress
 
-from services.cli.export_descriptors import export_descriptors
-from services.cli.export_geojson import export_geojson
-from services.cli.export_pairs import PairNames, export_pairs
+from services.cli.export import PairNames, export_descriptors, export_geojson, export_pairs
 from shared.client import Client
 from shared.errors import Conflict, InvalidRequest, NotFound
 from tests.unit.test_client import FakeServer, running_server

@@ -14,17 +14,16 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 
-from shared.errors import Misconfigured
-from shared.recipes import EXTRACTOR_CONFIGS, get_extractor_config
-from shared.vision.extractors import (
+from shared.descriptors.aggregation import average_pooling, gem_pooling, soft_vlad, vlad
+from shared.descriptors.extractor import (
     SHIPPED_VOCABULARIES,
     Extractor,
     choose_device,
     spec_fingerprint,
 )
-from shared.vision.pooling import average_pooling, gem_pooling
-from shared.vision.vlad import soft_vlad, vlad
-from shared.vision.vocabulary import decode_centres, parse_centres
+from shared.descriptors.vocabulary import decode_centres, parse_centres
+from shared.errors import Misconfigured
+from shared.extractor_config.configs import EXTRACTOR_CONFIGS, get_extractor_config
 
 CPU = torch.device("cpu")
 DAISY = 985  # of ImageNet's classes
@@ -194,7 +193,7 @@ def test_vlad_without_a_vocabulary_is_refused(tiny: Extractor) -> None:
 
 
 def test_efficientnet_loads_its_published_weights(efficientnet: Extractor) -> None:
-    from shared.vision.backbones.efficientnet_lite0 import weights_path
+    from shared.descriptors.backbones.efficientnet_lite0 import weights_path
 
     data = weights_path().read_bytes()
     assert efficientnet.backbone.fingerprint == hashlib.sha256(data).hexdigest()
@@ -213,7 +212,7 @@ def test_features_are_the_stride_16_map_of_a_network_that_recognises_a_daisy(
 ) -> None:
     import timm
 
-    from shared.vision.backbones.efficientnet_lite0 import _rename_tensors, weights_path
+    from shared.descriptors.backbones.efficientnet_lite0 import _rename_tensors, weights_path
 
     model = timm.create_model("tf_efficientnet_lite0", pretrained=False)
     state = torch.load(weights_path(), map_location="cpu", weights_only=True)
@@ -254,7 +253,7 @@ def test_shipped_vocabulary_names_the_photographs_that_it_was_learnt_on(
     named = {name for entry in provenance["photographs"].values() for name in entry["files"]}
     assert {"china.jpg", "coffee.png"} <= named
     assert set(provenance["photographs_sha256"]) == named
-    assert provenance["made_by"] == "python -m shared.vision.shipped_vocabulary"
+    assert provenance["made_by"] == "python -m tools.make_shipped_vocabulary"
 
 
 def test_shipped_vocabulary_is_the_file_that_its_provenance_describes(

@@ -6,11 +6,15 @@ import pytest
 import torch
 from torch.nn.functional import normalize
 
+from shared.descriptors import vocabulary_fit as batches_module
+from shared.descriptors.aggregation import assign_clusters
+from shared.descriptors.vocabulary_fit import (
+    PATCHES_PER_CLUSTER,
+    InMemoryPoints,
+    PointBatches,
+    VocabularyFit,
+)
 from shared.errors import Unprocessable
-from shared.vision import batches as batches_module
-from shared.vision.batches import InMemoryPoints, PointBatches
-from shared.vision.fit import PATCHES_PER_CLUSTER, VocabularyFit
-from shared.vision.vlad import assign_clusters
 from tests.support.points import clustered_points, full_kmeans, mean_cosine, unit_points
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from shared.objects import FolderStore
+from shared.storage import FolderStore
 
 
 def test_only_who_is_alone_in_a_folder_removes_what_is_half_written(tmp_path: Path) -> None:

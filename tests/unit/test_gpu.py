@@ -17,24 +17,16 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from services.search import answer as answer_module
-from services.search import device as device_module
+from services.search import executor as answer_module
 from services.search import gpu
-from services.search.answer import SearchOptions
-from services.search.device import GpuResidency, open_search_device
+from services.search import residency as device_module
+from services.search.executor import SearchOptions
 from services.search.gpu import GpuDevice, GpuError, GpuQuery, GpuUnsupported
+from services.search.residency import GpuResidency, open_search_device
 from services.search.snapshot import Snapshot
 from shared.errors import Misconfigured
-from shared.search_protocol import Mode
-from tests.support.search_rows import (
-    Case,
-    answer,
-    brute_force,
-    cases,
-    hits_of,
-    places,
-    snapshot_of,
-)
+from shared.search_api.protocol import Mode
+from tests.support.search_rows import Case, answer, brute_force, cases, hits_of, places, snapshot_of
 
 DIMENSION = 512
 KINDS = ("float16", "int8")

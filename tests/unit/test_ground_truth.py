@@ -10,13 +10,12 @@ import utm
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from shared.datasets import recall
-from shared.datasets.distances import pairwise_distances_m
-from shared.datasets.ground_truth import find_positives
-from shared.datasets.recall import positives_within
-from shared.datasets.rules import PositiveRule, parse_rule
-from shared.datasets.shots import DatasetPhoto
+from shared.datasets.dataset import DatasetPhoto
+from shared.datasets.ground_truth import PositiveRule, find_positives, parse_rule
+from shared.datasets.utm_coordinates import pairwise_distances_m
 from shared.errors import InvalidRequest
+from shared.evaluation import recall
+from shared.evaluation.recall import positives_within
 from shared.geodesy import distance_m
 
 

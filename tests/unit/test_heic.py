@@ -14,10 +14,10 @@ from PIL import Image
 from PIL.ExifTags import GPS, IFD, Base
 
 from shared.errors import Unprocessable
-from shared.intake.photo_header import read_photo_header
-from shared.photo_formats import detect_media_type
-from shared.vision.decode import THUMBNAIL_PIXELS, decode_photo
-from shared.vision.preprocessing import get_preprocessing
+from shared.imaging.decode import THUMBNAIL_PIXELS, decode_photo
+from shared.imaging.file_formats import detect_media_type
+from shared.imaging.photo_header import read_photo_header
+from shared.imaging.preprocessing import get_preprocessing
 from tests.support.photos import photo_image
 
 PIXELS = 50_000_000

@@ -9,9 +9,9 @@ import pytest
 from numpy.typing import NDArray
 
 from services.search.kernels import INT32_SAFE_TERMS, int8_product
-from shared.codes.int8 import INT8_MAX, QUERY_MAX, Int8Codes, Int8Query, int8_codes
+from shared.codes.int8_codes import INT8_MAX, QUERY_MAX, Int8Codes, Int8Query, int8_codes
 from shared.codes.rotation import get_rotation
-from shared.codes.stored import (
+from shared.codes.serialization import (
     decode_int8_codes,
     decode_sign_codes,
     encode_int8_codes,

@@ -15,8 +15,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from shared.datasets.ground_truth_files import read_ground_truth, write_ground_truth
-from shared.datasets.integer_lists import read_integer_lists, read_names, write_integer_lists
+from shared.datasets.ground_truth_files import (
+    read_ground_truth,
+    read_integer_lists,
+    read_names,
+    write_ground_truth,
+    write_integer_lists,
+)
 from shared.errors import InvalidRequest
 
 

@@ -10,9 +10,8 @@ from typing import Any
 import pytest
 from rich.progress import Progress
 
-from services.cli.journal import JournalEntry, UploadJournal
-from services.cli.photo_places import LocalPhoto, read_photo_manifest
-from services.cli.upload_many import upload_photos
+from services.cli.ingest.geotags import LocalPhoto, read_photo_manifest
+from services.cli.ingest.upload import JournalEntry, UploadJournal, upload_photos
 from shared.client import Client
 from shared.errors import InvalidRequest, NotFound
 from tests.unit.test_client import FakeServer, running_server

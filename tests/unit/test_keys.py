@@ -12,14 +12,19 @@ import pytest
 from pydantic import SecretStr, ValidationError
 from starlette.datastructures import Headers
 
-from services.gateway.keys import (
+from services.gateway.authentication import (
     ApiKeyAuthenticator,
     Authenticator,
     Caller,
     LocalhostAuthenticator,
     parse_bearer,
 )
-from shared.api_keys import (
+from shared.catalog.session import Catalog
+from shared.config.embedded_home import announce_server, find_running_server
+from shared.config.private_files import write_private
+from shared.config.settings import Settings
+from shared.errors import Forbidden, Unauthorized, Unavailable
+from shared.security.api_keys import (
     Scope,
     api_key_prefix,
     expand_scopes,
@@ -27,11 +32,6 @@ from shared.api_keys import (
     hash_api_key,
     is_loopback,
 )
-from shared.catalog.session import Catalog
-from shared.errors import Forbidden, Unauthorized, Unavailable
-from shared.home import announce_server, find_running_server
-from shared.private_files import write_private
-from shared.settings import Settings
 
 KEY = "pw_0123456789abcdef"
 

@@ -7,8 +7,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from shared.vision.kmeans import KMeansPass, KMeansPlusPlus
-from shared.vision.vlad import assign_clusters
+from shared.descriptors.aggregation import assign_clusters
+from shared.descriptors.kmeans import KMeansPass, KMeansPlusPlus
 from tests.support.points import unit_points
 
 

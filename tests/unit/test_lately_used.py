@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from services.extractor.lately_used import LruCache
+from services.extractor.model_registry import LruCache
 
 
 def test_value_that_was_used_least_lately_is_made_anew() -> None:

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from services.extractor.loaded import MAX_EXTRACTORS, ModelRegistry
+from services.extractor.model_registry import MAX_EXTRACTORS, ModelRegistry
+from shared.config.settings import Settings
 from shared.errors import Misconfigured
-from shared.objects import FolderStore
-from shared.settings import Settings
+from shared.storage import FolderStore
 from tests.support.added import none_added
 from tests.support.hub import write_hub
 

@@ -8,9 +8,9 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from shared.settings import Settings
+from shared.config.settings import Settings
 from shared.telemetry.logs import configure_logging
-from shared.telemetry.request_id import request_id_context, request_id_or_new
+from shared.telemetry.tracing import request_id_context, request_id_or_new
 
 Set = Callable[..., None]
 
@@ -100,10 +100,10 @@ def test_text_lines_end_with_the_facts(set_up: Set, capsys: pytest.CaptureFixtur
 def test_no_value_of_a_caller_starts_a_line_or_controls_a_terminal(
     set_up: Set, capsys: pytest.CaptureFixture[str], log_format: str, control: str
 ) -> None:
-    forged = "2026-11-21 12:00:00,000 INFO services.call_log: DELETE /api/v1/maps/a: 200"
+    forged = "2026-11-21 12:00:00,000 INFO services.request_log: DELETE /api/v1/maps/a: 200"
     said = f"/a{control}{forged}"
     set_up(LOG_FORMAT=log_format)
-    log = logging.getLogger("services.call_log")
+    log = logging.getLogger("services.request_log")
     log.info("GET %s: 404", said, extra={"file": said})
     try:
         raise ValueError(said)
@@ -118,7 +118,7 @@ def test_no_value_of_a_caller_starts_a_line_or_controls_a_terminal(
         assert (json.loads(called)["file"], end) == (said, "")
         assert said in json.loads(failed)["error"]
     else:
-        assert lines[0].count("INFO services.call_log") == 3, "in one line"
+        assert lines[0].count("INFO services.request_log") == 3, "in one line"
         assert "  Traceback (most recent call last):" in lines
         assert all(line.startswith("  ") for line in lines[2:-1])
 

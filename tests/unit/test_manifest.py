@@ -5,13 +5,13 @@ from __future__ import annotations
 import pytest
 
 from shared.errors import InvalidRequest, PlacewiseError
-from shared.intake.manifest import (
+from shared.ingest.photo_metadata import (
     MAX_REPORTED_LINES,
     ManifestEntry,
     read_csv_manifest,
+    read_form_fields,
     read_jsonl_manifest,
 )
-from shared.intake.photo_fields import read_form_fields
 
 
 def refused(data: bytes) -> PlacewiseError:

@@ -7,9 +7,14 @@ import pytest
 import torch
 from torch.nn.functional import normalize
 
-from shared.vision import matching
-from shared.vision.local_features import LocalFeatures
-from shared.vision.matching import VOTE_WEIGHT, mutual_matches, rerank_score, spatial_vote
+from shared.descriptors import reranking as matching
+from shared.descriptors.reranking import (
+    VOTE_WEIGHT,
+    LocalFeatures,
+    mutual_matches,
+    rerank_score,
+    spatial_vote,
+)
 
 CPU = torch.device("cpu")
 WIDTH, SIDE = 32, 12

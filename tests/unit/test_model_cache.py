@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from services.extractor.model_cache import STALE_PARTIAL_SECONDS, ModelFileCache
+from services.extractor.added_models import STALE_PARTIAL_SECONDS, ModelFileCache
 from shared.errors import NotFound, Unavailable
-from shared.objects import FolderStore
+from shared.storage import FolderStore
 
 
 class Bucket(FolderStore):

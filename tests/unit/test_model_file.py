@@ -10,9 +10,14 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import save
 
+from shared.descriptors.vpr_models.checkpoint import (
+    METADATA_KEY,
+    Checkpoint,
+    encode_model_file,
+    load_checkpoint,
+    read_model_file,
+)
 from shared.errors import Unavailable
-from shared.vision.place_models.checkpoint import Checkpoint, load_checkpoint
-from shared.vision.place_models.model_file import METADATA_KEY, encode_model_file, read_model_file
 from tests.support.checkpoints import SIDES, write_checkpoint
 
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
+from shared.config.settings import Settings
 from shared.errors import Misconfigured
-from shared.model_names import parse_trained_model_name
-from shared.recipes import get_extractor_config
-from shared.settings import Settings
+from shared.extractor_config.configs import get_extractor_config
+from shared.extractor_config.names import parse_trained_model_name
 
 
 def test_a_name_means_a_model_that_was_added_and_a_path_means_a_file() -> None:

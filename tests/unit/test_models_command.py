@@ -13,10 +13,12 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
-from services.cli import models, weights_here
-from shared.settings import Settings
-from shared.vision import download, torchhub_code
-from shared.vision.backbones.dinov2 import SHAPES, Dinov2
+from services.cli.descriptors import local_weights as weights_here
+from services.cli.descriptors import models
+from shared.config.settings import Settings
+from shared.descriptors import weight_files as download
+from shared.descriptors.backbones import torchhub as torchhub_code
+from shared.descriptors.backbones.dinov2 import SHAPES, Dinov2
 from tests.support.files_server import FilesServer, files_server
 from tests.support.hub import COMMIT, write_hub
 from tests.support.vit import random_weights, save

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import utm
 
-from shared.datasets.sets import open_evaluation_set
+from shared.datasets.open_dataset import open_evaluation_set
 from shared.errors import InvalidRequest, NotFound
 from tests.support.data_sets import write_csv, write_photos
 from tests.support.evaluation_sets import code_of, names, rows

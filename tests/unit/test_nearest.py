@@ -8,8 +8,8 @@ import faiss
 import numpy as np
 import pytest
 
-from services.trainer.evaluation.nearest import exact_knn
 from shared.errors import Misconfigured
+from shared.evaluation.exact_knn import exact_knn
 
 Rows = np.ndarray[Any, np.dtype[np.float32]]
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from shared.datasets.ground_truth_files import write_ground_truth
-from shared.datasets.sets import open_evaluation_set
+from shared.datasets.open_dataset import open_evaluation_set
 from shared.errors import InvalidRequest
 from tests.support.data_sets import save_lists, save_names, utm_name, write_photos
 from tests.support.evaluation_sets import code_of, names, pair, rows

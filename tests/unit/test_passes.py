@@ -11,15 +11,15 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from services.extractor import loaded as loaded_module
-from services.extractor.loaded import ModelRegistry
+from services.extractor import model_registry as loaded_module
+from services.extractor.model_registry import ModelRegistry
+from shared.config.settings import Settings
+from shared.descriptors.backbones.synthetic import TinyBackbone
+from shared.descriptors.extractor import Extractor
+from shared.descriptors.inference import BatchSizeLimit, PhotoTooLargeForGpu, run_in_batches
 from shared.errors import Misconfigured
-from shared.objects import FolderStore
-from shared.recipes import EXTRACTOR_CONFIGS, get_extractor_config
-from shared.settings import Settings
-from shared.vision.backbones.tiny import TinyBackbone
-from shared.vision.extractors import Extractor
-from shared.vision.passes import BatchSizeLimit, PhotoTooLargeForGpu, run_in_batches
+from shared.extractor_config.configs import EXTRACTOR_CONFIGS, get_extractor_config
+from shared.storage import FolderStore
 from tests.support.added import none_added
 
 CPU, CUDA = torch.device("cpu"), torch.device("cuda")

@@ -8,9 +8,14 @@ import numpy as np
 import pytest
 import torch
 
-from shared.objects import FolderStore
-from shared.vision import patches as patches_module
-from shared.vision.patches import PatchStore, StoredPatches, max_photos_to_sample, sample_photos
+from shared.descriptors import patches as patches_module
+from shared.descriptors.patches import (
+    PatchStore,
+    StoredPatches,
+    max_photos_to_sample,
+    sample_photos,
+)
+from shared.storage import FolderStore
 from tests.support.points import unit_points
 
 WIDTH = 8

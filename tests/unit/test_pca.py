@@ -13,20 +13,27 @@ from numpy.typing import NDArray
 from safetensors.numpy import load, save
 from sklearn.decomposition import PCA
 
-from shared.errors import Unprocessable
-from shared.objects import FolderStore
-from shared.vision.pca import PcaProjection, PcaWhitening, Rows
-from shared.vision.pca_file import PcaWhiteningFile, decode_whitening
-from shared.vision.pca_fit import PcaFit, fit_pca, fit_pca_columns
-from shared.vision.pca_rows import (
+from shared.descriptors.pca_fit import (
     SAMPLE_BYTES,
     ArrayColumns,
+    PcaFit,
     StoredColumns,
     block_width,
+    fit_pca,
+    fit_pca_columns,
     sample_rows,
     sample_size,
     usable_rows,
 )
+from shared.descriptors.pca_whitening import (
+    PcaProjection,
+    PcaWhitening,
+    PcaWhiteningFile,
+    Rows,
+    decode_whitening,
+)
+from shared.errors import Unprocessable
+from shared.storage import FolderStore
 
 CPU = torch.device("cpu")
 

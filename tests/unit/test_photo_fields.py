@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 import pytest
 
 from shared.errors import Unprocessable
-from shared.intake.photo_fields import (
+from shared.ingest.photo_metadata import (
     MAX_TAGS,
     MAX_TEXT_CHARACTERS,
     PhotoFields,

@@ -18,7 +18,7 @@ from PIL.TiffImagePlugin import IFDRational, TiffImageFile
 from PIL.WebPImagePlugin import WebPImageFile
 
 from shared.errors import Unprocessable
-from shared.intake.photo_header import PhotoHeader, read_photo_header
+from shared.imaging.photo_header import PhotoHeader, read_photo_header
 from tests.support.photos import photo_bytes, photo_image
 
 PIXELS = 50_000_000

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from services.cli.photo_places import find_photos
-from shared.datasets.utm_names import upload_fields_of_file_name
+from services.cli.ingest.geotags import find_photos
+from shared.datasets.utm_filenames import upload_fields_of_file_name
 from shared.errors import InvalidRequest
 
 # The Mole Antonelliana in Turin, zone 32T.

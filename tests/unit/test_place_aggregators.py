@@ -11,14 +11,10 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from shared.vision.place_models.aggregators.base import Aggregator
-from shared.vision.place_models.aggregators.boq import BoQ
-from shared.vision.place_models.aggregators.convap import ConvAP
-from shared.vision.place_models.aggregators.cosplace import CosPlace
-from shared.vision.place_models.aggregators.mixvpr import MixVPR
-from shared.vision.place_models.aggregators.netvlad import NetVLAD
-from shared.vision.place_models.aggregators.pooling import AveragePooling, GeM
-from shared.vision.place_models.aggregators.salad import SALAD, optimal_transport
+from shared.descriptors.vpr_models.aggregators.base import Aggregator
+from shared.descriptors.vpr_models.aggregators.clustering import SALAD, NetVLAD, optimal_transport
+from shared.descriptors.vpr_models.aggregators.mixing import BoQ, MixVPR
+from shared.descriptors.vpr_models.aggregators.pooling import AveragePooling, ConvAP, CosPlace, GeM
 
 Array = NDArray[np.float64]
 Weights = dict[str, Array]

@@ -12,16 +12,16 @@ from typing import Any
 import pytest
 import torch
 
-from services.extractor.add_model import training_card
-from shared.errors import NotFound, Unprocessable
-from shared.vision.place_models.checkpoint import (
+from services.extractor.added_models import training_card
+from shared.descriptors.vpr_models.checkpoint import (
     Checkpoint,
     checkpoint_state,
     load_checkpoint,
     model_fingerprint,
 )
-from shared.vision.place_models.config import VprModelConfig
-from shared.vision.place_models.model import VprModel, build_vpr_model
+from shared.descriptors.vpr_models.config import VprModelConfig
+from shared.descriptors.vpr_models.model import VprModel, build_vpr_model
+from shared.errors import NotFound, Unprocessable
 from tests.support.fit_memory import forget_peak_memory, memory_bytes
 
 SWOLLEN_BYTES = 256 << 20

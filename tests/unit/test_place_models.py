@@ -12,14 +12,14 @@ import torch
 import torchvision
 from safetensors.torch import save_file
 
+from shared.descriptors.backbones import normalise_features, normalise_pixels
+from shared.descriptors.backbones.efficientnet_lite0 import EfficientNetLite0
+from shared.descriptors.vpr_models import backbones as pretrained
+from shared.descriptors.vpr_models.backbones import StagedBackbone, build_backbone, build_dinov2
+from shared.descriptors.vpr_models.config import STAGES, VprModelConfig
+from shared.descriptors.vpr_models.model import VprModel, build_vpr_model
 from shared.errors import Misconfigured, Unprocessable
-from shared.torchhub_names import IMAGENET_MEAN, IMAGENET_STD
-from shared.vision.backbones.base import normalise_features, normalise_pixels
-from shared.vision.backbones.efficientnet_lite0 import EfficientNetLite0
-from shared.vision.place_models.backbones import StagedBackbone, build_backbone, pretrained
-from shared.vision.place_models.backbones.dinov2 import build_dinov2
-from shared.vision.place_models.config import STAGES, VprModelConfig
-from shared.vision.place_models.model import VprModel, build_vpr_model
+from shared.extractor_config.names import IMAGENET_MEAN, IMAGENET_STD
 from tests.support.vit import PLAIN, plain_forward, random_weights, save
 
 CPU = torch.device("cpu")

@@ -15,7 +15,10 @@ from pydantic import BaseModel
 
 import placewise
 from placewise import answers
-from services.gateway import batches, evaluations, figures, history, maps, schemas
+from services.gateway import schemas
+from services.gateway.routes import batches, evaluations, maps
+from services.gateway.routes import stats as figures
+from services.gateway.routes import stats as history
 from tests.unit.test_client import FakeServer, running_server
 from tools.make_sync_client import GENERATED_FILES, ROOT, to_synchronous
 

@@ -10,13 +10,13 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from shared.recipes import EXTRACTOR_CONFIGS, get_extractor_config
-from shared.vision.backbones.base import normalise_features
-from shared.vision.backbones.dinov2 import Dinov2, VitShape
-from shared.vision.extractors import Extractor, spec_fingerprint
-from shared.vision.precision import PRECISIONS, Precision, choose_precision
-from shared.vision.vlad import vlad
-from shared.vision.vocabulary import ClusterCentres, parse_centres
+from shared.descriptors.aggregation import vlad
+from shared.descriptors.backbones import normalise_features
+from shared.descriptors.backbones.dinov2 import Dinov2, VitShape
+from shared.descriptors.extractor import Extractor, spec_fingerprint
+from shared.descriptors.inference import PRECISIONS, Precision, choose_precision
+from shared.descriptors.vocabulary import ClusterCentres, parse_centres
+from shared.extractor_config.configs import EXTRACTOR_CONFIGS, get_extractor_config
 from tests.support.hub import COMMIT
 from tests.support.photos import photo_image
 from tests.support.vit import PLAIN, SWIGLU, random_weights, save

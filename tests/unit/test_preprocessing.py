@@ -16,11 +16,17 @@ from PIL import Image
 from torchvision.transforms import InterpolationMode
 from torchvision.transforms import functional as F  # noqa: N812
 
+from shared.descriptors.backbones import normalise_pixels
+from shared.descriptors.backbones.dinov2 import MEAN, STD
 from shared.errors import Misconfigured, Unprocessable
-from shared.vision.backbones.base import normalise_pixels
-from shared.vision.backbones.dinov2 import MEAN, STD
-from shared.vision.preprocessing import PREPROCESSINGS, get_preprocessing
-from shared.vision.resample import BICUBIC, BILINEAR, Kernel, resample
+from shared.imaging.preprocessing import (
+    BICUBIC,
+    BILINEAR,
+    PREPROCESSINGS,
+    Kernel,
+    get_preprocessing,
+    resample,
+)
 
 # Height, width: landscape, portrait, square, beyond 1024 either way, odd differences to crop.
 SIZES = [(480, 640), (768, 500), (224, 224), (1100, 1500), (1801, 1201), (333, 447), (14, 29)]

@@ -12,19 +12,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from services.cli.store_checks import permissions_check
-from services.search.local_files import MappedFileCache
-from services.trainer.evaluation.cache import CachedDescriber
-from shared.backup.folder import BackedUpObject, BackupFolder
-from shared.backup.rows import dump_rows
+from services.cli.operations.store_checks import permissions_check
+from services.search.chunk_loader import MappedFileCache
+from shared.backup.folder import BackedUpObject, BackupFolder, dump_rows
 from shared.catalog.schema import migrate
 from shared.catalog.session import Catalog
+from shared.config.embedded_home import announce_server, lock_home
+from shared.config.private_files import create_private_file, make_private_folder
+from shared.config.settings import Settings
 from shared.errors import Misconfigured
-from shared.home import announce_server, lock_home
-from shared.objects import FolderStore
-from shared.objects.upload_dir import resolve_upload_dir
-from shared.private_files import create_private_file, make_private_folder
-from shared.settings import Settings
+from shared.evaluation.descriptor_cache import CachedDescriber
+from shared.storage import FolderStore
+from shared.storage.open_store import resolve_upload_dir
 
 
 @pytest.fixture

@@ -7,11 +7,15 @@ from typing import Any
 import numpy as np
 import pytest
 
+from shared.descriptors.extractor import Extractor, choose_device
+from shared.descriptors.vocabulary import ClusterCentres, parse_centres
+from shared.descriptors.vocabulary_file import (
+    UNKNOWN_PROVENANCE,
+    check_vocabulary_fits,
+    feature_provenance,
+)
 from shared.errors import Unprocessable
-from shared.recipes import get_extractor_config
-from shared.vision.extractors import Extractor, choose_device
-from shared.vision.provenance import UNKNOWN_PROVENANCE, check_vocabulary_fits, feature_provenance
-from shared.vision.vocabulary import ClusterCentres, parse_centres
+from shared.extractor_config.configs import get_extractor_config
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from shared.datasets.recall import positives_within, rank_by_similarity, recall_at_k
+from shared.evaluation.recall import positives_within, rank_by_similarity, recall_at_k
 
 
 def indices(*rows: list[int]) -> list[np.ndarray[tuple[int], np.dtype[np.int64]]]:

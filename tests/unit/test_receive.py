@@ -11,11 +11,15 @@ import pytest
 from starlette.requests import ClientDisconnect, Request
 from starlette.types import Message
 
-from services.gateway.form import MAX_FIELDS_BYTES, OVERHEAD_BYTES
-from services.gateway.receive import STORE_WRITE_BYTES, store_form_file
+from services.gateway.multipart_upload import (
+    MAX_FIELDS_BYTES,
+    OVERHEAD_BYTES,
+    STORE_WRITE_BYTES,
+    store_form_file,
+)
 from shared.errors import InvalidRequest, PlacewiseError, TooLarge, UnsupportedMedia
-from shared.intake.received import StoredUpload, check_photo_signature
-from shared.objects import FolderStore
+from shared.ingest.validation import StoredUpload, check_photo_signature
+from shared.storage import FolderStore
 from tests.support.photos import photo_bytes
 
 BOUNDARY = "the-boundary"

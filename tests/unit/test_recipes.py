@@ -8,7 +8,7 @@ import sys
 import pytest
 
 from shared.errors import Misconfigured
-from shared.recipes import (
+from shared.extractor_config.configs import (
     EXTRACTOR_AGGREGATORS,
     EXTRACTOR_CONFIGS,
     PREPROCESSING_NAMES,
@@ -16,7 +16,7 @@ from shared.recipes import (
     add_extractor_options,
     get_extractor_config,
 )
-from shared.vision.preprocessing import PREPROCESSINGS as IN_VISION
+from shared.imaging.preprocessing import PREPROCESSINGS as IN_VISION
 
 ANYLOC_OPTIONS = "Its options: aggregator, clusters, facet, layer, preprocessing."
 
@@ -204,5 +204,5 @@ def test_only_what_changes_the_local_features_needs_another_backbone() -> None:
 
 
 def test_extractors_are_chosen_without_torch() -> None:
-    code = "import shared.recipes, sys; sys.exit('torch' in sys.modules)"
+    code = "import shared.extractor_config.configs, sys; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

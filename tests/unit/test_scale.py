@@ -15,10 +15,10 @@ from benchmarks.scale.limits import limits
 from benchmarks.scale.pages import amount, rounded
 from benchmarks.scale.plan import Plan, chunk_row_bytes
 from services.cli.bench import app
-from shared.chunks import write_chunk
 from shared.errors import Misconfigured
 from shared.ids import new_id
-from shared.objects.folder import FolderStore
+from shared.storage.chunks import write_chunk
+from shared.storage.folder import FolderStore
 
 PAGE = Path(__file__).parents[2] / "docs" / "scale.md"
 

@@ -12,15 +12,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from services.search.answer import SCORE_DECIMALS, SearchOptions, SearchResult, execute_query
-from services.search.loaded_chunk import LoadedChunk
-from services.search.photo_columns import PhotoColumns
-from services.search.scan import FLOAT32_MARGIN
-from services.search.select import build_row_mask
+from services.search.chunk_loader import LoadedChunk
+from services.search.dense_scan import FLOAT32_MARGIN
+from services.search.executor import SCORE_DECIMALS, SearchOptions, SearchResult, execute_query
+from services.search.photo_columns import PhotoColumns, build_row_mask
+from services.search.query_batcher import QueryBatcher
 from services.search.snapshot import Snapshot
-from services.search.together import QueryBatcher
 from shared.ids import new_id
-from shared.photo_filter import NO_FILTER
+from shared.search_api.photo_filter import NO_FILTER
 from tests.support.photo_facts import facts_of
 
 Rows = NDArray[np.float32]

@@ -9,9 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from shared.config.shards import Shard
 from shared.ids import new_id
-from shared.search_http.merge import merge_responses, merge_statuses
-from shared.search_protocol import (
+from shared.search_api.client import merge_responses, merge_statuses
+from shared.search_api.protocol import (
     EXHAUSTIVE,
     NONE,
     STATISTICAL,
@@ -21,7 +22,6 @@ from shared.search_protocol import (
     SearchResponse,
     SearchStatus,
 )
-from shared.shards import Shard
 
 
 def answer(*hits: tuple[int, float], **changes: Any) -> SearchResponse:

@@ -8,12 +8,11 @@ from uuid import UUID
 import httpx2
 import pytest
 
+from shared.config.shards import Shard
 from shared.errors import Gone, NotFound, Unavailable
 from shared.ids import new_id
-from shared.search_http.worker_call import WorkerUnavailable, call_search, fetch_status
-from shared.search_http.workers import WorkerDirectory
-from shared.search_protocol import SearchRequest, SearchStatus
-from shared.shards import Shard
+from shared.search_api.protocol import SearchRequest, SearchStatus
+from shared.search_api.workers import WorkerDirectory, WorkerUnavailable, call_search, fetch_status
 
 GENERATION = new_id()
 

@@ -10,10 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as some
 
-from services.search.photo_columns import PhotoColumns
-from services.search.select import build_row_mask
+from services.search.photo_columns import PhotoColumns, build_row_mask
 from shared.catalog.photos import PhotoFilterValues, PhotoRole
-from shared.photo_filter import NO_FILTER, Box, Circle, PhotoFilter
+from shared.search_api.photo_filter import NO_FILTER, Box, Circle, PhotoFilter
 from tests.support.photo_facts import facts_of
 from tests.support.photo_filters import HALF_EARTH_M, IDS, passes, photo_facts, photo_filters
 

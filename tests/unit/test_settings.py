@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 from pydantic import ValidationError
 
-from services.cli.configuration import read_settings
+from services.cli.environment import read_settings
+from shared.config.settings import Settings
 from shared.errors import Misconfigured
-from shared.objects.s3 import Bucket
-from shared.settings import Settings
+from shared.storage.s3 import Bucket
 
 
 def test_environment_decides_and_the_rest_has_defaults(

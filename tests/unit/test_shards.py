@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from shared.settings import Settings
-from shared.shards import SINGLE_SHARD, Shard, is_shard_name
+from shared.config.settings import Settings
+from shared.config.shards import SINGLE_SHARD, Shard, is_shard_name
 
 
 @given(slot=st.integers(0, 10_000), of=st.integers(1, 50))

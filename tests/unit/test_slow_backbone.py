@@ -9,8 +9,8 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from shared.recipes import get_extractor_config
-from shared.vision.extractors import Extractor
+from shared.descriptors.extractor import Extractor
+from shared.extractor_config.configs import get_extractor_config
 from tests.support.photos import photo_image
 
 WIDTHS = (16, 7168, 98_304)

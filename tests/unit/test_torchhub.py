@@ -11,14 +11,14 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
+from shared.descriptors.backbones import torchhub as torchhub_code
+from shared.descriptors.backbones.torchhub import TorchHubBackbone
+from shared.descriptors.extractor import Extractor, spec_fingerprint
+from shared.descriptors.pca_fit import fit_pca
+from shared.descriptors.pca_whitening import PcaProjection
 from shared.errors import Misconfigured
-from shared.recipes import get_extractor_config
-from shared.vision import torchhub_code
-from shared.vision.backbones.torchhub import TorchHubBackbone
-from shared.vision.extractors import Extractor, spec_fingerprint
-from shared.vision.pca import PcaProjection
-from shared.vision.pca_fit import fit_pca
-from shared.vision.preprocessing import get_preprocessing
+from shared.extractor_config.configs import get_extractor_config
+from shared.imaging.preprocessing import get_preprocessing
 from tests.support.hub import COMMIT, MIT, NETWORKS, write_hub
 from tests.support.photos import photo_image
 
@@ -245,7 +245,7 @@ def test_a_missing_folder_is_an_error_with_the_three_ways(tmp_path: Path) -> Non
 def test_weights_that_can_not_be_downloaded_are_an_error_with_the_three_ways(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("shared.vision.download.RETRY_PAUSE_SECONDS", 0)
+    monkeypatch.setattr("shared.descriptors.weight_files.RETRY_PAUSE_SECONDS", 0)
     assert "can't be downloaded" in refusal(folder, "from_network", "weights_missing")
 
 
@@ -253,7 +253,7 @@ def test_a_repository_in_torch_hubs_folder_is_taken_without_the_network(
     folder: Path, torch_home: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(torchhub_code, "GITHUB", "http://127.0.0.1:9")
-    monkeypatch.setattr("shared.vision.download.RETRY_PAUSE_SECONDS", 0)
+    monkeypatch.setattr("shared.descriptors.weight_files.RETRY_PAUSE_SECONDS", 0)
     name = f"torchhub:somebody/places@{COMMIT}:colours"
     recipe = get_extractor_config(name, allow_test_extractors=False)
     with pytest.raises(Misconfigured) as caught:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from shared.errors import Misconfigured
-from shared.recipes import get_extractor_config
-from shared.torchhub_names import IMAGENET_MEAN, TorchHubEntry, parse_torchhub_name
+from shared.extractor_config.configs import get_extractor_config
+from shared.extractor_config.names import IMAGENET_MEAN, TorchHubEntry, parse_torchhub_name
 from tests.support.hub import COMMIT
 
 REPOSITORY = f"torchhub:gmberton/eigenplaces@{COMMIT}:get_trained_model"

@@ -11,9 +11,15 @@ import typer
 from typer.testing import CliRunner
 
 from services.cli.main import build_app
-from services.cli.train_options import normalise_tokens
-from services.trainer.arguments import CITIES, TrainingArguments
-from services.trainer.configuration import build_arguments, load_yaml, resolve_keys, save_yaml
+from services.cli.training.options import normalise_tokens
+from services.trainer.arguments import (
+    CITIES,
+    TrainingArguments,
+    build_arguments,
+    load_yaml,
+    resolve_keys,
+    save_yaml,
+)
 from shared.errors import InvalidRequest, NotFound
 
 PREDECESSORS: dict[str, Any] = {

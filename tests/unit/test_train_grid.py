@@ -9,12 +9,18 @@ from typing import Any
 
 import pytest
 
-from services.trainer.configuration import build_arguments, save_yaml, to_plain_dict
-from services.trainer.display import Display, NullDisplay
-from services.trainer.grid import RunFunctions, RunState, load_outcome, run_grid
-from services.trainer.grid_plan import GridPlan, PlannedRun, load_grid_plan
+from services.trainer.arguments import build_arguments, save_yaml, to_plain_dict
+from services.trainer.grid import (
+    GridPlan,
+    PlannedRun,
+    RunFunctions,
+    RunState,
+    load_grid_plan,
+    load_outcome,
+    run_grid,
+)
 from services.trainer.leaderboard import leaderboard, write_leaderboard
-from services.trainer.stop import RunStopped, StopRequest
+from services.trainer.run_control import Display, NullDisplay, RunStopped, StopRequest
 from shared.errors import Conflict, InvalidRequest, Misconfigured, PlacewiseError
 
 CONFIGS = Path(__file__).parents[2] / "configs"
@@ -92,7 +98,7 @@ def test_the_predecessors_grid_is_its_28_published_runs() -> None:
 
 @pytest.mark.parametrize("file", sorted(CONFIGS.glob("*.yaml")), ids=lambda file: file.name)
 def test_every_example_is_read(file: Path) -> None:
-    from services.trainer.configuration import load_yaml
+    from services.trainer.arguments import load_yaml
 
     if file.name.startswith("train-"):
         build_arguments(load_yaml(file))

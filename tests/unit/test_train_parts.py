@@ -9,12 +9,15 @@ import pytest
 import torch
 
 from services.trainer.arguments import TrainingArguments
-from services.trainer.checkpoint_names import CheckpointNameTemplate, format_folder
-from services.trainer.device import resolve_device
-from services.trainer.keep import TopKCheckpoints
-from services.trainer.loggers import check_loggers
-from services.trainer.optimise import learning_rate, make_optimizer
-from services.trainer.random_state import restore_rng_state, rng_state
+from services.trainer.checkpointing import (
+    CheckpointNameTemplate,
+    TopKCheckpoints,
+    format_folder,
+    restore_rng_state,
+    rng_state,
+)
+from services.trainer.module import learning_rate, make_optimizer
+from services.trainer.resolve import check_loggers, resolve_device
 from shared.errors import InvalidRequest, Misconfigured
 
 

@@ -12,12 +12,17 @@ import pytest
 import torch
 from PIL import Image
 
-from services.trainer.augment import apply_randaugment, to_tensor
-from services.trainer.batches import PlaceDataset, ResumableDataLoader
-from services.trainer.sampling import PlaceBatchSampler, PlaceSample
-from shared.datasets.shots import TrainingPlace
+from services.trainer.data import (
+    PlaceBatchSampler,
+    PlaceDataset,
+    PlaceSample,
+    ResumableDataLoader,
+    apply_randaugment,
+    to_tensor,
+)
+from shared.datasets.dataset import TrainingPlace
 from shared.errors import Unprocessable
-from shared.vision.decode_small import decode_resized
+from shared.imaging.decode import decode_resized
 
 
 def places_of(**counts: int) -> list[TrainingPlace]:

@@ -13,8 +13,8 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from services.trainer.losses import make_loss
 from services.trainer.miners import MINERS, AngularMiner, batch_accuracy, make_miner
+from shared.descriptors.vpr_models.aggregators.base import normalise_rows
 from shared.errors import Unprocessable
-from shared.vision.place_models.aggregators.base import normalise_rows
 from tests.unit.test_trainer_losses import (
     LABELS,
     NEGATIVES,

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from shared.datasets.sets import TrainingSet, open_training_set
+from shared.datasets.open_dataset import TrainingSet, open_training_set
 from shared.errors import InvalidRequest, NotFound, PlacewiseError
 from tests.support.data_sets import utm_name, write_csv, write_photo, write_photos
 

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
+from shared.config.settings import Settings
 from shared.errors import Misconfigured
 from shared.ids import new_id
-from shared.objects.upload_dir import resolve_upload_dir
-from shared.settings import Settings
+from shared.storage.open_store import resolve_upload_dir
 
 
 def place(home: Path, upload_dir: Path | None) -> Mapping[str, Path]:

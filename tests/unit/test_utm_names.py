@@ -6,7 +6,7 @@ from datetime import UTC, datetime
 
 import pytest
 
-from shared.datasets.utm_names import (
+from shared.datasets.utm_filenames import (
     FileNameLocation,
     UtmFileName,
     parse_utm_file_name,

@@ -16,8 +16,8 @@ import torch
 from numpy.typing import NDArray
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from shared.vision.vlad import assign_clusters, soft_vlad, vlad
-from shared.vision.vocabulary_file import read_vocabulary
+from shared.descriptors.aggregation import assign_clusters, soft_vlad, vlad
+from shared.descriptors.vocabulary_file import read_vocabulary
 
 Matrix = NDArray[np.float64]
 

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from shared.descriptors.vocabulary import decode_centres, encode_centres, parse_centres
 from shared.errors import Unprocessable
-from shared.vision.vocabulary import decode_centres, encode_centres, parse_centres
 
 
 def good_centres(clusters: int = 4, width: int = 6) -> NDArray[np.float32]:

@@ -13,10 +13,15 @@ import numpy as np
 import pytest
 import torch
 
+from shared.descriptors.vocabulary import parse_centres
+from shared.descriptors.vocabulary_file import (
+    UNKNOWN_PROVENANCE,
+    Provenance,
+    VocabularyFile,
+    decode_vocabulary,
+    read_vocabulary,
+)
 from shared.errors import Unprocessable
-from shared.vision.provenance import UNKNOWN_PROVENANCE, Provenance
-from shared.vision.vocabulary import parse_centres
-from shared.vision.vocabulary_file import VocabularyFile, decode_vocabulary, read_vocabulary
 from tests.unit.test_vocabulary import Untrustworthy, good_centres, npy
 
 

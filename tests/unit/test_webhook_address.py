@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-from services.steward.webhooks.sign import sign_webhook
+from services.steward.webhooks import sign_webhook
 from shared.errors import PlacewiseError, Unprocessable
-from shared.webhook_address import (
+from shared.security.webhook_targets import (
     WebhookTarget,
     is_public_address,
     parse_webhook_url,

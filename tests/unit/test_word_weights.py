@@ -9,22 +9,23 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from shared.estimate.places import PhotoLocation, distance_between_m
-from shared.word_weights.compare import is_significant_improvement, sign_test_p_value
-from shared.word_weights.learn import (
-    PairStatistics,
-    ProductMoments,
-    apply_word_weights,
-    empty_pair_statistics,
-    word_products,
-)
-from shared.word_weights.pairs import (
+from shared.evaluation.place_evidence import PhotoLocation, distance_between_m
+from shared.word_weights.training_pairs import (
     MAX_PAIRS,
     MIN_PAIRS,
     PairBatch,
     PairSource,
     PairSplit,
     sample_pairs,
+)
+from shared.word_weights.weights import (
+    PairStatistics,
+    ProductMoments,
+    apply_word_weights,
+    empty_pair_statistics,
+    is_significant_improvement,
+    sign_test_p_value,
+    word_products,
 )
 
 WORDS, WIDTH = 4, 3

@@ -10,11 +10,17 @@ from typing import Annotated, Any
 import typer
 from rich.table import Column, Table
 
-from services.cli.ladder import BASELINE_KS, evaluate_baselines
+from services.cli.datasets.baselines import BASELINE_KS, evaluate_baselines
 from services.cli.output import JsonOption, console, print_json, progress_bar, report_errors
-from shared.datasets.city.plan import CityOptions, CityPlan, make_plan
-from shared.datasets.city.training_files import TrainingLayoutName, with_training_layout
-from shared.datasets.city.write import NOT_COMPARABLE, check_output_empty, describe_city, write_city
+from shared.synthetic_city.plan import CityOptions, CityPlan, make_plan
+from shared.synthetic_city.write import (
+    NOT_COMPARABLE,
+    TrainingLayoutName,
+    check_output_empty,
+    describe_city,
+    with_training_layout,
+    write_city,
+)
 
 Json = dict[str, Any]
 

@@ -12,17 +12,17 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
-from services.steward.archives.member import (
+from services.steward.archives.archive import (
     ARCHIVE_READ_BYTES,
     ArchiveLimits,
     ArchiveMember,
     MemberKind,
     damaged_archive_error,
     damaged_member_error,
+    read_exactly,
     unsupported_member_error,
 )
-from services.steward.archives.ranged import read_exactly
-from shared.archive_formats import is_tar_header
+from shared.imaging.file_formats import is_tar_header
 
 BLOCK_BYTES = 512
 MAX_HEADER_BYTES = 1024 * 1024  # of a pax header or a long name

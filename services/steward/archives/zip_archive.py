@@ -13,16 +13,16 @@ import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from services.steward.archives.member import (
+from services.steward.archives.archive import (
     ARCHIVE_READ_BYTES,
     ArchiveLimits,
     ArchiveMember,
     MemberKind,
     damaged_archive_error,
     damaged_member_error,
+    read_exactly,
     unsupported_member_error,
 )
-from services.steward.archives.ranged import read_exactly
 from shared.errors import PlacewiseError, Unprocessable
 
 END_RECORD = struct.Struct("<4s4H2LH")  # 4.3.16

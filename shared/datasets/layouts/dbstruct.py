@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from shared.datasets.layouts.layout import PLACEWISE_PROTOCOL, ListedSet
-from shared.datasets.shots import DatasetPhoto
+from shared.datasets.dataset import DatasetPhoto
+from shared.datasets.layouts.base import PLACEWISE_PROTOCOL, ListedSet
 from shared.errors import InvalidRequest, Misconfigured
 
 FIELDS = 8

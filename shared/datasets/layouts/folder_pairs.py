@@ -12,10 +12,10 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
-from shared.datasets.layouts.layout import DEFAULT_RULE, PLACEWISE_PROTOCOL, ListedSet, photos_below
-from shared.datasets.layouts.named_photos import add_exif_positions, photo_from_filename
-from shared.datasets.shots import DatasetPhoto
-from shared.datasets.zones import add_utm_positions
+from shared.datasets.dataset import DatasetPhoto
+from shared.datasets.layouts.base import DEFAULT_RULE, PLACEWISE_PROTOCOL, ListedSet, photos_below
+from shared.datasets.photo_lists import add_exif_positions, photo_from_filename
+from shared.datasets.utm_coordinates import add_utm_positions
 from shared.errors import InvalidRequest
 
 SPLITS = ("train", "val", "test")

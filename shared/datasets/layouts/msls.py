@@ -17,9 +17,9 @@ from pathlib import Path
 
 import utm
 
-from shared.datasets.layouts.layout import DEFAULT_RULE, ListedSet, city_missing_error
-from shared.datasets.layouts.tables import bad_row_error, parse_integer, parse_number, read_table
-from shared.datasets.shots import DatasetPhoto
+from shared.datasets.dataset import DatasetPhoto
+from shared.datasets.layouts.base import DEFAULT_RULE, ListedSet, city_missing_error
+from shared.datasets.photo_lists import bad_row_error, parse_integer, parse_number, read_table
 from shared.errors import InvalidRequest
 
 OFFICIAL_PROTOCOL = "msls-official"

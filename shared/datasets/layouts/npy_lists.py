@@ -12,11 +12,10 @@ from pathlib import Path
 
 import numpy as np
 
-from shared.datasets.ground_truth_files import read_ground_truth
-from shared.datasets.integer_lists import read_names
-from shared.datasets.layouts.layout import DEFAULT_RULE, PLACEWISE_PROTOCOL, ListedSet
-from shared.datasets.layouts.named_photos import photo_from_filename
-from shared.datasets.shots import DatasetPhoto, Indices
+from shared.datasets.dataset import DatasetPhoto, Indices
+from shared.datasets.ground_truth_files import read_ground_truth, read_names
+from shared.datasets.layouts.base import DEFAULT_RULE, PLACEWISE_PROTOCOL, ListedSet
+from shared.datasets.photo_lists import photo_from_filename
 from shared.errors import InvalidRequest
 
 QUERY_LIST_SUFFIXES = {"_dbImages": "_qImages", "_ref_image_names": "_query_image_names"}

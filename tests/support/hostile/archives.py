@@ -12,11 +12,7 @@ import zipfile
 from collections.abc import Iterator
 
 from tests.support.archives import tar_of, tar_with, zip_of
-from tests.support.hostile.file import (
-    OF_ARCHIVES,
-    Hostile,
-    photo,
-)
+from tests.support.hostile.file import OF_ARCHIVES, Hostile, photo
 
 
 def archives() -> Iterator[Hostile]:

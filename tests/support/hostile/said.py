@@ -7,12 +7,7 @@ import random
 import struct
 from collections.abc import Iterator
 
-from tests.support.hostile.file import (
-    BAD_FIELD,
-    FINE,
-    Hostile,
-    photo,
-)
+from tests.support.hostile.file import BAD_FIELD, FINE, Hostile, photo
 
 
 def _with_exif(number: int, block: bytes) -> bytes:

@@ -9,13 +9,7 @@ from collections.abc import Iterator
 
 from PIL import Image
 
-from tests.support.hostile.file import (
-    BROKEN,
-    FINE,
-    TOO_LARGE,
-    Hostile,
-    photo,
-)
+from tests.support.hostile.file import BROKEN, FINE, TOO_LARGE, Hostile, photo
 from tests.support.photos import photo_image
 
 

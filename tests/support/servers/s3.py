@@ -14,9 +14,9 @@ from urllib.parse import unquote, urlsplit
 import pytest
 import urllib3
 
+from shared.config.settings import Settings
 from shared.ids import new_id
-from shared.objects.s3 import Bucket, create_bucket
-from shared.settings import Settings
+from shared.storage.s3 import Bucket, create_bucket
 from tests.support.servers.containers import Container, engine_answers
 from tests.support.servers.daemon import Daemon, free_ports, new_folder
 from tests.support.servers.handle import Handle

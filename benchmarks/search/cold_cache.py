@@ -1,0 +1,99 @@
+"""Queries whose rows are on the disk and in no cache."""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import mmap
+import os
+import time
+
+import numpy as np
+from rich.progress import Progress
+
+from benchmarks.report import LatencySummary, Report
+from benchmarks.search.comparison import MATCHED_CASE, load_worker
+from benchmarks.search.methods import (
+    BenchmarkQuery,
+    BruteForce,
+    PlacewiseSearch,
+    Ranking,
+    same_ranking,
+)
+from benchmarks.search.synthetic_map import SyntheticCity, SyntheticMap
+from services.search.snapshot import Snapshot
+
+TARGET_SLOWDOWN = 5.0  # times a warm query, of the slowest in twenty
+MAX_CACHED_SHARE = 0.01  # of the rows' pages: else nothing was cold
+
+
+def measure_cold_cache(
+    report: Report, world: SyntheticMap, city: SyntheticCity, queries: int, bar: Progress
+) -> None:
+    """Each query warm, then with every row dropped from the page cache. The codes stay in memory.
+
+    A page that a process has mapped can't be dropped: its own mapping is given up first
+    (MADV_DONTNEED), then the file's pages are (posix_fadvise DONTNEED); `mincore` says what is
+    left.
+    """
+    gc.collect()  # mappings of those who were asked before
+    task = bar.add_task("cold", total=queries)
+    asked = city.revisits(len(world.photo_ids), queries)
+    pieces = (np.load(path, mmap_mode="r") for path in world.chunk_paths())
+    oracle = BruteForce.of(pieces, world.photo_ids, asked)
+    worker = load_worker(world)
+    snapshot = worker.snapshot(world.generation_id, world.version)
+    ours = PlacewiseSearch(world, worker, asked)
+    warm, cold, cached, differ = [], [], [], 0
+    for number in range(queries):
+        question = BenchmarkQuery(number, MATCHED_CASE.k)
+        ours.search(question)
+        warm.append(_time_search(ours, question)[0])
+        drop_page_cache(snapshot, world)
+        cached.append(cached_share(snapshot))
+        seconds, found = _time_search(ours, question)
+        cold.append(seconds)
+        differ += not same_ranking(found, oracle.best(number, MATCHED_CASE.k))
+        bar.advance(task)
+    w, c = LatencySummary.of(warm), LatencySummary.of(cold)
+    report.add("cold: our answers that differ", differ, at_most=0)
+    report.add("cold: pages still cached, at most", max(cached), at_most=MAX_CACHED_SHARE)
+    report.add("cold: warm query, p95", 1000 * w.p95, "ms")
+    report.add("cold: query, median", 1000 * c.median, "ms")
+    report.add("cold: query, p95", 1000 * c.p95, "ms")
+    report.add("cold: p95, of a warm query's", c.p95 / w.p95, "x", at_most=TARGET_SLOWDOWN)
+    report.details["cold"] = {"warm_seconds": warm, "cold_seconds": cold, "cached": cached}
+
+
+def drop_page_cache(snapshot: Snapshot, world: SyntheticMap) -> None:
+    """Drop the chunks' rows from the page cache."""
+    for chunk in snapshot.chunks:
+        assert chunk.stored is not None, "a loaded chunk lies on the disk"
+        chunk.stored.file.memory.madvise(mmap.MADV_DONTNEED)
+    for path in world.chunk_paths():
+        with path.open("rb") as file:
+            os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
+
+
+def cached_share(snapshot: Snapshot) -> float:
+    """The share of the rows' pages that are in memory."""
+    libc = ctypes.CDLL(None, use_errno=True)
+    there = pages = 0
+    for chunk in snapshot.chunks:
+        assert chunk.stored is not None
+        memory = chunk.stored.file.memory
+        address = np.frombuffer(memory, np.uint8).ctypes.data
+        count = -(-len(memory) // mmap.PAGESIZE)
+        found = np.empty(count, np.uint8)
+        room = ctypes.c_void_p(found.ctypes.data)
+        if libc.mincore(ctypes.c_void_p(address), ctypes.c_size_t(len(memory)), room) != 0:
+            raise OSError(ctypes.get_errno(), "mincore")
+        there += int(np.count_nonzero(found & 1))
+        pages += count
+    return there / pages
+
+
+def _time_search(ours: PlacewiseSearch, question: BenchmarkQuery) -> tuple[float, Ranking]:
+    begun = time.perf_counter()
+    found = ours.search(question)
+    return time.perf_counter() - begun, found

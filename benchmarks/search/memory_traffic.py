@@ -1,0 +1,128 @@
+"""How fast this machine reads memory, what a search reads of it, and how much a process holds."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+from typing import Any, Self
+from unittest.mock import patch
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.search import kernels
+from shared.codes.jit import REORDERED_FASTMATH, numba_jit
+
+STREAM_BYTES = 256_000_000  # beyond every cache
+
+Words = NDArray[np.uint64]
+
+
+@numba_jit(REORDERED_FASTMATH)
+def _xor_words(words: Words) -> np.uint64:
+    """Something that depends on every word; four streams at once, which is faster than one."""
+    quarter = words.shape[0] // 4
+    a, b, c = words[:quarter], words[quarter : 2 * quarter], words[2 * quarter : 3 * quarter]
+    d = words[3 * quarter :]
+    found = np.uint64(0)
+    for i in range(quarter):
+        found ^= a[i] ^ b[i] ^ c[i] ^ d[i]
+    return found
+
+
+class MemoryBandwidth:
+    """How fast memory is read: by one thread, and by one on each core; the faster is the floor.
+
+    A context manager. Samples are taken between other measurements, so that what disturbs one
+    disturbs the other.
+    """
+
+    def __init__(self, words: Words | None = None) -> None:
+        """What is read: these words, or some that lie in no cache."""
+        self._words = np.ones(STREAM_BYTES // 8, np.uint64) if words is None else words.ravel()
+        cores = len(os.sched_getaffinity(0))
+        self._parts = np.array_split(self._words, cores)
+        self._pool = ThreadPoolExecutor(cores, thread_name_prefix="read")
+        self._took: tuple[list[float], list[float]] = ([], [])
+        _xor_words(self._words[:8])
+
+    def sample(self) -> None:
+        """Read everything once in each way."""
+        begun = time.perf_counter()
+        _xor_words(self._words)
+        alone = time.perf_counter()
+        list(self._pool.map(_xor_words, self._parts))
+        self._took[0].append(alone - begun)
+        self._took[1].append(time.perf_counter() - alone)
+
+    @property
+    def bytes_per_second(self) -> float:
+        """The median of the faster way. StatisticsError before the first sample."""
+        return self._words.nbytes / min(map(median, self._took))
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._pool.shutdown()
+
+
+@dataclass(slots=True)
+class ByteCounter:
+    """Bytes of codes and rows that were read."""
+
+    size_bytes: int = 0
+
+
+@contextlib.contextmanager
+def count_bytes_read() -> Iterator[ByteCounter]:
+    """Counts what searches by codes read while the block runs: their loops are told which rows."""
+    count = ByteCounter()
+
+    lock = threading.Lock()
+    loops: dict[str, Callable[..., int]] = {
+        "distances": _distance_bytes,
+        "distances_at": lambda _, __, rows, query, *___: 8 * len(query) * len(rows),
+        "weighted_at": lambda _, __, rows, ___, planes, ____: 8 * planes.shape[1] * len(rows),
+        "products_at": lambda _, __, rows, query, *___: 4 * len(query) * len(rows),
+    }
+
+    def counted(loop: Callable[..., Any], bytes_of: Callable[..., int]) -> Callable[..., Any]:
+        def call(*arguments: Any) -> Any:
+            with lock:
+                count.size_bytes += bytes_of(*arguments)
+            return loop(*arguments)
+
+        return call
+
+    callers = [module for name, module in sys.modules.items() if name.startswith("services.search")]
+    with contextlib.ExitStack() as patches:
+        for name, bytes_of in loops.items():
+            loop: Callable[..., Any] = getattr(kernels, name)
+            for module in callers:
+                if module is not kernels and getattr(module, name, None) is loop:
+                    patches.enter_context(patch.object(module, name, counted(loop, bytes_of)))
+        yield count
+
+
+def _distance_bytes(
+    _blocks: Any, _first: Any, asked: NDArray[np.bool_], query: Words, begin: int, end: int, *_: Any
+) -> int:
+    rows = np.count_nonzero(asked[..., begin:end].reshape(-1, end - begin).any(axis=0))
+    return 8 * int(query.shape[-1]) * int(rows)
+
+
+def private_bytes() -> int:
+    """Memory of this process that is no file's: what mapped files take is the system's cache."""
+    for line in Path("/proc/self/status").read_text().splitlines():
+        if line.startswith("RssAnon:"):
+            return 1024 * int(line.split()[1])
+    raise AssertionError("Linux tells RssAnon")

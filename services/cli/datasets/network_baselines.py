@@ -1,0 +1,134 @@
+"""The ladder's rungs that need a network. Imports torch: only `ladder` imports this, when asked."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import timm
+import torch
+from numpy.typing import NDArray
+from PIL import Image
+from torch.nn.functional import normalize
+
+from shared.descriptors.aggregation import vlad
+from shared.descriptors.backbones import normalise_pixels
+from shared.descriptors.backbones.efficientnet_lite0 import MEAN, STD
+from shared.descriptors.extractor import Extractor, choose_device
+from shared.descriptors.patches import fit_vocabulary, sample_photos
+from shared.descriptors.pca_fit import fit_pca, sample_rows, sample_size
+from shared.descriptors.pca_whitening import PcaProjection
+from shared.extractor_config.configs import EXTRACTOR_CONFIGS
+
+EXTRACTOR = "efficientnet-lite0-vlad"
+BATCH_PHOTOS = 16
+FIT_SAMPLE_PHOTOS = 300
+SEED = 0
+
+Rows = NDArray[np.float32]
+
+
+class NetworkBaselines:
+    """Describes photos with an untrained network and with the default extractor twice, and shortens
+    the last rows by PCA whitening.
+    """
+
+    names = (
+        "untrained network",
+        f"{EXTRACTOR}, shipped vocabulary",
+        f"{EXTRACTOR}, fitted vocabulary",
+    )
+    pca_dimensions = (512, 256, 128)
+    """Dimensions, as far as there are enough database photos."""
+
+    def __init__(self, database: Sequence[Path]) -> None:
+        """`database` are the photos that the fitted vocabulary and the PCA are learnt from; they
+        are the first that `describe` is given.
+        """
+        self._database = len(database)
+        self.extractor = Extractor(EXTRACTOR_CONFIGS[EXTRACTOR], choose_device("auto"))
+        device = self.extractor.backbone.device
+        torch.manual_seed(SEED)
+        self._untrained = timm.create_model(
+            "tf_efficientnet_lite0", pretrained=False, features_only=True, out_indices=(3,)
+        )
+        self._untrained.eval().requires_grad_(False).to(device)
+        shipped = self.extractor.shipped_vocabulary()
+        assert shipped is not None
+        self._shipped = torch.from_numpy(shipped[0].array).to(device)
+        self._fitted = self._fit(database)
+
+    @property
+    def words(self) -> dict[str, int]:
+        """Of the rungs that have a vocabulary."""
+        return {self.names[1]: len(self._shipped), self.names[2]: len(self._fitted)}
+
+    def _fit(self, database: Sequence[Path]) -> torch.Tensor:
+        """(clusters, width) centres, learnt as a map learns its own."""
+        chosen = sample_photos(
+            len(database), FIT_SAMPLE_PHOTOS, self.extractor.backbone.width, SEED
+        )
+        photos = [database[number] for number in chosen]
+        fitted = fit_vocabulary(
+            self.extractor,
+            (list(pixels) for pixels in self._batches(photos)),
+            len(photos),
+            clusters=self.extractor.recipe.clusters,
+            seed=SEED,
+        )
+        return torch.from_numpy(fitted.centres.array).to(self.extractor.backbone.device)
+
+    @torch.inference_mode()
+    def describe(self, paths: Sequence[Path], advance: Callable[[int], None]) -> dict[str, Rows]:
+        """Unit rows of every photo, by rung; `advance` is told how many more are done."""
+        rows: dict[str, list[Rows]] = {name: [] for name in self.names}
+        for pixels in self._batches(paths):
+            features = self.extractor.features(pixels)
+            described = (
+                self._untrained_rows(pixels),
+                vlad(features, self._shipped),
+                vlad(features, self._fitted),
+            )
+            for name, batch in zip(self.names, described, strict=True):
+                rows[name].append(batch.cpu().numpy())
+            advance(len(pixels))
+        found = {name: np.concatenate(parts) for name, parts in rows.items()}
+        return found | self._whitened_rows(found[self.names[-1]])
+
+    def _whitened_rows(self, rows: Rows) -> dict[str, Rows]:
+        """The rows, whitened as a map whitens its own."""
+        shorter = {}
+        for kept in self.pca_dimensions:
+            if self._database > kept:
+                size = sample_size(rows.shape[1], kept)
+                found = fit_pca(rows[sample_rows(self._database, size, SEED)], kept)
+                projection = PcaProjection(found, self.extractor.backbone.device)
+                shorter[f"{self.names[-1]}, PCA to {kept}"] = projection.project(rows)
+        return shorter
+
+    def _untrained_rows(self, pixels: NDArray[np.uint8]) -> torch.Tensor:
+        on_device = torch.from_numpy(pixels).to(self.extractor.backbone.device)
+        maps = self._untrained(normalise_pixels(on_device, MEAN, STD))[0]
+        return normalize(normalize(maps.flatten(2), dim=1).mean(dim=-1), dim=-1)
+
+    def _batches(self, paths: Sequence[Path]) -> Iterator[NDArray[np.uint8]]:
+        """(up to BATCH, H, W, 3) uint8, in the order of the paths."""
+
+        def read(path: Path) -> NDArray[np.uint8]:
+            with Image.open(path) as image:
+                return np.asarray(self.extractor.preprocessing.apply(image.convert("RGB")))
+
+        def read_batch(start: int) -> NDArray[np.uint8]:
+            return np.stack([read(path) for path in paths[start : start + BATCH_PHOTOS]])
+
+        with ThreadPoolExecutor(1) as reader:  # the next batch is decoded beside the network
+            pending = None
+            for start in range(0, len(paths), BATCH_PHOTOS):
+                upcoming = reader.submit(read_batch, start)
+                if pending is not None:
+                    yield pending.result()
+                pending = upcoming
+            if pending is not None:
+                yield pending.result()

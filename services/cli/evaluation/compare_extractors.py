@@ -1,0 +1,315 @@
+"""Several descriptors on one data set: what each finds, takes and weighs. Imports torch.
+
+Rows of a data set shortened by PCA whitening, learnt from its database rows alone.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from rich.progress import Progress
+from rich.table import Column, Table
+
+from services.cli.environment import read_settings
+from services.cli.evaluation.data_sets import progress_bars
+from services.cli.evaluation.describers import Describer, checkpoint_describer, extractor_describer
+from services.cli.output import console, print_json, printable_path, progress_bar
+from shared.config.settings import Settings
+from shared.datasets.open_dataset import EvaluationSet, open_evaluation_set
+from shared.descriptors.extractor import choose_device
+from shared.descriptors.pca_fit import check_pca_fittable, fit_pca_stream, sample_rows, sample_size
+from shared.descriptors.pca_whitening import PcaProjection, PcaWhitening
+from shared.errors import InvalidRequest, Misconfigured
+from shared.evaluation.bootstrap import PairedDifference, cluster_queries, paired_differences
+from shared.evaluation.exact_knn import exact_knn
+from shared.evaluation.ranking import DEFAULT_KS, Rows, describe_evaluation_set
+from shared.evaluation.report.comparison import ComparedExtractor, pareto_front, render_comparison
+from shared.evaluation.results import package_versions
+from shared.evaluation.retrieval_metrics import RetrievalMetrics, compute_metrics
+from shared.extractor_config.configs import MAX_PCA_DIMENSION, get_extractor_config
+
+BLOCK_BYTES = 64_000_000
+SEED = 0
+
+
+@dataclass(frozen=True, slots=True)
+class WhitenedSet:
+    database: Rows
+    queries: Rows
+    whitening: PcaWhitening
+    milliseconds_a_photo: float
+    """what shortening one row takes"""
+
+
+def whiten_set(
+    database: Rows,
+    queries: Rows,
+    components: int,
+    device: torch.device,
+    on_progress: Callable[[str, int, int], None] = lambda what, done, most: None,
+) -> WhitenedSet:
+    """(m, D) and (n, D) rows -> (m, kept) and (n, kept).
+
+    Raises Unprocessable (`pca_too_few_rows`, `pca_too_many_dimensions`).
+    """
+    dimension = database.shape[1]
+    check_pca_fittable(len(database), dimension, components)
+    chosen = sample_rows(len(database), sample_size(dimension, components), SEED)
+    at_once = max(1, BLOCK_BYTES // (4 * dimension))
+    batches = (database[chosen[b : b + at_once]] for b in range(0, len(chosen), at_once))
+    whitening = fit_pca_stream(batches, len(chosen), dimension, components, on_progress)
+    projection = PcaProjection(whitening, device)
+    begun = time.perf_counter()
+    short = [_project(rows, projection, at_once, device) for rows in (database, queries)]
+    took = time.perf_counter() - begun
+    return WhitenedSet(
+        short[0], short[1], whitening, 1000 * took / max(1, len(database) + len(queries))
+    )
+
+
+def _project(rows: Rows, projection: PcaProjection, at_once: int, device: torch.device) -> Rows:
+    short = np.empty((len(rows), projection.kept), np.float32)
+    for begin, block in _blocks(rows, at_once):
+        projected = projection(torch.from_numpy(block).to(device)).cpu().numpy()
+        short[begin : begin + len(block)] = projected
+    return short
+
+
+def _blocks(rows: Rows, at_once: int) -> Iterator[tuple[int, Rows]]:
+    for begin in range(0, len(rows), at_once):
+        yield begin, np.array(rows[begin : begin + at_once])
+
+
+FLOAT32_BYTES = 4
+PCA_SUFFIX = re.compile(r"pca([1-9][0-9]{0,4})")
+
+
+@dataclass(frozen=True, slots=True)
+class ComparisonEntry:
+    """One descriptor of a comparison."""
+
+    spec_text: str
+    name: str
+    """an extractor's name with its options, or a checkpoint's path"""
+    fit: bool = False
+    pca: int | None = None
+
+
+def parse_entries(text: str) -> list[ComparisonEntry]:
+    """`a,b:layer=9,facet=key+pca512,run.ckpt` -> three; InvalidRequest (`bad_extractors`)."""
+    parts: list[str] = []
+    for part in text.split(","):
+        # A comma also separates the options of one extractor.
+        if parts and "=" in part.partition("+")[0] and ":" in parts[-1] and ":" not in part:
+            parts[-1] += "," + part
+        else:
+            parts.append(part.strip())
+    return [_parse_entry(part) for part in parts]
+
+
+def _parse_entry(spec_text: str) -> ComparisonEntry:
+    name, *additions = spec_text.split("+")
+    fit, pca = False, None
+    for addition in additions:
+        match = PCA_SUFFIX.fullmatch(addition)
+        if addition == "fit":
+            fit = True
+        elif match and int(match[1]) <= MAX_PCA_DIMENSION:
+            pca = int(match[1])
+        else:
+            raise InvalidRequest(
+                "bad_extractors",
+                f"{spec_text}: +{addition} is not known. There are +fit, and +pcaN to N dimensions, "
+                f"up to {MAX_PCA_DIMENSION}.",
+            )
+    if not name:
+        raise InvalidRequest("bad_extractors", f"--extractors: {spec_text!r} names no extractor.")
+    return ComparisonEntry(spec_text, name, fit, pca)
+
+
+def compare_extractors(
+    data: Path,
+    extractors: str,
+    *,
+    set_name: str | None,
+    protocol: str | None,
+    rule: str | None,
+    out: Path | None,
+    faiss_gpu: bool,
+    as_json: bool,
+) -> None:
+    """Raises as reading the set, loading the extractors and describing does."""
+    entries = parse_entries(extractors)
+    settings = read_settings()
+    _validate_entries(entries, settings, out)
+    asked = open_evaluation_set(data, set_name, protocol=protocol, rule=rule)
+    clusters = cluster_queries(asked.queries)
+    found: list[tuple[ComparedExtractor, RetrievalMetrics]] = []
+    with progress_bar() as progress:
+        for entry in entries:
+            about, measured = _evaluate_entry(entry, asked, settings, faiss_gpu, progress)
+            first = found[0][1] if found else None
+            difference: PairedDifference | None = None
+            if first is not None:
+                (difference,) = paired_differences(
+                    measured.within[:, :1], first.within[:, :1], clusters.of
+                )
+            found.append(
+                (ComparedExtractor(entry.spec_text, measured, difference, **about), measured)
+            )
+    compared = [one for one, _ in found]
+    report = _comparison_as_json(asked, compared)
+    if out is not None:
+        _write_report(out, report, render_comparison(asked, compared))
+    if as_json:
+        print_json(report)
+        return
+    _print_comparison(asked, compared)
+    if out is not None:
+        console.print(printable_path(out / "report.html"), soft_wrap=True, markup=False)
+
+
+def _validate_entries(
+    entries: Sequence[ComparisonEntry], settings: Settings, out: Path | None
+) -> None:
+    """All names, before the first of them takes its hours."""
+    for entry in entries:
+        if entry.name.endswith(".ckpt"):
+            if not Path(entry.name).is_file():
+                raise InvalidRequest("bad_extractors", f"There is no checkpoint {entry.name}.")
+            if entry.fit:
+                raise InvalidRequest(
+                    "bad_extractors", f"{entry.spec_text}: a checkpoint has no vocabulary to fit."
+                )
+            continue
+        recipe = get_extractor_config(
+            entry.name, allow_test_extractors=settings.allow_test_extractors
+        )
+        if entry.fit and not recipe.needs_vocabulary:
+            raise InvalidRequest(
+                "bad_extractors", f"{entry.spec_text}: {recipe.name} uses no vocabulary to fit."
+            )
+    if out is not None:
+        try:
+            out.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise Misconfigured(
+                "out_unwritable", f"{out} can't be written: {error.strerror}."
+            ) from error
+
+
+def _evaluate_entry(
+    entry: ComparisonEntry,
+    evaluation_set: EvaluationSet,
+    settings: Settings,
+    faiss_gpu: bool,
+    progress: Progress,
+) -> tuple[dict[str, Any], RetrievalMetrics]:
+    describer = _make_describer(entry, evaluation_set, settings, progress)
+    told = progress_bars(progress, entry.spec_text)
+    describer.describe.on_lookup = lambda done, most: told("known photos", done, most)
+    with describe_evaluation_set(describer.describe, evaluation_set, on_progress=told) as (
+        database,
+        queries,
+    ):
+        took = describer.describe.milliseconds_a_photo()
+        if entry.pca is not None:
+            short = whiten_set(database, queries, entry.pca, choose_device(settings.device), told)
+            database, queries = short.database, short.queries
+            took = None if took is None else took + short.milliseconds_a_photo
+        ranked = exact_knn(
+            queries,
+            database,
+            max(DEFAULT_KS),
+            faiss_gpu=faiss_gpu,
+            on_progress=lambda done, most: told("search", done, most),
+        )
+        dimension = database.shape[1]
+    measured = compute_metrics(
+        ranked.indices,
+        evaluation_set.positives,
+        cluster_queries(evaluation_set.queries),
+        scores=ranked.scores,
+    )
+    return {
+        "dimension": dimension,
+        "bytes_a_photo": FLOAT32_BYTES * dimension,
+        "milliseconds_a_photo": took,
+        "fingerprint": describer.fingerprint,
+        "device": str(describer.about.get("device", "")),
+    }, measured
+
+
+def _make_describer(
+    entry: ComparisonEntry, evaluation_set: EvaluationSet, settings: Settings, progress: Progress
+) -> Describer:
+    if entry.name.endswith(".ckpt"):
+        return checkpoint_describer(Path(entry.name), "same", settings)
+    recipe = get_extractor_config(entry.name, allow_test_extractors=settings.allow_test_extractors)
+    database = [shot.path for shot in evaluation_set.database]
+    return extractor_describer(recipe, None, database, settings, progress, fit=entry.fit)
+
+
+def _comparison_as_json(
+    evaluation_set: EvaluationSet, compared: Sequence[ComparedExtractor]
+) -> dict[str, Any]:
+    recalls = [one.recall_at_1 for one in compared]
+    by_size = pareto_front([one.bytes_a_photo for one in compared], recalls)
+    by_time = pareto_front([one.milliseconds for one in compared], recalls)
+    return {
+        "set": evaluation_set.name,
+        "protocol": evaluation_set.protocol,
+        "rule": evaluation_set.rule,
+        "fingerprint": evaluation_set.fingerprint,
+        "versions": package_versions(),
+        "extractors": [
+            {**one.as_json(), "pareto_by_size": size, "pareto_by_time": duration}
+            for one, size, duration in zip(compared, by_size, by_time, strict=True)
+        ],
+    }
+
+
+def _write_report(out: Path, report: dict[str, Any], page: str) -> None:
+    try:
+        text = json.dumps(report, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+        (out / "comparison.json").write_text(text, encoding="utf-8")
+        (out / "report.html").write_text(page, encoding="utf-8")
+    except OSError as error:
+        raise Misconfigured(
+            "out_unwritable", f"{out} can't be written: {error.strerror}."
+        ) from error
+
+
+def _print_comparison(evaluation_set: EvaluationSet, compared: Sequence[ComparedExtractor]) -> None:
+    ks = list(compared[0].measured.recalls.recall_all)
+    columns = (*(f"R@{k}" for k in ks), "95 % of R@1", "ms", "bytes", "against the first")
+    table = Table(
+        evaluation_set.name, *(Column(name, justify="right", no_wrap=True) for name in columns)
+    )
+    for one in compared:
+        interval = one.measured.recall_intervals
+        table.add_row(
+            one.name,
+            *(f"{100 * share:.1f}" for share in one.measured.recalls.recall_all.values()),
+            f"{100 * interval[0].low:.1f} to {100 * interval[0].high:.1f}" if interval else "-",
+            "-" if one.milliseconds_a_photo is None else f"{one.milliseconds_a_photo:.1f}",
+            f"{one.bytes_a_photo:,}",
+            one.against_first(),
+        )
+    console.print(table)
+    clusters = compared[0].measured.clusters
+    console.print(
+        f"Right: {evaluation_set.rule}; protocol {evaluation_set.protocol}; fingerprint {evaluation_set.fingerprint[:16]}; "
+        f"intervals over {clusters.count} {clusters.kind}. ms: network and aggregation of one "
+        "photo, measured when its row was made. bytes: float32.",
+        soft_wrap=True,
+        markup=False,
+    )

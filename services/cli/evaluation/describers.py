@@ -1,0 +1,180 @@
+"""What describes the photos of a data set: an extractor by name, or a checkpoint. Imports torch."""
+
+from __future__ import annotations
+
+import time
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from rich.progress import Progress
+
+from services.cli.descriptors.local_extractor import (
+    decode_batches,
+    decode_pixels,
+    load_extractor,
+    load_own_vocabulary,
+    resolve_centres,
+)
+from services.trainer.model_describer import ModelDescriber
+from shared.config.settings import Settings
+from shared.descriptors.extractor import Extractor, choose_device, spec_fingerprint
+from shared.descriptors.inference import PhotoTooLargeForGpu
+from shared.descriptors.patches import fit_vocabulary, sample_photos
+from shared.descriptors.vocabulary import ClusterCentres
+from shared.descriptors.vpr_models.checkpoint import load_checkpoint
+from shared.errors import PlacewiseError
+from shared.evaluation.descriptor_cache import CachedDescriber, TimedDescriber
+from shared.evaluation.ranking import Rows, refused_photos_error
+from shared.extractor_config.configs import ExtractorConfig
+from shared.imaging.decode import DECODER
+
+CACHE_FOLDER = "descriptors"
+FIT_SAMPLE_PHOTOS = 1000  # as a map's fit learns from
+SEED = 0
+
+
+@dataclass(slots=True)
+class Describer:
+    """Photos to rows, with what a result says of it."""
+
+    name: str
+    describe: CachedDescriber
+    spec: dict[str, Any]
+    """everything that decides a row's value"""
+    about: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def fingerprint(self) -> str:
+        return spec_fingerprint(self.spec)
+
+
+class ExtractorDescriber:
+    """An extractor's rows, by the decoding children of every upload."""
+
+    def __init__(
+        self, extractor: Extractor, centres: ClusterCentres | None, settings: Settings
+    ) -> None:
+        self._extractor = extractor
+        self._centres = centres
+        self._settings = settings
+        self.seconds = 0.0
+        """spent in the network, of `photos`; they are read and decoded meanwhile"""
+        self.photos = 0
+
+    def __call__(self, photos: Sequence[Path]) -> Iterator[Rows]:
+        refused: list[tuple[Path, PlacewiseError]] = []
+        batches = decode_batches(
+            photos, self._extractor.preprocessing, self._settings, defaultdict(float)
+        )
+        for batch in batches:
+            pixels = []
+            for photo, outcome in batch:
+                if isinstance(outcome, PlacewiseError):
+                    refused.append((photo, outcome))
+                else:
+                    pixels.append(outcome.pixels)
+            if refused or not pixels:  # after a refusal, the rest is read for what else is wrong
+                continue
+            begun = time.perf_counter()
+            try:
+                rows = self._extractor.describe(pixels, self._centres)
+            except PhotoTooLargeForGpu as error:
+                refused.append((batch[error.place][0], error))
+                continue
+            self.seconds += time.perf_counter() - begun
+            self.photos += len(rows)
+            yield rows
+        if refused:
+            raise refused_photos_error(refused, len(photos))
+
+
+def checkpoint_describer(
+    checkpoint: Path, image_size: str | tuple[int, int], settings: Settings
+) -> Describer:
+    """`image_size`: `same` as the model was built for, `native`, or (height, width)."""
+    loaded = load_checkpoint(checkpoint)
+    size = None if image_size == "native" else loaded.config.image_size
+    if not isinstance(image_size, str):
+        size = image_size
+    device = choose_device(settings.device)
+    describe = ModelDescriber(
+        loaded.model.to(device),
+        device,
+        size,
+        batch_photos=settings.batch_photos if size else 1,
+        max_pixels=settings.max_image_pixels,
+    )
+    spec = {
+        "checkpoint": loaded.fingerprint,
+        "preprocessing": describe.preprocessing.as_spec(),
+        "decoder": DECODER,
+    }
+    about = {
+        "checkpoint": checkpoint.name,
+        "model": loaded.config.model_dump(mode="json"),
+        "image size": "native" if size is None else f"{size[0]} x {size[1]}",
+        "device": device.type,
+    }
+    about |= {name: loaded.about[name] for name in ("epoch",) if name in loaded.about}
+    return Describer(checkpoint.stem, _with_cache(describe, spec, settings), spec, about)
+
+
+def extractor_describer(
+    recipe: ExtractorConfig,
+    vocabulary: Path | None,
+    database: Sequence[Path],
+    settings: Settings,
+    progress: Progress,
+    *,
+    fit: bool = False,
+) -> Describer:
+    """VLAD takes the vocabulary of the file; with `fit`, or where none is given or shipped, one
+    that is learnt from the database's own photos, never from the queries."""
+    about: dict[str, Any] = {}
+    extractor = load_extractor(recipe, settings)
+    if recipe.needs_vocabulary and vocabulary is None and (fit or not recipe.shipped_vocabulary):
+        centres: ClusterCentres | None = _fit_vocabulary(extractor, database, settings, progress)
+        about["vocabulary"] = "fitted on the database's photos"
+    else:
+        centres = resolve_centres(extractor, load_own_vocabulary(recipe, vocabulary))
+        if centres is not None:
+            about["vocabulary"] = vocabulary.name if vocabulary else "the shipped one"
+    spec = extractor.spec(centres)
+    describe = ExtractorDescriber(extractor, centres, settings)
+    about |= {"precision": extractor.precision, "device": extractor.backbone.device.type}
+    return Describer(recipe.name, _with_cache(describe, spec, settings), spec, about)
+
+
+def _fit_vocabulary(
+    extractor: Extractor, database: Sequence[Path], settings: Settings, progress: Progress
+) -> ClusterCentres:
+    chosen = sample_photos(len(database), FIT_SAMPLE_PHOTOS, extractor.backbone.width, SEED)
+    photos = [database[number] for number in chosen]
+    bars = {name: progress.add_task(name, total=None) for name in ("vocabulary", "clustering")}
+    names = {"describing": "vocabulary", "clustering": "clustering"}
+    refused: list[dict[str, str]] = []
+    fitted = fit_vocabulary(
+        extractor,
+        decode_pixels(photos, extractor.preprocessing, settings, refused),
+        len(photos),
+        clusters=extractor.recipe.clusters,
+        seed=SEED,
+        on_progress=lambda what, done, most: progress.update(
+            bars[names[what]], completed=done, total=most
+        ),
+    )
+    return fitted.centres
+
+
+def _with_cache(
+    describe: TimedDescriber, spec: dict[str, Any], settings: Settings
+) -> CachedDescriber:
+    return CachedDescriber(
+        describe,
+        settings.placewise_home / CACHE_FOLDER,
+        spec,
+        most_bytes=settings.descriptor_cache_bytes,
+    )

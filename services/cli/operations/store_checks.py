@@ -1,0 +1,90 @@
+"""The doctor's checks of the object store: its owner, held collection, file permissions."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from uuid import UUID
+
+from sqlalchemy import select
+from sqlalchemy.exc import SQLAlchemyError
+
+from shared.catalog.database_errors import to_unavailable
+from shared.catalog.installation import Installation
+from shared.catalog.tables import open_catalog
+from shared.config.private_files import is_open_to_others
+from shared.config.settings import Settings
+from shared.errors import Misconfigured
+from shared.storage import FolderStore, OwnedStore
+from shared.storage.open_store import open_store
+from shared.storage.ownership import read_owner, taken
+from shared.storage.trash import read_hold
+
+
+def collection_check(settings: Settings) -> str:
+    """Whether the store belongs to this catalog, and whether orphans are collected."""
+    folder = settings.placewise_home / "objects"
+    store: OwnedStore
+    if settings.s3_endpoint is not None:
+        store = open_store(settings, exclusive=False)
+    elif folder.exists():
+        store = FolderStore(folder, alone=False)  # UPLOAD_DIR, which has no notes, is not marked
+    else:
+        return "nothing is stored yet"
+    owner = read_owner(store)
+    if owner is None:
+        return "the object store has no owner yet; the next start marks it"
+    if str(_installation_id(settings)) != owner:
+        raise taken(store, "belongs to another catalog than this one")
+    hold = read_hold(store)
+    if hold is not None:
+        raise Misconfigured("collection_held", hold.describe())
+    return "the object store belongs to this catalog, and orphans are collected"
+
+
+def permissions_check(settings: Settings) -> str:
+    """Whether other users of this machine can read what is stored."""
+    roots = [settings.placewise_home, settings.upload_dir, _sqlite_file(settings)]
+    there = [root for root in roots if root is not None and root.exists()]
+    # What lies in a private folder can't be reached.
+    wide = [
+        root
+        for root in there
+        if is_open_to_others(root) and not any(_is_private_parent(parent, root) for parent in there)
+    ]
+    if wide:
+        named = " ".join(f"'{root}'" for root in wide)
+        raise Misconfigured(
+            "readable_by_others",
+            f"Other users of this machine have access to {named}: photos, hashes of keys and the "
+            f"catalog lie there. Take it away: chmod -R go-rwx {named}",
+        )
+    return "only this user can read what is stored" if there else "nothing is stored yet"
+
+
+def _is_private_parent(parent: Path, path: Path) -> bool:
+    return path != parent and path.is_relative_to(parent) and not is_open_to_others(parent)
+
+
+def _sqlite_file(settings: Settings) -> Path | None:
+    catalog = open_catalog(settings, "doctor")  # opens no connection
+    catalog.close()
+    return Path(catalog.url.database) if catalog.is_sqlite and catalog.url.database else None
+
+
+def _installation_id(settings: Settings) -> UUID | None:
+    """None for a catalog that does not exist."""
+    file = _sqlite_file(settings)
+    if file is not None and not file.exists():
+        return None
+    catalog = open_catalog(settings, "doctor")
+    try:
+        with catalog.read() as session:
+            return session.scalar(select(Installation.id))
+    except SQLAlchemyError as error:
+        raise to_unavailable(error) or Misconfigured(
+            "catalog_unreadable",
+            f"The catalog can't be read ({type(error).__name__}). Check its permissions, or "
+            "restore it from a backup.",
+        ) from error
+    finally:
+        catalog.close()

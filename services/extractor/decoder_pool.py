@@ -1,0 +1,128 @@
+"""Decoding in child processes with a memory limit and a time limit.
+
+A photo that makes the decoder crash, hang or swallow memory ends its child, not the worker, and
+not the photos beside it.
+"""
+
+from __future__ import annotations
+
+import logging
+import multiprocessing
+import threading
+from collections import deque
+from collections.abc import Sequence
+from concurrent.futures import TimeoutError as TimedOut
+from concurrent.futures import wait
+from concurrent.futures.process import BrokenProcessPool
+
+from pebble import ProcessExpired, ProcessFuture, ProcessPool
+
+from services.extractor.decoder_process import limit_memory
+from shared.config.settings import Settings
+from shared.errors import PlacewiseError, Unavailable, Unprocessable
+from shared.imaging.decode import DecodedPhoto, decode_photo
+from shared.imaging.preprocessing import Preprocessing
+
+log = logging.getLogger(__name__)
+
+POOL_POLL_SECONDS = 1.0  # how often a waiting batch looks whether the pool still lives
+
+# Photos of a batch that a child has before it: one under way and the next. All of them at once
+# would keep a query's photo, which comes from another thread, waiting behind the whole batch.
+SCHEDULED_PER_PROCESS = 2
+
+# A child may be killed for reasons of the machine (memory); a photo gets a second one.
+MAX_DECODE_ATTEMPTS = 2
+
+
+class DecoderPool:
+    """Decodes batches of photos in parallel; results come in the order of the photos."""
+
+    def __init__(self, settings: Settings) -> None:
+        self._settings = settings
+        self._restart_lock = threading.Lock()
+        self._pool = self._start_pool()
+
+    def decode(
+        self, photos: Sequence[bytes], preprocessing: Preprocessing
+    ) -> list[DecodedPhoto | PlacewiseError]:
+        """Each photo decoded, or the reason why it can't be."""
+        with self._restart_lock:  # batches and model changes decode from different threads
+            if not self._pool.active:
+                log.error("the decoder pool broke; starting a new one")
+                self.close()
+                self._pool = self._start_pool()
+        outcomes: list[DecodedPhoto | PlacewiseError] = []
+        pending: deque[tuple[ProcessFuture[DecodedPhoto], bytes]] = deque()
+        for data in photos:
+            if len(pending) == self._settings.decode_processes * SCHEDULED_PER_PROCESS:
+                outcomes.append(self._result(*pending.popleft(), preprocessing))
+            pending.append((self._schedule(data, preprocessing), data))
+        outcomes += [self._result(future, data, preprocessing) for future, data in pending]
+        return outcomes
+
+    def close(self) -> None:
+        """End the children now."""
+        self._pool.stop()  # type: ignore[no-untyped-call]
+        self._pool.join()
+
+    def _start_pool(self) -> ProcessPool:
+        return ProcessPool(
+            max_workers=self._settings.decode_processes,
+            # Fork would copy a process that holds torch's threads and locks.
+            context=multiprocessing.get_context("spawn"),
+            initializer=limit_memory,
+            initargs=[self._settings.decode_memory_bytes],
+        )
+
+    def _schedule(self, data: bytes, preprocessing: Preprocessing) -> ProcessFuture[DecodedPhoto]:
+        try:
+            return self._pool.schedule(
+                decode_photo,
+                args=[data, preprocessing, self._settings.max_image_pixels],
+                timeout=self._settings.decode_timeout_seconds,
+            )
+        except RuntimeError as error:  # how pebble says that the pool no longer runs
+            raise _pool_broken_error() from error
+
+    def _result(
+        self, future: ProcessFuture[DecodedPhoto], data: bytes, preprocessing: Preprocessing
+    ) -> DecodedPhoto | PlacewiseError:
+        for attempt in range(1, MAX_DECODE_ATTEMPTS + 1):
+            try:
+                return self._await(future)
+            except PlacewiseError as error:
+                if isinstance(error, Unavailable):
+                    raise
+                return error
+            except TimedOut:
+                return Unprocessable(
+                    "undecodable_photo",
+                    "The photo could not be decoded within "
+                    f"{self._settings.decode_timeout_seconds:g} s.",
+                )
+            except (ProcessExpired, MemoryError) as error:
+                if attempt == MAX_DECODE_ATTEMPTS:
+                    return Unprocessable(
+                        "undecodable_photo",
+                        f"The decoder crashed on this photo {MAX_DECODE_ATTEMPTS} times "
+                        f"({type(error).__name__}).",
+                    )
+                future = self._schedule(data, preprocessing)
+        raise AssertionError("the last try returns")
+
+    def _await(self, future: ProcessFuture[DecodedPhoto]) -> DecodedPhoto:
+        """The future's result; Unavailable when the pool broke, and no result will ever come."""
+        while True:
+            done, _ = wait([future], timeout=POOL_POLL_SECONDS)
+            if done:
+                try:
+                    return future.result()
+                except BrokenProcessPool as error:  # a child was killed between two photos
+                    raise _pool_broken_error() from error
+            if not self._pool.active:
+                raise _pool_broken_error()
+
+
+def _pool_broken_error() -> Unavailable:
+    return Unavailable("decoders_broke", "The decoder processes broke; trying again.")

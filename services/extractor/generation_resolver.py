@@ -1,0 +1,167 @@
+"""Which generation a batch is described into, with the extractor and centres that it takes.
+
+After an upgrade: maps whose descriptors this worker would make otherwise are described anew.
+
+Another release of the decoder changes pixels, and with them descriptors, a little. Rows of two
+specs never mix, so uploads would wait. Where this is the only worker, it starts the model change
+itself; among several, a person decides when all of them have been upgraded.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from uuid import UUID
+
+from sqlalchemy import select
+
+from services.extractor.model_registry import (
+    DescriptorPipeline,
+    ModelRegistry,
+    check_spec_matches,
+    ensure_model_row,
+    generation_spec_columns,
+)
+from shared.catalog.base import db_now
+from shared.catalog.generations import Generation, GenerationState, active_generation
+from shared.catalog.jobs import QUERY_JOBS
+from shared.catalog.maps import Map, increment_map_version, lock_map
+from shared.catalog.session import Catalog
+from shared.catalog.vocabularies import (
+    StoredWhitening,
+    Vocabulary,
+    VocabularyOrigin,
+    add_vocabulary,
+)
+from shared.descriptors.extractor import Extractor, spec_fingerprint
+from shared.descriptors.vocabulary import encode_centres
+from shared.errors import Conflict, PlacewiseError
+from shared.ids import new_id
+from shared.jobs import Job, JobKind
+from shared.jobs.model_changes import start_model_change, wake_vocabulary_waiters
+from shared.storage import ObjectStore
+from shared.storage.keys import new_vocabulary_key
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ResolvedGeneration(DescriptorPipeline):
+    generation: Generation
+
+
+def resolve_generation(
+    catalog: Catalog, store: ObjectStore, models: ModelRegistry, job: Job
+) -> ResolvedGeneration | None:
+    """Where the batch of `job` goes; None while the map has no vocabulary.
+
+    A job that names a generation goes there; the others go to the map's active one, which is made
+    here on first use when the extractor brings a vocabulary or needs none.
+    """
+    with catalog.read() as session:
+        if job.generation_id is not None:
+            generation = session.get(Generation, job.generation_id)
+        else:
+            generation = active_generation(session, job.map_id)
+        vocabulary, whitening = None, None
+        if generation is not None and generation.vocabulary_id is not None:
+            vocabulary = session.get(Vocabulary, generation.vocabulary_id)
+        if generation is not None and generation.whitening_id is not None:
+            whitening = session.get(StoredWhitening, generation.whitening_id)
+        map_extractor = session.get_one(Map, job.map_id).extractor
+    if generation is None:
+        first = _create_first_generation(
+            catalog, store, models.extractor(map_extractor), job.map_id
+        )
+        if first is None:
+            return None
+        generation, vocabulary = first
+    made = models.pipeline_of_generation(generation, vocabulary, whitening)
+    target = ResolvedGeneration(
+        made.extractor, made.centres, made.projection, generation=generation
+    )
+    # A query is compared once and thrown away: another decoder release is close enough.
+    check_spec_matches(generation, target, decoder_matters=job.kind not in QUERY_JOBS)
+    return target
+
+
+def _create_first_generation(
+    catalog: Catalog, store: ObjectStore, extractor: Extractor, map_id: UUID
+) -> tuple[Generation, Vocabulary | None] | None:
+    """The map's first generation, with the shipped vocabulary if one is needed."""
+    shipped = extractor.shipped_vocabulary()
+    if extractor.recipe.needs_vocabulary and shipped is None:
+        return None
+    key = new_vocabulary_key()
+    if shipped is not None:
+        store.put(key, encode_centres(shipped[0]))
+    with catalog.write() as session:
+        lock_map(session, map_id)
+        found = active_generation(session, map_id)
+        if found is not None:  # another worker was first
+            vocabulary = None
+            if found.vocabulary_id is not None:
+                vocabulary = session.get_one(Vocabulary, found.vocabulary_id)
+            return found, vocabulary
+        vocabulary, centres = None, None
+        if shipped is not None:
+            centres, provenance = shipped
+            vocabulary = add_vocabulary(
+                session,
+                map_id,
+                VocabularyOrigin.SHIPPED,
+                shape=centres.array.shape,
+                object_key=key,
+                sha256=centres.sha256,
+                provenance=provenance,
+            )
+        generation = Generation(
+            id=new_id(),
+            map_id=map_id,
+            state=GenerationState.ACTIVE,
+            activated_at=db_now(),
+            **generation_spec_columns(
+                ensure_model_row(session, extractor),
+                DescriptorPipeline(extractor, centres),
+                vocabulary.id if vocabulary else None,
+            ),
+        )
+        session.add(generation)
+        session.flush()
+        wake_vocabulary_waiters(session, map_id)
+        increment_map_version(session, map_id)
+    log.info("generation %s begins with %s", generation.id, extractor.recipe.name)
+    return generation, vocabulary
+
+
+def reindex_outdated_generations(catalog: Catalog, models: ModelRegistry) -> int:
+    """Start a switch to the same vocabulary and whitening in every outdated map; how many."""
+    with catalog.read() as session:
+        found = session.execute(
+            select(Generation, Vocabulary, StoredWhitening)
+            .outerjoin(Vocabulary, Vocabulary.id == Generation.vocabulary_id)
+            .outerjoin(StoredWhitening, StoredWhitening.id == Generation.whitening_id)
+            .join(Map, Map.id == Generation.map_id)
+            .where(Generation.state == GenerationState.ACTIVE, Map.deleted_at.is_(None))
+        ).all()
+    started = 0
+    for generation, vocabulary, whitening in found:
+        try:
+            made = models.pipeline_of_generation(generation, vocabulary, whitening)
+        except PlacewiseError as error:
+            log.error("generation %s can't be checked: %s", generation.id, error.detail)
+            continue
+        if spec_fingerprint(made.spec) == generation.spec_fingerprint:
+            continue
+        params = {
+            "vocabulary_id": str(vocabulary.id) if vocabulary else None,
+            "whitening_id": str(whitening.id) if whitening else None,
+        }
+        try:
+            with catalog.write() as session:
+                start_model_change(session, generation.map_id, JobKind.SWITCH, params)
+        except Conflict:
+            continue  # a model change is under way, and brings the new spec
+        log.warning("generation %s was made by other releases: describing anew", generation.id)
+        started += 1
+    return started

@@ -1,0 +1,329 @@
+"""`POST /upload/batch`: many photos in, one job; `GET /jobs/{job_id}/items`: each of them."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from typing import Annotated, Any
+from uuid import UUID
+
+from fastapi import APIRouter, Query, Request, Response
+from pydantic import Field
+from starlette.concurrency import run_in_threadpool
+
+from services.gateway.admission import (
+    ADMIT_JOB,
+    CHECK_PHOTO_QUOTA,
+    AdmissionDep,
+    UploadKind,
+    photo_limit,
+)
+from services.gateway.authentication import READ, WRITE, Caller, get_caller
+from services.gateway.batch_upload import (
+    ARCHIVE_FIELD,
+    FILES_FIELD,
+    MANIFEST_FIELD,
+    NDJSON_MEDIA_TYPES,
+    PREFIX_FIELD,
+    BatchFile,
+    BatchUpload,
+    discard_batch_upload,
+    parse_batch_upload,
+    too_many_photos_error,
+)
+from services.gateway.dependencies import DEFAULT_MAP, GatewayContext, GatewayDep, JobId, MapName
+from services.gateway.idempotency import IdempotentFormDep, IdempotentReplay, IdempotentRequest
+from services.gateway.schemas import JobAcceptedResponse, ResponseModel, job_url, to_job_accepted
+from shared.catalog.batch_items import (
+    BatchItem,
+    BatchSource,
+    add_batch_items,
+    create_batch,
+    list_batch_items,
+)
+from shared.catalog.jobs import get_job
+from shared.catalog.maps import get_map
+from shared.config.settings import Settings
+from shared.errors import Conflict, PlacewiseError, Unprocessable, invalid_field_error
+from shared.ingest.photo_metadata import (
+    KEY_FIELD,
+    MAX_REPORTED_LINES,
+    ManifestEntry,
+    bad_lines_error,
+    read_jsonl_manifest,
+)
+from shared.jobs import JobKind, JobState
+from shared.storage.keys import is_valid_key
+
+router = APIRouter(tags=["batches"])
+
+BATCH_UPLOAD_PATH = "/upload/batch"
+
+_BINARY_SCHEMA = {"type": "string", "format": "binary"}
+_MANIFEST_SCHEMA = {
+    "type": "string",
+    "description": "JSONL: `filename` (of a file of the form) or `key` (of an object below "
+    "IMPORT_PREFIX), and any of the fields of `POST /upload`",
+}
+REQUEST_BODY = {
+    "requestBody": {
+        "required": True,
+        "content": {
+            "multipart/form-data": {
+                "schema": {
+                    "type": "object",
+                    "properties": {
+                        FILES_FIELD: {
+                            "type": "array",
+                            "items": _BINARY_SCHEMA,
+                            "description": "photos",
+                        },
+                        ARCHIVE_FIELD: {
+                            **_BINARY_SCHEMA,
+                            "description": "one zip, tar or gzipped tar",
+                        },
+                        MANIFEST_FIELD: _MANIFEST_SCHEMA,
+                        PREFIX_FIELD: {
+                            "type": "string",
+                            "description": "every photo below it: a folder below IMPORT_PREFIX, "
+                            "or the same as s3://S3_BUCKET/...",
+                        },
+                    },
+                }
+            },
+            NDJSON_MEDIA_TYPES[0]: {"schema": _MANIFEST_SCHEMA},
+        },
+    }
+}
+
+
+class BatchAcceptedResponse(JobAcceptedResponse):
+    """202: `items_url` tells of each photo."""
+
+    items_url: str
+
+
+class BatchItemResponse(ResponseModel):
+    number: int = Field(description="from 1, in the order in which the photos came")
+    name: str
+    state: JobState = Field(description="`succeeded`: searchable")
+    file_id: UUID | None
+    job_id: UUID | None = Field(description="the job that describes the photo")
+    already_there: bool = Field(description="the map had these bytes; none were stored")
+    line: int | None = Field(description="of the manifest, where it speaks of the photo")
+    error: dict[str, Any] | None = Field(description="an RFC 9457 problem")
+
+    @classmethod
+    def of(cls, item: BatchItem) -> BatchItemResponse:
+        return cls(
+            number=item.number,
+            name=item.name,
+            state=JobState(item.state),
+            file_id=item.photo_id,
+            job_id=item.photo_job_id,
+            already_there=item.already_there,
+            line=item.line,
+            error=item.error,
+        )
+
+
+class BatchItemsResponse(ResponseModel):
+    items: list[BatchItemResponse]
+    next_cursor: str | None
+
+
+@router.post(
+    BATCH_UPLOAD_PATH,
+    operation_id="upload_batch",
+    status_code=202,
+    response_model=BatchAcceptedResponse,
+    openapi_extra=REQUEST_BODY,
+    dependencies=[WRITE, CHECK_PHOTO_QUOTA, ADMIT_JOB],
+)
+async def upload_batch(
+    request: Request,
+    response: Response,
+    gateway: GatewayDep,
+    idempotent: IdempotentFormDep,
+    admission: AdmissionDep,
+    map_name: MapName = DEFAULT_MAP,
+) -> BatchAcceptedResponse:
+    """Bring in many photos: files of a form, one archive, or objects that lie in the store, named
+    one by one or by their prefix.
+
+    One job counts them. Each photo is taken as `POST /upload` takes it; one that is refused is an
+    item that has failed, and the others go on.
+    """
+    with admission.admit_upload(UploadKind.UPLOAD, request):
+        received = await parse_batch_upload(request, gateway.store, gateway.settings)
+    whose = _caller_params(get_caller(request), gateway.settings)
+    started = await run_in_threadpool(_queue_batch, gateway, map_name, received, whose, idempotent)
+    response.headers["Location"] = started.status_url
+    response.headers["Retry-After"] = "1"
+    return started
+
+
+@router.get(
+    "/jobs/{job_id}/items",
+    operation_id="list_batch_items",
+    response_model=BatchItemsResponse,
+    dependencies=[READ],
+)
+def read_batch_items(
+    gateway: GatewayDep,
+    job_id: JobId,
+    state: Annotated[list[JobState] | None, Query()] = None,
+    limit: Annotated[int, Query(ge=1, le=1000)] = 100,
+    cursor: Annotated[str | None, Query()] = None,
+    map_name: MapName = DEFAULT_MAP,
+) -> BatchItemsResponse:
+    """The photos of a batch, in their order; an archive's once it was looked through."""
+    after = _parse_item_cursor(cursor)
+    with gateway.catalog.read() as session:
+        job = get_job(session, get_map(session, map_name).id, job_id)
+        if job.kind != JobKind.BATCH:
+            raise Conflict("no_items", f"The job {job.id} ({job.kind}) is no batch.")
+        found = list_batch_items(session, job.id, state or [], limit + 1, after)
+    page = found[:limit]
+    return BatchItemsResponse(
+        items=[BatchItemResponse.of(item) for item in page],
+        next_cursor=str(page[-1].number) if len(found) > limit else None,
+    )
+
+
+def _parse_item_cursor(cursor: str | None) -> int:
+    if cursor is None:
+        return 0
+    if not (cursor.isascii() and cursor.isdigit() and len(cursor) < 10):
+        raise invalid_field_error("cursor", "is not one that this call has given")
+    return int(cursor)
+
+
+def _queue_batch(
+    gateway: GatewayContext,
+    map_name: str,
+    received: BatchUpload,
+    caller_params: dict[str, Any],
+    idempotent: IdempotentRequest,
+) -> BatchAcceptedResponse:
+    try:
+        idempotent.claim_key(received.idempotency_content())
+        rows, source, params = _plan_items(gateway, received)
+        with gateway.catalog.write() as session:
+            map_id = get_map(session, map_name).id
+            job = create_batch(session, map_id, source, {**params, **caller_params})
+            if source not in (BatchSource.ARCHIVE, BatchSource.PREFIX):  # the steward lists those
+                add_batch_items(session, job, rows)
+            session.flush()
+            session.refresh(job)
+            answer = to_job_accepted(job, map_name)
+            items_url = job_url(job.id, map_name, "/items")
+            started = BatchAcceptedResponse(**answer.model_dump(), items_url=items_url)
+            headers = {"Location": started.status_url, "Retry-After": "1"}
+            idempotent.store_response(session, 202, started, headers)
+            return started
+    except (PlacewiseError, IdempotentReplay):
+        # Only what is certainly refused: after a lost connection the row may be committed.
+        discard_batch_upload(gateway.store, received)
+        raise
+
+
+def _caller_params(caller: Caller, settings: Settings) -> dict[str, Any]:
+    """What the steward has to know of the caller, as parameters of the job."""
+    if caller.key_id is None:
+        return {}
+    limited = photo_limit(caller, settings)
+    return {"key_id": str(caller.key_id), "max_photos": limited[1] if limited else None}
+
+
+def _plan_items(
+    gateway: GatewayContext, received: BatchUpload
+) -> tuple[list[dict[str, Any]], BatchSource, dict[str, Any]]:
+    """The batch's items as columns of BatchItem, where they come from, and its parameters."""
+    if received.archive is not None:
+        archive = received.archive
+        return [], BatchSource.ARCHIVE, {"object_key": archive.key, "filename": archive.name}
+    if received.files:
+        said = read_jsonl_manifest(received.manifest or b"", "the manifest")
+        return list(_form_file_items(received.files, said)), BatchSource.FILES, {}
+    if received.prefix is not None:
+        return (
+            [],
+            BatchSource.PREFIX,
+            {"prefix": validate_prefix(received.prefix, gateway.settings)},
+        )
+    said = read_jsonl_manifest(received.manifest or b"", "the manifest", (KEY_FIELD,))
+    _validate_keys(said, gateway.settings.import_prefix)
+    if not said:
+        raise Unprocessable("no_photos", "The manifest has no line.")
+    if len(said) > gateway.settings.max_batch_photos:
+        raise too_many_photos_error(gateway.settings.max_batch_photos)
+    rows = [
+        {"name": one.name, "object_key": one.name, "fields": one.fields, "line": one.line}
+        for one in said
+    ]
+    return rows, BatchSource.KEYS, {}
+
+
+def _form_file_items(
+    files: list[BatchFile], manifest_lines: list[ManifestEntry]
+) -> Iterator[dict[str, Any]]:
+    times = Counter(file.name for file in files)
+    strange = [
+        (one.line, f"the form has no file {one.name!r}")
+        for one in manifest_lines
+        if not times[one.name]
+    ]
+    strange += [
+        (one.line, f"{times[one.name]} files of the form are called {one.name!r}")
+        for one in manifest_lines
+        if times[one.name] > 1
+    ]
+    if strange:
+        raise bad_lines_error("bad_manifest", "the manifest", sorted(strange)[:MAX_REPORTED_LINES])
+    by_name = {one.name: one for one in manifest_lines}
+    for file in files:
+        line = by_name.get(file.name)
+        item: dict[str, Any] = {
+            "name": file.name,
+            "fields": line.fields if line else {},
+            "line": line.line if line else None,
+        }
+        if file.error is None:
+            item |= {
+                "object_key": file.key,
+                "source": {"size_bytes": file.size_bytes, "sha256": file.sha256},
+            }
+        else:
+            item |= {"state": JobState.FAILED, "error": file.error.as_problem()}
+        yield item
+
+
+def validate_prefix(value: str, settings: Settings) -> str:
+    """The folder of keys that is meant; 422 unless the operator has given it free."""
+    prefix = value
+    if value.startswith("s3://"):
+        bucket, _, prefix = value.removeprefix("s3://").partition("/")
+        if settings.s3_endpoint is None or bucket != settings.s3_bucket:
+            raise invalid_field_error(
+                PREFIX_FIELD,
+                f"names the bucket {bucket!r}, which is not this Placewise's own. Copy the photos "
+                f"below {settings.import_prefix} of its store",
+            )
+    prefix = prefix.rstrip("/") + "/"
+    if not (prefix.startswith(settings.import_prefix) and is_valid_key(prefix[:-1])):
+        raise invalid_field_error(
+            PREFIX_FIELD, f"is not below {settings.import_prefix} (IMPORT_PREFIX)"
+        )
+    return prefix
+
+
+def _validate_keys(manifest_lines: list[ManifestEntry], prefix: str) -> None:
+    """Only what the operator has given free: all else in the store is someone's photo."""
+    bad = [
+        (one.line, f"{KEY_FIELD} is not below {prefix} (IMPORT_PREFIX)")
+        for one in manifest_lines
+        if not (one.name.startswith(prefix) and is_valid_key(one.name))
+    ]
+    if bad:
+        raise bad_lines_error("bad_manifest", "the manifest", bad[:MAX_REPORTED_LINES])

@@ -1,0 +1,259 @@
+"""`/evaluations`: how often the right place comes first, measured on a live map.
+
+`/generations/{id}/word-weights`: which words of the vocabulary tell the map's places apart.
+"""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Annotated, Any
+from uuid import UUID
+
+from fastapi import APIRouter, Query, Response
+from fastapi import Path as PathParameter
+from pydantic import BaseModel, ConfigDict, Field
+from sqlalchemy.orm import Session
+
+from services.gateway.admission import ADMIT_JOB
+from services.gateway.authentication import READ, WRITE
+from services.gateway.dependencies import (
+    DEFAULT_MAP,
+    GatewayDep,
+    GenerationId,
+    MapName,
+    parse_cursor,
+)
+from services.gateway.idempotency import IdempotentDep, IdempotentRequest
+from services.gateway.schemas import JobAcceptedResponse, ResponseModel, accept_job
+from shared.catalog.chunks import has_geotagged
+from shared.catalog.generations import (
+    Evaluation,
+    Generation,
+    GenerationState,
+    active_generation,
+    get_generation,
+    list_evaluations,
+)
+from shared.catalog.maps import get_map
+from shared.catalog.photos import PhotoRole
+from shared.catalog.vocabularies import word_weights_unavailable_reason
+from shared.errors import Conflict, NotFound
+from shared.ids import new_id
+from shared.jobs import Job, JobKind, Priority
+from shared.word_weights.record import HeldOut, Outcome, WordWeights, parse_word_weights
+
+router = APIRouter(tags=["evaluations"])
+
+
+class EvaluationRequest(BaseModel):
+    """What to measure; {} is a good choice."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    sample: int = Field(
+        1000, ge=1, le=1_000_000, description="photos of the map to ask with, at most"
+    )
+    seed: int = Field(0, ge=0, le=2**31 - 1)
+
+
+class EvaluationResponse(ResponseModel):
+    evaluation_id: UUID
+    generation_id: UUID
+    automatic: bool = Field(description="made because the map had changed")
+    searchable: int = Field(description="photos that could be found then")
+    figures: dict[str, Any] = Field(
+        description="`leave_one_out`: the map's own photos asked, themselves left out; "
+        "`labelled_queries`: photos of role `query`; R@k is the share, of those that the map has "
+        "another photo of, with a right one among the first k; `with_word_weights`: the same, "
+        "ranked by the generation's word weights, null where it has none"
+    )
+    evaluated_at: datetime
+
+    @classmethod
+    def of(cls, evaluation: Evaluation) -> EvaluationResponse:
+        return cls(
+            evaluation_id=evaluation.id,
+            generation_id=evaluation.generation_id,
+            automatic=evaluation.automatic,
+            searchable=evaluation.searchable,
+            figures=evaluation.figures,
+            evaluated_at=evaluation.evaluated_at,
+        )
+
+
+class EvaluationsResponse(ResponseModel):
+    evaluations: list[EvaluationResponse]
+    next_cursor: str | None
+
+
+@router.post(
+    "/evaluations",
+    operation_id="evaluate",
+    status_code=202,
+    response_model=JobAcceptedResponse,
+    dependencies=[WRITE, ADMIT_JOB],
+)
+def start_evaluation(
+    gateway: GatewayDep,
+    response: Response,
+    idempotent: IdempotentDep,
+    options: EvaluationRequest | None = None,
+    map_name: MapName = DEFAULT_MAP,
+) -> JobAcceptedResponse:
+    """Measure the active generation: leave-one-out on the map's own photos whose place is known,
+    and recall on its labelled queries. The job's `result` has the figures."""
+    params = (options or EvaluationRequest.model_validate({})).model_dump()
+    with gateway.catalog.write() as session:
+        map_ = get_map(session, map_name)
+        generation = active_generation(session, map_.id)
+        job = queue_evaluation_job(
+            session,
+            idempotent,
+            map_.id,
+            generation,
+            JobKind.EVALUATE,
+            {**params, "automatic": False},
+        )
+    return accept_job(response, job, map_name)
+
+
+@router.get(
+    "/evaluations",
+    operation_id="list_evaluations",
+    response_model=EvaluationsResponse,
+    dependencies=[READ],
+)
+def read_evaluations(
+    gateway: GatewayDep,
+    limit: Annotated[int, Query(ge=1, le=1000)] = 50,
+    cursor: Annotated[str | None, Query()] = None,
+    map_name: MapName = DEFAULT_MAP,
+) -> EvaluationsResponse:
+    """Newest first, those made by themselves as well: before and after a vocabulary, in numbers."""
+    before = parse_cursor(cursor)
+    with gateway.catalog.read() as session:
+        found = list_evaluations(session, get_map(session, map_name).id, limit + 1, before)
+    page = found[:limit]
+    return EvaluationsResponse(
+        evaluations=[EvaluationResponse.of(evaluation) for evaluation in page],
+        next_cursor=str(page[-1].id) if len(found) > limit else None,
+    )
+
+
+def queue_evaluation_job(
+    session: Session,
+    idempotent: IdempotentRequest,
+    map_id: UUID,
+    generation: Generation | None,
+    kind: JobKind,
+    params: dict[str, Any],
+) -> Job:
+    """A job that asks the generation with the map's own photos; Conflict (`nothing_to_evaluate`)
+    where none of them has a place."""
+    if generation is None or not has_geotagged(session, generation.id, PhotoRole.DATABASE):
+        raise Conflict(
+            "nothing_to_evaluate",
+            "The map has no described photo with coordinates or a place. Upload some, and wait "
+            "for their jobs.",
+        )
+    job = Job(id=new_id(), map_id=map_id, kind=kind, priority=Priority.EVALUATION, params=params)
+    session.add(job)
+    session.flush()
+    idempotent.store_job_response(session, job)
+    return job
+
+
+class WordWeightsRequest(BaseModel):
+    """How to learn them; {} is a good choice."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    sample: int = Field(
+        1000, ge=1, le=1_000_000, description="photos of the map to try them on, at most"
+    )
+    seed: int = Field(0, ge=0, le=2**31 - 1, description="decides pairs, halves and sample")
+
+
+class WordWeightsResponse(ResponseModel):
+    generation_id: UUID
+    outcome: Outcome = Field(
+        description="`kept`: searches rank by them; `not kept`: recall did not rise by more than "
+        "chance; `not enough pairs`"
+    )
+    reason: str
+    taught_by: str = Field(description="`coordinates` or `places`")
+    near_pairs: int = Field(description="pairs of photos of one place that have taught")
+    far_pairs: int = Field(description="pairs of photos of two places that have taught")
+    seed: int
+    searchable: int = Field(description="photos that could be found then")
+    held_out: HeldOut | None = Field(
+        description="photos asked with what the half of the map without them has taught: recall "
+        "`without` weights and `weighted`"
+    )
+    weights: list[float] = Field(description="one for each word of the vocabulary, in its order")
+
+    @classmethod
+    def of(cls, generation_id: UUID, record: WordWeights) -> WordWeightsResponse:
+        said: dict[str, Any] = record.model_dump(exclude={"calibration"})
+        return cls(generation_id=generation_id, **said)
+
+
+GenerationIdPath = Annotated[GenerationId, PathParameter(description="of the map")]
+
+
+@router.post(
+    "/generations/{generation_id}/word-weights",
+    operation_id="learn_word_weights",
+    status_code=202,
+    response_model=JobAcceptedResponse,
+    dependencies=[WRITE, ADMIT_JOB],
+)
+def start_word_weights_fit(
+    gateway: GatewayDep,
+    response: Response,
+    idempotent: IdempotentDep,
+    generation_id: GenerationIdPath,
+    options: WordWeightsRequest | None = None,
+    map_name: MapName = DEFAULT_MAP,
+) -> JobAcceptedResponse:
+    """Learn from the map's own places which words of its vocabulary to trust; keep the weights
+    where they raise recall on photos that have not taught them."""
+    params = (options or WordWeightsRequest.model_validate({})).model_dump()
+    with gateway.catalog.write() as session:
+        map_ = get_map(session, map_name)
+        generation = get_generation(session, map_.id, generation_id)
+        if generation.state != GenerationState.ACTIVE:
+            raise Conflict(
+                "generation_not_active",
+                f"The generation is {generation.state}: no search asks it, so nothing can be "
+                "tried. GET /api/v1/generations names the active one.",
+            )
+        if reason := word_weights_unavailable_reason(session, generation):
+            raise Conflict("no_word_weights", f"This generation gets no word weights: {reason}.")
+        params["generation_id"] = str(generation.id)
+        job = queue_evaluation_job(
+            session, idempotent, map_.id, generation, JobKind.WORD_WEIGHTS, params
+        )
+    return accept_job(response, job, map_name)
+
+
+@router.get(
+    "/generations/{generation_id}/word-weights",
+    operation_id="read_word_weights",
+    response_model=WordWeightsResponse,
+    dependencies=[READ],
+)
+def read_word_weights(
+    gateway: GatewayDep, generation_id: GenerationIdPath, map_name: MapName = DEFAULT_MAP
+) -> WordWeightsResponse:
+    """What the map's places have taught; 404 before that."""
+    with gateway.catalog.read() as session:
+        generation = get_generation(session, get_map(session, map_name).id, generation_id)
+    record = parse_word_weights(generation.word_weights)
+    if record is None:
+        raise NotFound(
+            "word_weights_not_found",
+            f"The generation {generation_id} has learnt no word weights. Have them learnt: POST "
+            f"/api/v1/generations/{generation_id}/word-weights.",
+        )
+    return WordWeightsResponse.of(generation_id, record)

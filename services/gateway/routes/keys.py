@@ -1,0 +1,103 @@
+"""`/keys`: who may call. An admin's calls."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Annotated
+from uuid import UUID
+
+from fastapi import APIRouter
+from pydantic import BaseModel, ConfigDict, Field
+
+from services.gateway.authentication import ADMIN
+from services.gateway.dependencies import NO_NUL_PATTERN, GatewayDep, KeyId
+from services.gateway.schemas import ResponseModel
+from shared.catalog.api_keys import ApiKey, KeyLimits, create_api_key, list_api_keys, revoke_api_key
+from shared.security.api_keys import Scope
+
+router = APIRouter(tags=["administration"])
+
+DAY_SECONDS = 86_400
+MAX_KEY_DAYS = 36_500
+
+KeyLimit = Annotated[int | None, Field(ge=1, le=2**53)]
+
+
+class CreateKeyRequest(BaseModel):
+    """The key to make. A limit that is left out is the one of the server's settings."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    name: str = Field(min_length=1, max_length=200, pattern=NO_NUL_PATTERN)
+    scopes: list[Scope] = Field(min_length=1, max_length=len(Scope))
+    days: float | None = Field(
+        None,
+        gt=0,
+        le=MAX_KEY_DAYS,
+        allow_inf_nan=False,
+        description="until it expires; null: never",
+    )
+    requests_per_minute: Annotated[int | None, Field(ge=1, le=10**9)] = None
+    upload_bytes_per_day: KeyLimit = None
+    max_photos: KeyLimit = None
+
+
+class KeyResponse(ResponseModel):
+    id: UUID
+    name: str
+    prefix: str = Field(description="the key's first characters")
+    scopes: list[Scope]
+    requests_per_minute: int | None
+    upload_bytes_per_day: int | None
+    max_photos: int | None
+    created_at: datetime
+    expires_at: datetime | None
+    last_used_at: datetime | None = Field(description="to the minute")
+    revoked_at: datetime | None
+
+    @classmethod
+    def fields_of(cls, key: ApiKey) -> dict[str, object]:
+        return {name: getattr(key, name) for name in KeyResponse.model_fields}
+
+
+class CreatedKeyResponse(KeyResponse):
+    key: str = Field(description="the key itself: it is shown this once")
+
+
+@router.get(
+    "/keys", operation_id="list_keys", response_model=list[KeyResponse], dependencies=[ADMIN]
+)
+def read_keys(gateway: GatewayDep) -> list[KeyResponse]:
+    """Every key that was ever made, newest first; the keys themselves are kept nowhere."""
+    with gateway.catalog.read() as session:
+        return [
+            KeyResponse.model_validate(KeyResponse.fields_of(key)) for key in list_api_keys(session)
+        ]
+
+
+@router.post(
+    "/keys",
+    operation_id="create_key",
+    status_code=201,
+    response_model=CreatedKeyResponse,
+    dependencies=[ADMIN],
+)
+def create_key(gateway: GatewayDep, body: CreateKeyRequest) -> CreatedKeyResponse:
+    """Make a key. It stands in this answer and nowhere else, so this call takes no
+    `Idempotency-Key`: when the answer got lost, revoke the key and make another one."""
+    limits = KeyLimits(body.requests_per_minute, body.upload_bytes_per_day, body.max_photos)
+    life_seconds = None if body.days is None else body.days * DAY_SECONDS
+    with gateway.catalog.write() as session:
+        made, key = create_api_key(
+            session, body.name, set(body.scopes), life_seconds=life_seconds, limits=limits
+        )
+        return CreatedKeyResponse.model_validate({**KeyResponse.fields_of(made), "key": key})
+
+
+@router.delete(
+    "/keys/{key_id}", operation_id="revoke_key", response_model=KeyResponse, dependencies=[ADMIN]
+)
+def revoke_key_by_id(gateway: GatewayDep, key_id: KeyId) -> KeyResponse:
+    """From now on the key opens nothing, on no gateway. It stays in the list."""
+    with gateway.catalog.write() as session:
+        return KeyResponse.model_validate(KeyResponse.fields_of(revoke_api_key(session, key_id)))

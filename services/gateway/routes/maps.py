@@ -1,0 +1,158 @@
+"""`/maps`: named databases of photos, each with its own extractor, vocabulary and generation."""
+
+from __future__ import annotations
+
+import re
+from datetime import datetime
+from typing import Annotated
+from uuid import UUID
+
+from fastapi import APIRouter, Path
+from pydantic import BaseModel, ConfigDict, Field, field_validator
+from sqlalchemy.orm import Session
+
+from services.gateway.authentication import READ, WRITE
+from services.gateway.dependencies import DEFAULT_MAP, NO_NUL_PATTERN, GatewayDep
+from services.gateway.idempotency import IdempotentDep
+from services.gateway.schemas import ResponseModel
+from shared.catalog.generations import active_generation
+from shared.catalog.maps import (
+    MAP_NAME_PATTERN,
+    Map,
+    create_map,
+    get_map,
+    get_map_statistics,
+    get_or_create_default_map,
+    list_maps,
+    lock_map,
+    mark_map_deleted,
+)
+from shared.catalog.models import check_model_registered
+from shared.catalog.vocabularies import vocabulary_standing
+from shared.errors import Misconfigured, invalid_field_error
+from shared.jobs import Job
+from shared.jobs.transitions import cancel_jobs
+
+router = APIRouter(tags=["maps"])
+
+MapNamePath = Annotated[
+    str, Path(description="the map's name", min_length=1, max_length=100, pattern=NO_NUL_PATTERN)
+]
+
+
+class CreateMapRequest(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+    name: str = Field(json_schema_extra={"pattern": MAP_NAME_PATTERN})
+    extractor: str | None = Field(
+        None, max_length=200, pattern=NO_NUL_PATTERN, description="left out: the configured one"
+    )
+
+    @field_validator("name")
+    @classmethod
+    def _validate_name(cls, name: str) -> str:
+        if not re.fullmatch(MAP_NAME_PATTERN, name):
+            raise ValueError(
+                "a map's name has up to 100 letters, digits, `.`, `_` and `-`, and begins with a "
+                "letter or digit"
+            )
+        return name
+
+
+class MapResponse(ResponseModel):
+    name: str
+    extractor: str
+    version: int = Field(description="grows with every change of what can be found")
+    photos: int
+    searchable: int
+    labelled_queries: int
+    counted_at: datetime = Field(description="when the three counts above were made")
+    generation_id: UUID | None
+    vocabulary: str | None = Field(description="own, foreign, none; null before the first photo")
+    dimension: int | None = Field(description="of its descriptors; null before the first photo")
+    pca_from: int | None = Field(description="their dimension before PCA; null without")
+    created_at: datetime
+
+
+class DeletedMapResponse(ResponseModel):
+    success: bool
+    message: str
+    deleted_map: str
+
+
+@router.get(
+    "/maps", operation_id="list_maps", response_model=list[MapResponse], dependencies=[READ]
+)
+def read_maps(gateway: GatewayDep) -> list[MapResponse]:
+    """Every map, by name."""
+    with gateway.catalog.read() as session:
+        return [_map_response(session, map_) for map_ in list_maps(session)]
+
+
+@router.post(
+    "/maps",
+    operation_id="create_map",
+    status_code=201,
+    response_model=MapResponse,
+    dependencies=[WRITE],
+)
+def create_new_map(
+    gateway: GatewayDep, body: CreateMapRequest, idempotent: IdempotentDep
+) -> MapResponse:
+    """Make an empty map; 409 when the name is taken."""
+    settings = gateway.settings
+    try:
+        recipe = settings.recipe(body.extractor or settings.new_map_extractor)
+    except Misconfigured as error:
+        raise invalid_field_error("extractor", error.detail) from None
+    with gateway.catalog.write() as session:
+        check_model_registered(session, recipe)
+        answer = _map_response(session, create_map(session, body.name, recipe.name))
+        idempotent.store_response(session, 201, answer)
+    return answer
+
+
+@router.get("/maps/{name}", operation_id="get_map", response_model=MapResponse, dependencies=[READ])
+def read_map(gateway: GatewayDep, name: MapNamePath) -> MapResponse:
+    """One map."""
+    with gateway.catalog.read() as session:
+        return _map_response(session, get_map(session, name))
+
+
+@router.delete(
+    "/maps/{name}",
+    operation_id="delete_map",
+    response_model=DeletedMapResponse,
+    dependencies=[WRITE],
+)
+def delete_map(gateway: GatewayDep, name: MapNamePath) -> DeletedMapResponse:
+    """Gone with all its photos at once; its bytes follow. `default` is made anew, empty."""
+
+    def remove(session: Session) -> None:
+        map_ = lock_map(session, get_map(session, name).id)
+        cancel_jobs(session, Job.map_id == map_.id)
+        mark_map_deleted(session, map_)
+        if name == DEFAULT_MAP:
+            get_or_create_default_map(session, gateway.settings.new_map_extractor)
+
+    gateway.catalog.run(remove)
+    return DeletedMapResponse(success=True, message=f"The map {name} is deleted.", deleted_map=name)
+
+
+def _map_response(session: Session, map_: Map) -> MapResponse:
+    generation = active_generation(session, map_.id)
+    figures, counted_at = get_map_statistics(session, map_.id)
+    return MapResponse(
+        name=map_.name,
+        extractor=map_.extractor,
+        version=map_.version,
+        photos=figures.photos,
+        searchable=figures.searchable,
+        labelled_queries=figures.labelled_queries,
+        counted_at=counted_at,
+        generation_id=generation.id if generation else None,
+        vocabulary=vocabulary_standing(session, generation) if generation else None,
+        dimension=generation.dimension if generation else None,
+        pca_from=generation.pca_from if generation else None,
+        created_at=map_.created_at,
+    )

@@ -1,0 +1,246 @@
+"""`/models`: models that were trained elsewhere and added, for maps to be described with.
+
+The gateway stores what comes and queues a job; it never opens a checkpoint. An extractor checks it
+(`services.extractor.added_models`).
+"""
+
+from __future__ import annotations
+
+import re
+from datetime import datetime
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Path, Request, Response
+from pydantic import Field
+from sqlalchemy.orm import Session
+from starlette.concurrency import run_in_threadpool
+
+from services.gateway.admission import ADMIT_JOB, AdmissionDep, UploadKind
+from services.gateway.authentication import ADMIN, READ
+from services.gateway.dependencies import (
+    DEFAULT_MAP,
+    NO_NUL_PATTERN,
+    GatewayContext,
+    GatewayDep,
+    MapName,
+)
+from services.gateway.idempotency import IdempotentFormDep, IdempotentRequest
+from services.gateway.multipart_upload import multipart_schema, store_form_file
+from services.gateway.schemas import JobAcceptedResponse, ResponseModel, accept_job
+from shared.catalog.maps import get_map
+from shared.catalog.models import (
+    Model,
+    get_registered_model,
+    list_maps_using_model,
+    list_registered_models,
+    remove_model,
+)
+from shared.errors import PlacewiseError, TooLarge, invalid_field_error
+from shared.extractor_config.names import MODEL_NAME_PATTERN, MODEL_NAME_RULE
+from shared.ids import new_id
+from shared.jobs import Job, JobKind, Priority
+from shared.storage.keys import new_checkpoint_key
+
+MAX_LICENCE_CHARACTERS = 1000
+MAX_NOTE_CHARACTERS = 4000
+MODEL_FORM_FIELDS: dict[str, dict[str, Any]] = {
+    "name": {
+        "type": "string",
+        "pattern": MODEL_NAME_PATTERN,
+        "description": "what maps call it: gsv:NAME. Given once, it never means other weights",
+    },
+    "licence": {
+        "type": "string",
+        "maxLength": MAX_LICENCE_CHARACTERS,
+        "description": "of the weights",
+    },
+    "note": {"type": "string", "maxLength": MAX_NOTE_CHARACTERS, "description": "for people"},
+}
+
+router = APIRouter(tags=["models"])
+
+ModelNamePath = Annotated[
+    str, Path(description="the model's name", min_length=1, max_length=100, pattern=NO_NUL_PATTERN)
+]
+
+
+class ModelResponse(ResponseModel):
+    name: str
+    extractor: str = Field(description="what maps are described with: gsv:NAME")
+    fingerprint: str = Field(description="sha256 of its configuration and weights")
+    dimension: int = Field(description="numbers in one descriptor")
+    image_size: tuple[int, int] = Field(description="height and width that photos are brought to")
+    config: dict[str, Any] = Field(description="backbone and aggregator, as it was trained")
+    size_bytes: int = Field(description="of its file in the object store")
+    sha256: str = Field(description="of that file")
+    licence: str
+    note: str | None
+    about: dict[str, Any] = Field(description="the file it came in, and how it was trained")
+    added_at: datetime
+    maps: list[str] = Field(description="maps that are described with it")
+
+    @classmethod
+    def of(cls, session: Session, model: Model) -> ModelResponse:
+        assert model.added_name is not None
+        assert model.config is not None
+        height, width = model.config["image_size"]
+        return cls(
+            name=model.added_name,
+            extractor=model.name,
+            fingerprint=model.fingerprint,
+            dimension=model.dimension,
+            image_size=(height, width),
+            config=model.config,
+            size_bytes=model.size_bytes,
+            sha256=model.sha256,
+            licence=model.licence,
+            note=model.note,
+            about=model.card,
+            added_at=model.added_at,
+            maps=list_maps_using_model(session, model),
+        )
+
+
+class ModelsResponse(ResponseModel):
+    models: list[ModelResponse]
+
+
+class RemovedModelResponse(ResponseModel):
+    success: bool
+    message: str
+    removed_model: str
+
+
+@router.post(
+    "/models",
+    operation_id="add_model",
+    status_code=202,
+    response_model=JobAcceptedResponse,
+    openapi_extra=multipart_schema(
+        "a checkpoint (`.ckpt`) of `placewise train`",
+        ["name"],
+        **MODEL_FORM_FIELDS,
+    ),
+    dependencies=[ADMIN, ADMIT_JOB],
+)
+async def upload_model(
+    request: Request,
+    response: Response,
+    gateway: GatewayDep,
+    idempotent: IdempotentFormDep,
+    admission: AdmissionDep,
+    map_name: MapName = DEFAULT_MAP,
+) -> JobAcceptedResponse:
+    """Add a trained model: send a checkpoint, and a `name` for it.
+
+    An extractor checks it, in a job of the map: that it can be read without executing anything,
+    that its weights are finite and make a descriptor of a photo. One that can't be used ends the
+    job as `failed` with the reason, and so does a name that belongs to other weights.
+    """
+    with admission.admit_upload(UploadKind.UPLOAD, request):
+        received = await store_form_file(
+            request,
+            gateway.store,
+            new_checkpoint_key(),
+            gateway.settings.max_model_bytes,
+            too_large=_checkpoint_too_large_error,
+        )
+    try:
+        said = _parse_model_fields(received.fields)
+    except PlacewiseError:
+        await run_in_threadpool(gateway.store.delete, received.key)
+        raise
+    await idempotent.claim_form(gateway.store, received)
+    params = {
+        "object_key": received.key,
+        "filename": received.filename,
+        "checkpoint_sha256": received.sha256,
+        **said,
+    }
+    job = await run_in_threadpool(_queue_add_model, gateway, map_name, params, idempotent)
+    gateway.hints.send()
+    return accept_job(response, job, map_name)
+
+
+@router.get(
+    "/models", operation_id="list_models", response_model=ModelsResponse, dependencies=[READ]
+)
+def read_models(gateway: GatewayDep) -> ModelsResponse:
+    """Every model that was added, by name."""
+    with gateway.catalog.read() as session:
+        found = [ModelResponse.of(session, model) for model in list_registered_models(session)]
+    return ModelsResponse(models=found)
+
+
+@router.get(
+    "/models/{name}", operation_id="get_model", response_model=ModelResponse, dependencies=[READ]
+)
+def read_model(gateway: GatewayDep, name: ModelNamePath) -> ModelResponse:
+    """One model."""
+    with gateway.catalog.read() as session:
+        return ModelResponse.of(session, get_registered_model(session, name))
+
+
+@router.delete(
+    "/models/{name}",
+    operation_id="remove_model",
+    response_model=RemovedModelResponse,
+    dependencies=[ADMIN],
+)
+def delete_model(gateway: GatewayDep, name: ModelNamePath) -> RemovedModelResponse:
+    """Remove a model; 409 (`model_in_use`) while a map is described with it.
+
+    Its name stays taken, unless the same weights are added again.
+    """
+    new_map_extractor = gateway.settings.new_map_extractor
+    gateway.catalog.run(lambda session: remove_model(session, name, new_map_extractor))
+    return RemovedModelResponse(
+        success=True, message=f"The model {name} is removed.", removed_model=name
+    )
+
+
+def _parse_model_fields(fields: dict[str, str]) -> dict[str, str | None]:
+    """The name, the licence and the note that the form gives; 422 for what can't be taken."""
+    for field in fields.keys() - MODEL_FORM_FIELDS.keys():
+        raise invalid_field_error(field, f"is none of {', '.join(MODEL_FORM_FIELDS)}")
+    name = fields.get("name", "")
+    if not re.fullmatch(MODEL_NAME_PATTERN, name):
+        raise invalid_field_error("name", MODEL_NAME_RULE)
+    for field, most in (("licence", MAX_LICENCE_CHARACTERS), ("note", MAX_NOTE_CHARACTERS)):
+        value = fields.get(field, "")
+        if len(value) > most or "\x00" in value:
+            raise invalid_field_error(field, f"has up to {most} characters, none of them NUL")
+    return {
+        "name": name,
+        "licence": fields.get("licence") or None,
+        "note": fields.get("note") or None,
+    }
+
+
+def _queue_add_model(
+    gateway: GatewayContext, map_name: str, params: dict[str, Any], idempotent: IdempotentRequest
+) -> Job:
+    try:
+        with gateway.catalog.write() as session:
+            job = Job(
+                id=new_id(),
+                map_id=get_map(session, map_name).id,
+                kind=JobKind.ADD_MODEL,
+                priority=Priority.MODEL_CHANGE,
+                params=params,
+            )
+            session.add(job)
+            session.flush()
+            idempotent.store_job_response(session, job)
+            return job
+    except PlacewiseError:
+        gateway.store.delete(params["object_key"])
+        raise
+
+
+def _checkpoint_too_large_error(max_bytes: int) -> PlacewiseError:
+    return TooLarge(
+        "file_too_large",
+        f"The checkpoint is larger than {max_bytes} bytes (MAX_MODEL_BYTES).",
+        max_bytes=max_bytes,
+    )

@@ -1,0 +1,311 @@
+"""`/uploads/presign`: photos that callers send straight to the bucket.
+
+```
+POST /uploads/presign ─> a URL ─> PUT the bytes to incoming/<upload> ─> POST .../complete
+                                                                           │
+    originals/<new>  <─ copied by the store, and only then looked at ──────┘
+```
+A URL stays good until it expires, so what it leads to may change at any moment: what is checked,
+described and acknowledged is the copy.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+from contextlib import AbstractContextManager
+from datetime import datetime
+from typing import Annotated, Any
+from uuid import UUID
+
+from fastapi import APIRouter, Request, Response
+from fastapi import Path as PathParameter
+from pydantic import Field
+from sqlalchemy.orm import Session
+from starlette.concurrency import run_in_threadpool
+
+from services.gateway.admission import (
+    ADMIT_JOB,
+    CHECK_PHOTO_QUOTA,
+    AdmissionDep,
+    UploadKind,
+    place_for_photo,
+)
+from services.gateway.authentication import WRITE, get_caller
+from services.gateway.dependencies import (
+    DEFAULT_MAP,
+    NO_NUL_PATTERN,
+    GatewayContext,
+    GatewayDep,
+    MapName,
+    UploadId,
+)
+from services.gateway.idempotency import IdempotentDep, IdempotentReplay
+from services.gateway.routes.photos import PhotoUpdate
+from services.gateway.routes.uploads import UPLOAD_RESPONSES, UploadOutcome, respond_to_upload
+from services.gateway.schemas import ResponseModel, UploadResponse, url_in_map
+from shared.catalog.base import db_now_plus
+from shared.catalog.idempotency import StoredResponse
+from shared.catalog.maps import get_map
+from shared.catalog.photos import PresignedUpload, get_presigned_upload
+from shared.errors import Conflict, NotFound, PlacewiseError, Unavailable, Unprocessable
+from shared.ids import new_id
+from shared.imaging.file_formats import PHOTO_SIGNATURE_BYTES
+from shared.imaging.photo_header import read_photo_header
+from shared.ingest.photo_metadata import PhotoFields, check_coordinate_pair
+from shared.ingest.store_photo import StoreResult, store_photo
+from shared.ingest.validation import (
+    StoredUpload,
+    ValidatedPhoto,
+    base_name,
+    check_photo_signature,
+    file_too_large_error,
+)
+from shared.storage import ObjectInfo, PresigningStore
+from shared.storage.keys import incoming_key, new_original_key
+from shared.storage.s3 import S3Store
+
+router = APIRouter(tags=["photos"])
+
+HASH_READ_BYTES = 256 * 1024
+FILE_FIELDS = ("filename", "file_size", "sha256")
+
+
+class PresignRequest(PhotoUpdate):
+    """The file that will be sent, and what the form of `POST /upload` says of a photo."""
+
+    filename: str = Field(min_length=1, max_length=255, pattern=NO_NUL_PATTERN)
+    file_size: int = Field(gt=0, le=2**62, description="bytes")
+    sha256: str = Field(pattern="^[0-9a-f]{64}$", description="of the bytes, hexadecimal")
+
+    def photo_fields(self) -> dict[str, Any]:
+        """What is said of the photo, as JSON."""
+        return self.model_dump(mode="json", exclude=set(FILE_FIELDS), exclude_none=True)
+
+
+class PresignResponse(ResponseModel):
+    """PUT the bytes to `url` with exactly these `headers`, then POST to `complete_url`."""
+
+    upload_id: UUID
+    method: str
+    url: str
+    headers: dict[str, str]
+    complete_url: str
+    expires_at: datetime
+
+
+@router.post(
+    "/uploads/presign",
+    operation_id="presign_upload",
+    status_code=201,
+    response_model=PresignResponse,
+    dependencies=[WRITE, CHECK_PHOTO_QUOTA, ADMIT_JOB],
+)
+def create_presigned_upload(
+    request: Request,
+    gateway: GatewayDep,
+    body: PresignRequest,
+    idempotent: IdempotentDep,
+    map_name: MapName = DEFAULT_MAP,
+) -> PresignResponse:
+    """An address to which the photo's bytes can be sent without passing this server.
+
+    Only where Placewise keeps its objects in a bucket (S3_ENDPOINT). Nothing is stored until the
+    upload is completed.
+    """
+    store = _require_presigning_store(gateway)
+    limit = gateway.settings.max_file_size
+    if body.file_size > limit:
+        raise file_too_large_error(limit)
+    said = body.photo_fields()
+    _parse_photo_fields(
+        said
+    )  # what can't be understood is refused now, not after the bytes were sent
+    request.app.state.rate_limiter.count_upload_bytes(get_caller(request), body.file_size)
+    upload_id = new_id()
+    seconds = gateway.settings.presign_seconds
+    put = store.presign_put(
+        incoming_key(upload_id),
+        size_bytes=body.file_size,
+        sha256=body.sha256,
+        expires_seconds=seconds,
+    )
+    with gateway.catalog.write() as session:
+        upload = PresignedUpload(
+            id=upload_id,
+            map_id=get_map(session, map_name).id,
+            filename=base_name(body.filename),
+            size_bytes=body.file_size,
+            sha256=body.sha256,
+            said=said,
+            expires_at=db_now_plus(seconds),
+        )
+        session.add(upload)
+        session.flush()
+        answer = PresignResponse(
+            upload_id=upload_id,
+            method="PUT",
+            url=put.url,
+            headers=put.headers,
+            complete_url=url_in_map(f"/uploads/presign/{upload_id}/complete", map_name),
+            expires_at=upload.expires_at,
+        )
+        idempotent.store_response(session, 201, answer)
+    return answer
+
+
+@router.post(
+    "/uploads/presign/{upload_id}/complete",
+    operation_id="complete_upload",
+    status_code=202,
+    response_model=UploadResponse,
+    responses=UPLOAD_RESPONSES,
+    dependencies=[WRITE, CHECK_PHOTO_QUOTA, ADMIT_JOB],
+)
+async def complete_presigned_upload(
+    request: Request,
+    response: Response,
+    gateway: GatewayDep,
+    admission: AdmissionDep,
+    upload_id: Annotated[UploadId, PathParameter(description="as presigning answered it")],
+    map_name: MapName = DEFAULT_MAP,
+) -> UploadResponse:
+    """The bytes were sent: check and store the photo. Answers as `POST /upload` does; completed
+    again, it answers the same again."""
+    key = new_original_key()
+    with admission.admit_upload(UploadKind.UPLOAD, request):
+        key_id = get_caller(request).key_id
+        place = place_for_photo(request, gateway.settings)
+        stored = await run_in_threadpool(
+            _complete_upload, gateway, map_name, upload_id, key, key_id, place
+        )
+
+    def replace(said: UploadOutcome) -> None:
+        with gateway.catalog.write() as session:
+            upload = session.get(PresignedUpload, upload_id)
+            if upload is not None:  # its map may have been deleted during the wait
+                upload.status, upload.answer = said.status, said.body.model_dump_json()
+
+    return await respond_to_upload(request, response, gateway, map_name, stored, key, replace)
+
+
+def _complete_upload(
+    gateway: GatewayContext,
+    map_name: str,
+    upload_id: UUID,
+    key: str,
+    key_id: UUID | None,
+    place: AbstractContextManager[None],
+) -> StoreResult:
+    """The photo, whose bytes lie under `key` unless the map had them. Raises Replay for an upload
+    that was completed before."""
+    store = _require_presigning_store(gateway)
+    with gateway.catalog.read() as session:
+        upload = get_presigned_upload(session, get_map(session, map_name).id, upload_id)
+    _replay_if_completed(upload)
+    sent = incoming_key(upload_id)
+    try:
+        _check_object_size(store.head(sent), upload)
+        store.copy(sent, key)
+    except NotFound:
+        # Not there yet; or not any more, because another call has completed it since we looked.
+        with gateway.catalog.read() as session:
+            _replay_if_completed(get_presigned_upload(session, upload.map_id, upload_id))
+        raise _upload_incomplete_error(upload) from None
+
+    def keep(session: Session, stored: StoreResult) -> StoreResult:
+        locked = get_presigned_upload(session, upload.map_id, upload_id, lock=True)
+        _replay_if_completed(locked)
+        said = UploadOutcome.of(stored, stored.job, key, map_name)
+        locked.status, locked.answer = said.status, said.body.model_dump_json()
+        return stored
+
+    try:
+        _check_object_size(store.head(key), upload)
+        received = _verify_copied_object(store, key, upload)
+        media_type = check_photo_signature(received.begin)
+        with store.open(key) as file:
+            header = read_photo_header(file, gateway.settings.max_image_pixels)
+        incoming = ValidatedPhoto(
+            received, media_type, header, _parse_photo_fields(upload.said), key_id
+        )
+        with place:
+            stored = store_photo(gateway.catalog, gateway.hints, map_name, incoming, keep)
+    except (PlacewiseError, IdempotentReplay):
+        store.delete(key)
+        raise
+    if stored.photo.object_key != key:
+        store.delete(key)
+    # Acknowledged already; what stays here is collected.
+    with contextlib.suppress(Unavailable):
+        store.delete(sent)
+    return stored
+
+
+def _verify_copied_object(
+    store: PresigningStore, key: str, upload: PresignedUpload
+) -> StoredUpload:
+    """The stored bytes as a form would have brought them; Unprocessable (`sha256_differs`)."""
+    digest, begin, size = hashlib.sha256(), b"", 0
+    with store.open(key) as file:
+        while piece := file.read(HASH_READ_BYTES):
+            if not size:
+                begin = piece[:PHOTO_SIGNATURE_BYTES]
+            digest.update(piece)
+            size += len(piece)
+    if digest.hexdigest() != upload.sha256:
+        raise Unprocessable(
+            "sha256_differs",
+            f"The bytes that were sent have the SHA-256 {digest.hexdigest()}, not {upload.sha256}. "
+            "Send the announced file again to the same URL, or begin another upload.",
+        )
+    return StoredUpload(key, upload.filename, size, upload.sha256, begin)
+
+
+def _check_object_size(found: ObjectInfo | None, upload: PresignedUpload) -> None:
+    """Unprocessable (`size_differs`), and NotFound where there is nothing."""
+    if found is None:
+        raise NotFound("object_not_found", "Nothing was sent.")
+    if found.size_bytes != upload.size_bytes:
+        raise Unprocessable(
+            "size_differs",
+            f"{found.size_bytes} bytes were sent, and {upload.size_bytes} announced. Send the "
+            "announced file again to the same URL, or begin another upload.",
+        )
+
+
+def _upload_incomplete_error(upload: PresignedUpload) -> Conflict:
+    return Conflict(
+        "upload_incomplete",
+        f"Nothing was sent for the upload {upload.id} yet: PUT the bytes to its URL first.",
+    )
+
+
+def _replay_if_completed(upload: PresignedUpload) -> None:
+    if upload.answer is None:
+        return
+    assert upload.status is not None
+    headers = {"Location": json.loads(upload.answer)["status_url"]}
+    if upload.status == 202:
+        headers["Retry-After"] = "1"
+    raise IdempotentReplay(StoredResponse(upload.status, headers, upload.answer))
+
+
+def _parse_photo_fields(values: dict[str, Any]) -> PhotoFields:
+    columns = PhotoUpdate.model_validate(values).to_columns()
+    if "attributes" in columns:
+        columns["metadata"] = columns.pop("attributes")
+    fields = PhotoFields(**columns)
+    check_coordinate_pair(fields.latitude, fields.longitude)
+    return fields
+
+
+def _require_presigning_store(gateway: GatewayContext) -> PresigningStore:
+    if isinstance(gateway.store, S3Store):
+        return gateway.store
+    raise Conflict(
+        "no_direct_uploads",
+        "This Placewise keeps its photos in a folder, to which nobody can send them directly. "
+        "Use POST /api/v1/upload.",
+    )

@@ -1,0 +1,261 @@
+"""`POST /similarity` and `POST /similarity/{file_id}`: which known place is this?"""
+
+from __future__ import annotations
+
+import time
+from typing import Annotated, Any
+from uuid import UUID
+
+from fastapi import APIRouter, Request, Response
+from fastapi import Path as PathParameter
+from fastapi.responses import JSONResponse
+from starlette.concurrency import run_in_threadpool
+
+from services.gateway.admission import ADMIT_QUERY, AdmissionDep, UploadKind
+from services.gateway.authentication import READ
+from services.gateway.dependencies import (
+    DEFAULT_MAP,
+    FileId,
+    GatewayContext,
+    GatewayDep,
+    JobId,
+    MapName,
+    parse_prefer_wait,
+    wait_for_job,
+)
+from services.gateway.idempotency import IdempotentFormDep, IdempotentRequest
+from services.gateway.multipart_upload import multipart_schema, store_form_file
+from services.gateway.reranking import (
+    check_comparison_supported,
+    comparison_response,
+    start_comparison_of_query_photo,
+    start_comparison_of_stored_photo,
+)
+from services.gateway.schemas import JobAcceptedResponse, SimilarityResponse, accept_job
+from services.gateway.search_params import SearchParams, SearchParamsDep
+from services.gateway.similarity_search import find_similar, query_from_job, query_from_photo
+from shared.catalog.jobs import QUERY_JOBS, UNFINISHED_STATES, get_job
+from shared.catalog.maps import get_map
+from shared.errors import (
+    Conflict,
+    Gone,
+    NotFound,
+    PlacewiseError,
+    Unprocessable,
+    invalid_field_error,
+)
+from shared.ids import new_id
+from shared.imaging.photo_header import read_photo_header
+from shared.ingest.validation import StoredUpload, check_photo_signature
+from shared.jobs import Job, JobKind, JobState, Priority
+from shared.jobs.wakeups import WakeupQueue
+from shared.search_api.comparison import query_expired_error
+from shared.storage.keys import query_key
+
+router = APIRouter(tags=["similarity"])
+
+COMPARISON_PENDING: dict[int | str, dict[str, Any]] = {
+    202: {"model": JobAcceptedResponse, "description": "Being compared; poll, then fetch."}
+}
+# Of a failed job's error; everything else is the photo's fault.
+ERROR_BY_STATUS = {kind.status: kind for kind in (NotFound, Conflict, Gone)}
+
+
+@router.post(
+    "/similarity/{file_id}",
+    operation_id="similar_to_stored",
+    response_model=SimilarityResponse,
+    responses=COMPARISON_PENDING,
+    dependencies=[READ],
+)
+async def search_by_stored_photo(
+    request: Request,
+    response: Response,
+    gateway: GatewayDep,
+    idempotent: IdempotentFormDep,
+    admission: AdmissionDep,
+    file_id: Annotated[FileId, PathParameter(description="a stored photo")],
+    search_params: SearchParamsDep,
+    map_name: MapName = DEFAULT_MAP,
+) -> Any:
+    """The photos most similar to a stored one, without itself.
+
+    With `rerank` or `explain` an extractor looks at them: 202 with a job where that takes longer
+    than COMPARE_WAIT_SECONDS, or than N seconds with `Prefer: wait=N`. Poll `status_url`, then GET
+    `result_url`.
+    """
+
+    def ask() -> SimilarityResponse | Job:
+        if not search_params.needs_comparison:
+            return find_similar(
+                gateway, query_from_photo(gateway, map_name, file_id), search_params
+            )
+        check_comparison_supported(gateway, map_name, search_params)
+        admission.admit_query()
+        idempotent.claim_key(None, gateway.settings.query_ttl_seconds)
+        return start_comparison_of_stored_photo(
+            gateway, query_from_photo(gateway, map_name, file_id), search_params, idempotent
+        )
+
+    asked = await run_in_threadpool(ask)
+    if isinstance(asked, SimilarityResponse):
+        return asked
+    settings = gateway.settings
+    wait = parse_prefer_wait(request, settings.max_wait_seconds) or settings.compare_wait_seconds
+    return await _wait_for_result(gateway, response, asked, map_name, wait)
+
+
+@router.post(
+    "/similarity",
+    operation_id="similar_to_upload",
+    response_model=SimilarityResponse,
+    responses={
+        202: {"model": JobAcceptedResponse, "description": "Being described; poll, then fetch."}
+    },
+    openapi_extra=multipart_schema("the photo to ask with"),
+    dependencies=[READ, ADMIT_QUERY],
+)
+async def search_by_uploaded_photo(
+    request: Request,
+    response: Response,
+    gateway: GatewayDep,
+    idempotent: IdempotentFormDep,
+    admission: AdmissionDep,
+    search_params: SearchParamsDep,
+    map_name: MapName = DEFAULT_MAP,
+) -> Any:
+    """The photos most similar to one that is not stored.
+
+    202 with a job: poll `status_url`, then GET `result_url`. With `Prefer: wait=N` the answer
+    itself (200) when it takes no longer than N seconds. Repeated under an `Idempotency-Key`, it is
+    answered with the 202 of its job.
+    """
+    await run_in_threadpool(check_comparison_supported, gateway, map_name, search_params)
+    job_id = new_id()
+    key = query_key(job_id)
+    with admission.admit_upload(UploadKind.QUERY, request):
+        received = await store_form_file(
+            request, gateway.store, key, gateway.settings.max_file_size, check_photo_signature
+        )
+    await idempotent.claim_form(
+        gateway.store, received, life_seconds=gateway.settings.query_ttl_seconds
+    )
+    params = {"filename": received.filename, "wanted": search_params.model_dump(mode="json")}
+    job = await run_in_threadpool(
+        _queue_query, gateway, map_name, job_id, received, params, idempotent
+    )
+    wait = parse_prefer_wait(request, gateway.settings.max_wait_seconds)
+    if wait:
+        response.headers["Preference-Applied"] = f"wait={wait:g}"
+    return await _wait_for_result(gateway, response, job, map_name, wait)
+
+
+@router.get(
+    "/jobs/{job_id}/result",
+    operation_id="similarity_result",
+    response_model=SimilarityResponse,
+    responses=COMPARISON_PENDING,
+    dependencies=[READ],
+)
+async def read_similarity_result(
+    response: Response, gateway: GatewayDep, job_id: JobId, map_name: MapName = DEFAULT_MAP
+) -> Any:
+    """The answer to a query whose job has succeeded; 409 before that.
+
+    A query photo that is described and was asked with `rerank` or `explain` is now compared: 202
+    with that job where it takes longer than COMPARE_WAIT_SECONDS.
+    """
+
+    def find() -> Job:
+        with gateway.catalog.read() as session:
+            return get_job(session, get_map(session, map_name).id, job_id)
+
+    job = await run_in_threadpool(find)
+    if job.kind not in QUERY_JOBS:
+        raise Conflict("no_result", f"The job {job.id} ({job.kind}) has no similarity result.")
+    if job.state in UNFINISHED_STATES:
+        raise Conflict(
+            "job_unfinished",
+            f"The job {job.id} is {job.state}.",
+            job_id=str(job.id),
+            state=job.state,
+        )
+    wait = gateway.settings.compare_wait_seconds
+    return await _wait_for_result(gateway, response, job, map_name, wait)
+
+
+async def _wait_for_result(
+    gateway: GatewayContext, response: Response, job: Job, map_name: str, wait_seconds: float
+) -> SimilarityResponse | JSONResponse:
+    """What the query's job and the one that follows it come to within the time; else a 202."""
+    deadline = time.monotonic() + wait_seconds
+    while True:
+        left = deadline - time.monotonic()
+        if job.state in UNFINISHED_STATES and left > 0:
+            waited = await wait_for_job(gateway, job.id, left)
+            if waited is None:
+                raise query_expired_error()
+            job = waited
+        if job.state in UNFINISHED_STATES:
+            started = accept_job(response, job, map_name)
+            # As a response of its own: the route's model is that of the 200.
+            return JSONResponse(started.model_dump(mode="json"), 202, dict(response.headers))
+        result = await run_in_threadpool(_result_or_next_job, gateway, job, map_name)
+        if isinstance(result, SimilarityResponse):
+            return result
+        job = result
+
+
+def _queue_query(
+    gateway: GatewayContext,
+    map_name: str,
+    job_id: UUID,
+    received: StoredUpload,
+    params: dict[str, Any],
+    idempotent: IdempotentRequest,
+) -> Job:
+    try:
+        check_photo_signature(received.begin)
+        for name in received.fields:
+            raise invalid_field_error(name, "is unknown here; filters belong into the address")
+        with received.open(gateway.store) as file:
+            read_photo_header(file, gateway.settings.max_image_pixels)
+        with gateway.catalog.write() as session:
+            job = Job(
+                id=job_id,
+                map_id=get_map(session, map_name).id,
+                kind=JobKind.DESCRIBE,
+                priority=Priority.QUERY,
+                params=params,
+            )
+            session.add(job)
+            session.flush()
+            idempotent.store_job_response(session, job)
+    except PlacewiseError:
+        gateway.store.delete(received.key)
+        raise
+    gateway.hints.send(WakeupQueue.QUERY)
+    return job
+
+
+def _result_or_next_job(
+    gateway: GatewayContext, job: Job, map_name: str
+) -> SimilarityResponse | Job:
+    """The answer of an ended job, or the job that goes on with it."""
+    if job.state == JobState.SUCCEEDED:
+        if job.kind == JobKind.COMPARE:
+            return comparison_response(gateway, job, map_name)
+        wanted = SearchParams.model_validate(job.params["wanted"])
+        query = query_from_job(gateway, job)
+        if wanted.needs_comparison:
+            return start_comparison_of_query_photo(gateway, job, query, wanted)
+        return find_similar(gateway, query, wanted)
+    if job.state == JobState.CANCELLED:
+        raise Conflict("job_cancelled", f"The job {job.id} was cancelled.", job_id=str(job.id))
+    error = job.error or {}
+    kind = ERROR_BY_STATUS.get(error.get("status", 0), Unprocessable)
+    raise kind(
+        error.get("code", "query_failed"),
+        error.get("detail", "The photo could not be described."),
+        job_id=str(job.id),
+    )

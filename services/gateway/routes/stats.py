@@ -1,0 +1,143 @@
+"""`/searches`: what was asked of a map.
+
+`/database/stats`: how much there is, and how much was asked.
+"""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Annotated
+from uuid import UUID
+
+from fastapi import APIRouter, Query
+from pydantic import Field
+from sqlalchemy import func, select
+
+from services.gateway.authentication import READ
+from services.gateway.dependencies import DEFAULT_MAP, GatewayDep, MapName, parse_cursor
+from services.gateway.schemas import ResponseModel
+from shared.catalog.chunks import Chunk
+from shared.catalog.generations import active_generation
+from shared.catalog.maps import Search, get_map, get_map_statistics, list_searches
+from shared.catalog.vocabularies import vocabulary_standing
+
+router = APIRouter(tags=["operations"])
+
+
+class SearchHistoryEntry(ResponseModel):
+    search_id: UUID
+    query_file_id: UUID | None = Field(description="null when the query photo is not stored")
+    query_filename: str
+    generation_id: UUID
+    top_k: int
+    results: int
+    best_score: float | None
+    in_map: bool | None = Field(description="what the estimate said")
+    processing_time_ms: float
+    searched_at: datetime
+
+    @classmethod
+    def of(cls, search: Search) -> SearchHistoryEntry:
+        return cls(
+            search_id=search.id,
+            query_file_id=search.query_photo_id,
+            query_filename=search.query_filename,
+            generation_id=search.generation_id,
+            top_k=search.top_k,
+            results=search.results,
+            best_score=search.best_score,
+            in_map=search.in_map,
+            processing_time_ms=search.processing_ms,
+            searched_at=search.searched_at,
+        )
+
+
+class SearchHistoryResponse(ResponseModel):
+    searches: list[SearchHistoryEntry]
+    next_cursor: str | None
+
+
+@router.get(
+    "/searches",
+    operation_id="list_searches",
+    response_model=SearchHistoryResponse,
+    dependencies=[READ],
+)
+def read_searches(
+    gateway: GatewayDep,
+    limit: Annotated[int, Query(ge=1, le=1000)] = 50,
+    cursor: Annotated[str | None, Query()] = None,
+    map_name: MapName = DEFAULT_MAP,
+) -> SearchHistoryResponse:
+    """Similarity searches, newest first; kept for SEARCH_HISTORY_DAYS."""
+    with gateway.catalog.read() as session:
+        map_id = get_map(session, map_name).id
+        found = list_searches(session, map_id, limit + 1, parse_cursor(cursor))
+    page = found[:limit]
+    return SearchHistoryResponse(
+        searches=[SearchHistoryEntry.of(search) for search in page],
+        next_cursor=str(page[-1].id) if len(found) > limit else None,
+    )
+
+
+class StatsResponse(ResponseModel):
+    map: str
+    map_version: int
+    total_images: int
+    searchable_images: int
+    labelled_queries: int
+    total_chunks: int
+    total_storage_bytes: int
+    feature_dimension: int | None
+    max_images_per_chunk: int
+    extractor: str
+    vocabulary: str | None
+    total_searches: int
+    recent_uploads_24h: int
+    recent_searches_24h: int
+    avg_processing_time_ms: float | None
+    max_processing_time_ms: float | None
+    jobs: dict[str, int]
+    counted_at: datetime = Field(description="when the figures were counted")
+
+
+@router.get(
+    "/database/stats",
+    operation_id="database_stats",
+    response_model=StatsResponse,
+    dependencies=[READ],
+)
+def read_stats(gateway: GatewayDep, map_name: MapName = DEFAULT_MAP) -> StatsResponse:
+    """Figures of one map; search times are those of the last seven days. Those of a map with more
+    than 10,000 photos, jobs or searches may be as old as `counted_at` says."""
+    with gateway.catalog.read() as session:
+        map_ = get_map(session, map_name)
+        generation = active_generation(session, map_.id)
+        figures, counted_at = get_map_statistics(session, map_.id)
+        chunks, chunk_bytes = 0, 0
+        if generation is not None:
+            chunks, chunk_bytes = session.execute(
+                select(func.count(), func.coalesce(func.sum(Chunk.size_bytes), 0)).where(
+                    Chunk.generation_id == generation.id, Chunk.superseded_at.is_(None)
+                )
+            ).one()
+        return StatsResponse(
+            map=map_.name,
+            map_version=map_.version,
+            total_images=figures.photos,
+            searchable_images=figures.searchable,
+            labelled_queries=figures.labelled_queries,
+            total_chunks=chunks,
+            total_storage_bytes=int(chunk_bytes) + figures.photo_bytes,
+            feature_dimension=generation.dimension if generation else None,
+            max_images_per_chunk=gateway.settings.slot_rows,
+            extractor=generation.extractor if generation else map_.extractor,
+            vocabulary=vocabulary_standing(session, generation) if generation else None,
+            total_searches=figures.searches,
+            recent_uploads_24h=figures.uploads_24h,
+            recent_searches_24h=figures.searches_24h,
+            avg_processing_time_ms=figures.average_ms,
+            max_processing_time_ms=figures.longest_ms,
+            jobs=figures.jobs,
+            counted_at=counted_at,
+        )

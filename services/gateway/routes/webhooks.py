@@ -1,0 +1,162 @@
+"""`/webhooks`: who is told what happens. An admin's calls."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Annotated
+from uuid import UUID
+
+from fastapi import APIRouter, Query
+from pydantic import BaseModel, ConfigDict, Field
+
+from services.gateway.authentication import ADMIN
+from services.gateway.dependencies import GatewayDep, WebhookId, parse_cursor
+from services.gateway.schemas import ResponseModel
+from shared.catalog.webhooks import (
+    Delivery,
+    DeliveryState,
+    EventKind,
+    Webhook,
+    create_webhook,
+    delete_webhook,
+    get_webhook,
+    list_deliveries,
+    list_webhooks,
+)
+from shared.errors import PlacewiseError, invalid_field_error
+from shared.security.webhook_targets import parse_webhook_url, resolve_webhook_target
+
+router = APIRouter(tags=["administration"])
+
+
+class CreateWebhookRequest(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+    url: str = Field(
+        min_length=1, max_length=2000, description="HTTPS, at a public address; no redirect"
+    )
+    events: list[EventKind] = Field(min_length=1, max_length=100)
+
+
+class WebhookResponse(ResponseModel):
+    id: UUID
+    url: str
+    events: list[EventKind]
+    created_at: datetime
+
+    @classmethod
+    def of(cls, webhook: Webhook) -> WebhookResponse:
+        return cls(
+            id=webhook.id,
+            url=webhook.url,
+            events=[EventKind(event) for event in webhook.events],
+            created_at=webhook.created_at,
+        )
+
+
+class CreatedWebhookResponse(WebhookResponse):
+    secret: str = Field(description="signs what is sent; it is shown this once")
+
+
+class DeliveryResponse(ResponseModel):
+    id: UUID
+    event_id: UUID = Field(description="`webhook-id` is `msg_` and this, in every try")
+    event: EventKind
+    state: DeliveryState
+    attempts: int
+    next_attempt_at: datetime | None
+    last_status: int | None = Field(description="HTTP status of the last answer")
+    last_error: str | None
+    created_at: datetime
+    ended_at: datetime | None
+
+    @classmethod
+    def of(cls, delivery: Delivery) -> DeliveryResponse:
+        pending = delivery.state == DeliveryState.PENDING
+        return cls(
+            id=delivery.id,
+            event_id=delivery.event_id,
+            event=EventKind(delivery.event),
+            state=DeliveryState(delivery.state),
+            attempts=delivery.attempts,
+            next_attempt_at=delivery.next_attempt_at if pending else None,
+            last_status=delivery.last_status,
+            last_error=delivery.last_error,
+            created_at=delivery.created_at,
+            ended_at=delivery.ended_at,
+        )
+
+
+class DeliveriesResponse(ResponseModel):
+    deliveries: list[DeliveryResponse]
+    next_cursor: str | None
+
+
+@router.get(
+    "/webhooks",
+    operation_id="list_webhooks",
+    response_model=list[WebhookResponse],
+    dependencies=[ADMIN],
+)
+def read_webhooks(gateway: GatewayDep) -> list[WebhookResponse]:
+    """Newest first, without their secrets."""
+    with gateway.catalog.read() as session:
+        return [WebhookResponse.of(webhook) for webhook in list_webhooks(session)]
+
+
+@router.post(
+    "/webhooks",
+    operation_id="create_webhook",
+    status_code=201,
+    response_model=CreatedWebhookResponse,
+    dependencies=[ADMIN],
+)
+def register_webhook(gateway: GatewayDep, body: CreateWebhookRequest) -> CreatedWebhookResponse:
+    """Events are POSTed to the URL, signed with the answer's secret. It is shown this once, so this
+    call takes no `Idempotency-Key`."""
+    allow_private = gateway.settings.webhook_private_addresses
+    target = parse_webhook_url(body.url, allow_private=allow_private)
+    try:
+        # For whoever mistypes; what the name means when something is sent is looked up then.
+        resolve_webhook_target(target, allow_private=allow_private)
+    except PlacewiseError as error:
+        raise invalid_field_error("url", error.detail) from error
+    with gateway.catalog.write() as session:
+        made = create_webhook(session, body.url, body.events)
+        answer = WebhookResponse.of(made)
+        return CreatedWebhookResponse(**answer.model_dump(), secret=made.secret)
+
+
+@router.delete(
+    "/webhooks/{webhook_id}",
+    operation_id="delete_webhook",
+    response_model=WebhookResponse,
+    dependencies=[ADMIN],
+)
+def remove_webhook_by_id(gateway: GatewayDep, webhook_id: WebhookId) -> WebhookResponse:
+    """Nothing is sent to it any more, also not what waits; its log goes with it."""
+    with gateway.catalog.write() as session:
+        return WebhookResponse.of(delete_webhook(session, webhook_id))
+
+
+@router.get(
+    "/webhooks/{webhook_id}/deliveries",
+    operation_id="list_deliveries",
+    response_model=DeliveriesResponse,
+    dependencies=[ADMIN],
+)
+def read_deliveries(
+    gateway: GatewayDep,
+    webhook_id: WebhookId,
+    limit: Annotated[int, Query(ge=1, le=1000)] = 50,
+    cursor: Annotated[str | None, Query()] = None,
+) -> DeliveriesResponse:
+    """What was sent and what waits, newest first; kept for JOB_RETENTION_DAYS."""
+    before = parse_cursor(cursor)
+    with gateway.catalog.read() as session:
+        found = list_deliveries(session, get_webhook(session, webhook_id).id, limit + 1, before)
+    page = found[:limit]
+    return DeliveriesResponse(
+        deliveries=[DeliveryResponse.of(delivery) for delivery in page],
+        next_cursor=str(page[-1].id) if len(found) > limit else None,
+    )

@@ -1,0 +1,212 @@
+"""Evaluation jobs: measure a map's active generation, and keep what its scores mean.
+
+Word weights are learnt here, too: both ask a live map with its own photos. They run in a thread of
+their own, beside the steward's duties, and take only the search tier's time: no photo is described
+for them. One that was killed begins anew.
+
+How far a job is that asks many questions, and whether it is to go on.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from typing import Any
+from uuid import UUID
+
+from prometheus_client import CollectorRegistry
+from sqlalchemy.orm import Session
+
+from services.steward.job_runner import JobInterrupted, JobRunner
+from services.steward.map_evaluation import MapEvaluation
+from services.steward.metrics import StewardMetrics
+from services.steward.word_weights import WordWeightsFit
+from shared.catalog.chunks import count_searchable
+from shared.catalog.generations import Evaluation, Generation, active_generation
+from shared.catalog.session import Catalog
+from shared.catalog.vocabularies import Vocabulary, word_weights_unavailable_reason
+from shared.config.settings import Settings
+from shared.errors import Conflict
+from shared.evaluation.calibration import Calibration
+from shared.ids import new_id
+from shared.jobs import Job, JobKind
+from shared.jobs.leases import get_lease_token, lock_leased_jobs
+from shared.jobs.transitions import succeed_job
+from shared.search_api.protocol import SearchBackend
+from shared.storage import ObjectStore
+from shared.word_weights.record import parse_word_weights
+
+PROGRESS_INTERVAL_SECONDS = 0.5  # between two notes of the progress
+
+
+class EvaluationProgress:
+    """Counts the questions of one claimed job."""
+
+    def __init__(self, catalog: Catalog, job: Job, stop: threading.Event) -> None:
+        self._catalog = catalog
+        self._job = job
+        self._stop = stop
+        self._count = 0
+        self._reported = time.monotonic()
+
+    def set_total(self, total: int) -> None:
+        """So many there will be, about."""
+        self._write_progress(total)
+
+    def advance(self) -> None:
+        """One more; Stopped when the job is no longer ours, or its steward is to end."""
+        self._count += 1
+        if self._stop.is_set():
+            raise JobInterrupted
+        if time.monotonic() - self._reported > PROGRESS_INTERVAL_SECONDS:
+            self._reported = time.monotonic()
+            self._write_progress()
+
+    def _write_progress(self, total: int | None = None) -> None:
+        with self._catalog.write() as session:
+            mine = lock_leased_jobs(session, get_lease_token(self._job), [self._job])
+            for current in mine:
+                current.progress_total = max(1, total or current.progress_total)
+                current.progress_done = min(self._count, current.progress_total)
+        if not mine:
+            raise JobInterrupted
+
+
+class EvaluationWorker:
+    """Does one evaluation, or learning of weights, after the other; `run` until stopped."""
+
+    def __init__(
+        self,
+        catalog: Catalog,
+        store: ObjectStore,
+        search: SearchBackend,
+        settings: Settings,
+        name: str,
+        metrics: StewardMetrics | None = None,
+    ) -> None:
+        self._catalog = catalog
+        self._store = store
+        self._search = search
+        self._settings = settings
+        kinds = (JobKind.EVALUATE, JobKind.WORD_WEIGHTS)
+        counted = metrics or StewardMetrics(CollectorRegistry())
+        self._runner = JobRunner(catalog, settings, name, kinds, counted)
+
+    def run(self, stop: threading.Event) -> None:
+        """Take jobs until `stop` is set."""
+        self._runner.run(stop, lambda job: self._run_job(job, stop))
+
+    def run_next(self, stop: threading.Event) -> bool:
+        """Do the next job; False when there is none."""
+        return self._runner.run_next(lambda job: self._run_job(job, stop))
+
+    def _run_job(self, job: Job, stop: threading.Event) -> None:
+        asked = EvaluationProgress(self._catalog, job, stop)
+        with self._catalog.read() as session:
+            generation = active_generation(session, job.map_id)
+            if generation is None:
+                raise Conflict("nothing_to_evaluate", "The map has no described photo yet.")
+            searchable = count_searchable(session, generation.id)
+            words = _count_words(session, generation) if job.kind == JobKind.WORD_WEIGHTS else 0
+        measure = MapEvaluation(
+            self._catalog, self._search, generation, self._settings.estimate_radius_m, asked.advance
+        )
+        if job.kind == JobKind.WORD_WEIGHTS:
+            self._fit_word_weights(job, generation, words, searchable, measure, asked)
+        else:
+            self._evaluate(job, generation, searchable, measure, asked)
+
+    def _evaluate(
+        self,
+        job: Job,
+        generation: Generation,
+        searchable: int,
+        evaluation: MapEvaluation,
+        progress: EvaluationProgress,
+    ) -> None:
+        record = parse_word_weights(generation.word_weights)
+        weights = record.applied if record else ()
+        sample = evaluation.draw_sample(job.params["sample"], job.params["seed"])
+        progress.set_total((len(sample) + len(evaluation.queries)) * (2 if weights else 1))
+        measured = evaluation.evaluate(sample)
+        weighted = evaluation.evaluate(sample, weights) if weights else None
+        figures = {
+            **measured.figures,
+            "with_word_weights": weighted.figures if weighted else None,
+        }
+        evaluation_id = new_id()
+        with self._catalog.write() as session:
+            for mine in lock_leased_jobs(session, get_lease_token(job), [job]):
+                session.get_one(
+                    Generation, generation.id
+                ).calibration = measured.calibration.model_dump()
+                if weighted:
+                    _store_weighted_calibration(
+                        session, generation.id, weights, weighted.calibration
+                    )
+                session.add(
+                    Evaluation(
+                        id=evaluation_id,
+                        map_id=job.map_id,
+                        generation_id=generation.id,
+                        automatic=job.params["automatic"],
+                        searchable=searchable,
+                        labelled_queries=len(evaluation.queries),
+                        figures=figures,
+                    )
+                )
+                result: dict[str, Any] = {
+                    "evaluation_id": str(evaluation_id),
+                    "generation_id": str(generation.id),
+                    **figures,
+                }
+                succeed_job(mine, result)
+
+    def _fit_word_weights(
+        self,
+        job: Job,
+        generation: Generation,
+        words: int,
+        searchable: int,
+        evaluation: MapEvaluation,
+        progress: EvaluationProgress,
+    ) -> None:
+        if job.params["generation_id"] != str(generation.id):
+            raise Conflict(
+                "generation_not_active",
+                f"Another generation answers by now ({generation.id}). Learn its weights.",
+                generation_id=str(generation.id),
+            )
+        sample = evaluation.draw_sample(job.params["sample"], job.params["seed"])
+        progress.set_total(2 * len(sample) + len(evaluation.queries))
+        learn = WordWeightsFit(self._catalog, self._store, generation, words, evaluation)
+        record = learn.fit(sample, job.params["seed"], searchable)
+        with self._catalog.write() as session:
+            for mine in lock_leased_jobs(session, get_lease_token(job), [job]):
+                session.get_one(Generation, generation.id).word_weights = record.model_dump(
+                    mode="json"
+                )
+                result: dict[str, Any] = {
+                    "generation_id": str(generation.id),
+                    **record.model_dump(mode="json", exclude={"weights", "calibration"}),
+                }
+                succeed_job(mine, result)
+
+
+def _count_words(session: Session, generation: Generation) -> int:
+    """How many words the generation's vocabulary has; Conflict (`no_word_weights`)."""
+    if reason := word_weights_unavailable_reason(session, generation):
+        raise Conflict("no_word_weights", f"This generation gets no word weights: {reason}.")
+    return session.get_one(Vocabulary, generation.vocabulary_id).clusters
+
+
+def _store_weighted_calibration(
+    session: Session, generation_id: UUID, weights: tuple[float, ...], calibration: Calibration
+) -> None:
+    """What scores with these weights mean, unless others have been learnt meanwhile."""
+    generation = session.get_one(Generation, generation_id)
+    record = parse_word_weights(generation.word_weights)
+    if record and record.applied == weights:
+        generation.word_weights = record.model_copy(update={"calibration": calibration}).model_dump(
+            mode="json"
+        )

@@ -1,0 +1,263 @@
+"""The steward's one loop: which duty, how often.
+
+The object store of a duty that throws things away, with its deletions counted.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import BinaryIO
+
+from prometheus_client import CollectorRegistry
+from sqlalchemy.exc import SQLAlchemyError
+
+from services.steward.batches.worker import resume_batches
+from services.steward.metrics import StewardMetrics
+from services.steward.tasks.auto_evaluation import evaluate_changed_maps
+from services.steward.tasks.compaction import merge_small_chunks
+from services.steward.tasks.delete_maps import purge_deleted_maps
+from services.steward.tasks.garbage_collection import (
+    CollectionHeld,
+    collect_garbage,
+    collect_orphans,
+    empty_expired_trash,
+)
+from services.steward.tasks.generation_repair import mend_generations
+from services.steward.tasks.journal import JournalDuty
+from services.steward.tasks.maintenance import (
+    delete_expired_idempotency_keys,
+    delete_old_deliveries,
+    delete_old_jobs,
+    delete_old_searches,
+    release_expired_leases,
+    resend_hints,
+    update_statistics_of_large_maps,
+)
+from services.steward.tasks.model_changes import (
+    advance_model_changes,
+    auto_fit_vocabularies,
+    remove_dead_search_workers,
+)
+from shared.catalog.database_errors import OutageLog
+from shared.catalog.file_checks import sqlite_file
+from shared.catalog.session import Catalog
+from shared.config.settings import Settings
+from shared.jobs import Wakeups
+from shared.storage import ObjectStore, OwnedStore
+from shared.storage.disk_space import DiskReserve
+from shared.storage.protocol import ObjectInfo, ObjectWriter
+from shared.storage.read_retries import ReadRetries
+from shared.telemetry.heartbeat import Heartbeat
+
+log = logging.getLogger(__name__)
+
+
+class DeletionCountingStore:
+    """`store`, and `on_delete` after each deletion."""
+
+    def __init__(self, store: ObjectStore, on_delete: Callable[[], object]) -> None:
+        self._store = store
+        self._on_delete = on_delete
+
+    def delete(self, key: str) -> None:
+        self._store.delete(key)
+        self._on_delete()
+
+    def writer(self, key: str) -> ObjectWriter:
+        return self._store.writer(key)
+
+    def put(self, key: str, data: bytes) -> None:
+        self._store.put(key, data)
+
+    def get(self, key: str) -> bytes:
+        return self._store.get(key)
+
+    def open(self, key: str) -> BinaryIO:
+        return self._store.open(key)
+
+    def read_range(self, key: str, begin: int, size_bytes: int) -> bytes:
+        return self._store.read_range(key, begin, size_bytes)
+
+    def file(self, key: str) -> Path | None:
+        return self._store.file(key)
+
+    def head(self, key: str) -> ObjectInfo | None:
+        return self._store.head(key)
+
+    def list(self, prefix: str) -> Iterator[ObjectInfo]:
+        return self._store.list(prefix)
+
+    def check(self) -> None:
+        self._store.check()
+
+
+SCHEDULER_TICK_SECONDS = 0.25
+# The trash is emptied before the gateway refuses uploads (MIN_FREE_BYTES).
+FREE_TRASH_FACTOR = 2
+
+
+@dataclass(slots=True)
+class PeriodicTask:
+    name: str
+    interval_seconds: float
+    run: Callable[[], object]
+    next_run: float = field(default=0.0)
+
+
+class Scheduler:
+    """Does each duty when it is due. A duty that fails is logged and tried again next time."""
+
+    def __init__(
+        self,
+        catalog: Catalog,
+        store: OwnedStore,
+        hints: Wakeups,
+        settings: Settings,
+        metrics: StewardMetrics | None = None,
+    ) -> None:
+        self._metrics = metrics = metrics or StewardMetrics(CollectorRegistry())
+        self._outage = OutageLog("steward")
+        self._heartbeat = Heartbeat(settings.heartbeat_file)
+        merge_retries = ReadRetries()
+
+        def counted(duty: str) -> DeletionCountingStore:
+            return DeletionCountingStore(store, metrics.objects_deleted.labels(duty).inc)
+
+        # Of the catalog's own disk, where it is a file.
+        catalog_file = sqlite_file(catalog)
+        reserve = catalog_file and DiskReserve(catalog_file.parent, settings.min_free_bytes)
+        self._journal = PeriodicTask("write journal", 2.0, JournalDuty(catalog, store, metrics))
+        self.tasks = [
+            *([PeriodicTask("keep disk reserve", 5.0, reserve.keep)] if reserve else []),
+            PeriodicTask(
+                "free leases",
+                1.0,
+                lambda: metrics.leases_expired.inc(
+                    release_expired_leases(catalog, settings.max_attempts)
+                ),
+            ),
+            PeriodicTask(
+                "resend hints", 2.0, lambda: metrics.hints_resent.inc(resend_hints(catalog, hints))
+            ),
+            PeriodicTask(
+                "advance model changes",
+                0.5,
+                lambda: advance_model_changes(catalog, hints),
+            ),
+            PeriodicTask("mend generations", 5.0, lambda: mend_generations(catalog, store)),
+            PeriodicTask("resume batches", 5.0, lambda: resume_batches(catalog, settings)),
+            PeriodicTask(
+                "remove dead search workers", 2.0, lambda: remove_dead_search_workers(catalog)
+            ),
+            PeriodicTask(
+                "fit maps that wait",
+                2.0,
+                lambda: auto_fit_vocabularies(catalog, hints, settings.auto_fit_photos),
+            ),
+            PeriodicTask(
+                "count large maps", 10.0, lambda: update_statistics_of_large_maps(catalog)
+            ),
+            PeriodicTask(
+                "compact",
+                5.0,
+                lambda: metrics.slots_merged.inc(
+                    merge_small_chunks(catalog, store, settings.compact_chunks, merge_retries)
+                ),
+            ),
+            self._journal,
+            PeriodicTask(
+                "delete maps", 1.0, lambda: purge_deleted_maps(catalog, counted("delete_maps"))
+            ),
+            PeriodicTask(
+                "collect", 10.0, lambda: collect_garbage(catalog, counted("collect"), settings)
+            ),
+            PeriodicTask(
+                "forget old jobs",
+                10.0,
+                lambda: delete_old_jobs(catalog, settings.job_retention_days),
+            ),
+            PeriodicTask(
+                "forget old searches",
+                10.0,
+                lambda: delete_old_searches(catalog, settings.search_history_days),
+            ),
+            PeriodicTask(
+                "forget old deliveries",
+                10.0,
+                lambda: delete_old_deliveries(catalog, settings.job_retention_days),
+            ),
+            PeriodicTask("forget old keys", 10.0, lambda: delete_expired_idempotency_keys(catalog)),
+            PeriodicTask(
+                "evaluate changed maps",
+                2.0,
+                lambda: evaluate_changed_maps(
+                    catalog, settings.auto_evaluate_photos, settings.word_weights
+                ),
+            ),
+            PeriodicTask(
+                "collect orphans",
+                3600.0,
+                lambda: _collect_orphans(catalog, store, settings, metrics),
+            ),
+            PeriodicTask(
+                "free trash",
+                10.0,
+                lambda: _free_trash(store, FREE_TRASH_FACTOR * settings.min_free_bytes, metrics),
+            ),
+        ]
+
+    def run(self, stop: threading.Event) -> None:
+        """Do what is due until `stop` is set; then write what the journal does not have yet."""
+        while not stop.is_set():
+            for duty in self.tasks:
+                if time.monotonic() >= duty.next_run and not stop.is_set():
+                    self._run_task(duty)
+                    self._heartbeat.beat()
+            stop.wait(SCHEDULER_TICK_SECONDS)
+        self._run_task(self._journal)
+
+    def _run_task(self, duty: PeriodicTask) -> None:
+        started, outcome = time.monotonic(), "done"
+        try:
+            duty.run()
+            self._outage.record_success()
+        except SQLAlchemyError as error:
+            outcome = "catalog_away"
+            self._outage.record_error(error)
+        except Exception:  # one duty's trouble must not end the others
+            outcome = "failed"
+            log.exception(
+                "the steward could not %s; next try in %g s",
+                duty.name,
+                duty.interval_seconds,
+            )
+        self._metrics.observe_task(duty.name, outcome, time.monotonic() - started)
+        duty.next_run = time.monotonic() + duty.interval_seconds
+
+
+def _collect_orphans(
+    catalog: Catalog, store: OwnedStore, settings: Settings, metrics: StewardMetrics
+) -> None:
+    """Move orphans to the trash and delete what has been there long enough, or hold both back."""
+    try:
+        moved = collect_orphans(
+            catalog, store, settings.orphan_age_seconds, max_share=settings.collect_max_share
+        )
+    except CollectionHeld as held:
+        metrics.collection_held.set(1)
+        log.error("collection is held: %s", held.detail)
+        return
+    metrics.collection_held.set(0)
+    metrics.objects_trashed.inc(moved)
+    deleted, left = empty_expired_trash(catalog, store, settings.trash_days)
+    metrics.objects_deleted.labels("collect_orphans").inc(deleted)
+    metrics.trash_bytes.set(left.size_bytes)
+
+
+def _free_trash(store: OwnedStore, least_free_bytes: int, metrics: StewardMetrics) -> None:
+    metrics.objects_deleted.labels("free_trash").inc(store.free_trash(least_free_bytes))

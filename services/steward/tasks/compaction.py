@@ -1,0 +1,180 @@
+"""Merging small chunks into one, inside their slot; rows of deleted photos are dropped."""
+
+from __future__ import annotations
+
+import logging
+import random
+from uuid import UUID
+
+import numpy as np
+from sqlalchemy import delete, func, select, update
+from sqlalchemy.orm import Session
+
+from shared.catalog.base import db_now
+from shared.catalog.chunks import Chunk, Descriptor, list_live_rows
+from shared.catalog.generations import Generation, GenerationState, lock_generation
+from shared.catalog.maps import Map, increment_map_version, lock_map
+from shared.catalog.photos import Photo
+from shared.catalog.session import Catalog
+from shared.errors import NotFound, Unavailable
+from shared.ids import new_id
+from shared.storage import ObjectStore
+from shared.storage.chunks import read_chunk, write_chunk
+from shared.storage.read_retries import ReadRetries
+
+log = logging.getLogger(__name__)
+
+DEAD_ROW_SAMPLE_SLOTS = 100  # of which dead rows are counted in one round: 100,000 rows, some 0.2 s
+DEAD_ROW_SHARE = 0.2  # of a chunk's rows: more, and rewriting it is worth the reading
+
+
+def merge_small_chunks(
+    catalog: Catalog, store: ObjectStore, compact_chunks: int, retries: ReadRetries | None = None
+) -> int:
+    """Merge every slot that is worth it; returns how many were merged. `retries` keeps the slots
+    whose chunks can't be read from being read with every round."""
+    retries = retries or ReadRetries()
+    merged = 0
+    for generation_id, slot in _find_slots_to_merge(catalog, compact_chunks):
+        name = f"slot {slot} of generation {generation_id}"
+        if not retries.is_due(name):
+            continue
+        try:
+            merged += merge_slot(catalog, store, generation_id, slot)
+            retries.succeeded(name)
+        except (Unavailable, NotFound) as error:
+            retries.failed(name, error)
+    return merged
+
+
+def merge_slot(catalog: Catalog, store: ObjectStore, generation_id: UUID, slot: int) -> bool:
+    """Write the slot's live rows into one new chunk; False when something changed meanwhile."""
+    with catalog.read() as session:
+        generation = session.get_one(Generation, generation_id)
+        old = _slot_chunks(session, generation_id, slot)
+        kept = {chunk.id: list_live_rows(session, chunk.id) for chunk in old}
+    rows = [read_chunk(store, chunk.object_key, chunk.sha256) for chunk in old]
+    photo_ids = [photo_id for chunk in old for _, photo_id in kept[chunk.id]]
+    written, chunk_id = None, new_id()
+    if photo_ids:
+        matrix = np.concatenate(
+            [part[[row for row, _ in kept[c.id]]] for c, part in zip(old, rows, strict=True)]
+        )
+        written = write_chunk(
+            store,
+            generation_id=generation_id,
+            chunk_id=chunk_id,
+            rows=matrix,
+            photo_ids=photo_ids,
+            spec=generation.spec,
+        )
+    with catalog.write() as session:
+        lock_map(session, generation.map_id)
+        generation = lock_generation(session, generation_id)
+        now = {chunk.id for chunk in _slot_chunks(session, generation_id, slot)}
+        if now != {chunk.id for chunk in old}:
+            return False  # another steward, or a new chunk in the slot: the new file is an orphan
+        old_ids = [chunk.id for chunk in old]
+        # Rows of photos deleted meanwhile are copied but lead nowhere: dead rows of the new chunk.
+        present = set(
+            session.scalars(select(Descriptor.photo_id).where(Descriptor.chunk_id.in_(old_ids)))
+        )
+        session.execute(delete(Descriptor).where(Descriptor.chunk_id.in_(old_ids)))
+        if written is not None:
+            session.add(
+                Chunk(
+                    id=chunk_id,
+                    generation_id=generation_id,
+                    slot=slot,
+                    object_key=written.object_key,
+                    rows=written.rows,
+                    size_bytes=written.size_bytes,
+                    sha256=written.sha256,
+                    sealed=slot < generation.open_slot,
+                )
+            )
+            session.flush()
+            session.add_all(
+                Descriptor(
+                    generation_id=generation_id,
+                    photo_id=photo_id,
+                    chunk_id=chunk_id,
+                    row=row,
+                )
+                for row, photo_id in enumerate(photo_ids)
+                if photo_id in present
+            )
+        session.execute(update(Chunk).where(Chunk.id.in_(old_ids)).values(superseded_at=db_now()))
+        increment_map_version(session, generation.map_id)
+    log.info("slot %d of %s: %d chunks are one", slot, generation_id, len(old))
+    return True
+
+
+def _slot_chunks(session: Session, generation_id: UUID, slot: int) -> list[Chunk]:
+    return list(
+        session.scalars(
+            select(Chunk)
+            .where(
+                Chunk.generation_id == generation_id,
+                Chunk.slot == slot,
+                Chunk.superseded_at.is_(None),
+            )
+            .order_by(Chunk.id)
+        )
+    )
+
+
+def _find_slots_to_merge(catalog: Catalog, compact_chunks: int) -> list[tuple[UUID, int]]:
+    """Slots that are full but in pieces, open slots in many pieces, and slots with dead rows.
+
+    Dead rows are counted in SLOTS_AT_ONCE slots only, drawn anew each time: counting all of a
+    large catalog would keep the database busy.
+    """
+    with catalog.read() as session:
+        slots = session.execute(
+            select(
+                Chunk.generation_id,
+                Chunk.slot,
+                Generation.open_slot,
+                func.count(),
+                func.sum(Chunk.rows),
+            )
+            .join(Generation, Generation.id == Chunk.generation_id)
+            .join(Map, Map.id == Generation.map_id)
+            .where(
+                Map.deleted_at.is_(None),
+                Chunk.superseded_at.is_(None),
+                Generation.state.in_((GenerationState.ACTIVE, GenerationState.BUILDING)),
+            )
+            .group_by(Chunk.generation_id, Chunk.slot, Generation.open_slot)
+        ).all()
+        drawn = random.sample(slots, min(DEAD_ROW_SAMPLE_SLOTS, len(slots)))
+        dead = {
+            (generation_id, slot)
+            for generation_id, slot, _, _, rows in drawn
+            if rows - _count_live_rows(session, generation_id, slot) > DEAD_ROW_SHARE * rows
+        }
+    return [
+        (generation_id, slot)
+        for generation_id, slot, open_slot, chunks, _ in slots
+        if (slot < open_slot and chunks > 1)
+        or chunks >= compact_chunks
+        or (generation_id, slot) in dead
+    ]
+
+
+def _count_live_rows(session: Session, generation_id: UUID, slot: int) -> int:
+    """The rows of the slot that belong to live photos."""
+    counted = (
+        select(func.count())
+        .select_from(Chunk)
+        .join(Descriptor, Descriptor.chunk_id == Chunk.id)
+        .join(Photo, Photo.id == Descriptor.photo_id)
+        .where(
+            Chunk.generation_id == generation_id,
+            Chunk.slot == slot,
+            Chunk.superseded_at.is_(None),
+            Photo.deleted_at.is_(None),
+        )
+    )
+    return session.scalar(counted) or 0

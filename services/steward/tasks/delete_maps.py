@@ -1,0 +1,212 @@
+"""Removing what belonged to deleted maps: objects before the rows that remember them.
+
+A little at a time, from whatever is left: a crash repeats at most what is harmless. What a request
+that was under way still wrote into the map is found by the next round; the map's own row goes last.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from itertools import chain, islice
+from uuid import UUID
+
+from sqlalchemy import delete, select
+
+from services.steward.tasks.journal import deletion_is_journaled, journal_deletions
+from shared.catalog.base import affected_rows, is_journaled
+from shared.catalog.batch_items import BatchItem
+from shared.catalog.chunks import Chunk, Descriptor
+from shared.catalog.generations import Evaluation, Generation
+from shared.catalog.jobs import QUERY_JOBS, Job, JobKind
+from shared.catalog.maps import CachedMapStatistics, Map, Search
+from shared.catalog.photos import Photo, PresignedUpload
+from shared.catalog.session import Catalog
+from shared.catalog.vocabularies import StoredWhitening, Vocabulary
+from shared.jobs.transitions import cancel_jobs
+from shared.storage import ObjectStore
+from shared.storage.chunks import delete_chunk
+from shared.storage.keys import (
+    ORIGINALS,
+    incoming_key,
+    local_features_prefix,
+    query_object_keys,
+    thumbnail_key,
+)
+
+log = logging.getLogger(__name__)
+
+ROWS_PER_TRANSACTION = 500  # rows removed in one transaction
+SLICE_SECONDS = 2.0  # then the steward's other duties have their turn
+
+
+def purge_deleted_maps(catalog: Catalog, store: ObjectStore) -> None:
+    """Go on removing every deleted map, for a few seconds."""
+    journal_deletions(catalog, store, Map)
+    with catalog.read() as session:
+        gone = session.scalars(
+            select(Map.id).where(Map.deleted_at.is_not(None), deletion_is_journaled(Map))
+        ).all()
+    until = time.monotonic() + SLICE_SECONDS
+    for map_id in gone:
+        while not _purge_next(catalog, store, map_id):
+            if time.monotonic() > until:
+                return
+
+
+def _purge_next(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
+    """Remove the next rows of the map with their objects; True when nothing more can be removed."""
+    with catalog.write() as session:
+        cancel_jobs(session, Job.map_id == map_id)
+    for some_were_left in (
+        _purge_chunks,
+        _purge_queries,
+        _purge_batches,
+        _purge_photos,
+        _purge_presigned_uploads,
+        _purge_local_features,  # last: it asks the store, whatever is there
+    ):
+        if some_were_left(catalog, store, map_id):
+            return False
+    _purge_vocabulary_objects(catalog, store, map_id)
+    with catalog.write() as session:
+        session.execute(delete(CachedMapStatistics).where(CachedMapStatistics.map_id == map_id))
+        session.execute(delete(Evaluation).where(Evaluation.map_id == map_id))
+        session.execute(delete(Search).where(Search.map_id == map_id))
+        session.execute(delete(Job).where(Job.map_id == map_id))
+        session.execute(delete(Generation).where(Generation.map_id == map_id))
+        session.execute(delete(Vocabulary).where(Vocabulary.map_id == map_id))
+        session.execute(delete(StoredWhitening).where(StoredWhitening.map_id == map_id))
+        # Without a word in the journal the map would come back when the catalog is rebuilt.
+        gone = session.execute(delete(Map).where(Map.id == map_id, is_journaled(Map)))
+    if affected_rows(gone):
+        log.info("the deleted map %s is gone", map_id)
+    return True
+
+
+def _purge_chunks(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
+    with catalog.read() as session:
+        chunks = session.scalars(
+            select(Chunk)
+            .join(Generation, Generation.id == Chunk.generation_id)
+            .where(Generation.map_id == map_id)
+            .limit(ROWS_PER_TRANSACTION // 10)
+        ).all()
+    for chunk in chunks:
+        delete_chunk(store, chunk.object_key)
+    ids = [chunk.id for chunk in chunks]
+    if ids:
+        with catalog.write() as session:
+            session.execute(delete(Descriptor).where(Descriptor.chunk_id.in_(ids)))
+            session.execute(delete(Chunk).where(Chunk.id.in_(ids)))
+    return bool(ids)
+
+
+def _purge_queries(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
+    with catalog.read() as session:
+        ids = session.scalars(
+            select(Job.id)
+            .where(Job.map_id == map_id, Job.kind.in_(QUERY_JOBS))
+            .limit(ROWS_PER_TRANSACTION)
+        ).all()
+    for job_id in ids:
+        for key in query_object_keys(job_id):
+            store.delete(key)
+    if ids:
+        with catalog.write() as session:
+            session.execute(delete(Job).where(Job.id.in_(ids)))
+    return bool(ids)
+
+
+def _purge_batches(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
+    """Their archives, their items, and uploaded files that have not become photos."""
+    with catalog.read() as session:
+        params = session.scalars(
+            select(Job.params).where(Job.map_id == map_id, Job.kind == JobKind.BATCH)
+        ).all()
+        items = session.scalars(
+            select(BatchItem)
+            .join(Job, Job.id == BatchItem.job_id)
+            .where(Job.map_id == map_id)
+            .limit(ROWS_PER_TRANSACTION)
+        ).all()
+    for archive in params:
+        if "object_key" in archive:
+            store.delete(archive["object_key"])
+    for item in items:
+        if item.photo_id is None and item.object_key and item.object_key.startswith(ORIGINALS):
+            store.delete(item.object_key)
+    if items:
+        with catalog.write() as session:
+            for job_id in {item.job_id for item in items}:
+                numbers = [item.number for item in items if item.job_id == job_id]
+                session.execute(
+                    delete(BatchItem).where(
+                        BatchItem.job_id == job_id, BatchItem.number.in_(numbers)
+                    )
+                )
+    return bool(items)
+
+
+def _purge_photos(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
+    with catalog.read() as session:
+        photos = session.scalars(
+            select(Photo).where(Photo.map_id == map_id).limit(ROWS_PER_TRANSACTION)
+        ).all()
+    for photo in photos:
+        if photo.object_key:  # empty: its bytes went when it was deleted
+            store.delete(photo.object_key)
+        store.delete(thumbnail_key(photo.id))
+    ids = [photo.id for photo in photos]
+    if ids:
+        with catalog.write() as session:
+            session.execute(delete(Descriptor).where(Descriptor.photo_id.in_(ids)))
+            session.execute(delete(Job).where(Job.photo_id.in_(ids)))
+            session.execute(delete(Photo).where(Photo.id.in_(ids)))
+    return bool(ids)
+
+
+def _purge_presigned_uploads(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
+    with catalog.read() as session:
+        ids = session.scalars(
+            select(PresignedUpload.id)
+            .where(PresignedUpload.map_id == map_id)
+            .limit(ROWS_PER_TRANSACTION)
+        ).all()
+    for upload_id in ids:
+        store.delete(incoming_key(upload_id))
+    if ids:
+        with catalog.write() as session:
+            session.execute(delete(PresignedUpload).where(PresignedUpload.id.in_(ids)))
+    return bool(ids)
+
+
+def _purge_local_features(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
+    with catalog.read() as session:
+        ids = session.scalars(select(Generation.id).where(Generation.map_id == map_id)).all()
+    kept = chain.from_iterable(store.list(local_features_prefix(id_)) for id_ in ids)
+    keys = [info.key for info in islice(kept, ROWS_PER_TRANSACTION)]
+    for key in keys:
+        store.delete(key)
+    return bool(keys)
+
+
+def _purge_vocabulary_objects(catalog: Catalog, store: ObjectStore, map_id: UUID) -> None:
+    """Only the objects, also those of imports that never came to a row, those of whitenings, and
+    checkpoints that were sent under the map's name: the rows are few.
+    """
+    with catalog.read() as session:
+        keys = list(
+            session.scalars(select(Vocabulary.object_key).where(Vocabulary.map_id == map_id))
+        )
+        imports = session.scalars(
+            select(Job.params).where(
+                Job.map_id == map_id, Job.kind.in_((JobKind.IMPORT, JobKind.ADD_MODEL))
+            )
+        )
+        keys += [params["object_key"] for params in imports]
+        keys += session.scalars(
+            select(StoredWhitening.object_key).where(StoredWhitening.map_id == map_id)
+        )
+    for key in keys:
+        store.delete(key)

@@ -1,0 +1,128 @@
+"""The queue's duties: leases of dead workers come back, lost hints are sent again.
+
+What is kept for a while only: finished jobs, the history of searches, the
+log of webhooks, idempotency keys.
+
+Counting large maps, so that no caller has to.
+"""
+
+from __future__ import annotations
+
+import logging
+
+from sqlalchemy import delete, exists, or_, select
+
+from shared.catalog.base import db_now, db_now_plus
+from shared.catalog.idempotency import IdempotencyRecord
+from shared.catalog.jobs import Job, JobState, Priority, claimable_condition
+from shared.catalog.maps import (
+    Search,
+    are_statistics_stale,
+    cache_map_statistics,
+    is_large_map,
+    list_maps,
+)
+from shared.catalog.photos import Photo
+from shared.catalog.session import Catalog
+from shared.catalog.webhooks import Delivery
+from shared.jobs import Wakeups, reclaim_expired_leases
+from shared.jobs.wakeups import WakeupQueue
+
+log = logging.getLogger(__name__)
+
+
+def release_expired_leases(catalog: Catalog, max_attempts: int, *, all_leases: bool = False) -> int:
+    """Give back what dead workers held; see `reclaim_expired_leases`."""
+    with catalog.write() as session:
+        freed = reclaim_expired_leases(session, max_attempts, all_leases=all_leases)
+    if freed:
+        log.warning("%d jobs were held by workers that died: given back", freed)
+    return freed
+
+
+def resend_hints(catalog: Catalog, hints: Wakeups) -> int:
+    """Wake a worker when there is work: the hint that was sent with it may be lost. Returns how
+    many hints were sent."""
+    sent = 0
+    with catalog.read() as session:
+        for lane, condition in (
+            (WakeupQueue.QUERY, Job.priority >= Priority.QUERY),
+            (WakeupQueue.BULK, Job.priority < Priority.QUERY),
+        ):
+            if session.scalar(
+                select(exists(select(Job.id).where(claimable_condition(), condition)))
+            ):
+                hints.send(lane)
+                sent += 1
+    return sent
+
+
+RETENTION_ROWS_PER_TRANSACTION = 1000  # rows removed in one transaction
+DAY_SECONDS = 86_400.0
+
+
+def delete_old_jobs(catalog: Catalog, retention_days: float) -> None:
+    """Jobs that ended long ago. One that left its photo undescribed stays: it holds the reason, and
+    the same bytes again, or a retry, queue it anew."""
+    of_a_photo = exists().where(Photo.id == Job.photo_id, Photo.job_id == Job.id)
+    old = (
+        select(Job.id)
+        .where(
+            Job.finished_at < db_now_plus(-retention_days * DAY_SECONDS),
+            or_(Job.state == JobState.SUCCEEDED, ~of_a_photo),
+        )
+        .limit(RETENTION_ROWS_PER_TRANSACTION)
+        .with_for_update(skip_locked=True)
+    )
+    with catalog.write() as session:
+        session.execute(delete(Job).where(Job.id.in_(session.scalars(old).all())))
+
+
+def delete_old_searches(catalog: Catalog, history_days: float) -> None:
+    """Searches that were asked long ago."""
+    old = (
+        select(Search.id)
+        .where(Search.searched_at < db_now_plus(-history_days * DAY_SECONDS))
+        .limit(RETENTION_ROWS_PER_TRANSACTION)
+    )
+    with catalog.write() as session:
+        session.execute(delete(Search).where(Search.id.in_(session.scalars(old).all())))
+
+
+def delete_old_deliveries(catalog: Catalog, retention_days: float) -> None:
+    """The log of what was sent to webhooks. Nothing waits as long as that."""
+    old = (
+        select(Delivery.id)
+        .where(Delivery.created_at < db_now_plus(-retention_days * DAY_SECONDS))
+        .limit(RETENTION_ROWS_PER_TRANSACTION)
+    )
+    with catalog.write() as session:
+        session.execute(delete(Delivery).where(Delivery.id.in_(session.scalars(old).all())))
+
+
+def delete_expired_idempotency_keys(catalog: Catalog) -> None:
+    """Idempotency keys whose time is over."""
+    old = (
+        select(IdempotencyRecord.id)
+        .where(IdempotencyRecord.expires_at <= db_now())
+        .limit(RETENTION_ROWS_PER_TRANSACTION)
+        .with_for_update(skip_locked=True)
+    )
+    with catalog.write() as session:
+        session.execute(
+            delete(IdempotencyRecord).where(IdempotencyRecord.id.in_(session.scalars(old).all()))
+        )
+
+
+def update_statistics_of_large_maps(catalog: Catalog) -> None:
+    """Count each live map that is too large to be counted when someone asks, and is due."""
+    with catalog.read() as session:
+        maps = [map_.id for map_ in list_maps(session)]
+        due = [
+            map_id
+            for map_id in maps
+            if is_large_map(session, map_id) and are_statistics_stale(session, map_id)
+        ]
+    for map_id in due:
+        with catalog.write() as session:
+            cache_map_statistics(session, map_id)

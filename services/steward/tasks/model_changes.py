@@ -1,0 +1,283 @@
+"""Model changes' duties: queue photos for a generation that is built, switch when it is complete.
+
+Complete means: each live photo that the active generation can find has a descriptor in the new
+one, or a recorded failure there. Then every live search worker has to have loaded it. The last
+check and the switch are one transaction under the map's lock, which publishing takes as well: no
+photo can slip between them.
+
+Search workers' duties: dead ones are forgotten, live ones are waited for before a switch.
+"""
+
+from __future__ import annotations
+
+import logging
+from uuid import UUID
+
+from sqlalchemy import delete, exists, func, insert, select, update
+from sqlalchemy.orm import Session, aliased
+
+from shared.catalog.base import Condition, db_now, db_now_plus
+from shared.catalog.chunks import Descriptor, estimate_described
+from shared.catalog.generations import (
+    Generation,
+    GenerationState,
+    active_generation,
+    lock_generation,
+)
+from shared.catalog.jobs import MODEL_CHANGE_JOBS, UNFINISHED_STATES, WaitingFor
+from shared.catalog.maps import Map, increment_map_version, list_maps, lock_map
+from shared.catalog.photos import Photo, PhotoRole
+from shared.catalog.processes import delete_dead_search_workers, list_lagging_workers
+from shared.catalog.session import Catalog
+from shared.catalog.vocabularies import StoredWhitening
+from shared.catalog.webhooks import EventKind, enqueue_event
+from shared.errors import Conflict
+from shared.ids import new_id
+from shared.jobs import Job, JobKind, JobState, Priority, Wakeups
+from shared.jobs.model_changes import start_model_change
+from shared.jobs.transitions import succeed_job
+
+log = logging.getLogger(__name__)
+
+# Loading takes as long as reading; who takes longer than this is named, so that someone looks.
+SLOW_LOAD_SECONDS = 60.0
+
+
+def remove_dead_search_workers(catalog: Catalog) -> None:
+    """Those that have not been heard of for long; a worker that only paused registers anew."""
+    with catalog.write() as session:
+        gone = delete_dead_search_workers(session)
+    if gone:
+        log.warning("%d search workers were not heard of for long: forgotten", gone)
+
+
+def search_workers_have_loaded(session: Session, job: Job, generation: Generation) -> bool:
+    """Whether every live search worker can answer from the complete generation; if not, the job
+    waits for them.
+
+    What counts is the version at which the generation was complete for the first time: photos
+    that were described since are few, and queries wait for them by `min_version`. A worker that
+    is alive is waited for as long as it takes: switching without it would lose its photos.
+    """
+    if generation.complete_version is None:
+        generation.complete_version = session.get_one(Map, generation.map_id).version
+        generation.complete_at = db_now()
+        session.flush()
+    behind = list_lagging_workers(session, generation.id, generation.complete_version)
+    if not behind:
+        return True
+    job.waiting_for, job.stage = WaitingFor.SEARCH, "load"
+    if _loading_is_slow(session, generation):
+        names = [worker.name for worker in behind]
+        if names != job.awaited:
+            log.warning(
+                "generation %s is complete, and these search workers have not loaded it for %g s: "
+                "%s. The switch waits for them as long as they live; their logs say what they lack",
+                generation.id,
+                SLOW_LOAD_SECONDS,
+                ", ".join(names),
+            )
+        job.awaited = names
+    return False
+
+
+def _loading_is_slow(session: Session, generation: Generation) -> bool:
+    return bool(
+        session.scalar(
+            select(Generation.complete_at < db_now_plus(-SLOW_LOAD_SECONDS)).where(
+                Generation.id == generation.id
+            )
+        )
+    )
+
+
+ADVANCED_WAITS = (WaitingFor.DESCRIPTORS, WaitingFor.SEARCH)
+
+REINDEX_JOBS_PER_TRANSACTION = 2000  # reindex jobs queued in one transaction
+
+# What `POST /vocabularies` with {} asks for; no `clusters` means the extractor's own number.
+DEFAULT_FIT_PARAMS = {"clusters": None, "sample": 1000, "seed": 0}
+
+
+def advance_model_changes(catalog: Catalog, hints: Wakeups) -> None:
+    """One step for every model change that waits for descriptors, or for search to load them."""
+    with catalog.read() as session:
+        waiting = session.scalars(
+            select(Job).where(Job.kind.in_(MODEL_CHANGE_JOBS), Job.waiting_for.in_(ADVANCED_WAITS))
+        ).all()
+    for job in waiting:
+        with catalog.write() as session:
+            lock_map(session, job.map_id)
+            current = session.get_one(Job, job.id, with_for_update=True)
+            if current.waiting_for in ADVANCED_WAITS and current.generation_id:
+                queued = _advance_generation(session, current, current.generation_id)
+                if queued:
+                    hints.send()
+
+
+def auto_fit_vocabularies(catalog: Catalog, hints: Wakeups, auto_fit_photos: int) -> None:
+    """A map whose photos wait for a vocabulary gets one fitted once it has enough of them."""
+    with catalog.read() as session:
+        maps = [map_.id for map_ in list_maps(session)]
+        ready = [id_ for id_ in maps if _has_enough_waiting_photos(session, id_, auto_fit_photos)]
+    for map_id in ready:
+        with catalog.write() as session:
+            if _last_change_failed(session, map_id):
+                continue  # the reason is in the job; a person has to act
+            try:
+                job = start_model_change(session, map_id, JobKind.FIT, dict(DEFAULT_FIT_PARAMS))
+            except Conflict:
+                continue  # one is under way
+        log.info("map %s has enough photos: fitting a vocabulary (job %s)", map_id, job.id)
+        hints.send()
+
+
+def _has_enough_waiting_photos(session: Session, map_id: UUID, least: int) -> bool:
+    """Whether `least` database photos of the map wait for a vocabulary."""
+    waiting = (
+        select(Job.id)
+        .join(Photo, Photo.id == Job.photo_id)
+        .where(
+            Job.map_id == map_id,
+            Job.waiting_for == WaitingFor.VOCABULARY,
+            Job.kind == JobKind.INDEX,
+            Photo.role == PhotoRole.DATABASE,
+        )
+        .limit(least)
+    )
+    return session.scalar(select(func.count()).select_from(waiting.subquery())) == least
+
+
+def _advance_generation(session: Session, job: Job, generation_id: UUID) -> int:
+    """Queue what is missing, note the progress, or finish; returns how many jobs were queued."""
+    generation = lock_generation(session, generation_id)
+    if generation.state == GenerationState.BUILDING:
+        queued = _queue_missing_photos(session, generation)
+        open_jobs = (Job.kind == JobKind.REINDEX) & (Job.generation_id == generation_id)
+    else:  # the map's first generation: photos are described into it by their own jobs
+        queued = 0
+        open_jobs = (
+            (Job.kind == JobKind.INDEX)
+            & (Job.map_id == job.map_id)
+            & (Job.created_at <= generation.created_at)
+        )
+    if queued or session.scalar(
+        select(exists().where(open_jobs, Job.state.in_(UNFINISHED_STATES)))
+    ):
+        before = int(job.params.get("done_before", 0))
+        done = estimate_described(session, generation_id)
+        # Also when it was complete before: photos have come since.
+        job.waiting_for, job.stage, job.awaited = WaitingFor.DESCRIPTORS, "describe", None
+        job.progress_done = max(0, min(before + done, job.progress_total - 1))
+        return queued
+    failed = _count_jobs(session, open_jobs & (Job.state == JobState.FAILED))
+    if generation.state == GenerationState.BUILDING:
+        if not search_workers_have_loaded(session, job, generation):
+            return 0
+        _activate_generation(session, generation)
+    job.progress_failed = failed
+    job.progress_total = max(job.progress_total, failed)
+    photos = estimate_described(session, generation_id)
+    whitening = None
+    if generation.whitening_id is not None:
+        whitening = session.get_one(StoredWhitening, generation.whitening_id).summary()
+    succeed_job(
+        job,
+        {
+            "generation_id": str(generation_id),
+            "vocabulary_id": str(generation.vocabulary_id) if generation.vocabulary_id else None,
+            "clusters": generation.spec["clusters"],
+            "dimension": generation.dimension,
+            "pca": whitening,
+            "photos": photos,
+            "failed": failed,
+        },
+    )
+    log.info("generation %s answers, with %d photos", generation_id, photos)
+    return 0
+
+
+def _queue_missing_photos(session: Session, generation: Generation) -> int:
+    """A reindex job for each photo that still needs one; up to FILL_JOBS of them."""
+    active = active_generation(session, generation.map_id)
+    assert active is not None, "a generation is built only beside an active one"
+    described, reindexed = aliased(Descriptor), aliased(Job)
+    missing = (
+        select(Photo.id)
+        .join(
+            Descriptor,
+            (Descriptor.photo_id == Photo.id) & (Descriptor.generation_id == active.id),
+        )
+        .where(
+            Photo.map_id == generation.map_id,
+            Photo.deleted_at.is_(None),
+            ~exists().where(
+                described.photo_id == Photo.id, described.generation_id == generation.id
+            ),
+            ~exists().where(
+                reindexed.photo_id == Photo.id,
+                reindexed.generation_id == generation.id,
+                reindexed.state != JobState.CANCELLED,  # by someone, alone: the photo is missing
+            ),
+        )
+        .order_by(Photo.id)
+        .limit(REINDEX_JOBS_PER_TRANSACTION)
+    )
+    rows = [
+        {
+            "id": new_id(),
+            "map_id": generation.map_id,
+            "kind": JobKind.REINDEX,
+            "priority": Priority.REINDEX,
+            "photo_id": photo_id,
+            "generation_id": generation.id,
+        }
+        for photo_id in session.scalars(missing)
+    ]
+    if rows:
+        session.execute(insert(Job), rows)
+    return len(rows)
+
+
+def _activate_generation(session: Session, generation: Generation) -> None:
+    """The new generation answers from this commit on."""
+    active = active_generation(session, generation.map_id)
+    assert active is not None, "a generation is built only beside an active one"
+    active.state = GenerationState.RETIRED
+    active.ended_at = db_now()
+    session.flush()  # one generation of a map may be active at a time, also inside a transaction
+    generation.state = GenerationState.ACTIVE
+    generation.activated_at = db_now()
+    map_ = session.get_one(Map, generation.map_id)
+    map_.extractor = generation.extractor
+    enqueue_event(
+        session,
+        EventKind.GENERATION_SWITCHED,
+        {
+            "map": map_.name,
+            "generation_id": str(generation.id),
+            "replaced_generation_id": str(active.id),
+            "extractor": generation.extractor,
+        },
+    )
+    reindex = (Job.kind == JobKind.REINDEX) & (Job.generation_id == generation.id)
+    # A photo that could not be described anew says so through its own job from now on.
+    failed = select(Job.photo_id, Job.id).where(reindex, Job.state == JobState.FAILED)
+    for photo_id, job_id in session.execute(failed).all():
+        session.execute(update(Photo).where(Photo.id == photo_id).values(job_id=job_id))
+    session.execute(delete(Job).where(reindex, Job.state != JobState.FAILED))
+    increment_map_version(session, generation.map_id)
+
+
+def _last_change_failed(session: Session, map_id: UUID) -> bool:
+    last = session.scalar(
+        select(Job.state)
+        .where(Job.map_id == map_id, Job.kind.in_(MODEL_CHANGE_JOBS))
+        .order_by(Job.id.desc())
+        .limit(1)
+    )
+    return last in (JobState.FAILED, JobState.CANCELLED)
+
+
+def _count_jobs(session: Session, condition: Condition) -> int:
+    return session.scalar(select(func.count()).select_from(Job).where(condition)) or 0

@@ -1,0 +1,315 @@
+"""Webhooks: what happened is told to who wants to know, signed, until it was heard.
+
+The signature of a webhook, as the Standard Webhooks specification 1.0 has it.
+
+One POST to a webhook: to the address that was checked, no further, and not for long.
+
+The outbox's other end: what is due is sent, tried again later, or given up.
+
+A try is claimed in one transaction and its end is written in another. Whoever dies between them
+leaves a delivery that comes due again: each is sent at least once, and its id tells the receiver
+which he has had already.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import contextlib
+import hashlib
+import hmac
+import logging
+import random
+import ssl
+import threading
+import time
+from collections.abc import Callable, Collection
+from concurrent.futures import Future
+from dataclasses import dataclass
+from typing import Any, TypeVar
+from uuid import UUID
+
+import httpcore2
+from sqlalchemy import ColumnElement, select, update
+from sqlalchemy.exc import SQLAlchemyError
+
+from shared.catalog.base import db_now, db_now_plus
+from shared.catalog.database_errors import OutageLog
+from shared.catalog.session import Catalog
+from shared.catalog.webhooks import SECRET_PREFIX, Delivery, DeliveryState, Webhook
+from shared.config.settings import Settings
+from shared.errors import PlacewiseError
+from shared.security.webhook_targets import parse_webhook_url, resolve_webhook_target
+
+log = logging.getLogger(__name__)
+
+
+def sign_webhook(secret: str, message_id: str, timestamp_seconds: int, body: str) -> str:
+    """`v1,` and the base64 of HMAC-SHA256 over `id.timestamp.body`.
+
+    `secret` is `whsec_` and the key in base64; the time is Unix', so that a receiver can refuse
+    what is old, and a copy of it sent again.
+    """
+    key = base64.b64decode(secret.removeprefix(SECRET_PREFIX))
+    signed = f"{message_id}.{timestamp_seconds}.{body}".encode()
+    return "v1," + base64.b64encode(hmac.new(key, signed, hashlib.sha256).digest()).decode()
+
+
+def signature_headers(
+    secret: str, message_id: str, timestamp_seconds: int, body: str
+) -> dict[str, str]:
+    """What a receiver needs to believe the body. The id is the same in every try."""
+    return {
+        "webhook-id": message_id,
+        "webhook-timestamp": str(timestamp_seconds),
+        "webhook-signature": sign_webhook(secret, message_id, timestamp_seconds, body),
+    }
+
+
+# Deadline of one attempt: name lookup, connection, TLS handshake, request and response head.
+ATTEMPT_SECONDS = 15.0
+USER_AGENT = "Placewise-Webhooks/1"
+HTTP_ERRORS = (httpcore2.NetworkError, httpcore2.ProtocolError, httpcore2.TimeoutException)
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, slots=True)
+class DeliveryAttempt:
+    """What came of a try."""
+
+    status: int | None
+    """HTTP status; None where there was no answer."""
+    error: str | None
+    """Why it was no success; None for 2xx."""
+    is_permanent: bool = False
+    """The address may not be called: another try would find the same."""
+
+
+class PinnedBackend(httpcore2.AnyIOBackend):
+    """Connects to one address, whichever host is named; TLS still verifies the host name."""
+
+    def __init__(self, address: str) -> None:
+        super().__init__()
+        self._address = address
+        self._stream: httpcore2.AsyncNetworkStream | None = None
+
+    async def connect_tcp(
+        self, host: str, port: int, *args: Any, **options: Any
+    ) -> httpcore2.AsyncNetworkStream:
+        self._stream = await super().connect_tcp(self._address, port, *args, **options)
+        return self._stream
+
+    async def aclose(self) -> None:
+        """Close the connection: the pool forgets one that was cancelled in its TLS handshake."""
+        if self._stream is not None:
+            await self._stream.aclose()
+
+
+async def send_webhook(
+    webhook: Webhook, delivery: Delivery, tls: ssl.SSLContext, *, allow_private: bool
+) -> DeliveryAttempt:
+    """Attempt the delivery once, for ATTEMPT_SECONDS at most.
+
+    Never raises for what the network or the receiver does. `tls` verifies the receiver's
+    certificate. Redirects are not followed, and proxies of the environment are not used.
+    """
+    try:
+        async with asyncio.timeout(ATTEMPT_SECONDS):
+            status = await _post(webhook, delivery, tls, allow_private)
+    except PlacewiseError as error:
+        return DeliveryAttempt(
+            None, error.detail, is_permanent=error.code != "webhook_name_unknown"
+        )
+    except TimeoutError:
+        return DeliveryAttempt(None, f"no answer within {ATTEMPT_SECONDS:g} seconds")
+    except (OSError, ValueError, *HTTP_ERRORS) as error:
+        return DeliveryAttempt(None, f"{type(error).__name__}: {error}"[:500])
+    if 200 <= status < 300:
+        return DeliveryAttempt(status, None)
+    if 300 <= status < 400:
+        return DeliveryAttempt(status, f"answered HTTP {status}: redirects are not followed")
+    return DeliveryAttempt(status, f"answered HTTP {status}")
+
+
+async def _post(
+    webhook: Webhook, delivery: Delivery, tls: ssl.SSLContext, allow_private: bool
+) -> int:
+    """The response's status. Its body is not read: nothing in it is of use."""
+    target = parse_webhook_url(webhook.url, allow_private=allow_private)
+    address = await in_daemon_thread(
+        lambda: resolve_webhook_target(target, allow_private=allow_private)
+    )
+    signed = signature_headers(
+        webhook.secret, f"msg_{delivery.event_id}", int(time.time()), delivery.body
+    )
+    headers = [
+        *signed.items(),
+        ("Content-Type", "application/json"),
+        ("Host", target.host_header),
+        ("User-Agent", USER_AGENT),
+        ("Connection", "close"),
+    ]
+    url = httpcore2.URL(
+        scheme=target.scheme, host=target.host, port=target.port, target=target.path
+    )
+    backend = PinnedBackend(address)
+    async with (
+        contextlib.aclosing(backend),
+        httpcore2.AsyncConnectionPool(ssl_context=tls, network_backend=backend) as pool,
+        pool.stream("POST", url, headers=headers, content=delivery.body.encode()) as response,
+    ):
+        return response.status
+
+
+def in_daemon_thread(call: Callable[[], T]) -> asyncio.Future[T]:
+    """Run a blocking call that cannot be interrupted, such as a name lookup.
+
+    Returns:
+        Its result. Whoever gives up waiting for it leaves it behind: no event loop and no exiting
+        process waits for a daemon thread, as they do for the threads of an executor.
+    """
+    result: Future[T] = Future()
+    result.set_running_or_notify_cancel()
+
+    def run() -> None:
+        try:
+            result.set_result(call())
+        except BaseException as error:
+            result.set_exception(error)
+
+    threading.Thread(target=run, name="webhook", daemon=True).start()
+    return asyncio.wrap_future(result)
+
+
+DELIVERY_POLL_SECONDS = 1.0
+MAX_WEBHOOKS = 32  # served at the same time
+MAX_IN_FLIGHT = 4  # attempts for one webhook
+CLAIM_SECONDS = 4 * ATTEMPT_SECONDS  # after which a try whose steward died is due again
+# Between tries, as the Standard Webhooks specification recommends: 10 tries within some three days.
+RETRY_DELAYS_SECONDS = (5, 300, 1800, 7200, 18_000, 36_000, 50_400, 72_000, 86_400)
+RETRY_JITTER = (
+    0.2  # of a pause, at random: receivers that come back are not met by everyone at once
+)
+
+
+class WebhookDispatcher:
+    """Sends what is due; `run` until stopped. Any number of stewards may have one.
+
+    Each webhook with due deliveries has a task of its own, so a receiver that hangs delays only
+    its own deliveries, and at most MAX_IN_FLIGHT of them are in flight.
+    """
+
+    def __init__(self, catalog: Catalog, settings: Settings) -> None:
+        self._catalog = catalog
+        self._allow_private = settings.webhook_private_addresses
+        self._tls = ssl.create_default_context()
+        self._outage = OutageLog("sender of webhooks")
+
+    def run(self, stop: threading.Event) -> None:
+        """Send until `stop` is set. Attempts in flight are then cut off, not waited for: they
+        come due again after CLAIM_SECONDS."""
+        asyncio.run(self._run(stop))  # which cancels the tasks that are left
+
+    async def _run(self, stop: threading.Event) -> None:
+        stopped = in_daemon_thread(stop.wait)
+        tasks: dict[UUID, asyncio.Task[None]] = {}
+        while not stopped.done():
+            try:
+                due = await asyncio.to_thread(self.due_webhooks, list(tasks))
+                if not due:
+                    self._outage.record_success()
+            except SQLAlchemyError as error:
+                due = []
+                self._outage.record_error(error)
+            # At random: webhooks with a backlog must not keep the others from the last places.
+            for webhook_id in random.sample(due, min(len(due), MAX_WEBHOOKS - len(tasks))):
+                tasks[webhook_id] = asyncio.create_task(self._serve(webhook_id))
+            awaited: set[asyncio.Future[Any]] = {stopped, *tasks.values()}
+            await asyncio.wait(
+                awaited, timeout=DELIVERY_POLL_SECONDS, return_when=asyncio.FIRST_COMPLETED
+            )
+            for webhook_id in [one for one, task in tasks.items() if task.done()]:
+                tasks.pop(webhook_id).result()  # raises what nobody has foreseen
+
+    async def _serve(self, webhook_id: UUID) -> None:
+        try:
+            await self.deliver_due(webhook_id)
+            self._outage.record_success()
+        except SQLAlchemyError as error:
+            self._outage.record_error(error)
+            await asyncio.sleep(DELIVERY_POLL_SECONDS)
+
+    def due_webhooks(self, besides: Collection[UUID] = ()) -> list[UUID]:
+        """Ids of webhooks with due deliveries, but for those in `besides`."""
+        due = select(Delivery.webhook_id).where(*_is_due(), Delivery.webhook_id.not_in(besides))
+        with self._catalog.read() as session:
+            return list(session.scalars(due.distinct()))
+
+    async def deliver_due(self, webhook_id: UUID) -> int:
+        """Attempt what is due for one webhook, MAX_IN_FLIGHT at most; how many that were."""
+        webhook, claimed = await asyncio.to_thread(self._claim_due, webhook_id)
+        ends = await asyncio.gather(
+            *(self._attempt(webhook, delivery) for delivery in claimed), return_exceptions=True
+        )
+        for error in ends:  # only now: one that can't be noted must not cut off the others
+            if error is not None:
+                raise error
+        return len(claimed)
+
+    def _claim_due(self, webhook_id: UUID) -> tuple[Webhook | None, list[Delivery]]:
+        due = (
+            select(Delivery)
+            .where(*_is_due(), Delivery.webhook_id == webhook_id)
+            .order_by(Delivery.next_attempt_at)
+            .limit(MAX_IN_FLIGHT)
+            .with_for_update(skip_locked=True)
+        )
+        with self._catalog.write() as session:
+            claimed = list(session.scalars(due))
+            for delivery in claimed:
+                delivery.attempts += 1
+                delivery.next_attempt_at = db_now_plus(CLAIM_SECONDS)
+            session.flush()
+            for delivery in claimed:
+                session.refresh(delivery)
+            return session.get(Webhook, webhook_id), claimed
+
+    async def _attempt(self, webhook: Webhook | None, delivery: Delivery) -> None:
+        if webhook is None:  # deleted while the event was being written
+            outcome = DeliveryAttempt(None, "the webhook was deleted", is_permanent=True)
+        else:
+            outcome = await send_webhook(
+                webhook, delivery, self._tls, allow_private=self._allow_private
+            )
+        await asyncio.to_thread(self._record_attempt, delivery.id, delivery.attempts, outcome)
+
+    def _record_attempt(self, delivery_id: UUID, attempts: int, outcome: DeliveryAttempt) -> None:
+        values: dict[str, Any] = {"last_status": outcome.status, "last_error": outcome.error}
+        pause = retry_delay_seconds(attempts)
+        if outcome.error is None:
+            values |= {"state": DeliveryState.DELIVERED, "ended_at": db_now()}
+        elif outcome.is_permanent or pause is None:
+            values |= {"state": DeliveryState.FAILED, "ended_at": db_now()}
+            log.warning("webhook delivery %s is given up: %s", delivery_id, outcome.error)
+        else:
+            values |= {"next_attempt_at": db_now_plus(pause)}
+        with self._catalog.write() as session:
+            session.execute(
+                update(Delivery)
+                # Not where another steward has taken it over since.
+                .where(Delivery.id == delivery_id, Delivery.attempts == attempts)
+                .values(**values)
+                .execution_options(synchronize_session=False)
+            )
+
+
+def _is_due() -> tuple[ColumnElement[bool], ...]:
+    return (Delivery.state == DeliveryState.PENDING, Delivery.next_attempt_at <= db_now())
+
+
+def retry_delay_seconds(attempts: int) -> float | None:
+    """Until the next try, after so many; None when it is given up."""
+    if attempts > len(RETRY_DELAYS_SECONDS):
+        return None
+    return RETRY_DELAYS_SECONDS[attempts - 1] * random.uniform(1, 1 + RETRY_JITTER)  # noqa: S311

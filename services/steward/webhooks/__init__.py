@@ -1,1 +1,0 @@
-"""Webhooks: what happened is told to who wants to know, signed, until it was heard."""

@@ -1,8 +1,0 @@
-"""Evaluation: photos of a data set to rows, rows to rankings, rankings to figures and reports.
-
-    describe -> rows -> nearest -> recalls        what training validates with
-                                -> figures -> report, differences between runs
-
-Photos come through a `Describe`: a checkpoint's network here, any extractor where the command line
-wires it, so that the same figures are taken of everything.
-"""

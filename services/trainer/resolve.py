@@ -1,0 +1,227 @@
+"""What a run's arguments mean on this machine and with this data, before its first step.
+
+What computes: the accelerator, its number and its precision, checked before anything is read.
+
+Where a run's figures go while it learns.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from lightning.pytorch.loggers import (
+    CSVLogger,
+    Logger,
+    MLFlowLogger,
+    TensorBoardLogger,
+    WandbLogger,
+)
+
+from services.trainer.arguments import TrainingArguments, to_plain_dict
+from services.trainer.checkpointing import CheckpointNameTemplate, TopKCheckpoints
+from services.trainer.dataset_selection import EvaluationSets
+from services.trainer.run_control import Display
+from services.trainer.run_folder import CHECKPOINTS_FOLDER
+from shared.datasets.dataset import TrainingSet
+from shared.errors import InvalidRequest, Misconfigured
+from shared.evaluation.exact_knn import exact_knn
+from shared.evaluation.ranking import DEFAULT_KS
+
+PRECISION_ALIASES = {
+    "32": "32-true",
+    "32-true": "32-true",
+    "16": "16-mixed",
+    "16-mixed": "16-mixed",
+    "bf16": "bf16-mixed",
+    "bf16-mixed": "bf16-mixed",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Device:
+    accelerator: str
+    """gpu, mps or cpu"""
+    devices: Any
+    """as Lightning wants it: [0] or 1"""
+    precision: str
+    torch_device: torch.device
+
+
+def resolve_device(arguments: TrainingArguments) -> Device:
+    """The one device that the arguments mean.
+
+    Raises Misconfigured (`no_gpu`), InvalidRequest (`several_devices`, `unknown_precision`,
+    `precision_unfit`).
+    """
+    accelerator = _resolve_accelerator(arguments.accelerator)
+    index = _device_index(arguments.devices)
+    precision = PRECISION_ALIASES.get(str(arguments.precision))
+    if precision is None:
+        raise InvalidRequest(
+            "unknown_precision",
+            f"--precision {arguments.precision} is unknown; known: {', '.join(PRECISION_ALIASES)}.",
+        )
+    if precision == "16-mixed" and accelerator != "gpu":
+        raise InvalidRequest(
+            "precision_unfit", "--precision 16-mixed needs a CUDA GPU; bf16-mixed and 32 do not."
+        )
+    if accelerator != "gpu":
+        return Device(accelerator, 1, precision, torch.device(accelerator))
+    if index >= torch.cuda.device_count():
+        raise Misconfigured(
+            "no_gpu",
+            f"--devices [{index}]: this machine has {torch.cuda.device_count()} GPUs, "
+            "numbered from 0.",
+        )
+    return Device("gpu", [index], precision, torch.device("cuda", index))
+
+
+def _resolve_accelerator(requested: str) -> str:
+    if requested == "auto":
+        if torch.cuda.is_available():
+            return "gpu"
+        return "mps" if torch.backends.mps.is_available() else "cpu"
+    if requested in ("gpu", "cuda"):
+        if not torch.cuda.is_available():
+            raise Misconfigured(
+                "no_gpu",
+                "PyTorch finds no CUDA GPU here (--accelerator gpu is the default). Train on the "
+                "processor with --accelerator cpu --faiss_gpu False, or install the driver and a "
+                "CUDA build of PyTorch.",
+            )
+        return "gpu"
+    if requested == "mps" and not torch.backends.mps.is_available():
+        raise Misconfigured("no_gpu", "PyTorch finds no MPS device here: say --accelerator cpu.")
+    return requested
+
+
+def _device_index(devices: int | str | tuple[int, ...]) -> int:
+    if devices in (1, "1", "auto"):
+        return 0
+    if isinstance(devices, tuple) and len(devices) == 1 and devices[0] >= 0:
+        return devices[0]
+    raise InvalidRequest(
+        "several_devices",
+        f"--devices {devices}: a run has one device: 1, or its number as [0]. Runs of a grid can "
+        "share a machine's GPUs, each with its own number.",
+    )
+
+
+LOGGER_PACKAGES = {"tensorboard": ("tensorboard",), "wandb": ("wandb",), "mlflow": ("mlflow",)}
+
+
+def make_loggers(names: tuple[str, ...], folder: Path, arguments: dict[str, Any]) -> list[Logger]:
+    """One logger for each name. None needs an account but `wandb`, which can be offline
+    (`WANDB_MODE=offline`).
+
+    Raises Misconfigured (`logger_missing`) for one whose package is not installed.
+    """
+    check_loggers(names)
+    made: list[Logger] = []
+    for name in names:
+        if name == "csv":
+            made.append(CSVLogger(folder, name="csv"))
+        elif name == "tensorboard":
+            made.append(TensorBoardLogger(folder, name="", version="tensorboard"))
+        elif name == "wandb":
+            made.append(WandbLogger(name=folder.name, save_dir=folder, project="placewise"))
+        else:
+            made.append(MLFlowLogger(run_name=folder.name, save_dir=str(folder / "mlflow")))
+    for logger in made:
+        logger.log_hyperparams(arguments)
+    return made
+
+
+def check_loggers(names: tuple[str, ...]) -> None:
+    """As `make_loggers` raises, before anything else is done."""
+    for name in names:
+        for package in LOGGER_PACKAGES.get(name, ()):
+            if importlib.util.find_spec(package) is None:
+                raise Misconfigured(
+                    "logger_missing",
+                    f"--logger {name} needs the package {package}: install it, or name others "
+                    "(csv, tensorboard, none).",
+                )
+
+
+Json = dict[str, Any]
+
+
+def check_environment(arguments: TrainingArguments) -> Device:
+    """The device, when all that the arguments need of this machine is there.
+
+    Raises Misconfigured (`no_gpu`, `faiss_gpu_missing`, `logger_missing`), InvalidRequest.
+    """
+    device = resolve_device(arguments)
+    check_loggers(arguments.logger)
+    if arguments.faiss_gpu:
+        one = np.ones((1, 1), np.float32)
+        exact_knn(one, one, 1, faiss_gpu=True)
+    return device
+
+
+def resolve_arguments(
+    arguments: TrainingArguments, places: TrainingSet, sets: EvaluationSets
+) -> TrainingArguments:
+    """The arguments with what was left to the data set filled in."""
+    if arguments.img_per_place > arguments.min_img_per_place:
+        raise InvalidRequest(
+            "bad_argument",
+            f"--img_per_place {arguments.img_per_place} is more than --min_img_per_place "
+            f"{arguments.min_img_per_place}: places without enough photos would be in the set.",
+        )
+    assert arguments.data_root is not None
+    changes: Json = {
+        **sets.names,
+        "cities": places.cities,
+        "data_root": arguments.data_root.resolve(),
+        "eval_roots": tuple(root.resolve() for root in arguments.eval_roots),
+    }
+    if "monitor" not in arguments.model_fields_set and sets.validation:
+        changes["monitor"] = f"{sets.validation[0].name}/R1"
+    return TrainingArguments(**{**arguments.model_dump(), **changes})
+
+
+def make_checkpoints(
+    arguments: TrainingArguments, folder: Path, sets: EvaluationSets, display: Display
+) -> TopKCheckpoints:
+    """The run's checkpoints, none kept yet; InvalidRequest (`unknown_metric`, `bad_argument`)."""
+    metrics = [f"{each.name}/R{k}" for each in sets.validation for k in DEFAULT_KS]
+    if not metrics:
+        display.warn("There is no set to validate on: only last.ckpt is kept.")
+    elif arguments.monitor not in metrics:
+        raise InvalidRequest(
+            "unknown_metric",
+            f"--monitor {arguments.monitor} is not measured in this run; known: "
+            f"{', '.join(metrics)}.",
+        )
+    name = CheckpointNameTemplate(
+        arguments.filename,
+        to_plain_dict(arguments),
+        metrics,
+        monitored_set=arguments.monitor.rpartition("/")[0],
+        insert_names=arguments.auto_insert_metric_name,
+    )
+    for dropped in name.dropped_fields if metrics else ():
+        display.warn(f"--filename: no run on these sets logs {dropped}; it drops out of the names.")
+    return TopKCheckpoints(
+        folder / CHECKPOINTS_FOLDER,
+        name,
+        arguments.monitor,
+        arguments.mode,
+        arguments.save_top_k,
+        arguments.save_weights_only,
+    )
+
+
+def portable_arguments(arguments: TrainingArguments) -> Json:
+    """What a checkpoint says of its training; no paths of this machine."""
+    plain = to_plain_dict(arguments)
+    for name in ("data_root", "eval_roots", "weights", "model_path", "default_root_dir"):
+        plain.pop(name)
+    return plain

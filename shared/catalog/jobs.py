@@ -1,0 +1,238 @@
+"""The jobs table and its state machine.
+
+```
+            claim (lease + token)                finish, the token still its own
+  QUEUED ───────────────────────────> RUNNING ───────────────────────────────────> SUCCEEDED
+   ^  ^ │                              │ │ │ └──── the photo or the request is at fault ──> FAILED
+   │  │ │                              │ │ └── release: a slice is done, or what it needs is away
+   │  │ │ cancel                       │ │     (no attempt is counted) ──> QUEUED, or RUNNING
+   │  │ └─────────> CANCELLED <────────┘ │     without a lease for a sliced job
+   │  │                 │    cancel      │
+   │  └──── retry ──────┴──── FAILED     │ the lease expires: the worker died
+   │                                     v
+   ├──── nothing that could harm the worker had begun: as it was
+   └──── in a batch: marked `alone`, tried again one by one, no attempt counted
+         alone: attempts + 1; at `max_attempts` ──────────────────────────────────> FAILED
+```
+
+A job is claimable when it is unfinished, no one holds its lease, it waits for nothing
+(`waiting_for`) and its time has come (`run_after`). Every claim writes a fresh `lease_token`; a
+worker may only finish what still carries its token, so one that was taken over can compute but
+never commit. A batch's jobs share one token.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from datetime import datetime
+from enum import IntEnum, StrEnum
+from typing import Any
+from uuid import UUID
+
+from sqlalchemy import Boolean, ForeignKey, Index, Integer, Select, String, Uuid, and_, or_, select
+from sqlalchemy.orm import Mapped, Session, mapped_column
+
+from shared.catalog.base import Base, Condition, JsonValue, UtcDateTime, db_now, partial_index
+from shared.errors import NotFound
+from shared.ids import new_id
+from shared.telemetry.tracing import (
+    MAX_REQUEST_ID_CHARACTERS,
+    current_request_id,
+    current_traceparent,
+)
+
+
+class JobState(StrEnum):
+    QUEUED = "queued"  # waiting for a worker, or for what `waiting_for` names
+    RUNNING = "running"  # a worker holds its lease, or it rests between two slices
+    SUCCEEDED = "succeeded"  # done: what it promised can be seen
+    FAILED = "failed"  # ended with `error`; may be retried
+    CANCELLED = "cancelled"  # ended on request; may be retried
+
+
+UNFINISHED_STATES = (JobState.QUEUED, JobState.RUNNING)
+
+
+class JobKind(StrEnum):
+    INDEX = "index"  # describe a stored photo into the active generation
+    REINDEX = "reindex"  # describe a stored photo into one generation that is being built
+    DESCRIBE = "describe"  # describe a query photo that is not stored
+    COMPARE = "compare"  # look closely at what a search has found (`shared.search_api.comparison`)
+    FIT = "fit"  # learn a vocabulary from the map's photos and switch to it
+    IMPORT = "import_vocabulary"  # check a vocabulary file and switch to it
+    SWITCH = "switch"  # switch to a vocabulary that the map already has
+    PCA = "pca"  # fit PCA whitening on the map's descriptors and switch to shorter ones
+    ADD_MODEL = "add_model"  # check a checkpoint and keep it as a model, for any map
+    EVALUATE = "evaluate"  # ask the map about photos whose place is known, and count
+    WORD_WEIGHTS = "word_weights"  # learn which words of its vocabulary tell its places apart
+    BATCH = (
+        "batch"  # bring in many photos; each has a job of its own (`shared.catalog.batch_items`)
+    )
+
+
+MODEL_CHANGE_JOBS = (JobKind.FIT, JobKind.IMPORT, JobKind.SWITCH, JobKind.PCA)
+
+# Someone waits for their result, which is kept for QUERY_TTL_SECONDS.
+QUERY_JOBS = (JobKind.DESCRIBE, JobKind.COMPARE)
+
+# Who takes what: extractors need photos and a backbone, the steward only the search tier.
+EXTRACTOR_JOBS = (
+    JobKind.INDEX,
+    JobKind.REINDEX,
+    JobKind.ADD_MODEL,
+    *QUERY_JOBS,
+    *MODEL_CHANGE_JOBS,
+)
+STEWARD_JOBS = (JobKind.EVALUATE, JobKind.WORD_WEIGHTS, JobKind.BATCH)
+
+# Done in slices: between two of them they are running, and no one holds their lease.
+CHECKPOINTED_JOBS = (*MODEL_CHANGE_JOBS, JobKind.BATCH)
+
+# Claimed one at a time: each is as much work as a batch, or changes what the next one finds.
+SINGLE_CLAIM_JOBS = (*MODEL_CHANGE_JOBS, JobKind.ADD_MODEL, JobKind.COMPARE)
+
+
+class Priority(IntEnum):
+    """Higher goes first; within one priority, older goes first."""
+
+    QUERY = 100  # someone waits for the answer
+    UPLOAD = 50
+    BATCH = 40  # its photos, too: one upload does not wait for thousands
+    MODEL_CHANGE = 20
+    REINDEX = 10
+    EVALUATION = 5
+
+
+class WaitingFor(StrEnum):
+    VOCABULARY = "vocabulary"  # the map's extractor needs one and the map has none yet
+    DESCRIPTORS = "descriptors"  # every photo has to be described into the new generation
+    SEARCH = "search"  # every live search worker has to load the new generation
+    DISK_SPACE = "disk_space"  # a batch: the disk or the bucket has no room for its photos
+
+
+def _ready_condition(state: Any, lease_token: Any, waiting_for: Any) -> Condition:
+    """What `claimable` asks of every row: indexes of such rows serve claims."""
+    return and_(state.in_(UNFINISHED_STATES), lease_token.is_(None), waiting_for.is_(None))
+
+
+class Job(Base):
+    """One thing to do. See the module's docstring for `state`, `attempts` and the lease."""
+
+    __tablename__ = "jobs"
+
+    id: Mapped[UUID] = mapped_column(Uuid, primary_key=True, default=new_id)
+    map_id: Mapped[UUID] = mapped_column(Uuid, ForeignKey("maps.id"))
+    kind: Mapped[JobKind] = mapped_column(String(30))
+    state: Mapped[JobState] = mapped_column(String(20), default=JobState.QUEUED)
+    priority: Mapped[int] = mapped_column(Integer)
+    photo_id: Mapped[UUID | None] = mapped_column(Uuid, ForeignKey("photos.id"), index=True)
+    generation_id: Mapped[UUID | None] = mapped_column(Uuid, ForeignKey("generations.id"))
+    params: Mapped[dict[str, Any]] = mapped_column(JsonValue, default=dict)
+    stage: Mapped[str | None] = mapped_column(String(30))
+    waiting_for: Mapped[str | None] = mapped_column(String(30))
+    # The names of those that `waiting_for` waits for, once that takes long.
+    awaited: Mapped[list[str] | None] = mapped_column(JsonValue)
+    progress_done: Mapped[int] = mapped_column(Integer, default=0)
+    progress_total: Mapped[int] = mapped_column(Integer, default=1)
+    progress_failed: Mapped[int] = mapped_column(Integer, default=0)
+    result: Mapped[dict[str, Any] | None] = mapped_column(JsonValue)
+    error: Mapped[dict[str, Any] | None] = mapped_column(JsonValue)
+    attempts: Mapped[int] = mapped_column(Integer, default=0)
+    alone: Mapped[bool] = mapped_column(Boolean, default=False)
+    # How many are worked on at once; 0 until what could harm the worker has begun.
+    claimed_together: Mapped[int] = mapped_column(Integer, default=0)
+    worker: Mapped[str | None] = mapped_column(String(200))
+    lease_token: Mapped[UUID | None] = mapped_column(Uuid)
+    lease_until: Mapped[datetime | None] = mapped_column(UtcDateTime)
+    run_after: Mapped[datetime | None] = mapped_column(UtcDateTime)
+    created_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())
+    started_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
+    finished_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
+    # Of the request that made it, or of the job that did: logs and traces follow them.
+    request_id: Mapped[str | None] = mapped_column(
+        String(MAX_REQUEST_ID_CHARACTERS), default=current_request_id
+    )
+    traceparent: Mapped[str | None] = mapped_column(String(55), default=current_traceparent)
+
+    __table_args__ = (
+        # Claiming: whatever goes first, then the rest of its batch.
+        partial_index(
+            "ix_jobs_ready",
+            priority.desc(),
+            "id",
+            only=_ready_condition(state, lease_token, waiting_for),
+        ),
+        partial_index(
+            "ix_jobs_ready_batch",
+            "kind",
+            "map_id",
+            priority.desc(),
+            "id",
+            only=_ready_condition(state, lease_token, waiting_for),
+        ),
+        partial_index("ix_jobs_leased", "lease_until", only=lease_token.is_not(None)),
+        partial_index(
+            "ix_jobs_waiting", "map_id", "waiting_for", "id", only=waiting_for.is_not(None)
+        ),
+        # What is listed when no kind is asked for; a model change has very many others.
+        partial_index("ix_jobs_map_listed", "map_id", "id", only=kind != JobKind.REINDEX),
+        partial_index("ix_jobs_finished", "finished_at", only=finished_at.is_not(None)),
+        partial_index("ix_jobs_asked", "created_at", only=kind.in_(QUERY_JOBS)),
+        Index("ix_jobs_map_state", "map_id", "state", "id"),
+        Index("ix_jobs_map_kind", "map_id", "kind", "id"),
+        Index("ix_jobs_kind_waiting", "kind", "waiting_for"),
+        Index("ix_jobs_generation_state", "generation_id", "state"),
+    )
+
+
+def claimable_condition(kinds: Sequence[JobKind] = EXTRACTOR_JOBS) -> Condition:
+    """True for jobs of these kinds that a worker may take now."""
+    return and_(
+        Job.state.in_(UNFINISHED_STATES),
+        Job.kind.in_(kinds),
+        Job.lease_token.is_(None),
+        Job.waiting_for.is_(None),
+        or_(Job.run_after.is_(None), Job.run_after <= db_now()),
+    )
+
+
+def select_locked_job_ids(token: UUID) -> Select[UUID]:
+    """The ids of the jobs under the token, locked in the order in which everyone locks jobs.
+
+    The lease's thread and the transaction that finishes run at once: in two orders they would
+    wait for each other.
+    """
+    return select(Job.id).where(Job.lease_token == token).order_by(Job.id).with_for_update()
+
+
+def get_job(session: Session, map_id: UUID, job_id: UUID, *, lock: bool = False) -> Job:
+    """A job of the map; 404 when there is none."""
+    wanted = select(Job).where(Job.id == job_id, Job.map_id == map_id)
+    job = session.scalar(wanted.with_for_update() if lock else wanted)
+    if job is None:
+        raise NotFound(
+            "job_not_found",
+            f"There is no job {job_id} in this map.",
+            job_id=str(job_id),
+        )
+    return job
+
+
+def list_jobs(
+    session: Session,
+    map_id: UUID,
+    states: Sequence[JobState],
+    kinds: Sequence[JobKind],
+    limit: int,
+    before: UUID | None,
+) -> list[Job]:
+    """Newest first, up to `limit`, older than `before`; empty lists mean "any"."""
+    wanted = select(Job).where(Job.map_id == map_id)
+    if states:
+        wanted = wanted.where(Job.state.in_(states))
+    wanted = (
+        wanted.where(Job.kind.in_(kinds)) if kinds else wanted.where(Job.kind != JobKind.REINDEX)
+    )
+    if before is not None:
+        wanted = wanted.where(Job.id < before)
+    return list(session.scalars(wanted.order_by(Job.id.desc()).limit(limit)))

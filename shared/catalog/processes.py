@@ -1,0 +1,232 @@
+"""Which processes of a deployment live: gateways, extractors, stewards. (Search workers have a
+register of their own, which says what they have loaded.)
+
+Nothing is decided by it, leases decide: it is for `placewise doctor` and for people.
+
+Search workers: who lives, which shard it holds, which versions it has loaded.
+
+Written by the workers about every second or two. What a worker says here is a promise about its
+memory: it is why a generation is switched in only once it can be answered from.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import socket
+import threading
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from importlib.metadata import version
+from typing import Any
+from uuid import UUID
+
+from sqlalchemy import Integer, String, Text, Uuid, delete, select, update
+from sqlalchemy.exc import SQLAlchemyError
+from sqlalchemy.orm import Mapped, Session, mapped_column
+
+from shared.catalog.base import Base, JsonValue, UtcDateTime, affected_rows, db_now, db_now_plus
+from shared.catalog.chunks import Chunk
+from shared.catalog.database_errors import OutageLog
+from shared.catalog.session import Catalog
+from shared.config.shards import Shard
+from shared.ids import new_id
+
+log = logging.getLogger(__name__)
+
+PROCESS_HEARTBEAT_SECONDS = 10.0
+PROCESS_TIMEOUT_SECONDS = 35.0  # three of them, and a little
+PROCESS_RETENTION_SECONDS = 86_400.0
+
+
+class RegisteredProcess(Base):
+    """One process; `role` is the name of its command."""
+
+    __tablename__ = "live_processes"
+
+    id: Mapped[UUID] = mapped_column(Uuid, primary_key=True, default=new_id)
+    role: Mapped[str] = mapped_column(String(20))
+    name: Mapped[str] = mapped_column(String(200))
+    release: Mapped[str] = mapped_column(String(30))
+    started_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())
+    seen_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())
+
+
+@dataclass(frozen=True, slots=True)
+class ProcessStatus:
+    role: str
+    name: str
+    release: str
+    seconds_since_heartbeat: float
+
+
+@contextlib.contextmanager
+def process_heartbeat(catalog: Catalog, role: str) -> Iterator[None]:
+    """While the block runs, a thread says every EVERY_SECONDS that this process lives. While the
+    catalog is away it says nothing, and is the first to notice that nobody listens."""
+    process_id, stop = new_id(), threading.Event()
+    name = f"{socket.gethostname()}-{os.getpid()}"
+    outage = OutageLog(f"{role}'s sign of life")
+
+    def tell() -> None:
+        while True:
+            try:
+                with catalog.write() as session:
+                    _upsert_process(session, process_id, role, name)
+                outage.record_success()
+            except SQLAlchemyError as error:
+                outage.record_error(error)
+            if stop.wait(PROCESS_HEARTBEAT_SECONDS):
+                return
+
+    teller = threading.Thread(target=tell, name="signs-of-life", daemon=True)
+    teller.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        teller.join()
+        try:
+            with catalog.write() as session:
+                session.execute(delete(RegisteredProcess).where(RegisteredProcess.id == process_id))
+        except SQLAlchemyError as error:
+            log.info("this process could not sign off: %s", error)
+
+
+def _upsert_process(session: Session, process_id: UUID, role: str, name: str) -> None:
+    touched = session.execute(
+        update(RegisteredProcess)
+        .where(RegisteredProcess.id == process_id)
+        .values(seen_at=db_now())
+        .returning(RegisteredProcess.id)
+    )
+    if touched.first() is None:
+        session.execute(
+            delete(RegisteredProcess).where(
+                RegisteredProcess.seen_at < db_now_plus(-PROCESS_RETENTION_SECONDS)
+            )
+        )
+        session.add(
+            RegisteredProcess(id=process_id, role=role, name=name, release=version("placewise"))
+        )
+
+
+def list_processes(session: Session) -> list[ProcessStatus]:
+    """Every process that was heard of in the last day; who is silent for DEAD_SECONDS is dead, or
+    was killed."""
+    found = session.execute(
+        select(RegisteredProcess, db_now()).order_by(RegisteredProcess.role, RegisteredProcess.name)
+    )
+    return [
+        ProcessStatus(one.role, one.name, one.release, (now - one.seen_at).total_seconds())
+        for one, now in found
+    ]
+
+
+UNREADABLE = "unreadable"
+"""In `loaded`, beside the generations: the keys of the chunks that the worker can't read."""
+
+# Several heartbeats: a worker that was silent for longer holds up nothing any more.
+SEARCH_WORKER_TIMEOUT_SECONDS = 10.0
+
+
+class RegisteredSearchWorker(Base):
+    """One process that answers searches. `loaded`: generation id -> version without a gap, and
+    `UNREADABLE`."""
+
+    __tablename__ = "search_workers"
+
+    id: Mapped[UUID] = mapped_column(Uuid, primary_key=True, default=new_id)
+    name: Mapped[str] = mapped_column(String(200))
+    url: Mapped[str | None] = mapped_column(Text)
+    shard: Mapped[int] = mapped_column(Integer)
+    shards: Mapped[int] = mapped_column(Integer)
+    loaded: Mapped[dict[str, Any]] = mapped_column(JsonValue, default=dict)
+    started_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())
+    seen_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())
+
+    def has(self, generation_id: UUID, version: int) -> bool:
+        """Whether it has loaded the generation at this version or a later one."""
+        return int(self.loaded.get(str(generation_id), -1)) >= version
+
+
+def upsert_search_worker(
+    session: Session,
+    worker_id: UUID,
+    name: str,
+    url: str | None,
+    shard: Shard,
+    loaded: Mapping[UUID, int],
+    unreadable: Sequence[str] = (),
+) -> None:
+    """The worker lives, has loaded these versions, and can't read these chunks."""
+    versions: dict[str, Any] = {str(id_): version for id_, version in loaded.items()}
+    if unreadable:
+        versions[UNREADABLE] = list(unreadable)
+    known = session.execute(
+        update(RegisteredSearchWorker)
+        .where(RegisteredSearchWorker.id == worker_id)
+        .values(loaded=versions, seen_at=db_now())
+        .execution_options(synchronize_session=False)
+    )
+    if not affected_rows(known):  # new, or removed while it could not reach the catalog
+        session.add(
+            RegisteredSearchWorker(
+                id=worker_id,
+                name=name,
+                url=url,
+                shard=shard.index,
+                shards=shard.of,
+                loaded=versions,
+            )
+        )
+
+
+def delete_search_worker(session: Session, worker_id: UUID) -> None:
+    """The worker has ended."""
+    session.execute(delete(RegisteredSearchWorker).where(RegisteredSearchWorker.id == worker_id))
+
+
+def delete_dead_search_workers(session: Session, *, all_workers: bool = False) -> int:
+    """Remove the workers that are dead; `all_workers`, where none can live."""
+    dead = delete(RegisteredSearchWorker)
+    if not all_workers:
+        dead = dead.where(
+            RegisteredSearchWorker.seen_at < db_now_plus(-SEARCH_WORKER_TIMEOUT_SECONDS)
+        )
+    return affected_rows(session.execute(dead))
+
+
+def unreadable_keys(session: Session) -> set[str]:
+    """The chunks that a live worker reports as unreadable."""
+    live = session.scalars(
+        select(RegisteredSearchWorker.loaded).where(
+            RegisteredSearchWorker.seen_at >= db_now_plus(-SEARCH_WORKER_TIMEOUT_SECONDS)
+        )
+    )
+    return {key for loaded in live for key in loaded.get(UNREADABLE, ())}
+
+
+def list_lagging_workers(
+    session: Session, generation_id: UUID, version: int
+) -> list[RegisteredSearchWorker]:
+    """The live workers that hold a part of the generation and have not loaded it at `version`
+    yet, by name. A worker whose shard has no row of it has nothing to load."""
+    slots = session.scalars(
+        select(Chunk.slot)
+        .where(Chunk.generation_id == generation_id, Chunk.superseded_at.is_(None))
+        .distinct()
+    ).all()
+    live = session.scalars(
+        select(RegisteredSearchWorker)
+        .where(RegisteredSearchWorker.seen_at >= db_now_plus(-SEARCH_WORKER_TIMEOUT_SECONDS))
+        .order_by(RegisteredSearchWorker.name, RegisteredSearchWorker.id)
+    )
+    return [
+        worker
+        for worker in live
+        if any(Shard(worker.shard, worker.shards).owns(slot) for slot in slots)
+        and not worker.has(generation_id, version)
+    ]

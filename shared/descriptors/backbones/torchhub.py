@@ -1,0 +1,363 @@
+"""The code of a torch.hub extractor: brought here at its commit, fingerprinted, executed.
+
+A repository lies where torch.hub itself would put it (`$TORCH_HOME/hub/OWNER_NAME_COMMIT`), so that
+a folder filled by either serves both. Whether its code may run at all is decided before
+(`Settings.recipe`); what runs can do whatever this process can.
+
+A torch.hub entry as a backbone: a network that makes one global descriptor of a photo.
+
+MegaLoc, BoQ, CosPlace, EigenPlaces and others publish such entries: (B, 3, H, W) normalised pixels
+-> (B, D). Of a tuple the first member counts: BoQ adds its attention maps.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import io
+import os
+import re
+import shutil
+import sys
+import tempfile
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from urllib.error import URLError
+
+import httpx2
+import torch
+from torch.nn.functional import normalize
+
+from shared.descriptors.backbones import normalise_features, normalise_pixels
+from shared.descriptors.weight_files import OnProgress, download_file
+from shared.errors import Misconfigured, PlacewiseError
+from shared.extractor_config.configs import MAX_WIDTH
+from shared.extractor_config.names import TORCHHUB_PREFIX, TorchHubEntry
+
+GITHUB = "https://github.com"
+HUBCONF = "hubconf.py"
+LICENCE_FILES = re.compile(r"(licen[cs]e|copying)([.-].*)?", re.IGNORECASE)
+NETWORK_ERRORS = (URLError, httpx2.HTTPError, ConnectionError, TimeoutError)
+
+
+def ignore_progress(_done: int, _total: int | None) -> None:
+    """For who does not want to see bytes come."""
+
+
+def cached_code_folder(hub: TorchHubEntry) -> Path:
+    """Where the code lies, or would lie once it was brought."""
+    if hub.folder is not None:
+        return Path(hub.folder)
+    assert hub.repository is not None
+    return Path(torch.hub.get_dir(), f"{hub.repository.replace('/', '_')}_{hub.commit}")
+
+
+def find_or_download_code(hub: TorchHubEntry, on_progress: OnProgress = ignore_progress) -> Path:
+    """The folder of the code; a repository's is downloaded from GitHub if it is not there.
+
+    Misconfigured: `weights_missing` with the three ways to get it, `download_corrupt`.
+    """
+    folder = cached_code_folder(hub)
+    if hub.folder is None and not folder.exists():
+        try:
+            _download_repository(hub, folder, on_progress)
+        except (*NETWORK_ERRORS, OSError) as error:
+            raise code_missing_error(
+                hub, f"its code can't be downloaded: {_first_line(error)}"
+            ) from error
+    return find_local_code(hub)
+
+
+def find_local_code(hub: TorchHubEntry) -> Path:
+    """As `find_or_download_code`, but what would have to be downloaded is missing."""
+    folder = cached_code_folder(hub)
+    if not (folder / HUBCONF).is_file():
+        where = f"there is no {folder / HUBCONF}" if hub.folder else "its code is not here"
+        raise code_missing_error(hub, where)
+    return folder
+
+
+def load_module(
+    hub: TorchHubEntry, folder: Path, on_progress: OnProgress = ignore_progress
+) -> torch.nn.Module:
+    """Execute the entry of the folder's `hubconf.py` with its arguments.
+
+    Weights that it takes from the network through torch.hub come by `shared.descriptors.weight_files`.
+    Misconfigured: `weights_missing`, `torchhub_unfit`, `download_corrupt`.
+    """
+    try:
+        with _import_guard(folder, on_progress):
+            # From GitHub, too, it is a folder by now: torch.hub's own question whether it is to be
+            # trusted is not asked, and nothing is compared with the repository's branches.
+            load: Any = torch.hub.load  # untyped
+            module = load(str(folder), hub.entry, source="local", **dict(hub.arguments))
+    except PlacewiseError:
+        raise
+    except (Exception, SystemExit) as error:  # whatever the code of others does
+        said = f"{type(error).__name__}: {_first_line(error)}"
+        if isinstance(error, EOFError) and "reading a line" in said:
+            said += ". It asks a question (as torch.hub does about a further repository), and here "
+            said += "nobody answers"
+        if any(isinstance(cause, NETWORK_ERRORS) for cause in _exception_chain(error)):
+            raise code_missing_error(hub, f"what it needs can't be downloaded: {said}") from error
+        raise torchhub_unfit_error(hub, f"loading it ended with {said}") from error
+    if not isinstance(module, torch.nn.Module):
+        raise torchhub_unfit_error(
+            hub, f"{hub.entry} returns a {type(module).__name__}, not a torch.nn.Module"
+        )
+    return module
+
+
+def code_fingerprint(folder: Path) -> str:
+    """sha256 of every file's path and content; hidden files and bytecode don't count."""
+    digest = hashlib.sha256()
+    for path in sorted(folder.rglob("*")):
+        inside = path.relative_to(folder)
+        skipped = any(part.startswith(".") or part == "__pycache__" for part in inside.parts)
+        if skipped or not path.is_file():
+            continue
+        with path.open("rb") as file:
+            content = hashlib.file_digest(file, "sha256").hexdigest()
+        digest.update(f"{inside.as_posix()}\0{content}\n".encode(errors="surrogateescape"))
+    return digest.hexdigest()
+
+
+def find_licence(folder: Path) -> str:
+    """What the folder's licence file calls itself, with the file's name; or `none found`."""
+    for path in sorted(folder.iterdir()):
+        if not LICENCE_FILES.fullmatch(path.name) or not path.is_file():
+            continue
+        text = path.read_text(errors="replace")
+        lines = [line.strip() for line in text.splitlines() if line.strip()][:2]
+        named = ", ".join(lines if lines[1:] and lines[1].startswith("Version") else lines[:1])
+        return f"{named[:100]} ({path.name})"
+    return "none found"
+
+
+def code_missing_error(hub: TorchHubEntry, reason: str) -> Misconfigured:
+    """The refusal of what is not there. Callers of the API read it: it names no folder of this
+    machine that is not in the extractor's name.
+    """
+    cache = "$TORCH_HOME/hub (~/.cache/torch/hub where TORCH_HOME is not set)"
+    fetch = f"with internet access, `placewise models fetch {hub.name}`"
+    if hub.folder is not None:
+        ways = (
+            "(1) bring the folder to that path, on every machine that describes photos; (2) for "
+            f"weights that its code downloads, {fetch}; (3) copy them from a machine that has "
+            f"them: {cache}, the folder checkpoints."
+        )
+    else:
+        ways = (
+            f"(1) {fetch}; (2) copy {cache} with its checkpoints from a machine that has them; "
+            "(3) clone the repository at its commit and name the folder: "
+            f"{TORCHHUB_PREFIX}/FOLDER:{hub.entry}."
+        )
+    return Misconfigured(
+        "weights_missing",
+        f"The extractor {hub.name} can't be loaded: {reason}. Three ways to get its code and "
+        f"weights: {ways}",
+    )
+
+
+def torchhub_unfit_error(hub: TorchHubEntry, reason: str) -> Misconfigured:
+    """The refusal of what can't be used."""
+    return Misconfigured(
+        "torchhub_unfit",
+        f"The extractor {hub.name} can't be used: {reason}. Three ways out: (1) other arguments of "
+        "the entry, or what its network wants to see, in the name "
+        "(input.size=HEIGHTxWIDTH,input.mean=R/G/B,input.std=R/G/B); (2) another commit, with the "
+        "packages that it needs installed; (3) a copy of the folder, changed by you: "
+        f"{TORCHHUB_PREFIX}/FOLDER:{hub.entry}.",
+    )
+
+
+@contextlib.contextmanager
+def _import_guard(folder: Path, on_progress: OnProgress) -> Iterator[None]:
+    """While code of others is loaded: it asks nothing, prints nothing on stdout, leaves no bytecode
+    in its folder and no module behind that the next repository would take for its own.
+    """
+    torchs_own = torch.hub.download_url_to_file
+
+    def download_url_to_file(
+        url: str, dst: str, hash_prefix: str | None = None, progress: bool = True
+    ) -> None:
+        # torch.hub's own begins anew after a break, and waits without end for a silent server.
+        if not url.startswith(("http://", "https://")):
+            torchs_own(url, dst, hash_prefix, progress)
+            return
+        target = Path(dst).expanduser()
+        download_file(url, target, sha256=hash_prefix, on_progress=on_progress)
+
+    with (
+        _patched(sys, "stdin", io.StringIO()),
+        _patched(sys, "dont_write_bytecode", True),
+        _patched(torch.hub, "download_url_to_file", download_url_to_file),
+        contextlib.redirect_stdout(sys.stderr),
+    ):
+        try:
+            yield
+        finally:
+            _forget_modules(folder, Path(torch.hub.get_dir()))
+
+
+@contextlib.contextmanager
+def _patched(owner: Any, name: str, value: object) -> Iterator[None]:
+    before = getattr(owner, name)
+    setattr(owner, name, value)
+    try:
+        yield
+    finally:
+        setattr(owner, name, before)
+
+
+def _forget_modules(*folders: Path) -> None:
+    """Two repositories may both have a `models.py`, and one folder may have changed since."""
+    places = tuple(f"{folder.resolve()}{os.sep}" for folder in folders)
+    for name, module in list(sys.modules.items()):
+        file = getattr(module, "__file__", None)
+        if isinstance(file, str) and os.path.realpath(file).startswith(places):
+            del sys.modules[name]
+
+
+def _download_repository(hub: TorchHubEntry, folder: Path, on_progress: OnProgress) -> None:
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    packed = folder.with_name(f"{folder.name}.zip")
+    url = f"{GITHUB}/{hub.repository}/zipball/{hub.commit}"
+    download_file(url, packed, on_progress=on_progress)
+    with tempfile.TemporaryDirectory(dir=folder.parent) as unpacked:
+        try:
+            with zipfile.ZipFile(packed) as archive:
+                # GitHub writes the commit there; it is the one thing to compare with.
+                if archive.comment not in (b"", str(hub.commit).encode()):
+                    raise zipfile.BadZipFile(f"it is of the commit {archive.comment.decode()}")
+                archive.extractall(unpacked)  # leaves no folder: zipfile strips roots and ..
+        except zipfile.BadZipFile as error:
+            raise Misconfigured(
+                "download_corrupt",
+                f"{url} is not the archive of that commit: {error}. Nothing of it was kept. Try "
+                f"again, or clone the repository and name its folder: {TORCHHUB_PREFIX}/FOLDER:{hub.entry}.",
+            ) from error
+        finally:
+            packed.unlink()
+        inside = list(Path(unpacked).iterdir())
+        root = inside[0] if len(inside) == 1 else Path(unpacked)
+        with contextlib.suppress(FileExistsError):  # another process was first
+            shutil.move(root, folder)
+
+
+def _exception_chain(error: BaseException | None) -> Iterator[BaseException]:
+    while error is not None:
+        yield error
+        error = error.__cause__ or error.__context__
+
+
+def _first_line(error: BaseException) -> str:
+    return (str(error).strip() or type(error).__name__).splitlines()[0]
+
+
+PROBE_SEED = 20_242
+MIN_REPEAT_COSINE = 0.999  # of a photo described alone and beside others; kernels differ a little
+
+
+class TorchHubBackbone:
+    facet: str | None = None
+
+    def __init__(
+        self, hub: TorchHubEntry, device: torch.device, *, on_progress: OnProgress = ignore_progress
+    ) -> None:
+        """Load the entry, which executes its code, and let it describe two pictures of noise.
+
+        Misconfigured: `weights_missing`, `torchhub_unfit`, `download_corrupt`.
+        """
+        self._hub = hub
+        folder = find_or_download_code(hub, on_progress)
+        # Before anything is executed: the code may change what lies beside it.
+        self.code_fingerprint = code_fingerprint(folder)
+        self.name = hub.module
+        self.layer = hub.entry
+        self.licence = find_licence(folder)
+        self.device = device
+        module = load_module(hub, folder, on_progress)
+        self._module = module.eval().requires_grad_(False).to(device)
+        self.fingerprint, size_bytes = module_fingerprint(self._module)
+        self.card: dict[str, Any] = {
+            "source": hub.source,
+            "entry": hub.entry,
+            "arguments": dict(hub.arguments),
+            "size_bytes": size_bytes,
+        }
+        self.width = self._probe()
+
+    @torch.inference_mode()
+    def features(self, pixels: torch.Tensor) -> torch.Tensor:
+        return normalise_features(self._forward(pixels)).unsqueeze(1)
+
+    def grid(self, height: int, width: int) -> tuple[int, int]:
+        return 1, 1
+
+    def _forward(self, pixels: torch.Tensor) -> Any:
+        batch = normalise_pixels(pixels.to(self.device), self._hub.mean, self._hub.std)
+        out = self._module(batch)
+        return out[0] if isinstance(out, tuple | list) and out else out
+
+    @torch.inference_mode()
+    def _probe(self) -> int:
+        """The length of a descriptor, found by describing; `torchhub_unfit` for what is none."""
+        hub = self._hub
+        noise = torch.Generator().manual_seed(PROBE_SEED)
+        shape = (2, hub.height, hub.width, 3)
+        photos = torch.randint(0, 256, shape, dtype=torch.uint8, generator=noise)
+        try:
+            both, alone = self._forward(photos), self._forward(photos[:1])
+        except Exception as error:  # whatever the network of others does
+            said = (str(error).strip() or type(error).__name__).splitlines()[0]
+            raise torchhub_unfit_error(
+                hub,
+                f"with 2 photos of {hub.height} x {hub.width} pixels it ends with "
+                f"{type(error).__name__}: {said}",
+            ) from error
+        if not isinstance(both, torch.Tensor) or not both.is_floating_point():
+            raise torchhub_unfit_error(
+                hub, f"it makes a {_value_kind(both)}, not a tensor of floats"
+            )
+        if both.ndim != 2 or len(both) != 2 or alone.shape != (1, both.shape[1]):
+            raise torchhub_unfit_error(
+                hub,
+                f"of 2 photos it makes numbers of the shape {tuple(both.shape)}, of one "
+                f"{tuple(alone.shape)}; one descriptor for each is expected: (2, D) and (1, D)",
+            )
+        if both.shape[1] > MAX_WIDTH:
+            raise torchhub_unfit_error(hub, f"{both.shape[1]} dimensions are more than {MAX_WIDTH}")
+        if not torch.isfinite(both).all() or not torch.isfinite(alone).all():
+            raise torchhub_unfit_error(hub, "its descriptors hold NaN or infinite numbers")
+        if bool((both.norm(dim=-1) == 0).any()):
+            raise torchhub_unfit_error(hub, "its descriptors are zero")
+        cosine = float(normalize(both[:1].float(), dim=-1) @ normalize(alone[0].float(), dim=-1))
+        if cosine < MIN_REPEAT_COSINE:
+            raise torchhub_unfit_error(
+                hub,
+                "it describes a photo otherwise when another one is beside it (cosine "
+                f"{cosine:.3f}), and which ones are described together is chance here",
+            )
+        return int(both.shape[1])
+
+
+def module_fingerprint(module: torch.nn.Module) -> tuple[str, int]:
+    """sha256 of the module's tensors, name-sorted with type and shape, and their size in bytes."""
+    digest, size_bytes = hashlib.sha256(), 0
+    state: dict[str, Any] = module.state_dict()
+    for name in sorted(state):
+        tensor = state[name]
+        if not isinstance(tensor, torch.Tensor):
+            continue  # what a module keeps beside its weights
+        digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}\n".encode())
+        flat = tensor.detach().cpu().contiguous().reshape(-1)
+        digest.update(flat.view(torch.uint8).numpy().data)
+        size_bytes += tensor.nbytes
+    return digest.hexdigest(), size_bytes
+
+
+def _value_kind(value: object) -> str:
+    return f"tensor of {value.dtype}" if isinstance(value, torch.Tensor) else type(value).__name__

@@ -1,0 +1,237 @@
+"""Vocabularies as files that people keep and send.
+
+- `.npz`, as `placewise vocabulary fit DIR --out` writes it: an uncompressed NumPy archive of
+  `centres`, (clusters, dimension) float32, and `provenance`, one string of JSON.
+  `numpy.load` reads it without pickle.
+- `.npy`: the centres alone.
+- `.pt`: the centres alone, as one tensor: AnyLoc's `c_centers.pt`.
+
+Where a vocabulary comes from, and whether an extractor may use it.
+
+Cosines between local features and centres mean something only where both come from the same
+network, layer, facet and pixels: a vocabulary of the same width but other features would be
+accepted by every shape check, and quietly spoil every descriptor.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from shared.descriptors.extractor import Extractor
+from shared.descriptors.vocabulary import (
+    ARRAY_READ_ERRORS,
+    ClusterCentres,
+    decode_array,
+    decode_centres,
+    encode_centres,
+    parse_centres,
+)
+from shared.descriptors.vocabulary_fit import VocabularyFit
+from shared.errors import Unprocessable
+from shared.extractor_config.configs import ExtractorConfig
+from shared.storage.vocabulary_npz import CENTRES, PROVENANCE, encode_vocabulary_npz, has_provenance
+
+Provenance = dict[str, Any]
+"""JSON: what `feature_provenance` says, and of a fit `fit_provenance`. Without the former the vocabulary is of
+unknown origin, and `learnt_with` says `unknown`."""
+
+UNKNOWN_PROVENANCE: Provenance = {"learnt_with": "unknown"}
+
+
+def feature_provenance(extractor: Extractor) -> Provenance:
+    """What makes the local features that centres are learnt from."""
+    backbone = extractor.backbone
+    return {
+        "backbone": backbone.name,
+        "backbone_fingerprint": backbone.fingerprint,
+        "layer": backbone.layer,
+        "facet": backbone.facet,
+        "preprocessing": extractor.preprocessing.as_spec(),
+    }
+
+
+def fit_provenance(
+    extractor: Extractor,
+    centres: ClusterCentres,
+    fit: VocabularyFit,
+    *,
+    requested_clusters: int,
+    photos: int,
+    seed: int,
+) -> Provenance:
+    """How `centres` were learnt; `photos` were looked at."""
+    return {
+        **feature_provenance(extractor),
+        "clusters": centres.clusters,
+        "clusters_asked": requested_clusters,
+        "photos": photos,
+        "patches": fit.patches,
+        "seed": seed,
+        "passes": fit.passes,
+        "mean_cosine": fit.similarity,
+        "sha256": centres.sha256,
+    }
+
+
+def check_vocabulary_fits(
+    provenance: Provenance, centres: ClusterCentres, extractor: Extractor
+) -> None:
+    """Unprocessable (`vocabulary_unfit`) naming both specs unless the vocabulary was learnt from
+    what the extractor makes. One of unknown origin only has to be as wide.
+    """
+    if not extractor.recipe.needs_vocabulary:
+        raise Unprocessable(
+            "vocabulary_unfit", f"The extractor {extractor.recipe.name} uses no vocabulary."
+        )
+    made = feature_provenance(extractor)
+    if has_provenance(provenance):
+        learnt = {key: provenance.get(key) for key in made}
+        if learnt != made:
+            raise Unprocessable(
+                "vocabulary_unfit",
+                f"The vocabulary was learnt from {_describe_features(learnt)}; the extractor "
+                f"{extractor.recipe.name} makes {_describe_features(made)}. Fit one with this extractor.",
+                learnt_with=learnt,
+                extractor_makes=made,
+            )
+    check_vocabulary_width(centres, extractor.recipe, extractor.backbone.width)
+
+
+def check_vocabulary_width(
+    centres: ClusterCentres, recipe: ExtractorConfig, width: int | None
+) -> None:
+    """Unprocessable (`vocabulary_unfit`) unless the centres are as wide as the recipe's local
+    features; None: only the loaded network tells."""
+    if width is not None and centres.dimension != width:
+        raise Unprocessable(
+            "vocabulary_unfit",
+            f"The vocabulary has {centres.dimension} dimensions, the local features of "
+            f"{recipe.name} {width}.",
+        )
+
+
+def _describe_features(features: Provenance) -> str:
+    pixels = features["preprocessing"]
+    if isinstance(pixels, dict):
+        pixels = " ".join(f"{key} {value}" for key, value in pixels.items())
+    parts = [
+        f"{features['backbone']} (weights {str(features['backbone_fingerprint'])[:12]})",
+        f"layer {features['layer']}",
+        f"facet {features['facet']}",
+        f"preprocessing {pixels}",
+    ]
+    return ", ".join(parts)
+
+
+ARCHIVE_MEMBERS = {f"{CENTRES}.npy", f"{PROVENANCE}.npy"}
+MAX_PROVENANCE_BYTES = 100_000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class VocabularyFile:
+    centres: ClusterCentres
+    provenance: Provenance
+
+    @property
+    def suffix(self) -> str:
+        """`.npz`; `.npy` where the provenance is unknown."""
+        return ".npz" if has_provenance(self.provenance) else ".npy"
+
+    def encode(self) -> bytes:
+        """The bytes of a file of that kind."""
+        centres = encode_centres(self.centres)
+        return centres if self.suffix == ".npy" else encode_vocabulary_npz(centres, self.provenance)
+
+
+def decode_vocabulary(data: bytes) -> VocabularyFile:
+    """The vocabulary in the bytes of a `.npz` or `.npy` file, checked.
+
+    Raises Unprocessable (`vocabulary_unfit`).
+    """
+    if not data.startswith(b"PK"):
+        return VocabularyFile(decode_centres(data), UNKNOWN_PROVENANCE)
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            infos = archive.infolist()
+            # Before one is read: many may lie over the same bytes.
+            if sorted(info.filename for info in infos) != sorted(ARCHIVE_MEMBERS):
+                raise _vocabulary_unfit_error(
+                    f"it holds {_some([info.filename for info in infos]) or 'nothing'}"
+                )
+            members = {info.filename: _read(archive, info) for info in infos}
+    except (*ARRAY_READ_ERRORS, NotImplementedError, RuntimeError) as error:
+        raise _vocabulary_unfit_error(f"it can't be read ({error})") from error
+    centres = decode_centres(members[f"{CENTRES}.npy"])
+    provenance = _decode_provenance(members[f"{PROVENANCE}.npy"])
+    if provenance.get("sha256") != centres.sha256:
+        raise _vocabulary_unfit_error("its provenance belongs to other centres (the hash differs)")
+    return VocabularyFile(centres, provenance)
+
+
+def read_vocabulary(path: Path) -> VocabularyFile:
+    """The vocabulary in a `.npz`, `.npy` or `.pt` file, checked; Unprocessable as above."""
+    if path.suffix != ".pt":
+        return decode_vocabulary(path.read_bytes())
+    return VocabularyFile(_read_tensor(path), UNKNOWN_PROVENANCE)
+
+
+def _read(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> bytes:
+    if info.compress_type != zipfile.ZIP_STORED or info.file_size != info.compress_size:
+        raise ValueError(f"{info.filename} is compressed")  # it could swell without end
+    return archive.read(info)
+
+
+def _decode_provenance(data: bytes) -> Provenance:
+    if len(data) > MAX_PROVENANCE_BYTES:
+        raise _vocabulary_unfit_error("its provenance is too long")
+    try:
+        array = decode_array(data)
+        text = array.item() if array.dtype.kind == "U" and array.size == 1 else ""
+        found: Any = json.loads(text)
+    except (*ARRAY_READ_ERRORS, RecursionError) as error:
+        raise _vocabulary_unfit_error(f"its provenance can't be read ({error})") from error
+    if not isinstance(found, dict) or not has_provenance(found):
+        raise _vocabulary_unfit_error("its provenance does not say what it was learnt with")
+    return found
+
+
+def _some(names: list[str]) -> str:
+    more = f" and {len(names) - 3} more" if len(names) > 3 else ""
+    return ", ".join(sorted(names)[:3]) + more
+
+
+def _vocabulary_unfit_error(reason: str) -> Unprocessable:
+    return Unprocessable(
+        "vocabulary_unfit",
+        f"This .npz is not a vocabulary as `placewise vocabulary fit DIR --out` writes it: "
+        f"{reason}.",
+    )
+
+
+def _read_tensor(path: Path) -> ClusterCentres:
+    import torch
+
+    from shared.descriptors.weight_files import TENSOR_READ_ERRORS, check_promise, load_tensors
+
+    try:
+        tensor = load_tensors(path)
+        if isinstance(tensor, torch.Tensor):
+            check_promise([tensor], path)
+    except TENSOR_READ_ERRORS as error:
+        raise Unprocessable(
+            "vocabulary_unfit", f"{path.name} is not a file of tensors: {error}"
+        ) from error
+    if not isinstance(tensor, torch.Tensor):
+        raise Unprocessable(
+            "vocabulary_unfit",
+            f"{path.name} holds a {type(tensor).__name__}, not one tensor.",
+        )
+    tensor = tensor.detach().to_dense().clone()  # else mapped from the file, which may change
+    if tensor.is_floating_point():
+        tensor = tensor.to(torch.float32)  # NumPy has no bfloat16
+    return parse_centres(tensor.numpy())

@@ -1,0 +1,136 @@
+"""NetVLAD (Arandjelovic et al. 2016, "NetVLAD: CNN Architecture for Weakly Supervised Place
+Recognition", eq. 1 to 4).
+
+    x_i   = local feature of position i, L2-normalised
+    a_ik  = softmax over k of w_k . x_i + b_k
+    V_k   = sum over i of a_ik (x_i - c_k)
+    V_k  <- V_k / |V_k|
+    row   = [V_0 ... V_{K-1}] / | . |            cluster-major
+
+w, b and c are learnt apart. They begin as the paper has them, w_k = 2 alpha c_k and b_k = -alpha
+|c_k|^2, but around random unit vectors c_k: with alpha 100, the best cluster of a feature then
+outweighs the second by about 100 in 256 channels, which is the paper's rule for alpha.
+
+SALAD (Izquierdo and Civera 2024, "Optimal Transport Aggregation for Visual Place Recognition",
+section 3).
+
+    s_ik  = score of local feature i in cluster k, by an MLP; one learnt number for the dustbin
+    P     = Sinkhorn's plan for exp(s): every feature has a mass of 1 to give, every cluster room
+            for 1, the dustbin for the others
+    V_k   = sum over i of P_ik f_i              f: the features, by an MLP to `cluster_dim` numbers
+    g     = the global token, by an MLP to `token_dim` numbers
+    row   = [g / |g|, V_0 / |V_0|, V_1 / |V_1|, ...] / | . |
+
+The paper's backbone is DINOv2, whose class token is the global token. Of a network that has none,
+it is the mean of the map over its positions. There have to be more positions than clusters, or
+nothing is left for the dustbin.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, ClassVar
+
+import torch
+from pydantic import Field
+from torch import nn
+from torch.nn.functional import normalize
+
+from shared.descriptors.vpr_models.aggregators.base import (
+    Aggregator,
+    Positive,
+    Size,
+    normalise_rows,
+)
+
+
+class NetVLAD(Aggregator):
+    inferred: ClassVar = {"in_channels": "channels"}
+
+    def __init__(self, in_channels: Size, clusters: Size = 64, alpha: Positive = 100.0) -> None:
+        super().__init__(clusters * in_channels)
+        centres = normalize(torch.randn(clusters, in_channels), dim=1)
+        self.centres = nn.Parameter(centres)
+        self.weight = nn.Parameter(2 * alpha * centres)
+        self.bias = nn.Parameter(-alpha * centres.square().sum(dim=1))
+
+    def forward(self, maps: torch.Tensor) -> torch.Tensor:
+        features = normalize(maps.flatten(2).transpose(1, 2).float(), dim=-1)  # (B, hw, C)
+        shares = (features @ self.weight.T + self.bias).softmax(dim=-1)  # (B, hw, K)
+        # Sums apart, so that no (B, hw, K, C) is needed.
+        sums = shares.transpose(1, 2) @ features
+        residuals = sums - shares.sum(dim=1).unsqueeze(-1) * self.centres
+        return normalise_rows(normalize(residuals, dim=-1))
+
+
+HIDDEN_WIDTH = 512  # channels between the two layers of each MLP
+SINKHORN_ITERATIONS = 3  # of Sinkhorn's algorithm
+DUSTBIN_SCORE = 1.0  # to begin with
+
+Share = Annotated[float, Field(ge=0, lt=1)]
+
+
+class SALAD(Aggregator):
+    inferred: ClassVar = {"in_channels": "channels"}
+    takes_token: ClassVar = True
+
+    def __init__(
+        self,
+        in_channels: Size,
+        num_clusters: Size = 64,
+        cluster_dim: Size = 128,
+        token_dim: Size = 256,
+        dropout: Share = 0.3,
+    ) -> None:
+        super().__init__(token_dim + num_clusters * cluster_dim)
+        self.num_clusters = num_clusters
+        self.features = _at_each_position(in_channels, cluster_dim, dropout)
+        self.scores = _at_each_position(in_channels, num_clusters, dropout)
+        self.token = nn.Sequential(
+            nn.Linear(in_channels, HIDDEN_WIDTH), nn.ReLU(), nn.Linear(HIDDEN_WIDTH, token_dim)
+        )
+        self.dustbin = nn.Parameter(torch.tensor(DUSTBIN_SCORE))
+
+    def forward(self, maps: torch.Tensor, token: torch.Tensor | None) -> torch.Tensor:
+        features = self.features(maps).flatten(2).float()  # (B, cluster_dim, hw)
+        scores = self.scores(maps).flatten(2).float()  # (B, K, hw)
+        plan = optimal_transport(scores, self.dustbin)
+        clusters = normalize(plan @ features.transpose(1, 2), dim=-1)  # (B, K, cluster_dim)
+        if token is None:
+            token = maps.mean(dim=(-2, -1))
+        whole = normalize(self.token(token).float(), dim=-1)
+        return normalise_rows(torch.cat([whole, clusters.flatten(1)], dim=1))
+
+    def refusal(self, height: int, width: int) -> str | None:
+        if height * width > self.num_clusters:
+            return None
+        return (
+            f"their map has {height} x {width} positions, and it needs more of them than its "
+            f"{self.num_clusters} clusters (num_clusters)"
+        )
+
+
+def optimal_transport(scores: torch.Tensor, dustbin: torch.Tensor) -> torch.Tensor:
+    """(B, K, n) float32 scores, a number -> (B, K, n): how much of feature i goes to cluster k.
+
+    Sinkhorn and Knopp's algorithm on logarithms, with the masses 1 of a cluster, n - K of the
+    dustbin and 1 of a feature; the features' come out exactly, the others nearly.
+    """
+    batch, clusters, positions = scores.shape
+    extended = torch.cat([scores, dustbin.float().expand(batch, 1, positions)], dim=1)
+    room = scores.new_zeros(clusters + 1)
+    room[-1] = math.log(positions - clusters)
+    of_feature = scores.new_zeros(batch, 1, positions)
+    for _ in range(SINKHORN_ITERATIONS):
+        of_cluster = room.view(1, -1, 1) - (extended + of_feature).logsumexp(dim=2, keepdim=True)
+        of_feature = -(extended + of_cluster).logsumexp(dim=1, keepdim=True)
+    return (extended + of_cluster + of_feature).exp()[:, :clusters]
+
+
+def _at_each_position(channels: int, out: int, dropout: float) -> nn.Sequential:
+    return nn.Sequential(
+        nn.Conv2d(channels, HIDDEN_WIDTH, kernel_size=1),
+        nn.Dropout(dropout),
+        nn.ReLU(),
+        nn.Conv2d(HIDDEN_WIDTH, out, kernel_size=1),
+    )

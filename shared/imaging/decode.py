@@ -1,0 +1,181 @@
+"""Decoding one photo: the only place where pixels are read from untrusted bytes.
+
+Runs in child processes with a memory limit (`services.extractor.decoder_pool`), so that a poisonous
+photo harms nothing but its own job. Imports no torch.
+
+A photo decoded for a network that sees it small, as training does thousands of times a minute.
+
+A JPEG is decoded at the smallest of its eighths that still covers the wanted size (`Image.draft`):
+a large photo costs a fraction, and differs from a full decoding by less than one augmentation does.
+Imports no torch.
+"""
+
+from __future__ import annotations
+
+import io
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, UnidentifiedImageError
+from PIL import __version__ as pillow_version
+from PIL.ExifTags import Base
+
+from shared.errors import Unprocessable
+from shared.imaging.file_formats import (
+    ACCEPTED_PHOTOS,
+    HEIC_MEDIA_TYPE,
+    PHOTO_READ_ERRORS,
+    PHOTO_SIGNATURE_BYTES,
+    check_pixel_count,
+    detect_media_type,
+    open_photo,
+)
+from shared.imaging.preprocessing import Pixels, Preprocessing
+
+THUMBNAIL_PIXELS = 256  # the longer side
+DECODER = f"pillow-{pillow_version}"
+EXIF_TRANSPOSITIONS = {  # by EXIF orientation; 1 is upright already
+    2: Image.Transpose.FLIP_LEFT_RIGHT,
+    3: Image.Transpose.ROTATE_180,
+    4: Image.Transpose.FLIP_TOP_BOTTOM,
+    5: Image.Transpose.TRANSPOSE,
+    6: Image.Transpose.ROTATE_270,
+    7: Image.Transpose.TRANSVERSE,
+    8: Image.Transpose.ROTATE_90,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class DecodedPhoto:
+    pixels: Pixels
+    """(height, width, 3) RGB as the preprocessing left it."""
+    thumbnail: bytes
+    """JPEG without any metadata, its longer side at most THUMBNAIL_PIXELS."""
+
+
+def decode_photo(data: bytes, preprocessing: Preprocessing, max_pixels: int) -> DecodedPhoto:
+    """The photo in RGB as the preprocessing brings it, and its thumbnail, which is upright.
+
+    Only the first frame is read. Transparent parts show black, samples of 16 bits keep their upper
+    eight. Raises Unprocessable (`undecodable_photo` with the decoder's own reason,
+    `too_many_pixels`, `photo_too_small`, `no_heic_decoder`).
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # a strange tag is no reason to refuse the pixels
+            with _open_checked(data) as image:
+                check_pixel_count(image.width, image.height, max_pixels)
+                image.load()
+                as_stored = to_rgb(image)
+                upright = apply_exif_orientation(image, as_stored)
+            pixels = preprocessing.apply(upright if preprocessing.upright else as_stored)
+            return DecodedPhoto(pixels=pixels, thumbnail=_thumbnail(upright))
+    except UnidentifiedImageError as error:
+        raise Unprocessable(
+            "undecodable_photo",
+            f"The photo can't be decoded: it is not {ACCEPTED_PHOTOS}, or its header is damaged.",
+        ) from error
+    except PHOTO_READ_ERRORS as error:
+        raise Unprocessable(
+            "undecodable_photo",
+            f"The photo can't be decoded: {error or type(error).__name__}.",
+        ) from error
+    except MemoryError as error:
+        raise Unprocessable(
+            "undecodable_photo",
+            "The photo needs more memory to decode than one photo may have.",
+        ) from error
+
+
+def _open_checked(data: bytes) -> Image.Image:
+    if detect_media_type(data[:PHOTO_SIGNATURE_BYTES]) != HEIC_MEDIA_TYPE:
+        return open_photo(io.BytesIO(data))
+    try:
+        import pillow_heif  # an extra: its wheels bring libraries under licences of their own
+    except ImportError as error:
+        raise Unprocessable(
+            "no_heic_decoder",
+            "This server's extractor has no decoder for HEIC. Install the extra `heic` there "
+            "(pip install 'placewise[heic]') and retry the job, or send the photo as JPEG.",
+        ) from error
+    pillow_heif.options.DECODE_THREADS = 1  # the pool has as many children as there are cores
+    pillow_heif.register_heif_opener(thumbnails=False)
+    return Image.open(io.BytesIO(data), formats=("HEIF",))
+
+
+def apply_exif_orientation(image: Image.Image, rgb: Image.Image) -> Image.Image:
+    """`rgb` turned as the EXIF of `image` says. Not Pillow's `exif_transpose`: that also writes
+    the EXIF anew, and fails where any other tag of it is broken.
+    """
+    try:
+        orientation = image.getexif().get(Base.Orientation)
+    except PHOTO_READ_ERRORS:
+        return rgb  # broken EXIF is no reason to refuse the pixels
+    method = EXIF_TRANSPOSITIONS.get(orientation) if isinstance(orientation, int) else None
+    return rgb if method is None else rgb.transpose(method)
+
+
+def to_rgb(image: Image.Image) -> Image.Image:
+    """Three channels of 8 bits, on black; ValueError for samples without a brightness range."""
+    if image.mode.startswith("I;16"):
+        # Pillow would clip 16-bit samples at 255 and make the photo white.
+        samples = np.asarray(image, dtype=np.uint16)
+        return Image.fromarray((samples >> 8).astype(np.uint8)).convert("RGB")
+    if image.mode in ("I", "F"):
+        raise ValueError(f"samples of mode {image.mode!r} have no defined brightness range")
+    if not image.has_transparency_data:
+        return image.convert("RGB")
+    # What lies under full transparency is up to the program that wrote the file: mostly black.
+    seen = image.convert("RGBA")
+    on_black = Image.new("RGB", image.size)
+    on_black.paste(seen, mask=seen.getchannel("A"))
+    return on_black
+
+
+def _thumbnail(rgb: Image.Image) -> bytes:
+    small = rgb.copy()
+    # Averaged over whole pixels first: a fifth of the time, and no one sees it at this size.
+    small.thumbnail((THUMBNAIL_PIXELS, THUMBNAIL_PIXELS), reducing_gap=1.0)
+    small.info.clear()  # what the camera wrote (where, when, whose) stays with the original
+    buffer = io.BytesIO()
+    small.save(buffer, "JPEG", quality=85)
+    return buffer.getvalue()
+
+
+SIDEWAYS_ORIENTATIONS = (5, 6, 7, 8)
+"""EXIF orientations whose upright photo is as wide as the stored one is high"""
+MAX_TRAINING_PIXELS = 100_000_000
+
+
+def decode_resized(
+    path: Path, size: tuple[int, int], max_pixels: int = MAX_TRAINING_PIXELS
+) -> Image.Image:
+    """The photo in RGB, upright, squeezed to `size` (height, width) by antialiased bilinear.
+
+    Raises Unprocessable (`undecodable_photo`, `too_many_pixels`), which says why, not which.
+    """
+    height, width = size
+    try:
+        with warnings.catch_warnings(), path.open("rb") as file:
+            warnings.simplefilter("ignore")  # a strange tag is no reason to refuse the pixels
+            with open_photo(file) as image:
+                check_pixel_count(image.width, image.height, max_pixels)
+                image.draft("RGB", (height, width) if _is_sideways(image) else (width, height))
+                image.load()
+                upright = apply_exif_orientation(image, to_rgb(image))
+            return upright.resize((width, height), Image.Resampling.BILINEAR)
+    except UnidentifiedImageError as error:
+        raise Unprocessable(
+            "undecodable_photo", f"it is not {ACCEPTED_PHOTOS}, or its header is damaged"
+        ) from error
+    except PHOTO_READ_ERRORS as error:
+        raise Unprocessable("undecodable_photo", f"{error or type(error).__name__}") from error
+
+
+def _is_sideways(image: Image.Image) -> bool:
+    try:
+        return image.getexif().get(Base.Orientation) in SIDEWAYS_ORIENTATIONS
+    except PHOTO_READ_ERRORS:
+        return False  # broken EXIF is no reason to refuse the pixels

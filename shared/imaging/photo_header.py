@@ -1,0 +1,361 @@
+"""What the header of a HEIC photo says, read without its decoder.
+
+A HEIC file is a tree of boxes (ISO/IEC 14496-12): each has a length, a name of four letters and
+content. `meta` lists the items (ISO/IEC 23008-12): the picture, its tiles, its EXIF; properties in
+`iprp` say how large each is and how far it is turned. Everything is bounded before it is believed;
+what contradicts itself is a ValueError.
+
+What a photo's header says, read without decoding a pixel: size, and where and when it was taken.
+
+EXIF is a hint from a stranger: whatever is missing, broken or out of range is left out.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import struct
+import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from typing import Any, BinaryIO
+
+from PIL import Image
+from PIL.ExifTags import GPS, IFD, Base
+
+from shared.errors import Unprocessable
+from shared.imaging.file_formats import (
+    HEIC_MEDIA_TYPE,
+    PHOTO_READ_ERRORS,
+    PHOTO_SIGNATURE_BYTES,
+    check_pixel_count,
+    detect_media_type,
+    open_photo,
+)
+
+MAX_META_BYTES = 4 * 1024 * 1024
+MAX_EXIF_BYTES = 1024 * 1024
+MAX_BOXES = 100_000
+HEVC = (b"hvc1", b"grid")  # a picture, or one put together of tiles: what phones write
+QUARTER_TURNS = 4
+
+
+@dataclass(frozen=True, slots=True)
+class HeicHeader:
+    width: int
+    """pixels, upright"""
+    height: int
+    exif: bytes | None
+    """The TIFF block, as Pillow's `Exif.load` takes it."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Box:
+    name: bytes
+    content: bytes
+
+
+def read_heic_header(file: BinaryIO) -> HeicHeader:
+    """Size and EXIF of the primary picture. Raises ValueError where there is none, or where it is
+    not HEVC (an AVIF, say)."""
+    boxes = {box.name: box.content for box in _boxes(_meta(file))}
+    primary = _primary(boxes[b"pitm"])
+    kinds = dict(_kinds(boxes[b"iinf"]))
+    if kinds.get(primary) not in HEVC:
+        raise ValueError("the primary picture is not HEVC")
+    width, height = _upright_size(boxes[b"iprp"], primary)
+    exif_item = next((item for item, kind in kinds.items() if kind == b"Exif"), None)
+    exif = None if exif_item is None else _exif(file, boxes.get(b"iloc", b""), exif_item)
+    return HeicHeader(width, height, exif)
+
+
+def _meta(file: BinaryIO) -> bytes:
+    """The content of the box `meta`, which is looked for among the outermost ones."""
+    offset = 0
+    for _ in range(MAX_BOXES):
+        file.seek(offset)
+        head = file.read(16)
+        if len(head) < 8:
+            break
+        size, name = struct.unpack(">I4s", head[:8])
+        begin = 8
+        if size == 1 and len(head) == 16:
+            size, begin = struct.unpack(">Q", head[8:])[0], 16
+        if name == b"meta":
+            if not begin + 4 <= size <= MAX_META_BYTES:
+                raise ValueError("the box meta is too large")
+            file.seek(offset + begin + 4)  # version and flags
+            return _whole(file, size - begin - 4)
+        if size < begin:
+            break  # 0: the last box; less: broken
+        offset += size
+    raise ValueError("there is no box meta")
+
+
+def _boxes(data: bytes) -> Iterator[_Box]:
+    offset = 0
+    while offset + 8 <= len(data):
+        size, name = struct.unpack_from(">I4s", data, offset)
+        if size < 8 or offset + size > len(data):
+            raise ValueError(f"the box {name!r} has a wrong length")
+        yield _Box(name, data[offset + 8 : offset + size])
+        offset += size
+
+
+def _primary(data: bytes) -> int:
+    item: int = struct.unpack_from(">H" if data[0] == 0 else ">I", data, 4)[0]
+    return item
+
+
+def _kinds(data: bytes) -> Iterator[tuple[int, bytes]]:
+    """(item, kind) of each entry of `iinf`."""
+    for box in _boxes(data[6 if data[0] == 0 else 8 :]):
+        version = box.content[0]
+        if box.name == b"infe" and version >= 2:
+            item, _, kind = struct.unpack_from(">HH4s" if version == 2 else ">IH4s", box.content, 4)
+            yield item, kind
+
+
+def _upright_size(data: bytes, item: int) -> tuple[int, int]:
+    """Width and height of the item as it is seen, from its properties `ispe` and `irot`."""
+    parts = {box.name: box.content for box in _boxes(data)}
+    properties = list(_boxes(parts[b"ipco"]))
+    size: tuple[int, int] | None = None
+    turned = 0
+    for index in _properties_of(parts[b"ipma"], item):
+        if not 1 <= index <= len(properties):
+            raise ValueError("a property is missing")
+        one = properties[index - 1]
+        if one.name == b"ispe":
+            width, height = struct.unpack_from(">II", one.content, 4)
+            size = (width, height)
+        elif one.name == b"irot":
+            turned += one.content[0] % QUARTER_TURNS
+    if size is None or 0 in size:
+        raise ValueError("the picture has no size")
+    return size if turned % 2 == 0 else (size[1], size[0])
+
+
+def _properties_of(data: bytes, item: int) -> Iterator[int]:
+    """The numbers (from 1) of an item's properties, by `ipma`; 0 stands for none."""
+    version, wide = data[0], data[3] & 1
+    (entries,) = struct.unpack_from(">I", data, 4)
+    offset = 8
+    for _ in range(min(entries, MAX_BOXES)):
+        of, count = struct.unpack_from(">HB" if version == 0 else ">IB", data, offset)
+        offset += 3 if version == 0 else 5
+        if of == item:
+            for number in range(count):
+                if wide:
+                    index = struct.unpack_from(">H", data, offset + 2 * number)[0] & 0x7FFF
+                else:
+                    index = data[offset + number] & 0x7F
+                if index:
+                    yield index
+        offset += count * (2 if wide else 1)
+
+
+def _exif(file: BinaryIO, data: bytes, item: int) -> bytes | None:
+    """The EXIF item's TIFF block; None where it is not in one piece of this file."""
+    place = _place(data, item)
+    if place is None or not 4 < place[1] <= MAX_EXIF_BYTES:
+        return None
+    file.seek(place[0])
+    block = file.read(place[1])
+    if len(block) < 4:
+        return None
+    begin = 4 + struct.unpack_from(">I", block)[0]
+    return block[begin:] or None
+
+
+def _place(data: bytes, item: int) -> tuple[int, int] | None:
+    """(offset, bytes) of an item in the file, by `iloc`."""
+    if len(data) < 8:
+        return None
+    version = data[0]
+    offset_size, length_size = data[4] >> 4, data[4] & 15
+    base_size, index_size = data[5] >> 4, data[5] & 15 if version else 0
+    wide = version == 2
+    (entries,) = struct.unpack_from(">I" if wide else ">H", data, 6)
+    at = 10 if wide else 8
+
+    def number(size: int) -> int:
+        nonlocal at
+        if at + size > len(data):
+            raise ValueError("the box iloc is cut off")
+        value = int.from_bytes(data[at : at + size], "big")
+        at += size
+        return value
+
+    for _ in range(min(entries, MAX_BOXES)):
+        of = number(4 if wide else 2)
+        method = number(2) & 15 if version else 0
+        source, base, extents = number(2), number(base_size), number(2)
+        found = None
+        for _ in range(extents):
+            number(index_size)
+            found = base + number(offset_size), number(length_size)
+        if of == item:
+            return found if method == 0 and source == 0 and extents == 1 else None
+    return None
+
+
+def _whole(file: BinaryIO, size: int) -> bytes:
+    data = file.read(size)
+    if len(data) < size:
+        raise ValueError("the file is cut off")
+    return data
+
+
+ROTATED_ORIENTATIONS = (5, 6, 7, 8)  # EXIF orientations that swap width and height
+
+
+@dataclass(frozen=True, slots=True)
+class PhotoHeader:
+    width: int
+    """pixels, upright"""
+    height: int
+    latitude: float | None = None
+    """degrees, WGS 84"""
+    longitude: float | None = None
+    heading: float | None = None
+    """degrees clockwise from north, in [0, 360)"""
+    captured_at: datetime | None = None
+
+
+def read_photo_header(file: BinaryIO, max_pixels: int) -> PhotoHeader:
+    """Unprocessable (`undecodable_photo`, `too_many_pixels`) when the header can't be used."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # strange EXIF is no reason to refuse a photo
+            begin = file.read(PHOTO_SIGNATURE_BYTES)
+            file.seek(0)
+            if detect_media_type(begin) == HEIC_MEDIA_TYPE:
+                return _heic_header(file, max_pixels)
+            with open_photo(file) as image:
+                check_pixel_count(image.width, image.height, max_pixels)
+                return _header(image)
+    except PHOTO_READ_ERRORS as error:
+        raise Unprocessable(
+            "undecodable_photo", "The photo's header is broken: it can't be decoded."
+        ) from error
+
+
+def _header(image: Image.Image) -> PhotoHeader:
+    width, height = image.size
+    exif = _exif_of_photo_header(image)
+    # Pillow gives the size of a TIFF as it stands upright, that of all others as stored.
+    if image.format != "TIFF" and _orientation(exif) in ROTATED_ORIENTATIONS:
+        width, height = height, width
+    return _with_exif(width, height, exif)
+
+
+def _heic_header(file: BinaryIO, max_pixels: int) -> PhotoHeader:
+    """Its size is that of the boxes: EXIF's orientation does not count in HEIC."""
+    found = read_heic_header(file)
+    check_pixel_count(found.width, found.height, max_pixels)
+    exif = Image.Exif()
+    if found.exif:
+        with contextlib.suppress(*PHOTO_READ_ERRORS):
+            exif.load(found.exif)
+    return _with_exif(found.width, found.height, exif)
+
+
+def _with_exif(width: int, height: int, exif: Image.Exif) -> PhotoHeader:
+    gps = _directory(exif, IFD.GPSInfo)
+    latitude = _degrees(gps.get(GPS.GPSLatitude), gps.get(GPS.GPSLatitudeRef), "NS", limit=90)
+    longitude = _degrees(gps.get(GPS.GPSLongitude), gps.get(GPS.GPSLongitudeRef), "EW", limit=180)
+    if latitude is None or longitude is None:
+        latitude = longitude = None
+    heading = _number(gps.get(GPS.GPSImgDirection))
+    return PhotoHeader(
+        width=width,
+        height=height,
+        latitude=latitude,
+        longitude=longitude,
+        heading=heading % 360 if heading is not None else None,
+        captured_at=_captured_at(gps, _directory(exif, IFD.Exif)),
+    )
+
+
+def _exif_of_photo_header(image: Image.Image) -> Image.Exif:
+    """The EXIF block; for PNG only if it stands before the pixels, which are not decoded here."""
+    exif = Image.Exif()
+    try:
+        if image.format == "TIFF":
+            return image.getexif()
+        if block := image.info.get("exif"):
+            exif.load(block)
+    except PHOTO_READ_ERRORS:
+        return Image.Exif()
+    return exif
+
+
+def _orientation(exif: Image.Exif) -> Any:
+    try:
+        return exif.get(Base.Orientation)
+    except PHOTO_READ_ERRORS:
+        return None
+
+
+def _directory(exif: Image.Exif, tag: int) -> dict[int, Any]:
+    """One of EXIF's inner directories; empty when it is broken."""
+    try:
+        return dict(exif.get_ifd(tag))
+    except PHOTO_READ_ERRORS:
+        return {}
+
+
+def _number(value: Any) -> float | None:
+    try:
+        number = float(value)
+    except (TypeError, ValueError, ZeroDivisionError):
+        return None
+    return number if math.isfinite(number) else None
+
+
+def _degrees(parts: Any, reference: Any, signs: str, limit: float) -> float | None:
+    """EXIF's (degrees, minutes, seconds) as one number; `signs` are the letters of + and -.
+
+    Without either letter it is left out: the other hemisphere is no small error.
+    """
+    if not isinstance(parts, tuple) or len(parts) != 3 or not isinstance(reference, str):
+        return None
+    sign = signs.find(reference.strip("\0 ").upper()[:1] or "?")
+    if sign < 0:
+        return None
+    numbers = [_number(part) for part in parts]
+    if any(number is None for number in numbers):
+        return None
+    degrees, minutes, seconds = (number or 0.0 for number in numbers)
+    value = degrees + minutes / 60 + seconds / 3600
+    if sign:
+        value = -value
+    return value if abs(value) <= limit else None
+
+
+def _captured_at(gps: dict[int, Any], exif: dict[int, Any]) -> datetime | None:
+    """GPS time, which is UTC; else the camera's clock with its offset (none given: UTC)."""
+    day, clock = gps.get(GPS.GPSDateStamp), gps.get(GPS.GPSTimeStamp)
+    if isinstance(day, str) and isinstance(clock, tuple) and len(clock) == 3:
+        parts = [_number(part) for part in clock]
+        if all(part is not None for part in parts):
+            hours, minutes, seconds = (part or 0.0 for part in parts)
+            try:
+                midnight = datetime.strptime(day.strip("\0 "), "%Y:%m:%d").replace(tzinfo=UTC)
+                return midnight + timedelta(hours=hours, minutes=minutes, seconds=seconds)
+            except (ValueError, OverflowError):
+                pass  # fall through to the camera's clock
+    taken = exif.get(Base.DateTimeOriginal)
+    offset = exif.get(Base.OffsetTimeOriginal)
+    if not isinstance(taken, str):
+        return None
+    try:
+        local = datetime.strptime(taken.strip("\0 "), "%Y:%m:%d %H:%M:%S").replace(tzinfo=UTC)
+        if isinstance(offset, str) and offset.strip("\0 "):
+            zone = datetime.fromisoformat(f"2000-01-01T00:00:00{offset.strip(chr(0) + ' ')}").tzinfo
+            return local.replace(tzinfo=zone or UTC).astimezone(UTC)
+        return local
+    except (ValueError, OverflowError):
+        return None

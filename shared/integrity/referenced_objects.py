@@ -1,0 +1,101 @@
+"""Which objects the catalog's rows name, and what it knows of them: what a backup must hold, and
+what `placewise verify` looks for."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from enum import StrEnum
+from uuid import UUID
+
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from shared.catalog.batch_items import BatchItem
+from shared.catalog.chunks import Chunk
+from shared.catalog.generations import Generation, GenerationState
+from shared.catalog.jobs import UNFINISHED_STATES, Job, JobKind, JobState
+from shared.catalog.maps import Map
+from shared.catalog.models import Model
+from shared.catalog.photos import Photo
+from shared.catalog.vocabularies import StoredWhitening, Vocabulary
+from shared.storage.chunks import manifest_key
+from shared.storage.keys import ORIGINALS
+
+ROWS_PER_QUERY = 1000
+
+
+class ObjectKind(StrEnum):
+    ORIGINAL = "original"
+    CHUNK = "chunk"
+    MANIFEST = "manifest"
+    VOCABULARY = "vocabulary"
+    WHITENING = "whitening"
+    MODEL = "model"
+    CHECKPOINT = "checkpoint"  # of a model that is being added
+    ARCHIVE = "archive"  # of a batch that is not finished
+    FILE = "file"  # of such a batch, not a photo yet
+
+
+KIND_BY_JOB = {JobKind.BATCH: ObjectKind.ARCHIVE, JobKind.ADD_MODEL: ObjectKind.CHECKPOINT}
+"""What came with a job, and goes when it ends."""
+
+
+@dataclass(frozen=True, slots=True)
+class ReferencedObject:
+    key: str
+    what: ObjectKind
+    row_id: UUID
+    """Of the photo, chunk, vocabulary, whitening, model or job."""
+    size_bytes: int | None = None
+    """None: not known."""
+    sha256: str | None = None
+    """Of the object's bytes, hexadecimal; None: not known."""
+
+
+def list_referenced_objects(session: Session) -> Iterator[ReferencedObject]:
+    """Those of live photos and of what answers or is being built, of maps that are not deleted."""
+    photos = select(Photo.id, Photo.object_key, Photo.size_bytes, Photo.sha256).join(
+        Map, Map.id == Photo.map_id
+    )
+    photos = photos.where(Photo.deleted_at.is_(None), Map.deleted_at.is_(None))
+    for row in session.execute(photos.execution_options(yield_per=ROWS_PER_QUERY)):
+        yield ReferencedObject(
+            row.object_key, ObjectKind.ORIGINAL, row.id, row.size_bytes, row.sha256
+        )
+    chunks = (
+        select(Chunk.id, Chunk.object_key, Chunk.size_bytes, Chunk.sha256)
+        .join(Generation, Generation.id == Chunk.generation_id)
+        .join(Map, Map.id == Generation.map_id)
+        .where(
+            Chunk.superseded_at.is_(None),
+            Generation.state.in_((GenerationState.ACTIVE, GenerationState.BUILDING)),
+            Map.deleted_at.is_(None),
+        )
+    )
+    for row in session.execute(chunks.execution_options(yield_per=ROWS_PER_QUERY)):
+        yield ReferencedObject(row.object_key, ObjectKind.CHUNK, row.id, row.size_bytes, row.sha256)
+        yield ReferencedObject(manifest_key(row.object_key), ObjectKind.MANIFEST, row.id)
+    for table, what in (
+        (Vocabulary, ObjectKind.VOCABULARY),
+        (StoredWhitening, ObjectKind.WHITENING),
+    ):
+        # Their hashes are those of the numbers inside.
+        found = select(table.id, table.object_key).join(Map, Map.id == table.map_id)
+        for one in session.execute(found.where(Map.deleted_at.is_(None))):
+            yield ReferencedObject(one.object_key, what, one.id)
+    models = select(Model.id, Model.object_key, Model.size_bytes, Model.sha256)
+    for model in session.execute(models.where(Model.object_key.is_not(None))):
+        yield ReferencedObject(
+            model.object_key, ObjectKind.MODEL, model.id, model.size_bytes, model.sha256
+        )
+    for kind, what in KIND_BY_JOB.items():
+        jobs = select(Job.id, Job.params).where(Job.kind == kind, Job.state.in_(UNFINISHED_STATES))
+        for job in session.execute(jobs).all():
+            if (key := job.params.get("object_key")) is not None:
+                yield ReferencedObject(key, what, job.id)
+    files = select(BatchItem.object_key, BatchItem.job_id).where(
+        BatchItem.state == JobState.QUEUED, BatchItem.object_key.startswith(ORIGINALS)
+    )
+    for item in session.execute(files.execution_options(yield_per=ROWS_PER_QUERY)):
+        yield ReferencedObject(item.object_key, ObjectKind.FILE, item.job_id)

@@ -1,0 +1,329 @@
+"""What stands in the streets of a quarter: trees, lamps, posts and bins for ever, vehicles for a
+day.
+
+What of the street's things a camera sees: flat pictures, each with its columns and depths.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared.synthetic_city.camera import SUPERSAMPLING, Camera, Floats, cast_rays
+from shared.synthetic_city.catalogue import VEHICLE_PAINTS, Catalogue
+from shared.synthetic_city.sessions import CaptureSession
+from shared.synthetic_city.street_objects import VEHICLE_SHARES, Sprite
+from shared.synthetic_city.streets import PAVEMENT_M, Metres, Quarter, Street
+from shared.synthetic_city.textures import random_stream
+
+KERB_CLEARANCE_M = 1.05
+"""from the kerb to the middle of a parked vehicle"""
+CORNER_M = 9.0
+"""kept free of parked vehicles at both ends of a street"""
+BLADE_REACH_M = 0.85
+
+
+@dataclass(frozen=True, slots=True)
+class StreetObject:
+    """Something that is seen from every side as the same flat picture."""
+
+    position: Metres
+    kind: str
+    """`tree`, or the picture's tuple in the catalogue: lamps, posts, boxes"""
+    index: int
+
+
+@dataclass(frozen=True, slots=True)
+class Vehicle:
+    """A box: its sides and its ends are flat pictures."""
+
+    position: Metres
+    """of its middle"""
+    heading: Metres
+    """unit vector towards its nose"""
+    index: int
+
+
+@dataclass(frozen=True, slots=True)
+class VehiclePanel:
+    """A vertical picture in the city that runs left to right as it is seen."""
+
+    start: Metres
+    direction: Metres
+    picture: Sprite
+    key: tuple[str, int]
+    mirrored: bool = False
+
+
+def place_street_objects(
+    quarter: Quarter, street: Street, catalogue: Catalogue
+) -> list[StreetObject]:
+    """What stands on the street's pavements on every day."""
+    rng = random_stream(quarter.seed, quarter.name, "standing", street.number)
+    things = []
+    kerb = street.half_width - PAVEMENT_M
+    for side in (-1.0, 1.0):
+
+        def on_pavement(along: float, out: float, side: float = side) -> Metres:
+            middle = street.start + street.direction * along
+            return np.asarray(middle + street.left * side * (kerb + out))
+
+        if street.trees:
+            along = 14.0 + rng.uniform(0, street.trees)
+            while along < street.length - 14.0:
+                index = int(rng.integers(len(catalogue.trees["summer"])))
+                if rng.uniform() < 0.85:
+                    things.append(StreetObject(on_pavement(along, 0.7), "tree", index))
+                along += street.trees * rng.uniform(0.8, 1.25)
+        along = 10.0 + rng.uniform(0, 22)
+        while along < street.length - 8.0:
+            things.append(StreetObject(on_pavement(along, 0.35), "lamps", 0))
+            along += rng.uniform(22, 30)
+        for kind, count in (("posts", rng.poisson(1.6)), ("boxes", rng.poisson(1.4))):
+            for _ in range(int(count)):
+                along = rng.uniform(10, max(11.0, street.length - 10))
+                index = int(rng.integers(len(getattr(catalogue, kind))))
+                things.append(StreetObject(on_pavement(along, rng.uniform(0.3, 0.6)), kind, index))
+    return things
+
+
+def place_vehicles(quarter: Quarter, street: Street, day: str) -> list[Vehicle]:
+    """The vehicles of one day: parked at both kerbs, and a few on the move."""
+    rng = random_stream(quarter.seed, quarter.name, "vehicles", street.number, day)
+    vehicles = []
+    lane = street.half_width - PAVEMENT_M - KERB_CLEARANCE_M
+    for side in (-1.0, 1.0):
+        along = CORNER_M + rng.uniform(0, 6) + street.half_width
+        while along < street.length - CORNER_M - street.half_width:
+            if rng.uniform() < street.parking:
+                index = _any_vehicle(rng)
+                middle = street.start + street.direction * along
+                vehicles.append(
+                    Vehicle(middle + street.left * side * lane, street.direction * -side, index)
+                )
+            along += 6.2 + rng.uniform(0, 1.5)
+    for _ in range(int(rng.poisson(0.7))):
+        side = float(rng.choice([-1.0, 1.0]))
+        middle = street.start + street.direction * rng.uniform(10, street.length - 10)
+        vehicles.append(
+            Vehicle(
+                middle + street.left * side * lane * 0.4,
+                street.direction * -side,
+                _any_vehicle(rng),
+            )
+        )
+    return vehicles
+
+
+def _any_vehicle(rng: np.random.Generator) -> int:
+    """Its index in the catalogue, where all paints of one shape follow each other."""
+    shape = int(rng.choice(len(VEHICLE_SHARES), p=VEHICLE_SHARES))
+    return shape * len(VEHICLE_PAINTS) + int(rng.integers(len(VEHICLE_PAINTS)))
+
+
+def vehicle_panels(vehicle: Vehicle, catalogue: Catalogue, seen_from: Metres) -> list[VehiclePanel]:
+    """The side and the end of the vehicle that are seen from a point."""
+    side = catalogue.vehicle_sides[vehicle.index]
+    front = catalogue.vehicle_fronts[vehicle.index]
+    ahead = vehicle.heading
+    left = np.array([-ahead[1], ahead[0]])
+    away = seen_from - vehicle.position
+    half_length, half_width = side.width / 2, front.width / 2
+    panels = []
+    if away @ left > half_width:  # from its left its nose is on the left
+        start = vehicle.position + left * half_width + ahead * half_length
+        panels.append(VehiclePanel(start, -ahead, side, ("side", vehicle.index)))
+    elif away @ left < -half_width:
+        start = vehicle.position - left * half_width - ahead * half_length
+        panels.append(VehiclePanel(start, ahead, side, ("side", vehicle.index), mirrored=True))
+    screen = catalogue.vehicle_screens[vehicle.index]
+    to_front, to_back = (half_length - metres for metres in catalogue.cabins[vehicle.index])
+    if away @ ahead > half_length:
+        start = vehicle.position + ahead * half_length - left * half_width
+        panels.append(VehiclePanel(start, left, front, ("front", vehicle.index)))
+        start = vehicle.position + ahead * to_front - left * half_width
+        panels.append(VehiclePanel(start, left, screen, ("screen", vehicle.index)))
+    elif away @ ahead < -half_length:
+        start = vehicle.position - ahead * half_length + left * half_width
+        rear = catalogue.vehicle_rears[vehicle.index]
+        panels.append(VehiclePanel(start, -left, rear, ("rear", vehicle.index)))
+        start = vehicle.position + ahead * to_back + left * half_width
+        panels.append(VehiclePanel(start, -left, screen, ("screen", vehicle.index)))
+    return panels
+
+
+def shop_blades(
+    quarter: Quarter, side: int, catalogue: Catalogue
+) -> list[tuple[Metres, Metres, int]]:
+    """Boards that stand out from the shops of a facade row: foot, outward direction, index."""
+    row = quarter.sides[side]
+    outwards = np.array([row.direction[1], -row.direction[0]])
+    blades = []
+    for plot in range(len(row.cuts) - 1):
+        house = quarter.house(side, plot)
+        for bay, shop in enumerate(house.shops):
+            if shop >= 0 and shop % 3 == 0 and bay != house.door_bay:
+                along = row.cuts[plot] + (bay + 0.04) * house.width / house.bays
+                foot = row.start + row.direction * along
+                blades.append((foot, outwards, shop % len(catalogue.blades)))
+    return blades
+
+
+OBJECT_RANGE_M = 75.0
+BLADE_RANGE_M = 45.0
+NEAREST_M = 1.3
+"""what is nearer to the lens is left out"""
+LARGEST_REACH_M = 4.0
+"""half of the longest vehicle, and some more"""
+
+
+@dataclass(slots=True)
+class VisibleSprite:
+    """A flat picture and the canvas columns that it fills."""
+
+    depth: float
+    """of its middle, metres: farther ones are painted first"""
+    first: int
+    """column"""
+    depths: Floats
+    alongs: Floats
+    """metres from the picture's left edge, per column"""
+    picture: Sprite
+    key: tuple[str, int]
+
+
+class VisibleObjects:
+    """Looks around in one quarter; remembers what it has met."""
+
+    def __init__(self, quarter: Quarter, catalogue: Catalogue) -> None:
+        self.quarter = quarter
+        self.catalogue = catalogue
+        self._standing: dict[int, list[StreetObject]] = {}
+        self._vehicles: dict[tuple[int, str], list[Vehicle]] = {}
+        self._blades: dict[int, list[tuple[Metres, Metres, int]]] = {}
+        self._middles = np.stack(
+            [street.start + street.direction * street.length / 2 for street in quarter.streets]
+        )
+
+    def items(
+        self, camera: Camera, session: CaptureSession, sides: NDArray[np.int64], slopes: Floats
+    ) -> Iterator[VisibleSprite]:
+        """The pictures in sight on the session's day, before anything hides them; in no order.
+
+        `sides` are the facade rows whose shops' boards are looked at, `slopes` the columns' rays.
+        """
+        away = np.hypot(*(self._middles - camera.position).T)
+        for number in np.flatnonzero(away < OBJECT_RANGE_M + 60.0).tolist():
+            things = self._standing_at(number)
+            for i in _is_visible(camera, [thing.position for thing in things], OBJECT_RANGE_M):
+                item = self._billboard(camera, session, things[i])
+                if item:
+                    yield item
+            vehicles = self._vehicles_at(number, session.name)
+            for i in _is_visible(camera, [v.position for v in vehicles], OBJECT_RANGE_M):
+                for panel in vehicle_panels(vehicles[i], self.catalogue, camera.position):
+                    item = _panel_item(camera, panel, slopes)
+                    if item:
+                        yield item
+        for side in sides.tolist():
+            blades = self._blades_at(side)
+            for i in _is_visible(camera, [foot for foot, _, _ in blades], BLADE_RANGE_M):
+                foot, outwards, index = blades[i]
+                away = camera.position - foot
+                # Only one of its two faces is turned towards the camera.
+                from_right = away[0] * outwards[1] - away[1] * outwards[0] > 0
+                start = foot if from_right else foot + outwards * BLADE_REACH_M
+                direction = outwards if from_right else -outwards
+                panel = VehiclePanel(
+                    start, direction, self.catalogue.blades[index], ("blade", index)
+                )
+                item = _panel_item(camera, panel, slopes)
+                if item:
+                    yield item
+
+    def _standing_at(self, number: int) -> list[StreetObject]:
+        if number not in self._standing:
+            street = self.quarter.streets[number]
+            self._standing[number] = place_street_objects(self.quarter, street, self.catalogue)
+        return self._standing[number]
+
+    def _vehicles_at(self, number: int, day: str) -> list[Vehicle]:
+        key = (number, day)
+        if key not in self._vehicles:
+            street = self.quarter.streets[number]
+            self._vehicles[key] = place_vehicles(self.quarter, street, day)
+        return self._vehicles[key]
+
+    def _blades_at(self, side: int) -> list[tuple[Metres, Metres, int]]:
+        if side not in self._blades:
+            self._blades[side] = shop_blades(self.quarter, side, self.catalogue)
+        return self._blades[side]
+
+    def _billboard(
+        self, camera: Camera, session: CaptureSession, thing: StreetObject
+    ) -> VisibleSprite | None:
+        away = thing.position - camera.position
+        depth = float(away @ camera.forward)
+        if not NEAREST_M < depth < OBJECT_RANGE_M:
+            return None
+        if thing.kind == "tree":
+            picture = self.catalogue.trees[session.foliage][thing.index]
+            key = (f"tree {session.foliage}", thing.index)
+        else:
+            picture = getattr(self.catalogue, thing.kind)[thing.index]
+            key = (thing.kind, thing.index)
+        left = float(away @ camera.right) - picture.width / 2
+        scale = SUPERSAMPLING * camera.focal / depth
+        middle = SUPERSAMPLING * camera.width / 2
+        first = max(0, int(np.ceil(middle + left * scale - 0.5)))
+        last = min(
+            SUPERSAMPLING * camera.width, int(middle + (left + picture.width) * scale - 0.5) + 1
+        )
+        if last <= first:
+            return None
+        alongs = (np.arange(first, last) + 0.5 - middle) / scale - left
+        return VisibleSprite(
+            depth, first, np.full(last - first, depth), np.asarray(alongs, np.float64), picture, key
+        )
+
+
+def _is_visible(camera: Camera, positions: list[Metres], within: float) -> list[int]:
+    """Which of the positions lie before the camera, not far off, and about in its view."""
+    if not positions:
+        return []
+    away = np.stack(positions) - camera.position
+    depth, lateral = away @ camera.forward, away @ camera.right
+    reach = depth * (camera.width / 2 / camera.focal) + LARGEST_REACH_M
+    seen = (depth > NEAREST_M) & (depth < within) & (np.abs(lateral) < reach)
+    return [int(i) for i in np.flatnonzero(seen)]
+
+
+def _panel_item(camera: Camera, panel: VehiclePanel, slopes: Floats) -> VisibleSprite | None:
+    """The panel's columns; None when it is out of sight."""
+    width = panel.picture.width
+    ends = np.stack([panel.start, panel.start + panel.direction * width]) - camera.position
+    depths, laterals = ends @ camera.forward, ends @ camera.right
+    if depths.min() < NEAREST_M or depths.max() > OBJECT_RANGE_M:
+        return None
+    pixels = SUPERSAMPLING * (camera.width / 2 + camera.focal * laterals / depths)
+    first, last = max(0, int(pixels[0])), min(SUPERSAMPLING * camera.width, int(pixels[1]) + 1)
+    if last <= first:
+        return None
+    hits = cast_rays(
+        camera,
+        slopes[first:last],
+        panel.start[None],
+        panel.direction[None],
+        np.array([width]),
+    )
+    seen = np.flatnonzero(np.isfinite(hits.depth))
+    if not len(seen):
+        return None
+    run = slice(int(seen[0]), int(seen[-1]) + 1)
+    alongs = width - hits.along[run] if panel.mirrored else hits.along[run]
+    return VisibleSprite(
+        float(depths.mean()), first + run.start, hits.depth[run], alongs, panel.picture, panel.key
+    )

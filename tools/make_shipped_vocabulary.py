@@ -1,0 +1,149 @@
+"""Makes the general vocabulary that is shipped with EfficientNet-Lite0:
+
+    python -m tools.make_shipped_vocabulary
+
+It is learnt on photographs that installed packages bring (scikit-learn, scikit-image), cut into
+overlapping views at several scales. It has never seen your places: that is why every answer made
+with it says `vocabulary: foreign`, and why fitting one on your own photos is the first thing to do.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import json
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+
+from shared.descriptors.extractor import SHIPPED_VOCABULARIES, Extractor, choose_device
+from shared.descriptors.kmeans import KMeansPass, KMeansPlusPlus
+from shared.descriptors.vocabulary import encode_centres, parse_centres
+from shared.descriptors.vocabulary_fit import TOLERANCE
+from shared.extractor_config.configs import EXTRACTOR_CONFIGS
+
+# Photographs only: no drawings, scans, microscope or depth pictures, none of them generated.
+PHOTOGRAPHS = {
+    "sklearn": ("datasets/images", ("china.jpg", "flower.jpg")),
+    "skimage": (
+        "data",
+        (
+            "astronaut.png",
+            "brick.png",
+            "camera.png",
+            "chelsea.png",
+            "coffee.png",
+            "grass.png",
+            "gravel.png",
+            "motorcycle_left.png",
+            "motorcycle_right.png",
+            "rocket.jpg",
+        ),
+    ),
+}
+PACKAGES = {"sklearn": "scikit-learn", "skimage": "scikit-image"}
+VIEW_SCALES = (1.0, 0.6, 0.35)  # of the photograph's shorter side
+VIEWS_PER_SIDE = 4  # views along each side, at every scale below the whole
+SEED = 0
+MAX_KMEANS_PASSES = 100
+
+
+def main() -> None:
+    """Fit the centres and write them beside their provenance."""
+    recipe = EXTRACTOR_CONFIGS["efficientnet-lite0-vlad"]
+    extractor = Extractor(recipe, choose_device("cpu"))
+    views = [
+        view for path in list_photographs() for view in cut_views(Image.open(path).convert("RGB"))
+    ]
+    points = torch.cat(
+        [
+            extractor.features(
+                np.stack([extractor.preprocessing.apply(v) for v in views[i : i + 16]])
+            ).flatten(0, 1)
+            for i in range(0, len(views), 16)
+        ]
+    )
+    centres, iterations = _find_centres(points, recipe.clusters)
+    checked = parse_centres(centres.numpy(), width=extractor.backbone.width)
+    provenance = {
+        "backbone": extractor.backbone.name,
+        "backbone_fingerprint": extractor.backbone.fingerprint,
+        "layer": extractor.backbone.layer,
+        "facet": extractor.backbone.facet,
+        "preprocessing": extractor.preprocessing.as_spec(),
+        "clusters": checked.clusters,
+        "sha256": checked.sha256,
+        "seed": SEED,
+        "iterations": iterations,
+        "views": len(views),
+        "patches": len(points),
+        "made_by": "python -m tools.make_shipped_vocabulary",
+        "photographs": {
+            PACKAGES[package]: {
+                "version": version(PACKAGES[package]),
+                "files": list(names),
+            }
+            for package, (_, names) in PHOTOGRAPHS.items()
+        },
+        "photographs_sha256": {
+            path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in list_photographs()
+        },
+    }
+    target = SHIPPED_VOCABULARIES / str(recipe.shipped_vocabulary)
+    target.write_bytes(encode_centres(checked))
+    target.with_suffix(".json").write_text(json.dumps(provenance, indent=2) + "\n")
+    print(f"{checked.clusters} centres from {len(points)} patches of {len(views)} views: {target}")
+
+
+def _find_centres(points: torch.Tensor, clusters: int) -> tuple[torch.Tensor, int]:
+    """(clusters, D) centres and the passes that they took: all points fit into memory, so that
+    Lloyd's passes over all of them do without mini-batches.
+    """
+    seeding = KMeansPlusPlus(points, SEED)
+    while len(seeding.chosen) < clusters:
+        seeding.next()
+    centres = seeding.centres()
+    passes, movement = 0, float("inf")
+    while passes < MAX_KMEANS_PASSES and movement > TOLERANCE:
+        one = KMeansPass.begin(centres)
+        one.accumulate(points, centres)
+        moved = one.end(centres)
+        movement = float(((moved - centres) ** 2).sum())
+        centres = moved
+        passes += 1
+    return centres, passes
+
+
+def list_photographs() -> list[Path]:
+    """The photographs' files inside the installed packages."""
+    found = []
+    for package, (folder, names) in PHOTOGRAPHS.items():
+        spec = importlib.util.find_spec(package)
+        if spec is None or spec.origin is None:
+            raise SystemExit(f"{PACKAGES[package]} is not installed: make setup")
+        root = Path(spec.origin).parent / folder
+        found += [root / name for name in names]
+    return found
+
+
+def cut_views(photograph: Image.Image) -> list[Image.Image]:
+    """Square views: the middle of the whole, and a grid of overlapping ones at smaller scales."""
+    width, height = photograph.size
+    views = []
+    for scale in VIEW_SCALES:
+        side = int(min(width, height) * scale)
+        lefts = np.linspace(0, width - side, VIEWS_PER_SIDE) if side < width else np.zeros(1)
+        tops = np.linspace(0, height - side, VIEWS_PER_SIDE) if side < height else np.zeros(1)
+        views += [
+            photograph.crop((int(left), int(top), int(left) + side, int(top) + side))
+            for top in tops
+            for left in lefts
+        ]
+    return views
+
+
+if __name__ == "__main__":
+    main()
