@@ -30,7 +30,10 @@ class Figure:
     def bound(self) -> str:
         if self.wanted is None:
             return ""
-        return f"at {'least' if self.at_least else 'most'} {_format_number(self.wanted)} {self.unit}".strip()
+        return (
+            f"at {'least' if self.at_least else 'most'} {_format_number(self.wanted)} "
+            f"{self.unit}".strip()
+        )
 
 
 @dataclass(slots=True)

@@ -51,12 +51,12 @@ from shared.catalog.processes import delete_dead_search_workers
 from shared.catalog.schema import migrate
 from shared.catalog.session import Catalog, TransactionTimeouts
 from shared.catalog.tables import open_catalog
+from shared.config.disk_space import DiskReserve
 from shared.config.embedded_home import announce_server, lock_home
 from shared.config.settings import Settings
 from shared.errors import Misconfigured
 from shared.jobs import InProcessWakeups
 from shared.security.api_keys import Scope, generate_local_key, hash_api_key, is_loopback
-from shared.storage.disk_space import DiskReserve
 from shared.telemetry.metrics_server import serve_metrics
 
 log = logging.getLogger(__name__)
@@ -96,7 +96,8 @@ def run_standalone(settings: Settings) -> Iterator[Standalone]:
 
     Beyond loopback, or with an ADMIN_KEY, every call needs a key; where there is no admin's yet,
     the first one is made. Raises Misconfigured: `home_in_use` for a folder that another server has,
-    `address_in_use`, `separate_services` where SEARCH_URLS is set, and those of `open_installation_store`;
+    `address_in_use`, `separate_services` where SEARCH_URLS is set, and those of
+    `open_installation_store`;
     Unavailable for a bucket that can't be used.
     """
     if settings.search_worker_urls:

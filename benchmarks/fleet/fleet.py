@@ -107,7 +107,8 @@ POLL_SECONDS = 0.2
 class Fleet:
     """`gateway-0..`, `extractor-0..`, `search-SHARD-REPLICA` and `steward-0..` by name.
 
-    Settings are those of `shared.config.settings`; the tiny test extractor unless they say otherwise.
+    Settings are those of `shared.config.settings`; the tiny test extractor unless they say
+    otherwise.
     """
 
     def __init__(

@@ -276,7 +276,8 @@ class Plan:
 
 
 def chunk_row_bytes(dimension: int) -> float:
-    """In the object store, for one photo: what `shared/storage/chunks.py` writes for a full slot."""
+    """In the object store, for one photo: what `shared/storage/chunks.py` writes for a full
+    slot."""
     rows = np.zeros((2, dimension), np.float32)
     data = encode_rows(rows)
     header = len(data) - rows.nbytes

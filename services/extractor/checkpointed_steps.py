@@ -201,7 +201,8 @@ def run_fit_steps(
 ) -> bool:
     """A slice of steps; True when the fit is done.
 
-    Else it is saved and the job goes on. `resumed_param` is the parameter of the job that says that there
+    Else it is saved and the job goes on. `resumed_param` is the parameter of the job that says
+    that there
     is a saved one, `progress_done` the job's progress before the fit.
     """
     saved = job_work_key(job.id, "fit.npz")

@@ -272,7 +272,8 @@ class ExtractorWorker:
         *,
         publish_async: bool = False,
     ) -> None:
-        """`concurrent_jobs`: so many others may be under way beside it, and share the blame for a fall.
+        """`concurrent_jobs`: so many others may be under way beside it, and share the blame for
+        a fall.
         `publish_async`: it may be published while the model has the next one.
         """
         with work.lease:

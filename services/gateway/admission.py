@@ -26,11 +26,11 @@ from services.gateway.authentication import Caller, get_caller
 from services.gateway.concurrency import ConcurrencyLimit
 from services.gateway.dependencies import DEFAULT_MAP, GatewayDep, MapName
 from shared.catalog.session import Catalog
+from shared.config.disk_space import QUERY_SHARE, DiskSpace
 from shared.config.settings import Settings
 from shared.errors import TooManyRequests
 from shared.ingest.store_photo import PhotoQuota
 from shared.jobs.queue_depth import QueueDepth, measure_queue_depth
-from shared.storage.disk_space import QUERY_SHARE, DiskSpace
 
 ADMISSION_POLL_SECONDS = 1.0
 POLL_COST_DIVISOR = 20  # a look that takes long is taken seldom: one part in so many of the time

@@ -83,7 +83,8 @@ class Authenticator(Protocol):
 class LocalhostAuthenticator:
     """This machine's users may call: only they reach the server, and pages in their browsers.
 
-    A page of elsewhere must not. What it sends names it in `ContextFilter`; where it has its own name lead
+    A page of elsewhere must not. What it sends names it in `ContextFilter`; where it has its
+    own name lead
     to this machine (DNS rebinding), that name is in `Host`. Nor must whoever is behind a proxy on
     this machine: to the server, everyone behind it comes from loopback.
     """

@@ -97,8 +97,10 @@ async def parse_batch_upload(
             if received.prefix is None:
                 raise InvalidRequest(
                     "no_file",
-                    f"The form has no photos ({FILES_FIELD!r}, once for each), no archive ({ARCHIVE_FIELD!r}), "
-                    f"no manifest of keys ({MANIFEST_FIELD!r}) and no prefix of keys ({PREFIX_FIELD!r}): curl "
+                    f"The form has no photos ({FILES_FIELD!r}, once for each), no archive "
+                    f"({ARCHIVE_FIELD!r}), "
+                    f"no manifest of keys ({MANIFEST_FIELD!r}) and no prefix of keys "
+                    f"({PREFIX_FIELD!r}): curl "
                     "-F archive=@PHOTOS.zip.",
                 )
         elif received.prefix is not None:
@@ -176,7 +178,8 @@ class _BatchPartHandler:
         elif name not in (FILES_FIELD, ARCHIVE_FIELD):
             raise invalid_field_error(
                 name,
-                f"is unknown; known are {FILES_FIELD}, {ARCHIVE_FIELD}, {MANIFEST_FIELD} and {PREFIX_FIELD}. What is said "
+                f"is unknown; known are {FILES_FIELD}, {ARCHIVE_FIELD}, {MANIFEST_FIELD} and "
+                f"{PREFIX_FIELD}. What is said "
                 "of single photos belongs into the manifest",
             )
         elif filename is None:
@@ -292,8 +295,10 @@ def _display_name(filename: str) -> str:
 def _conflicting_sources_error(what: str) -> PlacewiseError:
     return InvalidRequest(
         "several_sources",
-        f"The form has {what}. A batch is photos ({FILES_FIELD!r}), to which one {MANIFEST_FIELD!r} may be "
-        f"added; or one {ARCHIVE_FIELD!r}, with its table in it; or one {MANIFEST_FIELD!r} of keys; or one "
+        f"The form has {what}. A batch is photos ({FILES_FIELD!r}), to which one "
+        f"{MANIFEST_FIELD!r} may be "
+        f"added; or one {ARCHIVE_FIELD!r}, with its table in it; or one {MANIFEST_FIELD!r} "
+        "of keys; or one "
         f"{PREFIX_FIELD!r} of keys.",
     )
 

@@ -167,7 +167,8 @@ async def store_form_file(
 
     `check_begin` sees the first bytes before anything else is read and may raise; `too_large` makes
     the refusal of more than `max_bytes`. Raises InvalidRequest (no multipart body, no file, an
-    empty file), TooLarge (`file_too_large_error`), and UnsupportedMedia for another kind of body. Nothing
+    empty file), TooLarge (`file_too_large_error`), and UnsupportedMedia for another kind of
+    body. Nothing
     is left in the store when it raises.
     """
     parts = _SingleFileHandler(StreamValidator(max_bytes, check_begin, too_large=too_large))

@@ -105,7 +105,8 @@ class RateLimiter:
         if not taken:
             raise TooManyRequests(
                 quota.code,
-                f"{quota.message} Come again after the time in Retry-After, or ask an admin for a key "
+                f"{quota.message} Come again after the time in Retry-After, or ask an admin "
+                "for a key "
                 "with a higher limit.",
                 retry_after_seconds=seconds,
                 limit=quota.window.amount,

@@ -109,7 +109,8 @@ def start_comparison_of_query_photo(
 
 
 def comparison_response(gateway: GatewayContext, job: Job, map_name: str) -> SimilarityResponse:
-    """The answer of a compare job that has succeeded; Gone (`query_expired_error`) once it has gone."""
+    """The answer of a compare job that has succeeded; Gone (`query_expired_error`) once it has
+    gone."""
     params = CompareJobParams.model_validate(job.params)
     try:
         data = gateway.store.get(comparison_key(job.id))

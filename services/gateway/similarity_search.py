@@ -103,7 +103,8 @@ def estimate_place(
 ) -> EstimateResponse:
     """Where the ranking points to, and what the generation's evaluations say of that place.
 
-    `calibration` is what rankings of this kind, plain or by word weights, have taught. `unfiltered_ranking`
+    `calibration` is what rankings of this kind, plain or by word weights, have taught.
+    `unfiltered_ranking`
     is the ranking without a filter: the place has to stand up to all others, as it had to when the
     evaluations learnt what is in the map.
     """

@@ -26,7 +26,8 @@ def scan_top_k(
 ) -> tuple[RowNumbers, Scores]:
     """The numbers and cosines of all rows that can be among the k most similar, unsorted.
 
-    `query` is (dimension,), of any length but 0; rows are unit vectors or zero. `row_mask`, (n,), says
+    `query` is (dimension,), of any length but 0; rows are unit vectors or zero. `row_mask`,
+    (n,), says
     which of the chunks' rows, one chunk after the other, may be answered; one at least. Cosines are
     float64 sums.
     """

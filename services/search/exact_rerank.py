@@ -63,7 +63,8 @@ MIN_PART_BYTES = 4_000_000  # less is done before another thread has woken up
 def parallel_for(run_range: Callable[[int, int], None], rows: int, bytes_each: int) -> None:
     """Call `work(begin, end)` for parts that make up 0 to `rows`, of so many bytes each row.
 
-    One part is worked on here. `run_range` has to let go of the interpreter's lock to gain anything.
+    One part is worked on here. `run_range` has to let go of the interpreter's lock to gain
+    anything.
     """
     parts = max(1, min(_cpu_count(), rows * bytes_each // MIN_PART_BYTES))
     ends = [rows * (part + 1) // parts for part in range(parts)]
@@ -137,7 +138,8 @@ class ExactReranker:
     def find_best(
         self, rows: Indices, upper_bounds: Scores, floor: float, budget: SearchBudget
     ) -> RerankedRows:
-        """Compare `rows`, of which none scores more than its `upper_bounds`, highest reach first; until
+        """Compare `rows`, of which none scores more than its `upper_bounds`, highest reach
+        first; until
         no other reaches `floor`, which rises to the k-th score."""
         order = np.argsort(-upper_bounds, kind="stable")
         order = order[: np.count_nonzero(upper_bounds >= floor)]

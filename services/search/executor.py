@@ -103,7 +103,8 @@ def execute_weighted_query(
     options: SearchOptions,
     batcher: QueryBatcher,
 ) -> SearchResult:
-    """The same in the order of the scores with the `weighted_query` query, each with its plain cosine
+    """The same in the order of the scores with the `weighted_query` query, each with its plain
+    cosine
     beside; `min_score` is of the plain one."""
     scanned = int(np.count_nonzero(row_mask))
     if options.min_score is not None and scanned:

@@ -1,7 +1,8 @@
 """Scores of all rows at once by matrix products on a GPU, each within a bound of the exact one.
 
 A generation's rows lie in the device's memory, as float16 where they fit and as int8 codes
-(`shared.codes.int8_codes`) where only those do. One product gives every row's score to within a bound;
+(`shared.codes.int8_codes`) where only those do. One product gives every row's score to within a
+bound;
 rows that may be among the best are compared exactly on the CPU, from their float32 rows. So the
 answers are those of the CPU.
 

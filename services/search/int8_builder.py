@@ -55,7 +55,8 @@ class Int8CodeBuilder:
         folder: Path,
         on_built: Callable[[UUID, dict[UUID, Int8Codes]], None],
     ) -> None:
-        """Files are kept below `folder`. `on_built` is called with a generation and the codes of its
+        """Files are kept below `folder`. `on_built` is called with a generation and the codes
+        of its
         chunks, by chunk id."""
         self._store = store
         self._folder = folder

@@ -137,7 +137,8 @@ def rows_above_floor(
     passed over. figures (3, rows): scale, error and length of each row; query_figures: scale and
     error of the query, and the lowest floor there is. least (k,): a heap, the least first, of the
     highest scores that rows have for certain; the floor is its least. Who passes is written to
-    `rows`, and to `upper_bounds` what it scores at most, from place `count` on; returns the next place.
+    `rows`, and to `upper_bounds` what it scores at most, from place `count` on; returns the
+    next place.
     """
     words = query.shape[0]
     scale, error, lowest = query_params

@@ -3,7 +3,8 @@
 1. The first bits of every row are compared with the query's. The rows that look best are compared
    exactly: their k-th score is a floor for the answer.
 2. A row goes on to the next level while its estimate, plus BOUND standard deviations, reaches the
-   floor: more bits, then all bits, then all bits weighted with the query (`shared.codes.sign_codes`).
+   floor: more bits, then all bits, then all bits weighted with the query
+   (`shared.codes.sign_codes`).
 3. What is left is compared exactly, best estimate first. The floor rises on the way, and the first
    row whose bound does not reach it ends the search.
 

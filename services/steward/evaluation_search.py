@@ -124,7 +124,8 @@ class EvaluationSearch:
         excluded_photos: tuple[UUID, ...] = (),
     ) -> LocatedRanking | None:
         """The k most similar database photos and their spots, without the query itself and those
-        of `excluded_photos`; None for a query that was deleted since. Conflict (`map_damaged`) when a part
+        of `excluded_photos`; None for a query that was deleted since. Conflict (`map_damaged`)
+        when a part
         can't be searched."""
         for attempt in range(1, MAX_READ_ATTEMPTS + 1):
             with self._catalog.read() as session:

@@ -46,10 +46,10 @@ from services.steward.tasks.model_changes import (
 from shared.catalog.database_errors import OutageLog
 from shared.catalog.file_checks import sqlite_file
 from shared.catalog.session import Catalog
+from shared.config.disk_space import DiskReserve
 from shared.config.settings import Settings
 from shared.jobs import Wakeups
 from shared.storage import ObjectStore, OwnedStore
-from shared.storage.disk_space import DiskReserve
 from shared.storage.protocol import ObjectInfo, ObjectWriter
 from shared.storage.read_retries import ReadRetries
 from shared.telemetry.heartbeat import Heartbeat

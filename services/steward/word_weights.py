@@ -1,6 +1,7 @@
 """Learning a map's word weights, and trying them on photos that have not taught them.
 
-The map is dealt out in two halves, place by place (`shared.word_weights.training_pairs`). Photos of one half
+The map is dealt out in two halves, place by place (`shared.word_weights.training_pairs`).
+Photos of one half
 are asked with what the other half has taught, in the whole map through the search tier that answers
 users. Each is left out with whatever lies within 5 m of it: its own burst would come first with and
 without weights, and hide what they do. Only where more photos find their place first than without

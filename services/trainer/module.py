@@ -136,7 +136,8 @@ def build_model_config(arguments: TrainingArguments) -> VprModelConfig:
 def make_model(arguments: TrainingArguments, display: Display, *, resuming: bool) -> VprModel:
     """With pretrained weights, with those of `model_path`, or random by the seed.
 
-    One that resumes gets its weights later. Raises what `build_vpr_model` and `load_checkpoint` do, and
+    One that resumes gets its weights later. Raises what `build_vpr_model` and `load_checkpoint`
+    do, and
     Conflict (`run_differs`) for a checkpoint of another network.
     """
     config = build_model_config(arguments)

@@ -78,7 +78,8 @@ def find_run(resume: Path) -> tuple[Path, Path]:
             raise NotFound(
                 "run_not_found",
                 f"--resume {resume}: there is no {needed}. Name the folder of a run, in which "
-                f"{CONFIG_FILE} and {CHECKPOINTS_FOLDER}/last.ckpt lie; a run that ended before its first "
+                f"{CONFIG_FILE} and {CHECKPOINTS_FOLDER}/last.ckpt lie; a run that ended "
+                "before its first "
                 "step has none.",
             )
     return folder, checkpoint

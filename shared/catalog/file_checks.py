@@ -13,8 +13,8 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from shared.catalog.database_errors import DAMAGED, reason_of, to_unavailable
 from shared.catalog.session import Catalog
+from shared.config.disk_space import RELEASE_BELOW_BYTES
 from shared.errors import Misconfigured
-from shared.storage.disk_space import RELEASE_BELOW_BYTES
 
 # Larger catalogs are checked by `placewise doctor` only: this reads all of it, at 1 GB/s or so.
 MAX_CHECKED_BYTES = 256_000_000

@@ -132,7 +132,8 @@ def register_model(session: Session, registration: ModelRegistration) -> tuple[M
         raise Conflict(
             "model_name_taken",
             f"The name {registration.name!r} belongs to other weights (fingerprint "
-            f"{found.fingerprint[:12]}, these have {registration.fingerprint[:12]}){gone}. Take another "
+            f"{found.fingerprint[:12]}, these have {registration.fingerprint[:12]}){gone}. "
+            "Take another "
             "name.",
             model=registration.name,
         )
@@ -178,7 +179,8 @@ def check_model_registered(session: Session, recipe: ExtractorConfig) -> None:
 
 
 def get_model_for_loading(session: Session, name: str, *, lock: bool = False) -> Model:
-    """`get_registered_model` for who describes photos: Misconfigured, as weights that are missing are.
+    """`get_registered_model` for who describes photos: Misconfigured, as weights that are
+    missing are.
 
     With `lock` it can't be removed before the transaction ends.
     """
@@ -201,7 +203,8 @@ def remove_model(session: Session, name: str, new_map_extractor: str) -> Model:
     if maps:
         raise Conflict(
             "model_in_use",
-            f"The model {name!r} describes the photos of {_join_names(maps)}. Switch them to another "
+            f"The model {name!r} describes the photos of {_join_names(maps)}. Switch them to "
+            "another "
             "extractor first (POST /api/v1/generations), or delete them.",
             model=name,
             maps=maps,

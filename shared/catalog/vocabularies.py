@@ -126,7 +126,8 @@ def list_vocabularies(session: Session, map_id: UUID) -> list[Vocabulary]:
 
 
 class StoredWhitening(Journaled, Base):
-    """From `dimension` numbers to `kept`: a file of `shared.descriptors.pca_whitening` under `object_key`.
+    """From `dimension` numbers to `kept`: a file of `shared.descriptors.pca_whitening` under
+    `object_key`.
 
     It goes when none of its generations answers or is built any more, some time after.
     """

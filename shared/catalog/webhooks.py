@@ -83,7 +83,8 @@ class Delivery(Base):
 
 
 def create_webhook(session: Session, url: str, events: list[EventKind]) -> Webhook:
-    """A webhook with a new secret; `shared.security.webhook_targets` says which `url` may be one."""
+    """A webhook with a new secret; `shared.security.webhook_targets` says which `url` may be
+    one."""
     secret = SECRET_PREFIX + base64.b64encode(secrets.token_bytes(SECRET_BYTES)).decode()
     made = Webhook(url=url, events=sorted(set(events)), secret=secret)
     session.add(made)

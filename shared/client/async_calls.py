@@ -208,7 +208,8 @@ class AsyncClient(AsyncTransport):
         return await self._send_file("/vocabularies/import", file)
 
     async def vocabulary_file(self, vocabulary_id: UUID | str) -> bytes:
-        """A vocabulary as a file that `start_vocabulary_import` takes: `.npz` (it begins with `PK`), or
+        """A vocabulary as a file that `start_vocabulary_import` takes: `.npz` (it begins with
+        `PK`), or
         `.npy` where no one knows what it was learnt with."""
         return await self._get_bytes(f"/vocabularies/{vocabulary_id}/file")
 

@@ -204,7 +204,8 @@ class Client(Transport):
         return self._send_file("/vocabularies/import", file)
 
     def vocabulary_file(self, vocabulary_id: UUID | str) -> bytes:
-        """A vocabulary as a file that `start_vocabulary_import` takes: `.npz` (it begins with `PK`), or
+        """A vocabulary as a file that `start_vocabulary_import` takes: `.npz` (it begins with
+        `PK`), or
         `.npy` where no one knows what it was learnt with."""
         return self._get_bytes(f"/vocabularies/{vocabulary_id}/file")
 

@@ -4,10 +4,12 @@ One line of JSON that says what follows and of which rows it is, filled up with 
 multiple of 64 bytes; then the arrays, little endian, each beginning at a multiple of 64. So they
 can be used where they lie in a mapped file.
 
-* Sign codes, `<chunk>.codes`: float32 norms and each level's words. `shared.storage.chunks` writes it
+* Sign codes, `<chunk>.codes`: float32 norms and each level's words. `shared.storage.chunks`
+writes it
   beside the rows.
 * Int8 codes: float32 scales, errors and lengths, and the bytes. Who searches by them makes them
-  (`services.search.chunk_loader`): they are as large as a quarter of the rows, and made in a fraction of
+  (`services.search.chunk_loader`): they are as large as a quarter of the rows, and made in a
+  fraction of
   the time that the rows took.
 
 Either can always be made again from the rows: a reader that finds none, or one that is made

@@ -12,9 +12,9 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
+from shared.config.disk_space import DISK_FULL
 from shared.config.private_files import FILE_MODE, make_private_folder, write_private
 from shared.errors import Misconfigured
-from shared.storage.disk_space import DISK_FULL
 
 log = logging.getLogger(__name__)
 

@@ -630,7 +630,8 @@ class Settings(BaseSettings):
     def recipe(self, name: str) -> ExtractorConfig:
         """The recipe of an extractor that this installation may load.
 
-        Misconfigured as `get_extractor_config`, `torchhub_not_allowed` for code that nobody allowed, and
+        Misconfigured as `get_extractor_config`, `torchhub_not_allowed` for code that nobody
+        allowed, and
         `model_not_added` for a checkpoint that is only a file.
         """
         recipe = get_extractor_config(name, allow_test_extractors=self.allow_test_extractors)

@@ -182,7 +182,8 @@ def _find_problems(evaluation: EvaluationSet) -> Iterator[DatasetProblem]:
         yield _problem(
             "ground_truth_differs",
             differing,
-            f"of {len(evaluation.queries)} queries of {name} have other positives by {RADIUS_RULE} than "
+            f"of {len(evaluation.queries)} queries of {name} have other positives by "
+            f"{RADIUS_RULE} than "
             f"in the ground truth that the set brings",
         )
 

@@ -1,4 +1,5 @@
-"""Extractors: recipes (`shared.extractor_config.configs`) with their weights loaded, at work on pixels."""
+"""Extractors: recipes (`shared.extractor_config.configs`) with their weights loaded, at work on
+pixels."""
 
 from __future__ import annotations
 
@@ -225,7 +226,8 @@ class Extractor:
     ) -> NDArray[np.float32]:
         """Photos (H, W, 3) as `preprocessing` brings them, of any sizes -> (n, dimension) float32.
 
-        Rows in the photos' order, of length 1; or 0, see `shared.descriptors.aggregation`; or NaN throughout
+        Rows in the photos' order, of length 1; or 0, see `shared.descriptors.aggregation`; or
+        NaN throughout
         where the network's features are not finite: these must not be stored (`not_finite_error`).
 
         Raises PhotoDoesNotFit for a photo that is too much for the GPU even alone.

@@ -124,7 +124,8 @@ def fit_vocabulary(
 
     `batches` are photos (height, width, 3) as the extractor's preprocessing leaves them, of any
     sizes, in a random order (`shared.descriptors.patches.sample_photos`); of `photos` at most.
-    `on_progress` hears what is being done (`describing`, `clustering`), how far it is and where it ends.
+    `on_progress` hears what is being done (`describing`, `clustering`), how far it is and where
+    it ends.
 
     Raises Unprocessable (`no_photos`) when no photo comes.
     """

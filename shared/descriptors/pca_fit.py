@@ -1,6 +1,7 @@
 """The rows that a PCA is fitted on: how many, and how they are read, by blocks of columns.
 
-Fitting a PCA whitening (`shared.descriptors.pca_whitening`) on database rows: queries would tell the map what
+Fitting a PCA whitening (`shared.descriptors.pca_whitening`) on database rows: queries would
+tell the map what
 they are.
 
 At 98,304 dimensions the covariance (39 GB) can't be held. With fewer rows than dimensions the same
@@ -314,7 +315,8 @@ def fit_pca(rows: Rows, kept: int, *, block_bytes: int = BLOCK_BYTES) -> PcaWhit
 def fit_pca_columns(
     rows: ColumnSource, kept: int, on_progress: Callable[[int, int], None] = lambda done, most: None
 ) -> PcaWhitening:
-    """The whitening of rows to `kept` dimensions in one go; `on_progress` hears how many steps are done,
+    """The whitening of rows to `kept` dimensions in one go; `on_progress` hears how many steps
+    are done,
     and of how many."""
     finding = PcaFit(rows, kept)
     parts = []

@@ -37,7 +37,8 @@ from shared.extractor_config.configs import ExtractorConfig
 from shared.storage.vocabulary_npz import CENTRES, PROVENANCE, encode_vocabulary_npz, has_provenance
 
 Provenance = dict[str, Any]
-"""JSON: what `feature_provenance` says, and of a fit `fit_provenance`. Without the former the vocabulary is of
+"""JSON: what `feature_provenance` says, and of a fit `fit_provenance`. Without the former the
+vocabulary is of
 unknown origin, and `learnt_with` says `unknown`."""
 
 UNKNOWN_PROVENANCE: Provenance = {"learnt_with": "unknown"}
@@ -95,7 +96,8 @@ def check_vocabulary_fits(
             raise Unprocessable(
                 "vocabulary_unfit",
                 f"The vocabulary was learnt from {_describe_features(learnt)}; the extractor "
-                f"{extractor.recipe.name} makes {_describe_features(made)}. Fit one with this extractor.",
+                f"{extractor.recipe.name} makes {_describe_features(made)}. Fit one with "
+                "this extractor.",
                 learnt_with=learnt,
                 extractor_makes=made,
             )

@@ -52,7 +52,8 @@ def exact_knn(
 ) -> Rankings:
     """(n, D) and (m, D) unit rows, which may be memory-mapped -> the first min(k, m) of each query.
 
-    Of equally similar rows the lower index comes first. `on_progress` hears how many products of rows are
+    Of equally similar rows the lower index comes first. `on_progress` hears how many products
+    of rows are
     done, and of how many. Raises Misconfigured (`faiss_gpu_missing`).
     """
     search = _make_gpu_search() if faiss_gpu else _search_cpu

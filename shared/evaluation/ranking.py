@@ -30,7 +30,8 @@ Rows = NDArray[np.float32]
 class DescribeFunction(Protocol):
     """Photos to their rows, batch by batch, in the photos' order: (b, D) float32, unit length.
 
-    A photo that can't be described is an Unprocessable error (`refused_photos_error`) that names it: a
+    A photo that can't be described is an Unprocessable error (`refused_photos_error`) that
+    names it: a
     figure over the others would be one of another data set.
     """
 
@@ -148,7 +149,8 @@ def evaluate_recall(
 ) -> RecallEvaluation:
     """Describe the database and the queries, rank, count.
 
-    `on_progress` hears what is being done (`database`, `queries`, `search`), how far it is and where it
+    `on_progress` hears what is being done (`database`, `queries`, `search`), how far it is and
+    where it
     ends. Raises what `describe` does, and Misconfigured (`faiss_gpu_missing`).
     """
     with describe_evaluation_set(

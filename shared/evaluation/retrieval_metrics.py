@@ -164,7 +164,8 @@ def calibrate_scores(
     queries_with_positive: int,
     clusters: QueryClusters,
 ) -> ScoreCalibration:
-    """(queries,) cosines of the first match and whether it is right; `queries_with_positive` queries have a
+    """(queries,) cosines of the first match and whether it is right; `queries_with_positive`
+    queries have a
     positive."""
     said, truth = scores.astype(np.float64).tolist(), correct.tolist()
     confidence = _cross_validated_confidence(said, truth, clusters)

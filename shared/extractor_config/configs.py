@@ -59,7 +59,8 @@ class ExtractorConfig:
     parameters: int | None
     """Of the whole backbone, rounded up; each takes 4 bytes. None as above."""
     preprocessing: str | None
-    """A name that `shared.imaging.preprocessing.get_preprocessing` knows; None where only the loaded
+    """A name that `shared.imaging.preprocessing.get_preprocessing` knows; None where only the
+    loaded
     network tells.
     """
     aggregator: str
@@ -207,7 +208,8 @@ def get_extractor_config(name: str, *, allow_test_extractors: bool) -> Extractor
         known = ", ".join(sorted(r.name for r in EXTRACTOR_CONFIGS.values() if not r.for_tests))
         raise Misconfigured(
             "unknown_extractor",
-            f"There is no extractor {base!r}. Known: {known}, {TORCHHUB_PREFIX}OWNER/NAME@COMMIT:ENTRY, and "
+            f"There is no extractor {base!r}. Known: {known}, "
+            f"{TORCHHUB_PREFIX}OWNER/NAME@COMMIT:ENTRY, and "
             f"{TRAINED_PREFIX}NAME of a model that was added (EXTRACTOR).",
         )
     if recipe.for_tests and not allow_test_extractors:

@@ -67,7 +67,8 @@ def parse_trained_model_name(extractor: str) -> TrainedModelName:
         raise Misconfigured(
             "bad_model_name",
             f"The extractor {extractor!r} can't be read: {MODEL_NAME_RULE}. It is written "
-            f"{TRAINED_MODEL_PREFIX}NAME for a model that was added, or {TRAINED_MODEL_PREFIX}/FOLDER/FILE for a checkpoint.",
+            f"{TRAINED_MODEL_PREFIX}NAME for a model that was added, or "
+            f"{TRAINED_MODEL_PREFIX}/FOLDER/FILE for a checkpoint.",
         )
     return TrainedModelName(rest, None)
 
@@ -153,7 +154,8 @@ def _parse_source(name: str, source: str) -> tuple[str | None, str | None, str |
         raise Misconfigured(
             "torchhub_unpinned",
             f"The extractor {name!r} would run whatever code {repository} has on GitHub that day. "
-            f"Pin it to a commit that you have looked at: {TORCHHUB_PREFIX}{repository}@COMMIT:ENTRY with "
+            "Pin it to a commit that you have looked at: "
+            f"{TORCHHUB_PREFIX}{repository}@COMMIT:ENTRY with "
             "all 40 hexadecimal digits of the commit. "
             f"`git ls-remote https://github.com/{repository} HEAD` prints the newest one.",
         )
@@ -185,7 +187,8 @@ def _parse_input(name: str, options: dict[str, str]) -> dict[str, Any]:
             if match is None or not all(int(side) in INPUT_SIDES_PIXELS for side in match.groups()):
                 _bad_option(
                     name,
-                    f"{option}={value} is not HEIGHTxWIDTH, each {INPUT_SIDES_PIXELS[0]} to {INPUT_SIDES_PIXELS[-1]}",
+                    f"{option}={value} is not HEIGHTxWIDTH, each {INPUT_SIDES_PIXELS[0]} to "
+                    f"{INPUT_SIDES_PIXELS[-1]}",
                 )
             given["height"], given["width"] = (int(side) for side in match.groups())
         elif option in ("input.mean", "input.std"):
@@ -251,5 +254,6 @@ def _raise_bad_name(name: str, fault: str) -> NoReturn:
     raise Misconfigured(
         "bad_torchhub_name",
         f"The extractor {name!r} can't be read: {fault}. It is written "
-        f"{TORCHHUB_PREFIX}OWNER/NAME@COMMIT:ENTRY or {TORCHHUB_PREFIX}/FOLDER:ENTRY, then :OPTION=VALUE,...",
+        f"{TORCHHUB_PREFIX}OWNER/NAME@COMMIT:ENTRY or {TORCHHUB_PREFIX}/FOLDER:ENTRY, then "
+        ":OPTION=VALUE,...",
     )

@@ -88,7 +88,8 @@ def verify_chunk(
     catalog_rows: list[tuple[int, UUID]],
     report: IntegrityReport,
 ) -> Iterator[IntegrityFault]:
-    """What is wrong with the chunk; `catalog_rows` is the row of each of its photos by the catalog."""
+    """What is wrong with the chunk; `catalog_rows` is the row of each of its photos by the
+    catalog."""
     manifest = manifest_key(object_key)
     try:
         data = store.get(object_key)

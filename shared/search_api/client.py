@@ -47,7 +47,8 @@ def merge_responses(
     answers: Sequence[SearchResponse], k: int, unreachable: Iterable[Shard] = ()
 ) -> SearchResponse:
     """The first `k` hits of all, and what has to be known of the way to them: the sums, the least
-    version, the weakest certificate. `unreachable` are the shards that are missing, and are named: of an
+    version, the weakest certificate. `unreachable` are the shards that are missing, and are
+    named: of an
     answer that lacks anything, nothing is certain."""
     hits = _top_hits(k, answers)
     missing = (

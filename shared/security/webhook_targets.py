@@ -44,7 +44,8 @@ class WebhookTarget:
 
 
 def parse_webhook_url(url: str, *, allow_private: bool) -> WebhookTarget:
-    """The URL's parts. Unprocessable (`invalid_field_error`) for what no webhook may be: it needs HTTPS,
+    """The URL's parts. Unprocessable (`invalid_field_error`) for what no webhook may be: it
+    needs HTTPS,
     unless private addresses are allowed, and holds no user, password or fragment."""
     schemes = ("https", "http") if allow_private else ("https",)
     if len(url) > MAX_URL_CHARACTERS or not re.fullmatch(r"[!-~]+", url):

@@ -17,10 +17,10 @@ from datetime import UTC, datetime
 from pathlib import Path, PurePosixPath
 from typing import BinaryIO
 
+from shared.config.disk_space import DISK_FULL
 from shared.config.private_files import create_private_file, make_private_folder, write_private
 from shared.errors import NotFound, StorageFull, Unavailable
 from shared.ids import new_id
-from shared.storage.disk_space import DISK_FULL
 from shared.storage.keys import TRASH, check_key, is_valid_key
 from shared.storage.protocol import ObjectInfo
 

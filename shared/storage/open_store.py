@@ -55,7 +55,8 @@ def resolve_upload_dir(home: Path, objects: Path, upload_dir: Path | None) -> Ma
                 raise Misconfigured(
                     "upload_dir_changed",
                     f"The photos lie in {before['folder']}, and UPLOAD_DIR is {upload_dir}, which "
-                    f"has no {OWNER_MARK} of that folder. Is its disk mounted? To move the photos: all "
+                    f"has no {OWNER_MARK} of that folder. Is its disk mounted? To move the "
+                    "photos: all "
                     f"that is in {before['folder']}, {OWNER_MARK} too.",
                 )
             _check_none_stored(objects / ORIGINALS_FOLDER, upload_dir)
@@ -101,7 +102,8 @@ def _check_none_stored(originals: Path, upload_dir: Path) -> None:
 def open_store(settings: Settings, *, exclusive: bool = True) -> OwnedStore:
     """The bucket at S3_ENDPOINT, else the folder PLACEWISE_HOME/objects with UPLOAD_DIR.
 
-    `exclusive` says that no other process writes there: a folder is then tidied of half-written files.
+    `exclusive` says that no other process writes there: a folder is then tidied of half-written
+    files.
     Asks nothing of an S3 server: `check` does. Whether the store is the catalog's own is for
     `shared.catalog.installation` to say. Raises Misconfigured as `resolve_upload_dir` does, and
     `bad_setting` for an IMPORT_PREFIX that is none.

@@ -69,7 +69,8 @@ def claim_store(
             raise Misconfigured(
                 "object_store_changed",
                 f"The objects lie in the bucket {before['bucket']} at {before['endpoint']}; "
-                f"S3_BUCKET is {place['bucket']} at {place['endpoint']}, which has no {OWNER_MARK} of "
+                f"S3_BUCKET is {place['bucket']} at {place['endpoint']}, which has no "
+                f"{OWNER_MARK} of "
                 f"it. To move them: copy the whole bucket, {OWNER_MARK} too.",
             )
         if place is not None and before is None:

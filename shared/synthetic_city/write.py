@@ -125,7 +125,8 @@ def write_city(
 ) -> None:
     """Write `database/`, `queries/`, `gsv_xs/` (or `gsv-cities/`) and `city.json` below `out`.
 
-    The photos to learn from are drawn for themselves, in a quarter of their own. `on_progress` is told
+    The photos to learn from are drawn for themselves, in a quarter of their own. `on_progress`
+    is told
     how many photos are ready. Raises Conflict when `out` is not empty, Misconfigured
     (`out_unwritable`) when it can't be written.
     """

@@ -1,6 +1,7 @@
 """Heartbeats: a file that a service's loop touches, so that a health check sees whether it turns.
 
-For services that answer no HTTP. `python -m shared.telemetry.heartbeat FILE SECONDS` is the check: exit code
+For services that answer no HTTP. `python -m shared.telemetry.heartbeat FILE SECONDS` is the
+check: exit code
 0 when the file was touched within that many seconds. It imports nothing, because it is run often.
 """
 

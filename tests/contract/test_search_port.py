@@ -1,4 +1,5 @@
-"""What every search tier promises (`shared.search_api.protocol`): exact, current, honest about gaps."""
+"""What every search tier promises (`shared.search_api.protocol`): exact, current, honest about
+gaps."""
 
 from __future__ import annotations
 

@@ -820,7 +820,7 @@ def test_a_batch_waits_while_the_disk_is_full_and_goes_on_by_itself(
 ) -> None:
     job_id = batches.start(archive=zip_of(files(1, 2)))
     free = SimpleNamespace(free=batches.settings.min_free_bytes - 1)
-    monkeypatch.setattr("shared.storage.disk_space.shutil.disk_usage", lambda folder: free)
+    monkeypatch.setattr("shared.config.disk_space.shutil.disk_usage", lambda folder: free)
     assert batches.work()
     for _ in range(2):
         resume_batches(batches.catalog, batches.settings)

@@ -241,7 +241,7 @@ def test_a_full_disk_takes_no_photo_and_answers_all_else(
     (photo,) = service.indexed(1)
     before = {info.key for info in store.list("")}
     free = SimpleNamespace(free=GIGABYTE - 1)
-    monkeypatch.setattr("shared.storage.disk_space.shutil.disk_usage", lambda folder: free)
+    monkeypatch.setattr("shared.config.disk_space.shutil.disk_usage", lambda folder: free)
     for path in ("/upload", "/vocabularies/import"):
         answer = service("POST", path, files={"file": photo_bytes(2)})
         body = problem(answer, 507, "disk_full")
@@ -274,7 +274,7 @@ def test_the_disk_of_the_originals_counts_too_and_no_disk_where_nothing_lies(
         asked.append(str(folder))
         return SimpleNamespace(free=5 if "photos" in str(folder) else 9)
 
-    monkeypatch.setattr("shared.storage.disk_space.shutil.disk_usage", usage)
+    monkeypatch.setattr("shared.config.disk_space.shutil.disk_usage", usage)
     photos = settings.placewise_home.parent / "photos"
     photos.mkdir()
     elsewhere = settings.model_copy(update={"upload_dir": photos})

@@ -151,6 +151,7 @@ def test_a_changed_vocabulary_is_found(vlads: Workplace) -> None:
 
 
 def test_every_table_that_names_objects_is_looked_at() -> None:
-    """A new one has to be added to `list_referenced_objects`, or backups would miss its objects unseen."""
+    """A new one has to be added to `list_referenced_objects`, or backups would miss its objects
+    unseen."""
     naming = {table.name for table in Base.metadata.sorted_tables if "object_key" in table.columns}
     assert naming == {"batch_items", "chunks", "models", "photos", "vocabularies", "whitenings"}

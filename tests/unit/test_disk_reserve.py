@@ -9,10 +9,10 @@ from types import SimpleNamespace
 
 import pytest
 
+from shared.config.disk_space import RESERVE_BYTES, DiskReserve
 from shared.config.embedded_home import announce_server, server_address_file
 from shared.errors import StorageFull
 from shared.storage import FolderStore
-from shared.storage.disk_space import RESERVE_BYTES, DiskReserve
 
 GIGABYTE = 1_000_000_000
 
@@ -20,7 +20,7 @@ GIGABYTE = 1_000_000_000
 @pytest.fixture
 def disk(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
     free = SimpleNamespace(free=GIGABYTE)
-    monkeypatch.setattr("shared.storage.disk_space.shutil.disk_usage", lambda folder: free)
+    monkeypatch.setattr("shared.config.disk_space.shutil.disk_usage", lambda folder: free)
     return free
 
 
@@ -49,7 +49,7 @@ def test_a_reserve_that_finds_no_room_leaves_nothing(
     def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr("shared.storage.disk_space.os.posix_fallocate", full, raising=False)
+    monkeypatch.setattr("shared.config.disk_space.os.posix_fallocate", full, raising=False)
     DiskReserve(tmp_path, 0).keep()
     assert list(tmp_path.iterdir()) == []
 

@@ -240,7 +240,8 @@ def ground_truth(
         print_json(figures)
         return
     console.print(
-        f"{printable_path(out)}, and {printable_path(sidecar_path(out))} beside it: {sum(counts)} positives ({meant}) "
+        f"{printable_path(out)}, and {printable_path(sidecar_path(out))} beside it: "
+        f"{sum(counts)} positives ({meant}) "
         f"of {len(asked)} queries among {len(listed)} database photos; {counts.count(0)} queries "
         "have none.",
         soft_wrap=True,

@@ -234,7 +234,8 @@ def describe_files(
     """Write (photos, dimension) float32 to `out`, whole or not at all: an `.npy` of rows, or with
     `names`, one for each photo, an `.h5` of hloc's global features.
 
-    `advance` is told how many more photos are done. Raises Unprocessable: `refused_photos_error`, which
+    `advance` is told how many more photos are done. Raises Unprocessable:
+    `refused_photos_error`, which
     names every photo that can't be described and why; `vocabulary_unfit`, `pca_unfit`;
     Misconfigured: `vocabulary_missing`, `out_unwritable`, and what loading the extractor raises.
     """

@@ -181,7 +181,8 @@ def _open_row_file(file: Path) -> Rows:
     if not isinstance(rows, np.ndarray) or rows.ndim != 2 or rows.dtype.kind != "f":
         raise InvalidRequest(
             "bad_rows",
-            f"{printable_path(file)} does not hold rows of floating point numbers, one for each photo, as "
+            f"{printable_path(file)} does not hold rows of floating point numbers, one for "
+            "each photo, as "
             "`placewise describe` writes them.",
         )
     return rows

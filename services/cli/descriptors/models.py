@@ -244,7 +244,10 @@ def _fetch_torchhub(hub: TorchHubEntry, on_progress: OnProgress) -> int:
 
 def _print_weights(weights: LocalWeights, dimension: int | None) -> None:
     for line in (
-        f"{weights.extractor}: {dimension} dimensions, {_format_megabytes(weights.size_bytes)} of weights.",
+        (
+            f"{weights.extractor}: {dimension} dimensions, "
+            f"{_format_megabytes(weights.size_bytes)} of weights."
+        ),
         f"They are from {weights.source}, and lie at {weights.path}.",
         f"Licence: {weights.licence}. Fingerprint: {weights.fingerprint}.",
     ):

@@ -169,8 +169,8 @@ def list_(
         for v in found:
             table.add_row(
                 "*" if v["vocabulary_id"] in active else "",
-                f"{v['vocabulary_id']}\n{_format_provenance(v['provenance'])}\nsha256 {v['sha256'][:12]}"
-                + _format_pca(answering.get(v["vocabulary_id"])),
+                f"{v['vocabulary_id']}\n{_format_provenance(v['provenance'])}\nsha256 "
+                f"{v['sha256'][:12]}" + _format_pca(answering.get(v["vocabulary_id"])),
                 v["origin"],
                 str(v["clusters"]),
                 str(v["dimension"]),

@@ -127,7 +127,8 @@ def _parse_entry(spec_text: str) -> ComparisonEntry:
         else:
             raise InvalidRequest(
                 "bad_extractors",
-                f"{spec_text}: +{addition} is not known. There are +fit, and +pcaN to N dimensions, "
+                f"{spec_text}: +{addition} is not known. There are +fit, and +pcaN to N "
+                "dimensions, "
                 f"up to {MAX_PCA_DIMENSION}.",
             )
     if not name:
@@ -307,7 +308,8 @@ def _print_comparison(evaluation_set: EvaluationSet, compared: Sequence[Compared
     console.print(table)
     clusters = compared[0].measured.clusters
     console.print(
-        f"Right: {evaluation_set.rule}; protocol {evaluation_set.protocol}; fingerprint {evaluation_set.fingerprint[:16]}; "
+        f"Right: {evaluation_set.rule}; protocol {evaluation_set.protocol}; fingerprint "
+        f"{evaluation_set.fingerprint[:16]}; "
         f"intervals over {clusters.count} {clusters.kind}. ms: network and aggregation of one "
         "photo, measured when its row was made. bytes: float32.",
         soft_wrap=True,

@@ -117,12 +117,15 @@ def _estimate_lines(figures: Json) -> list[str]:
         teaching = labelled["queries"] + labelled["out_of_map"] - labelled["same_session"]
         lines.append(
             f"Confidence is uncalibrated: {teaching} labelled queries of another session are "
-            f"there, at least {MIN_LABELLED_QUERIES} are needed, with {MIN_QUERIES_PER_CLASS} whose answer is "
+            f"there, at least {MIN_LABELLED_QUERIES} are needed, with "
+            f"{MIN_QUERIES_PER_CLASS} whose answer is "
             f"right and {MIN_QUERIES_PER_CLASS} whose answer is wrong."
         )
     lines.append(
-        f"Of {labelled['queries']} queries in the map {_format_percent(labelled['accepted_in_map'])} are "
-        f"accepted; of {labelled['out_of_map']} out of it {_format_percent(labelled['false_accepts'])}; "
+        f"Of {labelled['queries']} queries in the map "
+        f"{_format_percent(labelled['accepted_in_map'])} are "
+        f"accepted; of {labelled['out_of_map']} out of it "
+        f"{_format_percent(labelled['false_accepts'])}; "
         f"of all accepted {_format_percent(labelled['right_of_accepted'])} are right."
     )
     if labelled["auroc"] is not None:

@@ -179,7 +179,10 @@ def _format_share(
         return "-"
     if intervals is None:
         return f"{100 * share:.1f} %"
-    return f"{100 * share:.1f} % ({100 * intervals[position].low:.1f} to {100 * intervals[position].high:.1f})"
+    return (
+        f"{100 * share:.1f} % ({100 * intervals[position].low:.1f} to "
+        f"{100 * intervals[position].high:.1f})"
+    )
 
 
 def _unwritable_error(path: Path | None, error: OSError) -> Misconfigured:

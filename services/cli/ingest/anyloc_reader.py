@@ -242,7 +242,8 @@ def _uploaded_files(folder: Path, below: list[Path], uploads: Path | None) -> di
     if not paths:
         raise InvalidRequest(
             "no_anyloc_uploads",
-            f"No photo lies in a folder called {UPLOADS_FOLDER} below {folder}. If they lie elsewhere: "
+            f"No photo lies in a folder called {UPLOADS_FOLDER} below {folder}. If they lie "
+            "elsewhere: "
             "--uploads FOLDER.",
         )
     files: dict[str, set[Path]] = defaultdict(set)

@@ -121,7 +121,8 @@ class UploadJournal:
         if not lines or lines[0] != about:
             raise InvalidRequest(
                 "bad_journal",
-                f"{printable_path(self._path)} is no journal of this server and map. Name another file.",
+                f"{printable_path(self._path)} is no journal of this server and map. Name "
+                "another file.",
             )
         self._done = {line["path"]: line for line in lines[1:]}
 
@@ -146,7 +147,8 @@ FitOption = Annotated[
     bool,
     typer.Option(
         "--fit/--no-fit",
-        help=f"Fit a vocabulary at the end, from {MIN_PHOTOS_TO_FIT} photos up, if the map has none "
+        help=f"Fit a vocabulary at the end, from {MIN_PHOTOS_TO_FIT} photos up, if the map "
+        "has none "
         "of its own.",
     ),
 ]

@@ -295,6 +295,7 @@ def _check_clock_skew(server_name: str, seconds: float) -> None:
     if abs(seconds) > MAX_CLOCK_SKEW_SECONDS:
         raise Misconfigured(
             "clocks_differ",
-            f"The clocks of {server_name} and of this machine are {abs(seconds):.0f} s apart. Set them "
+            f"The clocks of {server_name} and of this machine are {abs(seconds):.0f} s "
+            "apart. Set them "
             "by NTP: signatures expire, and orphans are taken for older or younger than they are.",
         )

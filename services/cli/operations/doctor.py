@@ -60,7 +60,10 @@ def check_device(settings: Settings) -> str:
     from shared.descriptors.inference import choose_precision
 
     device = choose_device(settings.device)
-    new = f"new generations in {choose_precision(settings.precision, _default_recipe(settings), device)}"
+    new = (
+        "new generations in "
+        f"{choose_precision(settings.precision, _default_recipe(settings), device)}"
+    )
     if device.type == "cuda":
         return f"CUDA: {torch.cuda.get_device_name(device)}, PyTorch {torch.__version__}, {new}"
     return f"CPU, PyTorch {torch.__version__} (CUDA available: {torch.cuda.is_available()}), {new}"

@@ -159,7 +159,8 @@ async def respond_to_upload(
 ) -> UploadResponse:
     """What is answered to an upload that was kept, after the wait that the request prefers.
 
-    `key` is that of the bytes that came; `on_described` is told when the photo was described meanwhile,
+    `key` is that of the bytes that came; `on_described` is told when the photo was described
+    meanwhile,
     to answer so again.
     """
     job = stored.job

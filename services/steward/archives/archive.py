@@ -72,7 +72,8 @@ class ArchiveLimits:
 
 
 class Archive(Protocol):
-    """Raises Unprocessable (`damaged_archive_error`, `damaged_member_error`) for what can't be read, and what
+    """Raises Unprocessable (`damaged_archive_error`, `damaged_member_error`) for what can't be
+    read, and what
     the object store raises."""
 
     def members(self) -> Iterator[ArchiveMember]:

@@ -149,7 +149,8 @@ def _validate_member(
     if manifest_line is not None and times > 1:
         raise Unprocessable(
             "ambiguous_name",
-            f"{times} photos of the archive are called {name!r}, and line {manifest_line.line} of its table "
+            f"{times} photos of the archive are called {name!r}, and line "
+            f"{manifest_line.line} of its table "
             "does not say which of them it means.",
         )
     return {

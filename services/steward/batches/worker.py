@@ -47,6 +47,7 @@ from shared.catalog.batch_items import (
 )
 from shared.catalog.jobs import WaitingFor, claimable_condition
 from shared.catalog.session import Catalog
+from shared.config.disk_space import DiskSpace
 from shared.config.settings import Settings
 from shared.errors import InvalidRequest, PlacewiseError, StorageFull, Unavailable
 from shared.imaging.file_formats import PHOTO_SIGNATURE_BYTES
@@ -63,7 +64,6 @@ from shared.jobs import Job, JobKind, JobState, Priority, Wakeups
 from shared.jobs.leases import get_lease_token, lock_leased_jobs
 from shared.jobs.transitions import release_job, succeed_job, wake_waiting_jobs
 from shared.storage import ObjectStore
-from shared.storage.disk_space import DiskSpace
 from shared.storage.keys import new_original_key
 
 log = logging.getLogger(__name__)

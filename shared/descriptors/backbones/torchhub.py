@@ -84,7 +84,8 @@ def load_module(
 ) -> torch.nn.Module:
     """Execute the entry of the folder's `hubconf.py` with its arguments.
 
-    Weights that it takes from the network through torch.hub come by `shared.descriptors.weight_files`.
+    Weights that it takes from the network through torch.hub come by
+    `shared.descriptors.weight_files`.
     Misconfigured: `weights_missing`, `torchhub_unfit`, `download_corrupt`.
     """
     try:
@@ -237,7 +238,8 @@ def _download_repository(hub: TorchHubEntry, folder: Path, on_progress: OnProgre
             raise Misconfigured(
                 "download_corrupt",
                 f"{url} is not the archive of that commit: {error}. Nothing of it was kept. Try "
-                f"again, or clone the repository and name its folder: {TORCHHUB_PREFIX}/FOLDER:{hub.entry}.",
+                "again, or clone the repository and name its folder: "
+                f"{TORCHHUB_PREFIX}/FOLDER:{hub.entry}.",
             ) from error
         finally:
             packed.unlink()

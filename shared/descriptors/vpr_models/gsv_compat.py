@@ -16,8 +16,14 @@ from typing import Any
 from shared.descriptors.vpr_models.config import NO_FREEZING, VprModelConfig
 
 GSV_IMAGE_SIZE = (320, 320)  # pixels
-GSV_MODEL_ARGUMENTS = ("backbone_arch", "pretrained", "layers_to_freeze", "layers_to_crop", "agg_arch",
-                   "agg_config")  # fmt: skip
+GSV_MODEL_ARGUMENTS = (
+    "backbone_arch",
+    "pretrained",
+    "layers_to_freeze",
+    "layers_to_crop",
+    "agg_arch",
+    "agg_config",
+)
 
 _RENAMED = (
     (r"backbone\.model\.conv1\.", "backbone.stem.0."),

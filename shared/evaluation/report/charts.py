@@ -241,7 +241,10 @@ def _scale_bar(span: float, scale: float, height: int) -> list[str]:
     metres = next(m for m in (power, 2 * power, 5 * power, 10 * power) if m >= least)
     y = height - 12
     return [
-        f'<line x1="{MAP_MARGIN_PIXELS}" y1="{y}" x2="{MAP_MARGIN_PIXELS + metres * scale:.1f}" y2="{y}" class="b"/>',
+        (
+            f'<line x1="{MAP_MARGIN_PIXELS}" y1="{y}" '
+            f'x2="{MAP_MARGIN_PIXELS + metres * scale:.1f}" y2="{y}" class="b"/>'
+        ),
         f'<text x="{MAP_MARGIN_PIXELS + metres * scale + 6:.1f}" y="{y + 4}">{metres:g} m</text>',
     ]
 

@@ -107,8 +107,10 @@ def render_comparison(evaluation_set: EvaluationSet, compared: Sequence[Compared
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
         f"<title>{escape(title)}</title><style>{STYLE}</style></head><body>"
-        f"<h1>{escape(title)}</h1><p>{len(evaluation_set.database)} database photos, {len(evaluation_set.queries)} "
-        f"queries; right: {escape(evaluation_set.rule)}; protocol {escape(evaluation_set.protocol)}; fingerprint "
+        f"<h1>{escape(title)}</h1><p>{len(evaluation_set.database)} database photos, "
+        f"{len(evaluation_set.queries)} "
+        f"queries; right: {escape(evaluation_set.rule)}; protocol "
+        f"{escape(evaluation_set.protocol)}; fingerprint "
         f"<code>{evaluation_set.fingerprint}</code>.</p>"
         f"<div class='wide'><table><tr>{''.join(f'<th>{h}</th>' for h in heads)}</tr>{rows}</table>"
         f'</div><p class="note">Intervals: a bootstrap over {clusters.count} {clusters.kind}; the '

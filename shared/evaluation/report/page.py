@@ -141,7 +141,8 @@ def _audit_section(result: EvaluationResult) -> str:
         return ""
     rows = "".join(
         f"<tr><td>{escape(one.query_name)}</td><td>{escape(one.database_name)}</td>"
-        f'<td class="n">{_format_number(one.score)}</td><td class="n">{_format_rounded(one.metres)}</td>'
+        f'<td class="n">{_format_number(one.score)}</td><td '
+        f'class="n">{_format_rounded(one.metres)}</td>'
         f'<td class="n">{_format_rounded(one.degrees)}</td></tr>'
         for one in result.suspects[:MAX_SUSPECTS_SHOWN]
     )
