@@ -79,7 +79,7 @@ class Snapshot:
         chunks = np.searchsorted(first, rows, side="right") - 1
         inside = rows - first[chunks]
         for number, row in zip(chunks.tolist(), inside.tolist(), strict=True):
-            self.chunks[number].read_ahead(row)
+            self.chunks[number].prefetch_row(row)
 
     @cached_property
     def sign_code_blocks(self) -> SignCodeBlocks:

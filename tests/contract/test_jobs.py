@@ -453,7 +453,7 @@ def test_leases_that_have_not_expired_stay(catalog: Catalog, map_id: UUID) -> No
 def test_everyones_lease_is_freed_on_request(catalog: Catalog, map_id: UUID) -> None:
     waiting = queue(catalog, map_id, 2)
     take(catalog)
-    assert free(catalog, everyone=True) == 2
+    assert free(catalog, all_leases=True) == 2
     assert states(catalog, waiting) == [JobState.QUEUED, JobState.QUEUED]
 
 
