@@ -31,7 +31,7 @@ REPLACEMENTS = (
     (r"\b__aenter__\b", "__enter__"),
     (r"\b__aexit__\b", "__exit__"),
     (r"\ba(close|read|iter_bytes)\b", r"\1"),
-    (r"\bAsync(Wire|Client|RawClient)\b", r"\1"),
+    (r"\bAsync(Transport|Client|RawClient)\b", r"\1"),
     (r"\basync_(wire|calls|client)\b", r"\1"),
     (r"\bconnect_async\b", "connect"),
     (r"for (\w+) in (.+):\n\s+yield \1$", r"yield from \2"),

@@ -89,10 +89,10 @@ def count_bytes_read() -> Iterator[ByteCounter]:
 
     lock = threading.Lock()
     loops: dict[str, Callable[..., int]] = {
-        "distances": _distance_bytes,
-        "distances_at": lambda _, __, rows, query, *___: 8 * len(query) * len(rows),
-        "weighted_at": lambda _, __, rows, ___, planes, ____: 8 * planes.shape[1] * len(rows),
-        "products_at": lambda _, __, rows, query, *___: 4 * len(query) * len(rows),
+        "hamming_distances": _distance_bytes,
+        "add_hamming_distances": lambda _, __, rows, query, *___: 8 * len(query) * len(rows),
+        "weighted_bit_sums": lambda _, __, rows, ___, planes, ____: 8 * planes.shape[1] * len(rows),
+        "exact_products": lambda _, __, rows, query, *___: 4 * len(query) * len(rows),
     }
 
     def counted(loop: Callable[..., Any], bytes_of: Callable[..., int]) -> Callable[..., Any]:

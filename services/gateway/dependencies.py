@@ -211,7 +211,7 @@ class GatewayContext:
     connections: Connections = field(init=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "job_watch", JobNotifier(self.catalog))
+        object.__setattr__(self, "job_notifier", JobNotifier(self.catalog))
         object.__setattr__(self, "connections", Connections(ConnectionLimits.of(self.settings)))
 
 

@@ -301,7 +301,7 @@ from datetime import UTC, datetime
 from shared.errors import NotFound
 from shared.storage.s3 import Bucket, S3Store
 from shared.config.settings import Settings
-store = S3Store(Bucket.of(Settings()))
+store = S3Store(Bucket.from_settings(Settings()))
 assert store.head("never") is None
 store.put("a", b"x")
 assert store.get("a") == b"x"

@@ -44,7 +44,7 @@ sys.meta_path.insert(0, Absent())
 for module in modules:
     importlib.import_module(module)
 if "services.cli.main" in modules:
-    sys.modules["services.cli.main"].tree()
+    sys.modules["services.cli.main"].build_app()
 """
 
 

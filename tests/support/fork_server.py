@@ -103,7 +103,7 @@ def _exit_code(pid: int) -> int | None:
 
 def _import() -> None:
     entry_point = services.cli.main
-    importlib.import_module("services.cli.main").tree()
+    importlib.import_module("services.cli.main").build_app()
     for module in MODULES:
         importlib.import_module(module)
     services.cli.main = entry_point  # the submodule of the same name has taken its place

@@ -180,7 +180,7 @@ def test_device_out_of_memory_when_asked_leaves_the_query_to_the_cpu(
     without = residency.update(snapshot)
     assert without.gpu_snapshot is None
     assert not residency.needs_update(without), "and tried again after a while"
-    monkeypatch.setattr(residency, "_again", {})
+    monkeypatch.setattr(residency, "_retry_at", {})
     (status,) = residency.status([residency.update(without)])
     assert status.failure is None
     assert status.generations == {snapshot.generation_id: "float16"}
@@ -199,7 +199,7 @@ def test_device_out_of_memory_when_loading_is_told_and_tried_again_later(
     (status,) = residency.status([snapshot])
     assert status.failure == "CUDA out of memory"
     assert not residency.needs_update(snapshot)
-    monkeypatch.setattr(residency, "_again", {})
+    monkeypatch.setattr(residency, "_retry_at", {})
     assert residency.needs_update(snapshot)
 
 
