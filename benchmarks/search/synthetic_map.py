@@ -30,6 +30,7 @@ from services.search.catalog_sync import MIN_CODED_BYTES
 from services.steward.tasks.compaction import merge_slot
 from shared.catalog.chunks import Chunk, Descriptor, list_live_chunks
 from shared.catalog.generations import Generation, GenerationState
+from shared.catalog.installation import open_installation_store
 from shared.catalog.maps import Map, create_map, increment_map_version, lock_map
 from shared.catalog.models import get_or_create_model
 from shared.catalog.photos import Photo, mark_photo_deleted
@@ -185,6 +186,7 @@ def create_synthetic_map(
                 model_id=get_or_create_model(session, "bench", "0" * 64, "MIT", {}).id,
             )
             session.add(generation)
+        open_installation_store(catalog, chosen, exclusive=True)  # marks the folder as the catalog's
         store = FolderStore(home / "objects")
         world = SyntheticMap(chosen, catalog, store, map_id, generation.id, dimension)
         yield world

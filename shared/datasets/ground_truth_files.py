@@ -57,7 +57,14 @@ def read_integer_lists(path: Path) -> list[Indices]:
             return [_row(value, path) for value in _unpickled(file, shape)]
     except (OSError, ValueError, EOFError, pickle.UnpicklingError) as error:
         raise _bad_list_error(path, str(error)) from error
-    except (TypeError, AttributeError, LookupError, RecursionError, MemoryError) as error:
+    except (
+        TypeError,
+        AttributeError,
+        LookupError,
+        OverflowError,
+        RecursionError,
+        MemoryError,
+    ) as error:
         # What a pickle that is no pickle, or a malicious one, makes the unpickler stumble over.
         raise _bad_list_error(path, f"its pickle is broken ({type(error).__name__})") from error
 
