@@ -15,7 +15,7 @@ UV_VERSION := 0.13.8
 INSTALLED := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help setup run test test-deploy test-browser test-api-fuzz pictures client api-page lint types bench demo env clean
+.PHONY: help setup run test test-fast test-deploy test-browser test-api-fuzz pictures client api-page lint types bench demo env clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F':.*## ' '{printf "  make %-13s %s\n", $$1, $$2}'
@@ -43,6 +43,9 @@ run: $(INSTALLED) ## serve the embedded Placewise on http://HOST:PORT, data unde
 
 test: $(INSTALLED) ## every test (PLACEWISE_TEST_DATA=FOLDER adds those on real photos)
 	$(BIN)/python -m pytest tests --numprocesses auto --dist loadfile --no-loadscope-reorder
+
+test-fast: $(INSTALLED) ## unit and contract tests that need no server
+	PLACEWISE_TEST_NO_SERVERS=1 $(BIN)/python -m pytest tests/unit tests/contract --numprocesses auto --dist loadfile
 
 test-deploy: $(INSTALLED) ## the files for containers and Kubernetes alone (`make test` has them, too)
 	$(BIN)/python -m pytest tests/deploy

@@ -27,6 +27,9 @@ from tests.support.spare_databases import SpareDatabases
 
 REAL_PHOTOS = "PLACEWISE_TEST_DATA"
 BROWSER = "PLACEWISE_TEST_BROWSER"
+NO_SERVERS = "PLACEWISE_TEST_NO_SERVERS"
+SERVER_FIXTURES = frozenset({"postgres", "redis", "s3", "moto"})
+SERVER_PARAMETERS = frozenset({"postgresql", "redis", "s3", "moto", "bucket"})
 TESTS = Path(__file__).parent
 # Some wait for other processes, the others calculate; the longest of each come first, as one that
 # begins last is waited for alone.
@@ -54,6 +57,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         for item in items
         if (item.get_closest_marker("real_photos") and not os.environ.get(REAL_PHOTOS))
         or (_kind(item) == "browser" and not os.environ.get(BROWSER))
+        or (os.environ.get(NO_SERVERS) and _needs_server(item))
     ]
     if without:
         config.hook.pytest_deselected(items=without)
@@ -65,6 +69,14 @@ def _places(items: list[pytest.Item], kinds: tuple[str, ...]) -> dict[Path, floa
     files = {item.path: kinds.index(_kind(item)) for item in items if _kind(item) in kinds}
     ordered = sorted(files, key=files.__getitem__)
     return {file: place / len(ordered) for place, file in enumerate(ordered)}
+
+
+def _needs_server(item: pytest.Item) -> bool:
+    """Whether the test starts PostgreSQL, Redis or an S3 server, by its fixtures or parameters."""
+    fixtures = set(getattr(item, "fixturenames", ()))
+    callspec = getattr(item, "callspec", None)
+    parameters = set() if callspec is None else {str(value) for value in callspec.params.values()}
+    return bool(fixtures & SERVER_FIXTURES or parameters & SERVER_PARAMETERS)
 
 
 def _kind(item: pytest.Item) -> str:

@@ -186,7 +186,9 @@ def create_synthetic_map(
                 model_id=get_or_create_model(session, "bench", "0" * 64, "MIT", {}).id,
             )
             session.add(generation)
-        open_installation_store(catalog, chosen, exclusive=True)  # marks the folder as the catalog's
+        open_installation_store(
+            catalog, chosen, exclusive=True
+        )  # marks the folder as the catalog's
         store = FolderStore(home / "objects")
         world = SyntheticMap(chosen, catalog, store, map_id, generation.id, dimension)
         yield world

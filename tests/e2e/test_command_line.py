@@ -381,7 +381,7 @@ def test_doctor_finds_the_running_server(server: ServerProcess, placewise: Comma
     findings = {finding["part"]: finding for finding in placewise("doctor", "--json").json()}
     assert set(findings) == {
         *("python", "settings", "folder", "permissions", "uploads", "collection"),
-        *("server", "vocabulary"),
+        *("server", "vocabulary", "journal"),
         *("device", "memory", "extractor"),
     }
     assert all(finding["ok"] for finding in findings.values())

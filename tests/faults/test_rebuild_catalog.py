@@ -45,7 +45,7 @@ def found_by(server: ServerProcess, file_id: str) -> list[str]:
 
 def test_removed_and_older_catalogs_lose_nothing(tmp_path: Path) -> None:
     home = tmp_path / "home"
-    with ServerProcess(home, **SETTINGS) as server:
+    with ServerProcess(home) as server:
         photos = [
             server.indexed(
                 photo_bytes(n), f"{n}.jpg", latitude=45, longitude=7 + n, place="hall", tags="a,b"
@@ -84,13 +84,13 @@ def test_removed_and_older_catalogs_lose_nothing(tmp_path: Path) -> None:
         assert objects(home, "originals/") == originals
         assert run(home, "rebuild-catalog", code=1)["code"] == "catalog_not_empty"
 
-        # An older catalog is there.
-        for file in catalog_files(home):
-            file.unlink()
-        for file in older.iterdir():
-            shutil.copy(file, home)
-        before = objects(home)
-        server.start()
+    # An older catalog is there.
+    for file in catalog_files(home):
+        file.unlink()
+    for file in older.iterdir():
+        shutil.copy(file, home)
+    before = objects(home)
+    with ServerProcess(home, **SETTINGS) as server:
         (journal,) = (one for one in run(home, "doctor", code=1) if one["part"] == "journal")
         assert not journal["ok"]
         assert before <= objects(home)

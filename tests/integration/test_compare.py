@@ -138,7 +138,7 @@ def test_shares_of_clusters_add_up_to_the_similarity(service: Service) -> None:
         assert sum(shares) == pytest.approx(found["similarity_score"], abs=1e-5)
         assert shares == sorted(shares, reverse=True)
         assert found["rerank_score"] is None, "nothing was to be reranked"
-    assert compare_job["status_url"] == f"/api/v1/jobs/{compare_job['job_id']}"
+    assert compare_job["status_url"] == f"/api/v1/jobs/{compare_job['job_id']}?map=words"
 
 
 def test_filters_and_least_score_hold_for_what_is_compared(service: Service) -> None:
