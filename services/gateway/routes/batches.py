@@ -16,7 +16,7 @@ from services.gateway.admission import (
     CHECK_PHOTO_QUOTA,
     AdmissionDep,
     UploadKind,
-    photo_limit,
+    get_photo_limit,
 )
 from services.gateway.authentication import READ, WRITE, Caller, get_caller
 from services.gateway.batch_upload import (
@@ -232,7 +232,7 @@ def _caller_params(caller: Caller, settings: Settings) -> dict[str, Any]:
     """What the steward has to know of the caller, as parameters of the job."""
     if caller.key_id is None:
         return {}
-    limited = photo_limit(caller, settings)
+    limited = get_photo_limit(caller, settings)
     return {"key_id": str(caller.key_id), "max_photos": limited[1] if limited else None}
 
 

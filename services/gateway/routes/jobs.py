@@ -167,7 +167,7 @@ async def _events(
     gateway: GatewayContext, job_id: UUID, job: JobResponse, map_name: str
 ) -> AsyncIterator[str]:
     """The stream of a job that is now as `job` says."""
-    number, mark, sent = 0, (), ""
+    number, last_seen, sent = 0, (), ""
     while True:
         if (text := job.model_dump_json()) != sent:
             sent, number = text, number + 1
@@ -176,7 +176,9 @@ async def _events(
             return
         while True:
             try:
-                change = await gateway.job_notifier.wait_for_change(job_id, mark, HEARTBEAT_SECONDS)
+                change = await gateway.job_notifier.wait_for_change(
+                    job_id, last_seen, HEARTBEAT_SECONDS
+                )
                 break
             except TimeoutError:
                 yield ": still here\n\n"
@@ -187,4 +189,4 @@ async def _events(
                 await asyncio.sleep(CATALOG_RETRY_SECONDS)
         if change is None:
             return
-        job, mark = JobResponse.of(change.job, map_name), change.mark
+        job, last_seen = JobResponse.of(change.job, map_name), change.state

@@ -30,7 +30,7 @@ from services.gateway.admission import (
     CHECK_PHOTO_QUOTA,
     AdmissionDep,
     UploadKind,
-    place_for_photo,
+    reserve_photo_quota,
 )
 from services.gateway.authentication import WRITE, get_caller
 from services.gateway.dependencies import (
@@ -176,7 +176,7 @@ async def complete_presigned_upload(
     key = new_original_key()
     with admission.admit_upload(UploadKind.UPLOAD, request):
         key_id = get_caller(request).key_id
-        place = place_for_photo(request, gateway.settings)
+        place = reserve_photo_quota(request, gateway.settings)
         stored = await run_in_threadpool(
             _complete_upload, gateway, map_name, upload_id, key, key_id, place
         )

@@ -17,7 +17,7 @@ from services.gateway.admission import (
     CHECK_PHOTO_QUOTA,
     AdmissionDep,
     UploadKind,
-    place_for_photo,
+    reserve_photo_quota,
 )
 from services.gateway.authentication import WRITE, get_caller
 from services.gateway.dependencies import (
@@ -103,7 +103,7 @@ async def upload_photo(
         return stored
 
     key_id = get_caller(request).key_id
-    place = place_for_photo(request, gateway.settings)
+    place = reserve_photo_quota(request, gateway.settings)
     stored = await run_in_threadpool(
         _store_upload, gateway, map_name, received, key_id, place, keep
     )
