@@ -1,4 +1,4 @@
-"""`/jobs`: what is being done, and how far it is."""
+"""Routes of `/jobs`: status, long polling, event streams, cancel and retry."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ from shared.jobs.wakeups import queue_for_priority
 
 router = APIRouter(tags=["jobs"])
 
-CATALOG_RETRY_SECONDS = 1.0  # between two looks while the catalog is away
-HEARTBEAT_SECONDS = 15.0  # a comment line, so that proxies keep a silent stream open
+CATALOG_RETRY_SECONDS = 1.0  # between two polls while the catalog is unreachable
+HEARTBEAT_SECONDS = 15.0  # interval of comment lines, so that proxies do not close idle streams
 
 
 @router.get("/jobs", operation_id="list_jobs", response_model=JobsResponse, dependencies=[READ])
@@ -49,14 +49,14 @@ def read_jobs(
     cursor: Annotated[str | None, Query()] = None,
     map_name: MapName = DEFAULT_MAP,
 ) -> JobsResponse:
-    """Newest first. The `reindex` jobs of a model change under way are listed only by `kind`."""
+    """List jobs, newest first. `reindex` jobs of a running model change need `kind=reindex`."""
     before = parse_cursor(cursor)
     with gateway.catalog.read() as session:
         map_id = get_map(session, map_name).id
         found = list_jobs(session, map_id, state or [], kind or [], limit + 1, before)
     page = found[:limit]
     return JobsResponse(
-        jobs=[JobResponse.of(read_job_status, map_name) for read_job_status in page],
+        jobs=[JobResponse.of(job, map_name) for job in page],
         next_cursor=str(page[-1].id) if len(found) > limit else None,
     )
 
@@ -67,10 +67,10 @@ def read_jobs(
 async def read_job_status(
     gateway: GatewayDep,
     job_id: JobId,
-    wait: Annotated[float, Query(ge=0, description="seconds to wait for the end")] = 0.0,
+    wait: Annotated[float, Query(ge=0, description="seconds to wait for the end of the job")] = 0.0,
     map_name: MapName = DEFAULT_MAP,
 ) -> JobResponse:
-    """One job; `?wait=20` answers when it ends, or after 20 seconds as it is then."""
+    """Get one job. `?wait=20` waits up to 20 seconds for its end (long polling)."""
     found = await run_in_threadpool(_load_job_of_map, gateway, map_name, job_id)
     if wait and found.state in UNFINISHED_STATES:
         seconds = min(wait, gateway.settings.max_wait_seconds)
@@ -78,9 +78,9 @@ async def read_job_status(
     return JobResponse.of(found, map_name)
 
 
-async def _event_stream(request: Request, room: AdmissionDep) -> AsyncIterator[None]:
-    """A place among the event streams, until the answer has ended."""
-    with room.event_streams.hold(request):
+async def _hold_event_stream(request: Request, admission: AdmissionDep) -> AsyncIterator[None]:
+    """Dependency that counts an event stream until its response has ended."""
+    with admission.event_streams.hold(request):
         yield
 
 
@@ -89,15 +89,17 @@ async def _event_stream(request: Request, room: AdmissionDep) -> AsyncIterator[N
     operation_id="job_events",
     response_class=StreamingResponse,
     responses={200: {"content": {"text/event-stream": {}}, "description": "`progress` events"}},
-    dependencies=[READ, Depends(_event_stream, scope="request")],
+    dependencies=[READ, Depends(_hold_event_stream, scope="request")],
 )
 async def stream_job_events(
     gateway: GatewayDep,
     job_id: JobId,
     map_name: MapName = DEFAULT_MAP,
 ) -> StreamingResponse:
-    """Server-sent events: a `progress` event with the job at every change, until it ends. Where
-    too many are sent already (429, `too_many_event_streams`), poll the job."""
+    """Stream server-sent events: a `progress` event with the job at every change, until it ends.
+
+    If too many streams are open (429, `too_many_event_streams`), poll the job instead.
+    """
     found = await run_in_threadpool(_load_job_of_map, gateway, map_name, job_id)
     return StreamingResponse(
         _events(gateway, job_id, JobResponse.of(found, map_name), map_name),
@@ -115,9 +117,9 @@ async def stream_job_events(
 def cancel_job_by_id(
     gateway: GatewayDep, job_id: JobId, idempotent: IdempotentDep, map_name: MapName = DEFAULT_MAP
 ) -> JobResponse:
-    """End a job at once; what a worker computes for it meanwhile is thrown away."""
+    """Cancel a job immediately. Results that a worker is still computing are discarded."""
 
-    def end(session: Session) -> JobResponse:
+    def cancel(session: Session) -> JobResponse:
         found = get_job(session, get_map(session, map_name).id, job_id, lock=True)
         if found.kind in MODEL_CHANGE_JOBS:
             cancel_model_change(session, found)
@@ -131,7 +133,7 @@ def cancel_job_by_id(
         idempotent.store_response(session, 200, answer)
         return answer
 
-    return gateway.catalog.run(end)
+    return gateway.catalog.run(cancel)
 
 
 @router.post(
@@ -143,7 +145,7 @@ def cancel_job_by_id(
 def retry_job_by_id(
     gateway: GatewayDep, job_id: JobId, idempotent: IdempotentDep, map_name: MapName = DEFAULT_MAP
 ) -> JobResponse:
-    """Queue a failed or cancelled job again; of a batch, the items that have failed."""
+    """Queue a failed or cancelled job again; for a batch, only its failed items."""
     with gateway.catalog.write() as session:
         found = get_job(session, get_map(session, map_name).id, job_id, lock=True)
         if found.kind == JobKind.BATCH:
@@ -166,7 +168,7 @@ def _load_job_of_map(gateway: GatewayContext, map_name: str, job_id: UUID) -> Jo
 async def _events(
     gateway: GatewayContext, job_id: UUID, job: JobResponse, map_name: str
 ) -> AsyncIterator[str]:
-    """The stream of a job that is now as `job` says."""
+    """Yields the event stream of a job, beginning with its current state `job`."""
     number, last_seen, sent = 0, (), ""
     while True:
         if (text := job.model_dump_json()) != sent:
@@ -181,11 +183,11 @@ async def _events(
                 )
                 break
             except TimeoutError:
-                yield ": still here\n\n"
+                yield ": heartbeat\n\n"
             except SQLAlchemyError as error:
                 if to_unavailable(error) is None:
                     raise
-                yield ": the catalog is away\n\n"
+                yield ": the catalog is unreachable\n\n"
                 await asyncio.sleep(CATALOG_RETRY_SECONDS)
         if change is None:
             return
