@@ -185,11 +185,11 @@ def read_batch_items(
         job = get_job(session, get_map(session, map_name).id, job_id)
         if job.kind != JobKind.BATCH:
             raise Conflict("no_items", f"The job {job.id} ({job.kind}) is not a batch.")
-        found = list_batch_items(session, job.id, state or [], limit + 1, after)
-    page = found[:limit]
+        items = list_batch_items(session, job.id, state or [], limit + 1, after)
+    page = items[:limit]
     return BatchItemsResponse(
         items=[BatchItemResponse.of(item) for item in page],
-        next_cursor=str(page[-1].number) if len(found) > limit else None,
+        next_cursor=str(page[-1].number) if len(items) > limit else None,
     )
 
 

@@ -53,11 +53,11 @@ def read_jobs(
     before = parse_cursor(cursor)
     with gateway.catalog.read() as session:
         map_id = get_map(session, map_name).id
-        found = list_jobs(session, map_id, state or [], kind or [], limit + 1, before)
-    page = found[:limit]
+        jobs = list_jobs(session, map_id, state or [], kind or [], limit + 1, before)
+    page = jobs[:limit]
     return JobsResponse(
         jobs=[JobResponse.of(job, map_name) for job in page],
-        next_cursor=str(page[-1].id) if len(found) > limit else None,
+        next_cursor=str(page[-1].id) if len(jobs) > limit else None,
     )
 
 
@@ -71,11 +71,11 @@ async def read_job_status(
     map_name: MapName = DEFAULT_MAP,
 ) -> JobResponse:
     """Get one job. `?wait=20` waits up to 20 seconds for its end (long polling)."""
-    found = await run_in_threadpool(_load_job_of_map, gateway, map_name, job_id)
-    if wait and found.state in UNFINISHED_STATES:
+    job = await run_in_threadpool(_load_job_of_map, gateway, map_name, job_id)
+    if wait and job.state in UNFINISHED_STATES:
         seconds = min(wait, gateway.settings.max_wait_seconds)
-        found = await wait_for_job(gateway, job_id, seconds) or found
-    return JobResponse.of(found, map_name)
+        job = await wait_for_job(gateway, job_id, seconds) or job
+    return JobResponse.of(job, map_name)
 
 
 async def _hold_event_stream(request: Request, admission: AdmissionDep) -> AsyncIterator[None]:
@@ -100,9 +100,9 @@ async def stream_job_events(
 
     If too many streams are open (429, `too_many_event_streams`), poll the job instead.
     """
-    found = await run_in_threadpool(_load_job_of_map, gateway, map_name, job_id)
+    job = await run_in_threadpool(_load_job_of_map, gateway, map_name, job_id)
     return StreamingResponse(
-        _events(gateway, job_id, JobResponse.of(found, map_name), map_name),
+        _events(gateway, job_id, JobResponse.of(job, map_name), map_name),
         media_type="text/event-stream",
         headers={"Cache-Control": "no-store", "X-Accel-Buffering": "no"},
     )
@@ -120,16 +120,16 @@ def cancel_job_by_id(
     """Cancel a job immediately. Results that a worker is still computing are discarded."""
 
     def cancel(session: Session) -> JobResponse:
-        found = get_job(session, get_map(session, map_name).id, job_id, lock=True)
-        if found.kind in MODEL_CHANGE_JOBS:
-            cancel_model_change(session, found)
-        elif found.kind == JobKind.BATCH:
-            cancel_batch(session, found)
+        job = get_job(session, get_map(session, map_name).id, job_id, lock=True)
+        if job.kind in MODEL_CHANGE_JOBS:
+            cancel_model_change(session, job)
+        elif job.kind == JobKind.BATCH:
+            cancel_batch(session, job)
         else:
-            cancel_job(found)
+            cancel_job(job)
         session.flush()
-        session.refresh(found)
-        answer = JobResponse.of(found, map_name)
+        session.refresh(job)
+        answer = JobResponse.of(job, map_name)
         idempotent.store_response(session, 200, answer)
         return answer
 
@@ -147,16 +147,16 @@ def retry_job_by_id(
 ) -> JobResponse:
     """Queue a failed or cancelled job again; for a batch, only its failed items."""
     with gateway.catalog.write() as session:
-        found = get_job(session, get_map(session, map_name).id, job_id, lock=True)
-        if found.kind == JobKind.BATCH:
-            retry_batch(session, found)
+        job = get_job(session, get_map(session, map_name).id, job_id, lock=True)
+        if job.kind == JobKind.BATCH:
+            retry_batch(session, job)
         else:
-            retry_job(session, found)
+            retry_job(session, job)
         session.flush()
-        session.refresh(found)
-        answer = JobResponse.of(found, map_name)
+        session.refresh(job)
+        answer = JobResponse.of(job, map_name)
         idempotent.store_response(session, 200, answer)
-    gateway.hints.send(queue_for_priority(found.priority))
+    gateway.hints.send(queue_for_priority(job.priority))
     return answer
 
 

@@ -60,8 +60,8 @@ def read_photo(
 ) -> PhotoDetailResponse:
     """Get the metadata of a photo and the state of its job."""
     with gateway.catalog.read() as session:
-        found = get_photo(session, get_map(session, map_name).id, file_id)
-        return _photo_detail_response(session, found, map_name)
+        photo = get_photo(session, get_map(session, map_name).id, file_id)
+        return _photo_detail_response(session, photo, map_name)
 
 
 class PhotoUpdate(BaseModel):
@@ -113,13 +113,13 @@ def patch_photo(
     columns = patch.to_columns()
     with gateway.catalog.write() as session:
         map_ = lock_map(session, get_map(session, map_name).id)
-        found = get_photo(session, map_.id, file_id)
+        photo = get_photo(session, map_.id, file_id)
         for name, value in columns.items():
-            setattr(found, name, value)
-        check_coordinate_pair(found.latitude, found.longitude)
-        found.changed_version = increment_map_version(session, map_.id)
+            setattr(photo, name, value)
+        check_coordinate_pair(photo.latitude, photo.longitude)
+        photo.changed_version = increment_map_version(session, map_.id)
         session.flush()
-        return _photo_detail_response(session, found, map_name)
+        return _photo_detail_response(session, photo, map_name)
 
 
 @router.delete(
@@ -135,10 +135,10 @@ def delete_photo(
 
     def remove(session: Session) -> str:
         map_ = lock_map(session, get_map(session, map_name).id)
-        found = get_photo(session, map_.id, file_id)
-        mark_photo_deleted(session, found, increment_map_version(session, map_.id))
-        cancel_jobs(session, Job.photo_id == found.id)
-        return found.filename
+        photo = get_photo(session, map_.id, file_id)
+        mark_photo_deleted(session, photo, increment_map_version(session, map_.id))
+        cancel_jobs(session, Job.photo_id == photo.id)
+        return photo.filename
 
     filename = gateway.catalog.run(remove)
     return DeletedPhotoResponse(
@@ -161,16 +161,16 @@ def read_image(
 ) -> Response:
     """Get the original bytes of a photo."""
     with gateway.catalog.read() as session:
-        found = get_photo(session, get_map(session, map_name).id, file_id)
-    etag = f'"{found.sha256}"'
+        photo = get_photo(session, get_map(session, map_name).id, file_id)
+    etag = f'"{photo.sha256}"'
     if request.headers.get("if-none-match") == etag:
         return Response(status_code=304, headers={"ETag": etag})
     return StreamingResponse(
-        _read_blocks(gateway.store.open(found.object_key)),
-        media_type=found.media_type,
+        _read_blocks(gateway.store.open(photo.object_key)),
+        media_type=photo.media_type,
         headers={
-            "Content-Length": str(found.size_bytes),
-            "Content-Disposition": f"inline; filename*=UTF-8''{quote(found.filename)}",
+            "Content-Length": str(photo.size_bytes),
+            "Content-Disposition": f"inline; filename*=UTF-8''{quote(photo.filename)}",
             "ETag": etag,
             "Cache-Control": "private, no-cache",  # browsers may cache, but must revalidate
         },
@@ -189,9 +189,9 @@ def read_thumbnail(
 ) -> Response:
     """Get a small JPEG without metadata; it exists once the photo has been described."""
     with gateway.catalog.read() as session:
-        found = get_photo(session, get_map(session, map_name).id, file_id)
+        photo = get_photo(session, get_map(session, map_name).id, file_id)
     try:
-        data = gateway.store.get(thumbnail_key(found.id))
+        data = gateway.store.get(thumbnail_key(photo.id))
     except NotFound:
         raise NotFound(
             "thumbnail_not_found",
@@ -239,13 +239,13 @@ def search_photos_by_metadata(
     after = _decode_cursor(cursor) if cursor else None
     with gateway.catalog.read() as session:
         map_id = get_map(session, map_name).id
-        found, total = search_photos(session, map_id, metadata_filter, limit + 1, after)
-    page = found[:limit]
+        matches, total = search_photos(session, map_id, metadata_filter, limit + 1, after)
+    page = matches[:limit]
     return MetadataSearchResponse(
         total_found=total,
         total_is_exact=total < MAX_COUNTED_MATCHES,
         images=[PhotoResponse(**PhotoResponse.fields_of(item, map_name)) for item in page],
-        next_cursor=_encode_cursor(page[-1]) if len(found) > limit else None,
+        next_cursor=_encode_cursor(page[-1]) if len(matches) > limit else None,
         query_time_ms=(time.perf_counter() - started) * 1000,
     )
 
