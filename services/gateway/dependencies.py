@@ -88,7 +88,11 @@ class JobNotifier:
         self._shutdown_deadline = math.inf
 
     def begin_shutdown(self) -> None:
-        """Ends all waits for changes now, and waits for job ends after SHUTDOWN_WAIT_SECONDS."""
+        """Releases the waiting requests before the server stops.
+
+        Those that wait for a change are released now, those that wait for the end of a job after
+        SHUTDOWN_WAIT_SECONDS at the latest.
+        """
         self._shutdown_deadline = time.monotonic() + SHUTDOWN_WAIT_SECONDS
         _release(waiter for waiter in self._waiters if waiter.last_seen is not None)
 

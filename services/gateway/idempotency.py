@@ -3,10 +3,10 @@
 The repeated request gets the stored response of the first one. A route supports this with a
 dependency, and by storing its response in the transaction that executes the request:
 
-    def route(gateway: GatewayDep, idempotent: IdempotentDep, ...) -> Answer:
+    def route(gateway: GatewayDep, idempotent: IdempotentDep, ...) -> MapResponse:
         with gateway.catalog.write() as session:
             ...
-            idempotent.store_response(session, 201, answer)
+            idempotent.store_response(session, 201, response)
 
 The content of a multipart form is known only after it has been received: its routes use
 `IdempotentFormDep`, and `await idempotent.claim_form(gateway.store, received)` after
@@ -153,7 +153,7 @@ class IdempotentRequest:
         self,
         session: Session,
         status: int,
-        answer: BaseModel,
+        body: BaseModel,
         headers: dict[str, str] | None = None,
     ) -> None:
         """Stores the response, in the transaction that executes the request.
@@ -161,7 +161,7 @@ class IdempotentRequest:
         A response that was stored before is replaced.
         """
         if self._token is not None:
-            stored = StoredResponse(status, headers or {}, answer.model_dump_json())
+            stored = StoredResponse(status, headers or {}, body.model_dump_json())
             store_response(session, self._token, stored)
             self._response_stored = True
 
@@ -173,12 +173,12 @@ class IdempotentRequest:
         )
 
     def replace_response(
-        self, status: int, answer: BaseModel, headers: dict[str, str] | None = None
+        self, status: int, body: BaseModel, headers: dict[str, str] | None = None
     ) -> None:
         """Replaces the stored response in a transaction of its own."""
         if self._token is not None:
             with self._gateway.catalog.write() as session:
-                self.store_response(session, status, answer, headers)
+                self.store_response(session, status, body, headers)
 
     def store_refusal(self, error: PlacewiseError) -> None:
         """Stores the refusal of a request, unless a repetition might succeed."""

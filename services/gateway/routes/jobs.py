@@ -129,9 +129,9 @@ def cancel_job_by_id(
             cancel_job(job)
         session.flush()
         session.refresh(job)
-        answer = JobResponse.of(job, map_name)
-        idempotent.store_response(session, 200, answer)
-        return answer
+        response = JobResponse.of(job, map_name)
+        idempotent.store_response(session, 200, response)
+        return response
 
     return gateway.catalog.run(cancel)
 
@@ -154,10 +154,10 @@ def retry_job_by_id(
             retry_job(session, job)
         session.flush()
         session.refresh(job)
-        answer = JobResponse.of(job, map_name)
-        idempotent.store_response(session, 200, answer)
+        response = JobResponse.of(job, map_name)
+        idempotent.store_response(session, 200, response)
     gateway.hints.send(queue_for_priority(job.priority))
-    return answer
+    return response
 
 
 def _load_job_of_map(gateway: GatewayContext, map_name: str, job_id: UUID) -> Job:

@@ -114,9 +114,9 @@ def create_new_map(
         raise invalid_field_error("extractor", error.detail) from None
     with gateway.catalog.write() as session:
         check_model_registered(session, config)
-        answer = _map_response(session, create_map(session, body.name, config.name))
-        idempotent.store_response(session, 201, answer)
-    return answer
+        response = _map_response(session, create_map(session, body.name, config.name))
+        idempotent.store_response(session, 201, response)
+    return response
 
 
 @router.get("/maps/{name}", operation_id="get_map", response_model=MapResponse, dependencies=[READ])

@@ -163,8 +163,8 @@ def read_vocabularies(
 ) -> list[VocabularyResponse]:
     """List the vocabularies of a map, newest first, with their provenance."""
     with gateway.catalog.read() as session:
-        found = list_vocabularies(session, get_map(session, map_name).id)
-    return [VocabularyResponse.of(vocabulary) for vocabulary in found]
+        vocabularies = list_vocabularies(session, get_map(session, map_name).id)
+    return [VocabularyResponse.of(vocabulary) for vocabulary in vocabularies]
 
 
 @router.get(
@@ -192,14 +192,14 @@ def read_vocabulary_file(
     is unknown.
     """
     with gateway.catalog.read() as session:
-        found = get_vocabulary(session, get_map(session, map_name).id, vocabulary_id)
+        vocabulary = get_vocabulary(session, get_map(session, map_name).id, vocabulary_id)
     data, suffix = encode_vocabulary_file(
-        gateway.store.get(found.object_key), found.sha256, found.provenance
+        gateway.store.get(vocabulary.object_key), vocabulary.sha256, vocabulary.provenance
     )
     return Response(
         data,
         media_type="application/zip" if suffix == ".npz" else "application/octet-stream",
-        headers={"Content-Disposition": f'attachment; filename="{found.id}{suffix}"'},
+        headers={"Content-Disposition": f'attachment; filename="{vocabulary.id}{suffix}"'},
     )
 
 

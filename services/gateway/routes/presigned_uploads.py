@@ -141,7 +141,7 @@ def create_presigned_upload(
         )
         session.add(upload)
         session.flush()
-        answer = PresignResponse(
+        response = PresignResponse(
             upload_id=upload_id,
             method="PUT",
             url=put.url,
@@ -149,8 +149,8 @@ def create_presigned_upload(
             complete_url=url_in_map(f"/uploads/presign/{upload_id}/complete", map_name),
             expires_at=upload.expires_at,
         )
-        idempotent.store_response(session, 201, answer)
-    return answer
+        idempotent.store_response(session, 201, response)
+    return response
 
 
 @router.post(

@@ -138,7 +138,7 @@ class UploadOutcome:
         status_url = url_in_map(
             f"/jobs/{job.id}" if job else f"/uploads/{stored.photo.id}", map_name
         )
-        answer = UploadResponse(
+        body = UploadResponse(
             file_id=stored.photo.id,
             job_id=job.id if job else None,
             filename=stored.photo.filename,
@@ -150,10 +150,10 @@ class UploadOutcome:
             message=_outcome_message(stored, job),
         )
         if not stored.queued or job is None:
-            return cls(200, {"Location": status_url}, answer)
+            return cls(200, {"Location": status_url}, body)
         if job.state == JobState.SUCCEEDED:
-            return cls(201, {"Location": status_url}, answer)
-        return cls(202, {"Location": status_url, "Retry-After": "1"}, answer)
+            return cls(201, {"Location": status_url}, body)
+        return cls(202, {"Location": status_url, "Retry-After": "1"}, body)
 
 
 async def respond_to_upload(
