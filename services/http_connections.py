@@ -1,14 +1,15 @@
-"""Limits for the connections of an HTTP server: how many, and how slow their clients may be.
+"""Connection limits of an HTTP server: the number of connections, and timeouts for slow clients.
 
-uvicorn has no such limits. `LimitedProtocol` adds them to its HTTP/1.1 protocol:
+uvicorn has no such limits, and without them a few slow clients can use up all file descriptors
+(Slowloris). `LimitedProtocol` adds them to uvicorn's HTTP/1.1 protocol:
 
-| what | limit | beyond it |
+| | limit | when exceeded |
 |---|---|---|
-| connections in all | MAX_CONNECTIONS | an idle one is closed; where none is, 503 |
-| connections of one address | MAX_CONNECTIONS_PER_ADDRESS | the same, 429 |
-| a request's head | REQUEST_HEAD_SECONDS | 408; closed where nothing came |
-| a request's body | MIN_BODY_BYTES_PER_SECOND | 408 |
-| an answer that is not read | STALLED_SECONDS | closed |
+| connections in total | MAX_CONNECTIONS | the longest idle one is closed; 503 if none is idle |
+| connections per address | MAX_CONNECTIONS_PER_ADDRESS | the same, with 429 |
+| request head | REQUEST_HEAD_SECONDS | 408; closed if nothing was received |
+| request body | MIN_BODY_BYTES_PER_SECOND | 408 |
+| client does not read the response | STALLED_SECONDS | closed |
 """
 
 from __future__ import annotations
@@ -34,18 +35,18 @@ from shared.http.problem_details import CLOSED_WITH
 
 log = logging.getLogger(__name__)
 
-# The body's rate is taken over this time: as long may a client be silent. Time in which the server
-# does not read does not count.
+# Window over which the rate of a body is measured, and so the longest pause of a client. Windows in
+# which the server itself paused reading do not count.
 BODY_WINDOW_SECONDS = 10.0
-STALLED_SECONDS = 75.0  # in which a client has to read something of its answer
+STALLED_SECONDS = 75.0  # within which a client must read a part of its response
 RETRY_SECONDS = 1
-LOG_SECONDS = 60.0  # between two lines about closed connections
-MOST_FILES = 65_536  # more than this is not asked of the system
-RESERVED_FILES = 256  # for the catalog, chunks, uploads and other parts of the process
+LOG_SECONDS = 60.0  # between two log lines about closed connections
+MAX_OPEN_FILES = 65_536  # file limit that is requested from the system, at most
+RESERVED_FILES = 256  # for the catalog, chunks, uploads and other services of the process
 
 
 class Reason(StrEnum):
-    """Why the server closed a connection or did not take one; values of a metric's label."""
+    """Why the server closed or refused a connection; values of a metric label."""
 
     TOTAL_LIMIT = "total_limit"
     ADDRESS_LIMIT = "address_limit"
@@ -57,24 +58,24 @@ class Reason(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class ConnectionLimits:
-    """Limits of one server. `per_address` and `body_bytes_per_second`: 0 for none."""
+    """Limits of one server. 0 disables `per_address` and `body_bytes_per_second`."""
 
     total: int
     per_address: int
     head_seconds: float
     body_bytes_per_second: int
     trusted_proxies: tuple[IPv4Network | IPv6Network, ...] = ()
-    """Their connections are not limited per address."""
+    """Networks whose connections are not limited per address."""
 
     @classmethod
     def of(cls, settings: Settings) -> Self:
-        """The settings' limits, lower where this process may open few files."""
+        """Creates the limits from the settings, capped by the file limit of the process."""
         files = raise_file_limit()
         total = min(settings.max_connections, files - min(RESERVED_FILES, files // 2))
         if total < settings.max_connections:
             log.warning(
-                "The server takes %d connections instead of %d (MAX_CONNECTIONS): this process may "
-                "open %d files. Raise its limit (ulimit -Hn) for more.",
+                "The server accepts %d connections instead of %d (MAX_CONNECTIONS), because this "
+                "process may open only %d files. Raise its file limit (ulimit -Hn).",
                 total,
                 settings.max_connections,
                 files,
@@ -88,44 +89,50 @@ class ConnectionLimits:
         )
 
     def of_address(self, address: str) -> int:
-        """Connections that the address may have; 0 for any number."""
+        """Returns the maximum number of connections of an address; 0 if it is unlimited."""
         trusted = address and any(ip_address(address) in net for net in self.trusted_proxies)
         return 0 if trusted else self.per_address
 
 
 class Connections:
-    """The open connections of a server. For its event loop; figures may be read anywhere."""
+    """The open connections of a server, and the counts of closed ones.
+
+    Must be used on the event loop of the server; the counts may be read from any thread.
+    """
 
     def __init__(self, limits: ConnectionLimits) -> None:
         self.limits = limits
         self.closed = Counter(dict.fromkeys(Reason, 0))
         self._open: dict[LimitedProtocol, None] = {}
-        self._of_group: Counter[str] = Counter()
+        self._count_by_group: Counter[str] = Counter()
         self._idle: defaultdict[str, dict[LimitedProtocol, None]] = defaultdict(dict)
-        """Without a request under way, of each group of addresses; longest idle first."""
+        """Connections without a request in flight, by address group; longest idle first."""
         self._logged = Counter(self.closed)
         self._next_log = 0.0
 
     @property
     def count(self) -> int:
-        """Connections that are open now."""
+        """Number of open connections."""
         return len(self._open)
 
     def add(self, connection: LimitedProtocol) -> PlacewiseError | None:
-        """Count a new connection, closing an idle one where there are too many; the refusal where
-        none is idle."""
+        """Adds a new connection; closes an idle one if a limit is reached.
+
+        Returns:
+            The error to respond with if no connection is idle; else None.
+        """
         group, limits = connection.group, self.limits
-        most = limits.of_address(connection.address)
+        group_limit = limits.of_address(connection.address)
         if (
-            most
-            and self._of_group[group] >= most
+            group_limit
+            and self._count_by_group[group] >= group_limit
             and not self._close_idle(group, Reason.ADDRESS_LIMIT)
         ):
             self.closed[Reason.ADDRESS_LIMIT] += 1
             return TooManyRequests(
                 "too_many_connections",
-                f"Your address has {most} connections with calls under way "
-                "(MAX_CONNECTIONS_PER_ADDRESS). Call again when one has ended.",
+                f"Your address has {group_limit} connections with requests in flight "
+                "(MAX_CONNECTIONS_PER_ADDRESS). Try again when one of them has ended.",
                 retry_after_seconds=RETRY_SECONDS,
             )
         if self.count >= limits.total and not self._close_idle(
@@ -135,53 +142,57 @@ class Connections:
             self.closed[Reason.TOTAL_LIMIT] += 1
             return Unavailable(
                 "too_many_connections",
-                f"The server has {limits.total} connections with calls under way "
-                "(MAX_CONNECTIONS). Call again in a moment.",
+                f"The server has {limits.total} connections with requests in flight "
+                "(MAX_CONNECTIONS). Try again in a moment.",
                 retry_after_seconds=RETRY_SECONDS,
             )
         self._open[connection] = None
-        self._of_group[group] += 1
+        self._count_by_group[group] += 1
         self.mark_idle(connection)
         return None
 
     def remove(self, connection: LimitedProtocol) -> None:
-        """The connection is closed, or about to be. May be called again."""
+        """Removes a connection that is closed or about to be closed. Idempotent."""
         if connection not in self._open:
             return
         del self._open[connection]
         self.mark_busy(connection)
-        self._of_group[connection.group] -= 1
-        if not self._of_group[connection.group]:
-            del self._of_group[connection.group]
+        self._count_by_group[connection.group] -= 1
+        if not self._count_by_group[connection.group]:
+            del self._count_by_group[connection.group]
 
     def mark_idle(self, connection: LimitedProtocol) -> None:
-        """No request of the connection is under way: it may be closed for another one."""
+        """Marks a connection without a request in flight: it may be closed for a new one."""
         if connection in self._open:
             self._idle[connection.group].setdefault(connection)
 
     def mark_busy(self, connection: LimitedProtocol) -> None:
+        """Marks a connection with a request in flight."""
         idle = self._idle.get(connection.group, {})
         idle.pop(connection, None)
         if not idle:
             self._idle.pop(connection.group, None)
 
     def check(self) -> None:
-        """Close what is too slow, and log what was closed; called about once a second."""
+        """Closes connections of slow clients and logs the counts; called about once a second."""
         now = time.monotonic()
         for connection in list(self._open):
             connection.check(now)
         if self.closed != self._logged and now >= self._next_log:
-            since = self.closed - self._logged
+            new = self.closed - self._logged
             self._logged, self._next_log = Counter(self.closed), now + LOG_SECONDS
             log.warning(
                 "Connections closed or refused: %s; open now: %d",
-                ", ".join(f"{reason} {count}" for reason, count in sorted(since.items())),
+                ", ".join(f"{reason} {count}" for reason, count in sorted(new.items())),
                 self.count,
             )
 
     def on_loop_error(self, loop: Any, context: dict[str, Any]) -> None:
-        """The event loop's exception handler. asyncio pauses after an accept that failed for lack
-        of resources, but logs a trace for each."""
+        """Exception handler of the event loop that counts failed accepts.
+
+        asyncio pauses after an accept that failed for lack of resources, but would log a traceback
+        for each.
+        """
         error = context.get("exception")
         if isinstance(error, OSError) and error.errno in (
             errno.EMFILE,
@@ -194,7 +205,7 @@ class Connections:
             loop.default_exception_handler(context)
 
     def _close_idle(self, group: str, reason: Reason) -> bool:
-        """Close the group's connection that has been idle for longest, if there is one."""
+        """Closes the longest idle connection of the group; False if none is idle."""
         oldest = next(iter(self._idle.get(group, ())), None)
         if oldest is None:
             return False
@@ -204,18 +215,18 @@ class Connections:
 
 
 class LimitedProtocol(H11Protocol):
-    """uvicorn's protocol of one connection, within the limits of `connections`."""
+    """uvicorn's HTTP/1.1 protocol of one connection, with the limits of `connections`."""
 
     def __init__(self, connections: Connections, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         self.address = self.group = ""
         self._connections = connections
         self._head_since: float | None = None
-        """When the server began to wait for the head's rest; None while it does not."""
+        """When the server began to wait for a request head; None while it does not wait."""
         self._window_since: float | None = None
-        """When the body's window began; None while no body is received."""
+        """Start of the body's rate window; None while no body is received."""
         self._window_bytes = 0
-        self._paused = False  # reading was, in this window
+        self._paused = False  # whether reading was paused in this window
         self._unsent_bytes = 0
         self._unsent_since = 0.0
 
@@ -262,7 +273,7 @@ class LimitedProtocol(H11Protocol):
             self._paused |= self.flow.read_paused
 
     def check(self, now: float) -> None:
-        """Close the connection if its client is too slow."""
+        """Closes the connection if its client is too slow."""
         limits = self._connections.limits
         unsent = self.transport.get_write_buffer_size()
         if unsent == 0 or unsent < self._unsent_bytes:
@@ -277,22 +288,23 @@ class LimitedProtocol(H11Protocol):
                 self._refuse(
                     RequestTimeout(
                         "request_too_slow",
-                        "The head of the request did not come within "
+                        "The head of the request was not received within "
                         f"{limits.head_seconds:g} seconds (REQUEST_HEAD_SECONDS).",
                     )
                 )
             else:
                 self.close()
         elif self._window_since is not None and now - self._window_since >= BODY_WINDOW_SECONDS:
-            least = limits.body_bytes_per_second * (now - self._window_since)
-            waits_for_us = self._paused or self.cycle.waiting_for_100_continue
-            if self._window_bytes < least and not waits_for_us:
+            min_bytes = limits.body_bytes_per_second * (now - self._window_since)
+            server_paused = self._paused or self.cycle.waiting_for_100_continue
+            if self._window_bytes < min_bytes and not server_paused:
                 self._connections.closed[Reason.SLOW_BODY] += 1
                 self._refuse(
                     RequestTimeout(
                         "request_too_slow",
-                        f"The body came with {self._window_bytes / (now - self._window_since):.0f} "
-                        f"bytes a second; at least {limits.body_bytes_per_second} are expected "
+                        "The body was received at "
+                        f"{self._window_bytes / (now - self._window_since):.0f} bytes per second; "
+                        f"at least {limits.body_bytes_per_second} are required "
                         "(MIN_BODY_BYTES_PER_SECOND). Send the request again.",
                     )
                 )
@@ -300,7 +312,7 @@ class LimitedProtocol(H11Protocol):
                 self._begin_window(now)
 
     def close(self) -> None:
-        """Close the connection at once."""
+        """Aborts the connection at once."""
         self._connections.remove(self)
         self.transport.abort()
 
@@ -309,47 +321,54 @@ class LimitedProtocol(H11Protocol):
         self._paused = self.flow.read_paused
 
     def _refuse(self, error: PlacewiseError) -> None:
-        """Answer with the problem, unless an answer has begun, and close the connection."""
+        """Sends the problem, unless a response has started, and closes the connection."""
         self._connections.remove(self)
         self._head_since = self._window_since = None
-        under_way = self.cycle is not None and not self.cycle.response_complete
-        if not (under_way and self.cycle.response_started):
-            self.transport.write(_answer(error))
-        if under_way:
+        in_flight = self.cycle is not None and not self.cycle.response_complete
+        if not (in_flight and self.cycle.response_started):
+            self.transport.write(_problem_response_bytes(error))
+        if in_flight:
             cast(dict[str, Any], self.scope)[CLOSED_WITH] = error.status
-            self.cycle.disconnected = True  # what the application answers is not sent any more
+            self.cycle.disconnected = True  # uvicorn drops the response of the application
             self.cycle.message_event.set()
         self.transport.close()
 
 
 def address_group(address: str) -> str:
-    """What counts as one address: of IPv6, the /64 that one customer or machine has."""
+    """Returns the key that limits count as one address: the IPv4 address, or the IPv6 /64 network.
+
+    One customer or machine usually has a whole /64.
+    """
     try:
-        found = ip_address(address.partition("%")[0])
-    except ValueError:  # as a proxy named it
+        parsed = ip_address(address.partition("%")[0])
+    except ValueError:  # a name that a proxy has set
         return address
-    if isinstance(found, IPv6Address):
-        if found.ipv4_mapped is None:
-            return str(ip_network((int(found), 64), strict=False))
-        found = found.ipv4_mapped
-    return str(found)
+    if isinstance(parsed, IPv6Address):
+        if parsed.ipv4_mapped is None:
+            return str(ip_network((int(parsed), 64), strict=False))
+        parsed = parsed.ipv4_mapped
+    return str(parsed)
 
 
 def raise_file_limit() -> int:
-    """Let this process open as many files as the system allows (65,536 at most); how many."""
+    """Raises the soft limit of open files to the hard limit, at most MAX_OPEN_FILES.
+
+    Returns:
+        The limit that is in effect.
+    """
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    most = MOST_FILES if hard == resource.RLIM_INFINITY else min(hard, MOST_FILES)
-    if soft == resource.RLIM_INFINITY or soft >= most:
-        return MOST_FILES if soft == resource.RLIM_INFINITY else soft
+    target = MAX_OPEN_FILES if hard == resource.RLIM_INFINITY else min(hard, MAX_OPEN_FILES)
+    if soft == resource.RLIM_INFINITY or soft >= target:
+        return MAX_OPEN_FILES if soft == resource.RLIM_INFINITY else soft
     try:
-        resource.setrlimit(resource.RLIMIT_NOFILE, (most, hard))
-    except (OSError, ValueError):  # macOS allows less than it says
+        resource.setrlimit(resource.RLIMIT_NOFILE, (target, hard))
+    except (OSError, ValueError):  # macOS refuses values below its reported hard limit
         return soft
-    return most
+    return target
 
 
-def _answer(error: PlacewiseError) -> bytes:
-    """A whole HTTP/1.1 answer with the problem."""
+def _problem_response_bytes(error: PlacewiseError) -> bytes:
+    """A complete HTTP/1.1 response with the problem."""
     body = json.dumps(error.as_problem()).encode()
     status = HTTPStatus(error.status)
     head = [

@@ -1,4 +1,4 @@
-"""What every process that answers HTTP does alike: listen, serve, stop in good order."""
+"""HTTP server shared by all services: uvicorn with connection limits and graceful shutdown."""
 
 from __future__ import annotations
 
@@ -17,17 +17,20 @@ from services.http_connections import Connections, LimitedProtocol
 from shared.errors import Misconfigured
 
 BACKLOG = 2048  # connections that wait to be accepted
-# Then those are counted before more are accepted: a crowd can't use up all file descriptors.
+# Connections accepted per wakeup. They are counted before more are accepted, so that a burst of
+# connections can't use up all file descriptors.
 ACCEPTED_AT_ONCE = 16
-# Of a connection without a request. Longer than clients and balancers keep theirs (mostly 60 s):
-# who closes first must not be the one that may be sent a request at the same moment.
+# Longer than the idle timeout of clients and load balancers (mostly 60 s): if the server closed the
+# connection first, a request sent at the same moment would be lost.
 KEEP_ALIVE_SECONDS = 75
-SHUTDOWN_GRACE_SECONDS = 10  # for requests under way when the server is asked to stop
+SHUTDOWN_GRACE_SECONDS = 10  # for requests in flight when the server is stopped
 
 
 class NotifyingServer(uvicorn.Server):
-    """uvicorn's, with limits for connections, that says when it begins to stop: requests under way
-    may then come to an end."""
+    """uvicorn server that checks its connections regularly and calls `on_stop` before shutdown.
+
+    `on_stop` lets requests that wait for something finish early.
+    """
 
     on_stop: Callable[[], object]
     connections: Connections
@@ -36,10 +39,10 @@ class NotifyingServer(uvicorn.Server):
         asyncio.get_running_loop().set_exception_handler(self.connections.on_loop_error)
         await super().startup(sockets)
         for listener in sockets or []:
-            listener.listen(BACKLOG)  # asyncio takes one number for both
+            listener.listen(BACKLOG)  # asyncio uses one number for both
 
     async def on_tick(self, counter: int) -> bool:
-        if counter % 10 == 0:  # tenths of a second
+        if counter % 10 == 0:  # a tick is a tenth of a second
             self.connections.check()
         return await super().on_tick(counter)
 
@@ -51,9 +54,14 @@ class NotifyingServer(uvicorn.Server):
 def http_server(
     app: FastAPI, connections: Connections, *, on_stop: Callable[[], object] = lambda: None
 ) -> NotifyingServer:
-    """A server of the application, not started yet, within the limits of `connections`. `on_stop`
-    is called on its event loop when it takes no more requests; it answers those that it has for
-    GRACEFUL_SECONDS."""
+    """Creates a server for the application without starting it.
+
+    Args:
+        app: The application.
+        connections: Applies the connection limits.
+        on_stop: Called on the event loop when the shutdown begins. Requests in flight have
+            SHUTDOWN_GRACE_SECONDS to finish.
+    """
     proxies = [str(network) for network in connections.limits.trusted_proxies]
     server = NotifyingServer(
         uvicorn.Config(
@@ -63,7 +71,7 @@ def http_server(
             forwarded_allow_ips=proxies,
             backlog=ACCEPTED_AT_ONCE,
             log_config=None,
-            access_log=False,  # `call_log` writes them
+            access_log=False,  # `request_log` logs requests
             timeout_keep_alive=KEEP_ALIVE_SECONDS,
             timeout_graceful_shutdown=SHUTDOWN_GRACE_SECONDS,
         )
@@ -75,37 +83,41 @@ def http_server(
 
 @contextlib.contextmanager
 def stop_on_signals(server: uvicorn.Server) -> Iterator[None]:
-    """SIGTERM and Ctrl-C end the block in good order, not the process.
+    """Context manager in which SIGTERM and SIGINT stop the server gracefully.
 
-    uvicorn raises the signal that stopped it once more. By Python's own handlers that would end
-    the process there, before its parts have given back what they hold.
+    uvicorn raises the signal again after its shutdown. Python's default handlers would then end the
+    process before the other services have released their resources.
     """
     if threading.current_thread() is not threading.main_thread():
-        yield  # signals are the main thread's, and so is their handling
+        yield  # only the main thread may set signal handlers
         return
 
     def stop(_number: int, _frame: object) -> None:
         server.should_exit = True
 
-    before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
+    previous = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield
     finally:
-        for number, handler in before.items():
+        for number, handler in previous.items():
             signal.signal(number, handler)
 
 
 @contextlib.contextmanager
 def listen(host: str, port: int) -> Iterator[socket.socket]:
-    """The listening socket; port 0 takes a free one. Misconfigured: `address_in_use`."""
+    """Context manager that opens a listening socket; port 0 chooses a free port.
+
+    Raises:
+        Misconfigured: `address_in_use`, if the socket can't be bound.
+    """
     try:
         family, kind, protocol, _, address = socket.getaddrinfo(
             host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
         )[0]
         listener = socket.socket(family, kind, protocol)
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        # Inherited by every connection: an answer's second packet waits for no acknowledgement,
-        # which costs 40 ms a call. (asyncio sets it only on sockets that it has made.)
+        # Inherited by every connection. Without it, Nagle's algorithm delays the second packet of a
+        # response by 40 ms. (asyncio sets it only on sockets that it has created.)
         listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         listener.bind(address)
         listener.listen(BACKLOG)
@@ -113,13 +125,13 @@ def listen(host: str, port: int) -> Iterator[socket.socket]:
         raise Misconfigured(
             "address_in_use",
             f"Can't listen on {host}:{port}: {error.strerror or error}. "
-            "Choose another one, for example: make run PORT=8001.",
+            "Choose another port, for example: make run PORT=8001.",
         ) from error
     with listener:
         yield listener
 
 
 def reachable_url(host: str, port: int) -> str:
-    """An address that this machine reaches; "every address" is none that can be called."""
+    """Returns a URL for this machine; the wildcard addresses are replaced by loopback ones."""
     host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)  # noqa: S104
     return f"http://{f'[{host}]' if ':' in host else host}:{port}"

@@ -1,4 +1,4 @@
-"""Every HTTP call of a service: its id, its line in the log, its span, its place in the figures."""
+"""Request logging middleware: request ids, log lines, trace spans and metrics of HTTP requests."""
 
 from __future__ import annotations
 
@@ -16,31 +16,30 @@ from shared.telemetry.tracing import REQUEST_ID_HEADER, request_id_context, requ
 
 log = logging.getLogger(__name__)
 
-NO_ROUTE = "none"  # of a call that no route takes: its path is anyone's choice
+NO_ROUTE = "none"  # label of unrouted requests: their paths are unbounded
 KNOWN_METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"})
 SAFE_METHODS = frozenset({"GET", "HEAD", "OPTIONS"})
 
 
 @dataclass(slots=True)
 class RequestRecord:
-    """One call. `method` and `route` are of a few: they may become labels."""
+    """A request. `method` and `route` have few values, so they can be metric labels."""
 
     method: str
     route: str = NO_ROUTE
-    """The route's template: /api/v1/jobs/{job_id}."""
+    """The route template, such as /api/v1/jobs/{job_id}."""
     status: int = 500
-    """What is answered when no answer has begun: the error handler's."""
+    """500 unless a response has started: then the error handler responds."""
     received_bytes: int = 0
     first_byte_seconds: float | None = None
-    """Until the answer's first byte; None while there is none."""
+    """Seconds to the first byte of the response; None if none was sent."""
 
 
 class RequestLogMiddleware:
-    """The outermost middleware. A call's id is the caller's `X-Request-ID`, or a fresh one; the
-    answer carries it. `on_begin` and `on_end` are for the service's figures.
+    """Outermost middleware: assigns the request id, and logs, traces and measures each request.
 
-    Calls that may change something and those that fail have their line at INFO, all others at
-    DEBUG; where `quiet`, all that do not fail.
+    The request id is the client's `X-Request-ID` or a new one, and is returned in the response.
+    Unsafe methods and 5xx responses are logged at INFO, other requests at DEBUG.
     """
 
     def __init__(
@@ -49,8 +48,16 @@ class RequestLogMiddleware:
         *,
         quiet: bool = False,
         on_start: Callable[[], object] = lambda: None,
-        on_end: Callable[[RequestRecord], object] = lambda call: None,
+        on_end: Callable[[RequestRecord], object] = lambda record: None,
     ) -> None:
+        """Creates the middleware.
+
+        Args:
+            app: The next ASGI application.
+            quiet: Log all requests except those with 5xx responses at DEBUG.
+            on_start: Called when a request starts, for metrics.
+            on_end: Called with the record when it has ended, for metrics.
+        """
         self._app = app
         self._quiet = quiet
         self._on_start = on_start
@@ -62,27 +69,27 @@ class RequestLogMiddleware:
             return
         headers = Headers(scope=scope)
         method = scope["method"] if scope["method"] in KNOWN_METHODS else "OTHER"
-        call, started = RequestRecord(method), time.perf_counter()
+        record, started = RequestRecord(method), time.perf_counter()
         request_id = request_id_or_new(headers.get(REQUEST_ID_HEADER))
-        # For the handler of unforeseen errors, which stands outside of every middleware.
+        # For the handler of unexpected exceptions, which is outside of all middleware.
         scope[REQUEST_ID_SCOPE_KEY] = request_id
 
-        gone = False
+        disconnected = False
 
-        async def counted() -> Message:
-            nonlocal gone
+        async def counted_receive() -> Message:
+            nonlocal disconnected
             message = await receive()
-            # Whatever is answered from now on, the client does not get it.
-            gone = gone or (
-                message["type"] == "http.disconnect" and call.first_byte_seconds is None
+            # The client will not receive a response that starts from now on.
+            disconnected = disconnected or (
+                message["type"] == "http.disconnect" and record.first_byte_seconds is None
             )
-            call.received_bytes += len(message.get("body", b""))
+            record.received_bytes += len(message.get("body", b""))
             return message
 
-        async def marked(message: Message) -> None:
+        async def send_with_request_id(message: Message) -> None:
             if message["type"] == "http.response.start":
-                call.status = message["status"]
-                call.first_byte_seconds = time.perf_counter() - started
+                record.status = message["status"]
+                record.first_byte_seconds = time.perf_counter() - started
                 MutableHeaders(scope=message)[REQUEST_ID_HEADER] = request_id
             await send(message)
 
@@ -92,36 +99,38 @@ class RequestLogMiddleware:
             span(method, [headers.get("traceparent")], request_id=request_id) as describe,
         ):
             try:
-                await self._app(scope, counted, marked)
+                await self._app(scope, counted_receive, send_with_request_id)
             finally:
-                if gone or CLOSED_WITH in scope:
-                    call.status = scope.get(CLOSED_WITH, CLIENT_GONE)
-                call.route = _route_template(scope)
-                describe(f"{method} {call.route}", status=call.status)
-                self._on_end(call)
-                self._write(call, scope, time.perf_counter() - started)
+                if disconnected or CLOSED_WITH in scope:
+                    record.status = scope.get(CLOSED_WITH, CLIENT_GONE)
+                record.route = _route_template(scope)
+                describe(f"{method} {record.route}", status=record.status)
+                self._on_end(record)
+                self._log(record, scope, time.perf_counter() - started)
 
-    def _write(self, call: RequestRecord, scope: Scope, seconds: float) -> None:
-        worth = call.status >= 500 or not (self._quiet or call.method in SAFE_METHODS)
-        facts: dict[str, Any] = {
-            "route": call.route,
-            "status": call.status,
+    def _log(self, record: RequestRecord, scope: Scope, seconds: float) -> None:
+        at_info = record.status >= 500 or not (self._quiet or record.method in SAFE_METHODS)
+        fields: dict[str, Any] = {
+            "route": record.route,
+            "status": record.status,
             "seconds": round(seconds, 4),
-            "received_bytes": call.received_bytes,
+            "received_bytes": record.received_bytes,
         }
         log.log(
-            logging.INFO if worth else logging.DEBUG,
+            logging.INFO if at_info else logging.DEBUG,
             "%s %s: %d",
-            call.method,
+            record.method,
             scope["path"],
-            call.status,
-            extra=facts,
+            record.status,
+            extra=fields,
         )
 
 
 def _route_template(scope: Scope) -> str:
-    """The path of the route that took the call, with its router's prefix: that is not in the route,
-    and is the same in every path."""
+    """The path template of the matched route, with the prefix of its router.
+
+    `route.path` lacks the prefix, which has no parameters: it is taken from the request's path.
+    """
     template: str | None = getattr(scope.get("route"), "path", None)
     if template is None:
         return NO_ROUTE

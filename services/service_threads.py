@@ -1,4 +1,4 @@
-"""The parts of a process that run beside its HTTP server: threads that may not die unnoticed."""
+"""Background threads of a service process, with a callback for crashes."""
 
 from __future__ import annotations
 
@@ -9,21 +9,21 @@ from collections.abc import Callable
 log = logging.getLogger(__name__)
 
 RunUntilStopped = Callable[[threading.Event], None]
-"""Works until the event is set."""
+"""Runs until the event is set."""
 
 
 def start_service_thread(
     name: str, run: RunUntilStopped, stop: threading.Event, on_crash: Callable[[], None]
 ) -> threading.Thread:
-    """The part at work in a thread; `on_crash` is called when it raises."""
+    """Starts `run(stop)` in a thread; logs its exception and calls `on_crash` if it raises."""
 
     def guarded() -> None:
         try:
             run(stop)
         except BaseException:
-            log.exception("the %s died", name)
+            log.exception("the service thread %s crashed", name)
             on_crash()
 
-    part = threading.Thread(target=guarded, name=name)
-    part.start()
-    return part
+    thread = threading.Thread(target=guarded, name=name)
+    thread.start()
+    return thread

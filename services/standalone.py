@@ -1,12 +1,13 @@
-"""Everything in one process, no servers: gateway, extractor, search and steward on SQLite and a
-local folder (with S3_ENDPOINT, a bucket). These are the very classes that the separate services
-run; only the ports differ:
+"""The embedded server: gateway, extractor, search and steward in one process.
 
-| port | here | between machines |
+It needs no other servers: it uses SQLite and a local folder, or a bucket if S3_ENDPOINT is set. It
+runs the same classes as the separate services; only the backends differ:
+
+| | embedded | separate services |
 |---|---|---|
-| hints | an event | a Celery message |
-| object store | a folder | S3 |
-| search protocol | a call | HTTP |
+| wakeups | `threading.Event` | Celery messages |
+| object store | folder | S3 |
+| search protocol | function call | HTTP |
 | catalog | SQLite | PostgreSQL |
 """
 
@@ -64,55 +65,64 @@ log = logging.getLogger(__name__)
 
 @dataclass(slots=True)
 class Standalone:
-    """A running embedded Placewise."""
+    """A running embedded server."""
 
     url: str
-    """An address of it that this machine reaches."""
+    """Its URL, reachable from this machine."""
     server: uvicorn.Server
     listener: socket.socket
     first_admin_key: str | None
-    """The first admin key, where this start has made it: to be shown now or never."""
+    """The first admin key if this start has created it. It can't be shown again later."""
     local_key: str | None
-    """A key for the commands of this user; None on loopback without ADMIN_KEY: none is needed."""
+    """Key for the CLI of this user; None on loopback without ADMIN_KEY, where no key is needed."""
     failed: threading.Event
-    """Set when one of the parts has died: the process should end and say so."""
+    """Set when a service thread has crashed: the process must end with an error."""
 
     def stop(self) -> None:
-        """A part has died: stop the others."""
+        """Stops the server after a service thread has crashed."""
         self.failed.set()
         self.server.should_exit = True
 
     def serve(self) -> None:
-        """Answer HTTP until the process is asked to stop."""
+        """Serves HTTP until the process is stopped by a signal.
+
+        Raises:
+            Misconfigured: `part_died`, if a service thread has crashed.
+        """
         with stop_on_signals(self.server):
             self.server.run(sockets=[self.listener])
         if self.failed.is_set():
-            raise Misconfigured("part_died", "A part of Placewise died; the log above says why.")
+            raise Misconfigured(
+                "part_died", "A service thread crashed. Its exception is in the log above."
+            )
 
 
 @contextlib.contextmanager
 def run_standalone(settings: Settings) -> Iterator[Standalone]:
-    """Lock the folder, recover what a killed process left, and start every part.
+    """Context manager that starts all services and stops them at the end.
 
-    Beyond loopback, or with an ADMIN_KEY, every call needs a key; where there is no admin's yet,
-    the first one is made. Raises Misconfigured: `home_in_use` for a folder that another server has,
-    `address_in_use`, `separate_services` where SEARCH_URLS is set, and those of
-    `open_installation_store`;
-    Unavailable for a bucket that can't be used.
+    Locks PLACEWISE_HOME and releases the leases of a killed process first. If HOST is not a
+    loopback address, or ADMIN_KEY is set, every request needs a key; the first admin key is created
+    if there is none.
+
+    Raises:
+        Misconfigured: `home_in_use` if another server uses the folder, `address_in_use`,
+            `separate_services` if SEARCH_URLS is set, and those of `open_installation_store`.
+        Unavailable: The bucket can't be used.
     """
     if settings.search_worker_urls:
         raise Misconfigured(
             "separate_services",
-            "SEARCH_URLS names search workers, and the embedded Placewise asks none: it searches "
-            "in its own process, and takes every lease for a dead worker's. Unset SEARCH_URLS, or "
-            "run placewise gateway, extractor and steward.",
+            "SEARCH_URLS is set, but the embedded server searches in its own process and releases "
+            "the leases of all other workers. Unset SEARCH_URLS, or run placewise gateway, "
+            "extractor and steward.",
         )
     home = settings.placewise_home
-    with contextlib.ExitStack() as held:
-        held.enter_context(lock_home(home))
-        listener = held.enter_context(listen(settings.host, settings.port))
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(lock_home(home))
+        listener = stack.enter_context(listen(settings.host, settings.port))
         catalog = open_catalog(settings, "embedded")
-        held.callback(catalog.close)
+        stack.callback(catalog.close)
         if (file := sqlite_file(catalog)) is not None:
             DiskReserve(file.parent, settings.min_free_bytes).release()
         check_before_new_catalog(catalog, settings)
@@ -121,43 +131,45 @@ def run_standalone(settings: Settings) -> Iterator[Standalone]:
         hints = InProcessWakeups()
         with catalog.write() as session:
             get_or_create_default_map(session, settings.new_map_extractor)
-            # The lock says that no other worker lives: what is there is left by a killed process.
+            # The lock proves that no other worker is alive: rows are left from a killed process.
             delete_dead_search_workers(session, all_workers=True)
         release_expired_leases(catalog, settings.max_attempts, all_leases=True)
 
-        # After all that can be refused: a key that no start gets to show would be lost.
+        # After everything that can fail: a key that is created but not shown would be lost.
         host, port = listener.getsockname()[:2]
         requests = catalog.with_timeouts(TransactionTimeouts.for_requests(settings))
-        keys, made_key, local_key = _create_authenticator(settings, host, requests)
+        authenticator, first_admin_key, local_key = _create_authenticator(settings, host, requests)
         url = reachable_url(host, port)
-        held.enter_context(announce_server(home, url, local_key))
+        stack.enter_context(announce_server(home, url, local_key))
 
-        registry = CollectorRegistry()  # of all parts: one /metrics tells of everything
+        registry = CollectorRegistry()  # shared: /metrics has the metrics of all services
         search = SearchWorker(catalog, store, settings)
         name = f"embedded-{os.getpid()}"
-        presence = WorkerHeartbeat(catalog, search, name)
+        heartbeat = WorkerHeartbeat(catalog, search, name)
         extractor = ExtractorWorker(
             catalog, store, settings, name=name, only_worker=True, registry=registry
         )
-        stewards = StewardMetrics(registry)
-        steward = Scheduler(catalog, store, hints, settings, stewards)
-        evaluator = EvaluationWorker(catalog, store, search, settings, name, stewards)
+        steward_metrics = StewardMetrics(registry)
+        steward = Scheduler(catalog, store, hints, settings, steward_metrics)
+        evaluator = EvaluationWorker(catalog, store, search, settings, name, steward_metrics)
         webhooks = WebhookDispatcher(catalog, settings)
-        batches = BatchWorker(catalog, store, hints, settings, name, stewards)
-        counted = MeteredSearch(search, registry)
-        gateway = GatewayContext(requests, store, hints, counted, settings, keys, registry)
+        batches = BatchWorker(catalog, store, hints, settings, name, steward_metrics)
+        metered_search = MeteredSearch(search, registry)
+        gateway = GatewayContext(
+            requests, store, hints, metered_search, settings, authenticator, registry
+        )
         server = http_server(
             create_app(gateway), gateway.connections, on_stop=gateway.job_notifier.begin_shutdown
         )
-        held.enter_context(serve_metrics(settings, registry))
-        running = Standalone(url, server, listener, made_key, local_key, threading.Event())
+        stack.enter_context(serve_metrics(settings, registry))
+        running = Standalone(url, server, listener, first_admin_key, local_key, threading.Event())
         stop = threading.Event()
-        parts = [
-            start_service_thread(name, part, stop, running.stop)
-            for name, part in (
+        threads = [
+            start_service_thread(thread_name, run, stop, running.stop)
+            for thread_name, run in (
                 ("search", search.run),
-                ("search of what is built", search.run_building),
-                ("search's presence", presence.run),
+                ("search of building generations", search.run_building),
+                ("search heartbeat", heartbeat.run),
                 ("extractor", partial(extractor.run, hints=hints)),
                 ("steward", steward.run),
                 ("evaluator", evaluator.run),
@@ -170,25 +182,26 @@ def run_standalone(settings: Settings) -> Iterator[Standalone]:
         finally:
             stop.set()
             hints.send()
-            for part in parts:
-                part.join()
+            for thread in threads:
+                thread.join()
             extractor.close()
 
 
 def _create_authenticator(
     settings: Settings, host: str, catalog: Catalog
 ) -> tuple[Authenticator, str | None, str | None]:
-    """What the gateway asks, the first admin key if it is made now, and a key for this user's
-    commands."""
-    # The name as well as what it means today: what a name leads to can change.
+    """Returns the authenticator, the first admin key if it is created now, and the local key."""
+    # Both the configured name and the address it resolves to, which can change.
     if settings.admin_key is None and is_loopback(settings.host) and is_loopback(host):
         return LocalhostAuthenticator(settings.allowed_origins), None, None
-    local_key, made_key = generate_local_key(), None
+    local_key, first_admin_key = generate_local_key(), None
     admins = [hash_api_key(local_key)]
     if settings.admin_key is not None:
         admins.append(hash_api_key(settings.admin_key.get_secret_value()))
     else:
         with catalog.write() as session:
             if not has_admin_key(session):
-                _, made_key = create_api_key(session, "made at the first start", [Scope.ADMIN])
-    return ApiKeyAuthenticator(catalog, *admins), made_key, local_key
+                _, first_admin_key = create_api_key(
+                    session, "made at the first start", [Scope.ADMIN]
+                )
+    return ApiKeyAuthenticator(catalog, *admins), first_admin_key, local_key

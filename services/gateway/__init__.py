@@ -1,5 +1,5 @@
-"""The HTTP API. Stateless: no torch, no vectors, no local files.
+"""The HTTP API: a stateless FastAPI application without torch, vectors or local files.
 
-`receive` takes a body apart as a stream, `photo_header` checks what came, `store_photo` makes it
-true; `find_similar` asks the search tier. One module of routes per noun.
+`multipart_upload` and `batch_upload` parse request bodies as streams, `shared.ingest` validates and
+stores photos, `similarity_search` queries the search tier. `routes` has one module per resource.
 """

@@ -1,11 +1,14 @@
-"""Refusing work before anything fills up: the queue, the disk, this process's memory.
+"""Admission control: refuses requests before the job queue, the disk or the memory is full.
 
-A route that makes jobs names what it needs room for, which is asked before its body is read:
+Routes that queue jobs check for room before they read the body:
 
-    @router.post("/evaluations", dependencies=[ROOM_FOR_JOBS])
+    @router.post("/evaluations", dependencies=[ADMIT_JOB])
 
-and one that receives a file does it `with room.receiving(Kind.UPLOAD, request):`. Query photos have
-limits of their own: however many uploads wait, a query is asked.
+and those that receive a file limit the concurrent uploads:
+
+    with admission.admit_upload(UploadKind.UPLOAD, request):
+
+Query photos have separate limits, so that queued uploads do not block queries.
 """
 
 from __future__ import annotations
@@ -33,11 +36,11 @@ from shared.ingest.store_photo import PhotoQuota
 from shared.jobs.queue_depth import QueueDepth, measure_queue_depth
 
 ADMISSION_POLL_SECONDS = 1.0
-POLL_COST_DIVISOR = 20  # a look that takes long is taken seldom: one part in so many of the time
-RETRY_TARGET_SHARE = 0.9  # of a limit: come again when the queue has shrunk to this
+POLL_COST_DIVISOR = 20  # polling takes at most 1/20 of the time: slow polls become rare
+RETRY_TARGET_SHARE = 0.9  # Retry-After: when the queue has shrunk to this share of its limit
 MAX_RETRY_SECONDS = 60
 UPLOAD_RETRY_SECONDS = 1
-STREAM_RETRY_SECONDS = 10  # others watch jobs, which may take long: polling is better
+STREAM_RETRY_SECONDS = 10  # event streams last as long as their jobs
 
 
 class UploadKind(StrEnum):
@@ -46,7 +49,11 @@ class UploadKind(StrEnum):
 
 
 class AdmissionControl:
-    """What one gateway still takes. Thread-safe."""
+    """Decides whether this gateway accepts another job, query or upload.
+
+    Thread-safe, except `admit_upload`. The depth of the queue is polled about once a second; jobs
+    that were admitted since the last poll are counted in addition.
+    """
 
     def __init__(self, catalog: Catalog, settings: Settings) -> None:
         self._catalog = catalog
@@ -55,7 +62,7 @@ class AdmissionControl:
         self._refresh_lock = threading.Lock()
         self._queue_depth: QueueDepth | None = None
         self._next_refresh = 0.0
-        self._admitted: Counter[str | None] = Counter()  # since the last look; None: queries
+        self._admitted: Counter[str | None] = Counter()  # since the last poll; None: queries
         self._active_uploads = {
             kind: ConcurrencyLimit(
                 f"{kind} (MAX_CONCURRENT_UPLOADS, MAX_CONCURRENT_UPLOADS_PER_CALLER)",
@@ -75,47 +82,62 @@ class AdmissionControl:
         )
 
     def admit_job(self, map_name: str) -> None:
-        """Room for one more job of the map, and for what it stores.
+        """Admits a job of the map, and the data that it stores.
 
-        Raises TooManyRequests (`queue_full`) and StorageFull (`disk_full`).
+        Raises:
+            TooManyRequests: `queue_full`.
+            StorageFull: `disk_full`.
         """
         self.disk.check()
-        seen, settings = self.queue_depth(), self._settings
-        taken = sum(count for name, count in self._admitted.items() if name is not None)
-        for what, waiting, most in (
-            ("", seen.jobs + taken, settings.max_queued_jobs),
+        depth, settings = self.queue_depth(), self._settings
+        admitted = sum(count for name, count in self._admitted.items() if name is not None)
+        for suffix, queued, limit in (
+            ("", depth.jobs + admitted, settings.max_queued_jobs),
             (
                 f" of the map {map_name!r}",
-                seen.jobs_by_map.get(map_name, 0) + self._admitted[map_name],
+                depth.jobs_by_map.get(map_name, 0) + self._admitted[map_name],
                 settings.max_queued_jobs_per_map,
             ),
         ):
-            if waiting >= most:
-                raise _queue_full_error(f"jobs{what}", waiting, most, seen.finished_per_second)
+            if queued >= limit:
+                raise _queue_full_error(f"jobs{suffix}", queued, limit, depth.finished_per_second)
         self._admitted[map_name] += 1
 
     def admit_query(self) -> None:
-        """Room for one more query photo; raises as `take_job` does. While uploads are refused for
-        want of disk space, queries go on down to QUERY_SHARE of MIN_FREE_BYTES."""
+        """Admits a query photo.
+
+        Queries are admitted until less than QUERY_SHARE of MIN_FREE_BYTES is free, so they still
+        work while uploads are refused because the disk is full.
+
+        Raises:
+            TooManyRequests: `queue_full`.
+            StorageFull: `disk_full`.
+        """
         self.disk.check(QUERY_SHARE)
-        seen, most = self.queue_depth(), self._settings.max_queued_queries
-        waiting = seen.queries + self._admitted[None]
-        if waiting >= most:
-            raise _queue_full_error("query photos", waiting, most, seen.finished_per_second)
+        depth, limit = self.queue_depth(), self._settings.max_queued_queries
+        queued = depth.queries + self._admitted[None]
+        if queued >= limit:
+            raise _queue_full_error("query photos", queued, limit, depth.finished_per_second)
         self._admitted[None] += 1
 
     def admit_upload(self, kind: UploadKind, request: Request) -> AbstractContextManager[None]:
-        """While a file is received. TooManyRequests (`too_many_uploads`) when enough are already,
-        in all, of the call's key or of its address: each holds a part of its file in memory. On the
-        event loop only."""
+        """Context manager that counts an upload while its file is received.
+
+        Each upload buffers a part of its file in memory, so concurrent uploads are limited: in
+        total, per key and per address. Must be used on the event loop only.
+
+        Raises:
+            TooManyRequests: `too_many_uploads`.
+        """
         return self._active_uploads[kind].hold(request)
 
     def active_uploads(self, kind: UploadKind) -> int:
+        """Returns the number of uploads that are being received."""
         return self._active_uploads[kind].count
 
     def queue_depth(self) -> QueueDepth:
-        """The queue as it was a moment ago."""
-        # Whoever finds another one looking goes on with what was seen before.
+        """Returns the depth of the queue, at most about a second old."""
+        # While another thread polls, the previous result is used.
         due = self._queue_depth is None or time.monotonic() >= self._next_refresh
         if due and self._refresh_lock.acquire(blocking=self._queue_depth is None):
             try:
@@ -126,20 +148,21 @@ class AdmissionControl:
         return self._queue_depth
 
     def _refresh(self) -> None:
-        began = time.monotonic()
-        if self._queue_depth is not None and began < self._next_refresh:
-            return  # someone looked while we waited
-        most = max(self._settings.max_queued_jobs, self._settings.max_queued_queries)
-        self._admitted.clear()  # before the look: what comes meanwhile is rather counted twice
+        started = time.monotonic()
+        if self._queue_depth is not None and started < self._next_refresh:
+            return  # another thread has polled while this one waited for the lock
+        limit = max(self._settings.max_queued_jobs, self._settings.max_queued_queries)
+        self._admitted.clear()  # before the poll: a job may be counted twice, but is never missed
         with self._catalog.read() as session:
-            self._queue_depth = measure_queue_depth(session, most)
-        took = time.monotonic() - began
-        self._next_refresh = began + max(ADMISSION_POLL_SECONDS, POLL_COST_DIVISOR * took)
+            self._queue_depth = measure_queue_depth(session, limit)
+        elapsed = time.monotonic() - started
+        self._next_refresh = started + max(ADMISSION_POLL_SECONDS, POLL_COST_DIVISOR * elapsed)
 
 
 def get_admission_control(request: Request) -> AdmissionControl:
-    room: AdmissionControl = request.app.state.admission
-    return room
+    """Dependency that returns the admission control of the application."""
+    admission: AdmissionControl = request.app.state.admission
+    return admission
 
 
 AdmissionDep = Annotated[AdmissionControl, Depends(get_admission_control)]
@@ -154,22 +177,25 @@ def _admit_query(admission: AdmissionDep) -> None:
 
 
 def _check_photo_quota(request: Request, gateway: GatewayDep) -> None:
-    limited = photo_limit(get_caller(request), gateway.settings)
-    if limited is not None:
-        request.app.state.photo_quota.check(*limited)
+    key_limit = get_photo_limit(get_caller(request), gateway.settings)
+    if key_limit is not None:
+        request.app.state.photo_quota.check(*key_limit)
 
 
-def place_for_photo(request: Request, settings: Settings) -> AbstractContextManager[None]:
-    """In which the caller's photo is stored. TooManyRequests (`photo_quota_reached`)."""
+def reserve_photo_quota(request: Request, settings: Settings) -> AbstractContextManager[None]:
+    """Returns a context manager in which a photo of the caller is stored.
+
+    Entering it raises TooManyRequests (`photo_quota_reached`) if the quota of the key is used up.
+    """
     quota: PhotoQuota = request.app.state.photo_quota
-    limited = photo_limit(get_caller(request), settings)
-    return contextlib.nullcontext() if limited is None else quota.place(*limited)
+    key_limit = get_photo_limit(get_caller(request), settings)
+    return contextlib.nullcontext() if key_limit is None else quota.place(*key_limit)
 
 
-def photo_limit(caller: Caller, settings: Settings) -> tuple[UUID, int] | None:
-    """The caller's key, and how many photos may be stored through it; None for any number."""
-    most = caller.limits.max_photos or settings.key_max_photos
-    return None if caller.key_id is None or most is None else (caller.key_id, most)
+def get_photo_limit(caller: Caller, settings: Settings) -> tuple[UUID, int] | None:
+    """Returns the caller's key and its maximum number of photos; None if it is unlimited."""
+    limit = caller.limits.max_photos or settings.key_max_photos
+    return None if caller.key_id is None or limit is None else (caller.key_id, limit)
 
 
 CHECK_PHOTO_QUOTA = Depends(_check_photo_quota)
@@ -177,14 +203,14 @@ ADMIT_JOB = Depends(_admit_job)
 ADMIT_QUERY = Depends(_admit_query)
 
 
-def _queue_full_error(what: str, waiting: int, most: int, per_second: float) -> TooManyRequests:
-    excess = waiting - RETRY_TARGET_SHARE * most
+def _queue_full_error(what: str, queued: int, limit: int, per_second: float) -> TooManyRequests:
+    excess = queued - RETRY_TARGET_SHARE * limit
     seconds = excess / per_second if per_second > 0 else MAX_RETRY_SECONDS
     return TooManyRequests(
         "queue_full",
-        f"{waiting} {what} wait already, and {most} may. Come again after the time in Retry-After; "
-        "more extractors make it shorter.",
+        f"The queue is full: {queued} {what} are waiting, the limit is {limit}. Retry after the "
+        "seconds in Retry-After. More extractors process the queue faster.",
         retry_after_seconds=math.ceil(min(max(seconds, 1), MAX_RETRY_SECONDS)),
-        waiting=waiting,
-        limit=most,
+        waiting=queued,
+        limit=limit,
     )

@@ -1,4 +1,4 @@
-"""The application: every router, every problem handler, one gateway."""
+"""Application factory: registers the middleware, exception handlers and routers of the gateway."""
 
 from __future__ import annotations
 
@@ -47,10 +47,10 @@ from shared.http.problem_details import (
 )
 from shared.ingest.store_photo import PhotoQuota
 
-DESCRIPTION = """Photo in, place out. Upload geotagged photos, poll their jobs, and ask which known
-place a photo shows. Every error is an RFC 9457 problem with a stable `code`."""
+DESCRIPTION = """Visual place recognition over HTTP. Upload geotagged photos, poll their jobs, and
+find out which known place a photo shows. Errors are RFC 9457 problems with a stable `code`."""
 
-# What a trusted page's script may read of an answer, beside its body.
+# Response headers that scripts of the allowed origins may read (CORS).
 CORS_EXPOSED_HEADERS = (
     "Idempotent-Replayed",
     "Location",
@@ -63,13 +63,13 @@ CORS_EXPOSED_HEADERS = (
 
 
 def create_app(gateway: GatewayContext) -> FastAPI:
-    """The HTTP API on the given ports."""
+    """Creates the FastAPI application that uses the stores and clients of `gateway`."""
     app = FastAPI(
         title="Placewise",
         version=health.VERSION,
         description=DESCRIPTION,
         responses=PROBLEM_RESPONSES,
-        docs_url=None,  # web_page.py serves them without another server
+        docs_url=None,  # web_page.py serves both without a CDN
         redoc_url=None,
     )
     app.state.gateway = gateway
@@ -77,7 +77,7 @@ def create_app(gateway: GatewayContext) -> FastAPI:
     app.state.rate_limiter = RateLimiter(gateway.settings)
     app.state.photo_quota = PhotoQuota(gateway.catalog)
     gateway_metrics = GatewayMetrics(gateway, app.state.admission)
-    # Starlette calls the middleware that was added last first.
+    # Starlette runs the middleware that is added last first.
     app.add_middleware(
         BodySizeLimitMiddleware, exempt_paths={f"{API_PREFIX}{batches.BATCH_UPLOAD_PATH}"}
     )

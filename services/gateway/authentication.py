@@ -1,9 +1,9 @@
-"""Who calls, and what they may do: by the key in `Authorization`, or, embedded on loopback without
-keys, whoever is on this machine.
+"""Authentication by API key, and authorization by scopes.
 
-The key is asked for before anything else: before the route, and before the body is read.
+`AuthenticationMiddleware` authenticates a request before it is routed and before its body is read:
+by the API key in `Authorization`, or, on a loopback address without ADMIN_KEY, by its origin alone.
 
-What the caller may do is asked by the route, which declares its scope once:
+A route declares exactly one required scope:
 
     @router.get("/maps", dependencies=[READ])
 """
@@ -44,53 +44,56 @@ from shared.security.api_keys import Scope as KeyScope
 
 log = logging.getLogger(__name__)
 
-# RFC 6750 in one line; a scheme's name is written in any case (RFC 9110).
+# RFC 6750; the name of the scheme is case-insensitive (RFC 9110).
 BEARER_HEADER = re.compile(r"bearer +(?P<key>[!-~]+) *", re.IGNORECASE)
 HOW_TO_AUTHENTICATE = (
     "send the header `Authorization: Bearer KEY` (the commands: PLACEWISE_KEY=KEY)"
 )
-# What proxies add (RFC 9110, RFC 7239, and the usual ones before them).
+# Headers that proxies add (RFC 9110, RFC 7239, and the de facto ones before them).
 FORWARDED = ("Forwarded", "Via", "X-Forwarded-For", "X-Forwarded-Host", "X-Real-IP")
-MAX_REMEMBERED_USES = 10_000  # keys whose last use this process knows; above that it forgets all
+MAX_REMEMBERED_USES = 10_000  # keys whose last use is cached; the cache is cleared when full
 
 
 @dataclass(frozen=True, slots=True)
 class Caller:
-    """Whoever makes a call."""
+    """The authenticated caller of a request."""
 
     identity: str
-    """The same for the same key, and no secret."""
+    """Stable for a key, and not secret."""
     scopes: frozenset[KeyScope]
     key_id: UUID | None = None
-    """None for keys that are no row of the catalog: ADMIN_KEY, and that of this user's commands."""
+    """None for keys that are not in the catalog: ADMIN_KEY and the local key of the CLI."""
     limits: KeyLimits = field(default=KeyLimits())
 
 
 class Authenticator(Protocol):
-    """Decides about every call before it reaches a route."""
+    """Authenticates requests before they are routed."""
 
     async def authenticate(self, headers: Headers) -> Caller:
-        """Raise Unauthorized (`key_missing`, `key_unknown`, `key_revoked`, `key_expired`) unless
-        `Authorization` holds a key, Forbidden (`foreign_page`, `forwarded_request`) where none is
-        asked for and a browser's page of elsewhere or a proxy calls, and Unavailable while the
-        catalog can't be asked.
+        """Returns the caller of a request.
+
+        Raises:
+            Unauthorized: `key_missing`, `key_unknown`, `key_revoked` or `key_expired`.
+            Forbidden: If no key is required: `foreign_page` for a web page of another origin,
+                `forwarded_request` for a proxy.
+            Unavailable: The catalog can't be reached.
         """
 
     async def record_use(self, caller: Caller) -> None:
-        """Called once the call has been answered."""
+        """Called after the response has been sent."""
 
 
 class LocalhostAuthenticator:
-    """This machine's users may call: only they reach the server, and pages in their browsers.
+    """Accepts requests of this machine without a key.
 
-    A page of elsewhere must not. What it sends names it in `ContextFilter`; where it has its
-    own name lead
-    to this machine (DNS rebinding), that name is in `Host`. Nor must whoever is behind a proxy on
-    this machine: to the server, everyone behind it comes from loopback.
+    On a loopback address the server is reached only by this machine's users and by web pages in
+    their browsers. Pages of other origins are refused: the `Origin` header names them, and the
+    `Host` header those that resolve their own name to this machine (DNS rebinding). Requests that
+    a proxy forwards are refused as well, because all of them come from loopback.
     """
 
     def __init__(self, trusted_origins: Container[str] = ()) -> None:
-        """`trusted_origins` (CORS_ORIGINS) name pages of elsewhere that may call."""
+        """`trusted_origins` (CORS_ORIGINS) are origins of web pages that are accepted."""
         self._trusted = trusted_origins
 
     async def authenticate(self, headers: Headers) -> Caller:
@@ -98,23 +101,25 @@ class LocalhostAuthenticator:
             if name in headers:
                 raise Forbidden(
                     "forwarded_request",
-                    f"A proxy has forwarded this call (it has the header {name}). Without a key "
-                    "only calls of this machine are answered, and nobody can tell who is behind a "
-                    "proxy. Set ADMIN_KEY and restart Placewise; then every call needs a key.",
+                    f"The request was forwarded by a proxy (it has the header {name}). Without a "
+                    "key only requests of this machine are accepted, and the origin of forwarded "
+                    "requests is unknown. Set ADMIN_KEY and restart Placewise; then every request "
+                    "needs a key.",
                 )
         host = headers.get("host", "")
         if not is_loopback(_host_name(host)):
             raise Forbidden(
                 "foreign_page",
-                "Without a key only calls to localhost are answered; this one is to "
-                f"{host[:100]!r} (its Host header). Set ADMIN_KEY to answer under other names.",
+                "Without a key only requests to localhost are accepted; this one is to "
+                f"{host[:100]!r} (Host header). Set ADMIN_KEY to accept other host names.",
             )
         origin = headers.get("origin", f"http://{host}")
         if origin.partition("://")[2] != host and origin not in self._trusted:
             raise Forbidden(
                 "foreign_page",
-                f"Without a key no page of another site may call; this one is of {origin[:100]!r} "
-                "(its Origin header). Name the page in CORS_ORIGINS, or set ADMIN_KEY.",
+                "Without a key web pages of other origins are refused; this one is of "
+                f"{origin[:100]!r} (Origin header). Add the origin to CORS_ORIGINS, or set "
+                "ADMIN_KEY.",
             )
         return Caller("this machine", ALL_SCOPES)
 
@@ -123,32 +128,32 @@ class LocalhostAuthenticator:
 
 
 def _host_name(host: str) -> str:
-    """The name or the address in a `Host` header."""
+    """The host name or address in a `Host` header, without the port."""
     try:
         return (urlsplit(f"//{host}").hostname or "").rstrip(".")
-    except ValueError:  # an unfinished IPv6 address
+    except ValueError:  # a malformed IPv6 address
         return ""
 
 
 class ApiKeyAuthenticator:
-    """The catalog's keys, and a few beside them that may do everything (ADMIN_KEY).
+    """Authenticates with the API keys of the catalog and with fixed admin keys (ADMIN_KEY).
 
-    The catalog is asked at each call: a revoked key opens nothing from that commit on, whichever
-    gateway is asked. Those beside it open also while the catalog is away.
+    The catalog is queried for every request, so a revoked key is refused by all gateways as soon as
+    the revocation is committed. Admin keys also work while the catalog is unreachable.
     """
 
     def __init__(self, catalog: Catalog, *admin_sha256: str) -> None:
-        """`admin_sha256` in hexadecimal, as `hash_api_key` makes it."""
+        """`admin_sha256` are hexadecimal hashes of admin keys (`hash_api_key`)."""
         self._catalog = catalog
         self._admins = admin_sha256
         self._use_recorded_at: dict[UUID, float] = {}
 
     async def authenticate(self, headers: Headers) -> Caller:
-        shown = hash_api_key(parse_bearer(headers.get("authorization")))
-        # In constant time: how long a refusal takes says nothing of how near a guess was.
-        if any(hmac.compare_digest(shown, known) for known in self._admins):
+        key_sha256 = hash_api_key(parse_bearer(headers.get("authorization")))
+        # In constant time, against timing attacks.
+        if any(hmac.compare_digest(key_sha256, admin) for admin in self._admins):
             return Caller("admin", ALL_SCOPES)
-        return await run_in_threadpool(self._find_caller, shown)
+        return await run_in_threadpool(self._find_caller, key_sha256)
 
     def _find_caller(self, sha256: str) -> Caller:
         try:
@@ -156,7 +161,7 @@ class ApiKeyAuthenticator:
                 key = authenticate_api_key(session, sha256)
         except Unauthorized as error:
             raise Unauthorized(
-                error.code, f"{error.detail} To call: {HOW_TO_AUTHENTICATE}."
+                error.code, f"{error.detail} To authenticate, {HOW_TO_AUTHENTICATE}."
             ) from None
         except SQLAlchemyError as error:
             unavailable = to_unavailable(error)
@@ -171,7 +176,7 @@ class ApiKeyAuthenticator:
         )
 
     async def record_use(self, caller: Caller) -> None:
-        """`last_used_at`, at most once a minute for a key; no reason to fail a call."""
+        """Updates `last_used_at` at most once a minute per key; errors are only logged."""
         key_id, now = caller.key_id, time.monotonic()
         if (
             key_id is None
@@ -185,7 +190,9 @@ class ApiKeyAuthenticator:
         try:
             await run_in_threadpool(self._write_use, key_id)
         except SQLAlchemyError as error:
-            log.warning("the use of the key %s was not noted: %s", key_id, error.__class__.__name__)
+            log.warning(
+                "the use of the key %s was not recorded: %s", key_id, error.__class__.__name__
+            )
 
     def _write_use(self, key_id: UUID) -> None:
         with self._catalog.write() as session:
@@ -193,14 +200,18 @@ class ApiKeyAuthenticator:
 
 
 def parse_bearer(authorization: str | None) -> str:
-    """The key in an `Authorization` header; Unauthorized (`key_missing`) when there is none."""
-    found = BEARER_HEADER.fullmatch(authorization or "")
-    if found is None:
-        raise Unauthorized("key_missing", f"This server wants its key: {HOW_TO_AUTHENTICATE}.")
-    return found["key"]
+    """Returns the key of an `Authorization: Bearer` header.
+
+    Raises:
+        Unauthorized: `key_missing`, if the header is missing or malformed.
+    """
+    match = BEARER_HEADER.fullmatch(authorization or "")
+    if match is None:
+        raise Unauthorized("key_missing", f"The server requires a key: {HOW_TO_AUTHENTICATE}.")
+    return match["key"]
 
 
-# Probes, and descriptions of the service: none of them tells what is stored.
+# Health probes, the web page and the API documentation: none of them exposes stored data.
 PUBLIC_PATHS = frozenset(
     {
         "/",
@@ -211,20 +222,21 @@ PUBLIC_PATHS = frozenset(
         "/openapi.json",
     }
 )
-PUBLIC_PATH_PREFIX = "/console/"  # the page's own files, which has a field for the key
+PUBLIC_PATH_PREFIX = "/console/"  # assets of the web page, where the user enters the key
 
-# Only describes: `AuthenticationMiddleware` is what asks for the key, before a route is looked for.
+# For the OpenAPI schema only: `AuthenticationMiddleware` checks the key, before routing.
 BEARER_SCHEME = HTTPBearer(
     auto_error=False,
     scheme_name="key",
-    description="A key with the scope that the call names. The embedded Placewise on loopback "
-    "needs none, unless ADMIN_KEY is set.",
+    description="An API key with the required scope. The embedded server on a loopback address "
+    "needs no key unless ADMIN_KEY is set.",
 )
 
 
 class AuthenticationMiddleware:
-    """Answers 401 to a call without a key, whatever it asks for: not even which paths exist. Where
-    none is needed, 403 to a page of elsewhere.
+    """Responds 401 to requests without a valid key before routing, also for unknown paths.
+
+    If no key is required, it responds 403 to web pages of other origins.
     """
 
     def __init__(self, app: ASGIApp, authenticator: Authenticator) -> None:
@@ -254,7 +266,7 @@ def _is_public(path: str) -> bool:
 
 
 def get_caller(request: Request) -> Caller:
-    """Who makes the call."""
+    """Returns the authenticated caller of a request."""
     caller: Caller = request.state.caller
     return caller
 
@@ -264,14 +276,14 @@ def _require_scope(
     scopes: SecurityScopes,
     _documented_scheme: Annotated[object, Security(BEARER_SCHEME)],
 ) -> None:
-    lacking = set(scopes.scopes) - get_caller(request).scopes
-    if lacking:
+    missing = set(scopes.scopes) - get_caller(request).scopes
+    if missing:
         raise Forbidden(
             "scope_missing",
-            f"This call needs a key with the scope {', '.join(sorted(lacking))}; yours may "
-            f"{', '.join(sorted(get_caller(request).scopes))}. An admin makes one: placewise keys "
-            "create.",
-            needed=sorted(lacking),
+            f"This request needs a key with the scope {', '.join(sorted(missing))}; yours has "
+            f"{', '.join(sorted(get_caller(request).scopes))}. An admin can create one with "
+            "placewise keys create.",
+            needed=sorted(missing),
         )
 
 
@@ -281,7 +293,11 @@ ADMIN = Security(_require_scope, scopes=[KeyScope.ADMIN.value])
 
 
 def check_declared_scopes(router: APIRouter) -> None:
-    """Every call declares its one scope: a route that forgets it can't be served."""
+    """Checks that every route declares exactly one scope.
+
+    Raises:
+        AssertionError: A route declares none or several.
+    """
     for route in router.routes:
         if not isinstance(route, APIRoute):
             continue

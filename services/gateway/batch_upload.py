@@ -1,7 +1,8 @@
-"""The body of a batch, stored while it arrives: many files, or one archive, or a list of keys.
+"""Streaming parser of batch uploads: many files, one archive, or a manifest of object keys.
 
-Each file is checked on its own: one that is refused is an item that has failed, and the rest of its
-bytes is read past. Nothing is left in the store of a body that is refused as a whole.
+The files are written to the object store while they are received. Each file is validated on its
+own: a refused file becomes a failed item of the batch, and the rest of its bytes is skipped. If the
+whole body is refused, nothing is left in the store.
 """
 
 from __future__ import annotations
@@ -36,12 +37,12 @@ from shared.storage.keys import new_archive_key, new_original_key
 FILES_FIELD, ARCHIVE_FIELD, MANIFEST_FIELD, PREFIX_FIELD = "file", "archive", "manifest", "prefix"
 NDJSON_MEDIA_TYPES = ("application/x-ndjson", "application/jsonl", "application/x-jsonlines")
 MAX_PART_HEADER_BYTES = 1024
-MAX_PREFIX_BYTES = 1024  # the longest key that S3 knows
+MAX_PREFIX_BYTES = 1024  # the maximum length of an S3 key
 
 
 @dataclass(slots=True)
 class BatchFile:
-    """A file of the form: stored under `key`, or refused."""
+    """A file of the form: stored under `key`, or refused with `error`."""
 
     name: str
     key: str
@@ -52,13 +53,15 @@ class BatchFile:
 
 @dataclass(slots=True)
 class BatchUpload:
+    """The parsed body of a batch upload."""
+
     files: list[BatchFile] = field(default_factory=list)
     archive: BatchFile | None = None
     manifest: bytes | None = None
     prefix: str | None = None
 
     def idempotency_content(self) -> list[Any]:
-        """What the body said, as JSON: equal for the same files and lines."""
+        """Content for the idempotency fingerprint: equal for the same files and manifest."""
         return [
             [[file.name, file.sha256] for file in self.files],
             self.archive and [self.archive.name, self.archive.sha256],
@@ -70,22 +73,26 @@ class BatchUpload:
 async def parse_batch_upload(
     request: Request, store: ObjectStore, settings: Settings
 ) -> BatchUpload:
-    """What came; `discard` removes it again.
+    """Parses the body of a batch upload and stores its files.
 
-    Raises InvalidRequest (`no_file`, `several_sources`, `empty_file`, `malformed_body`), TooLarge
-    (`batch_too_large_error`, `too_many_photos_error`, `manifest_too_large`), UnsupportedMedia
-    (`unsupported_archive`, `unsupported_body`) and Unprocessable (`invalid_field_error`).
+    Nothing is left in the store if it raises; `discard_batch_upload` deletes the files later.
+
+    Raises:
+        InvalidRequest: `no_file`, `several_sources`, `empty_file`, `malformed_body`.
+        TooLarge: `batch_too_large`, `too_many_photos`, `manifest_too_large`.
+        UnsupportedMedia: `unsupported_archive`, `unsupported_body`.
+        Unprocessable: `invalid_field`.
     """
     if body_media_type(request) in NDJSON_MEDIA_TYPES:
         return BatchUpload(manifest=await _read_manifest_body(request))
-    most_bytes = (
+    max_bytes = (
         settings.max_archive_size
         + MAX_MANIFEST_BYTES
         + settings.max_batch_photos * MAX_PART_HEADER_BYTES
     )
     parts = _BatchPartHandler(store, settings)
     form = MultipartFormParser(
-        request, parts, most_bytes, lambda: batch_too_large_error(settings.max_archive_size)
+        request, parts, max_bytes, lambda: batch_too_large_error(settings.max_archive_size)
     )
     try:
         async for piece in request.stream():
@@ -98,13 +105,11 @@ async def parse_batch_upload(
                 raise InvalidRequest(
                     "no_file",
                     f"The form has no photos ({FILES_FIELD!r}, once for each), no archive "
-                    f"({ARCHIVE_FIELD!r}), "
-                    f"no manifest of keys ({MANIFEST_FIELD!r}) and no prefix of keys "
-                    f"({PREFIX_FIELD!r}): curl "
-                    "-F archive=@PHOTOS.zip.",
+                    f"({ARCHIVE_FIELD!r}), no manifest of keys ({MANIFEST_FIELD!r}) and no prefix "
+                    f"of keys ({PREFIX_FIELD!r}). Send one of them: curl -F archive=@PHOTOS.zip.",
                 )
         elif received.prefix is not None:
-            raise _conflicting_sources_error("a prefix and something else")
+            raise _conflicting_sources_error("a prefix and another source")
         parts.commit()
     finally:
         await run_in_threadpool(parts.discard_uncommitted)
@@ -112,17 +117,18 @@ async def parse_batch_upload(
 
 
 def discard_batch_upload(store: ObjectStore, received: BatchUpload) -> None:
-    """Remove what was stored of the batch."""
+    """Deletes the stored files of the batch."""
     for file in (*received.files, received.archive):
         if file is not None and file.error is None:
             store.delete(file.key)
 
 
 def batch_too_large_error(max_bytes: int) -> PlacewiseError:
+    """Builds the 413 error for a batch of more than `max_bytes`."""
     return TooLarge(
         "batch_too_large",
-        f"The archive, or all files of the batch, are larger than {max_bytes} bytes "
-        "(MAX_ARCHIVE_SIZE). Send them in several batches.",
+        f"The files of the batch are larger than {max_bytes} bytes together (MAX_ARCHIVE_SIZE). "
+        "Split the batch into several.",
         max_bytes=max_bytes,
     )
 
@@ -137,8 +143,11 @@ async def _read_manifest_body(request: Request) -> bytes:
 
 
 class _BatchPartHandler:
-    """The form's parts. `begin`, `data` and `end` only take note; `write` does what takes time, in
-    another thread."""
+    """Collects the parts of the form.
+
+    `begin`, `data` and `end` only queue the data on the event loop; `write` validates and stores it
+    and is called in a worker thread.
+    """
 
     def __init__(self, store: ObjectStore, settings: Settings) -> None:
         self.batch = BatchUpload()
@@ -149,20 +158,20 @@ class _BatchPartHandler:
         self._prefix = bytearray()
         self._files_bytes = 0
         self._write_queue: deque[tuple[BatchFile, bytes | None]] = deque()
-        """A file's next bytes, in order; None at its end."""
+        """The bytes of the files, in order; None marks the end of a file."""
         self._file: BatchFile | None = None
-        self._inspector: StreamValidator | None = None
+        self._validator: StreamValidator | None = None
         self._writer: ObjectWriter | None = None
         self._committed = False
 
     def discard_uncommitted(self) -> None:
-        """Remove what is half written, and all of a body that was not whole."""
+        """Aborts the current write, and deletes the files unless `commit` was called."""
         self._abort_write()
         if not self._committed:
             discard_batch_upload(self._store, self.batch)
 
     def commit(self) -> None:
-        """The body was whole: what is stored stays."""
+        """Keeps the stored files: the body was complete."""
         self._committed = True
 
     def begin(self, name: str, filename: str | None) -> None:
@@ -178,13 +187,13 @@ class _BatchPartHandler:
         elif name not in (FILES_FIELD, ARCHIVE_FIELD):
             raise invalid_field_error(
                 name,
-                f"is unknown; known are {FILES_FIELD}, {ARCHIVE_FIELD}, {MANIFEST_FIELD} and "
-                f"{PREFIX_FIELD}. What is said "
-                "of single photos belongs into the manifest",
+                f"is unknown; valid are {FILES_FIELD}, {ARCHIVE_FIELD}, {MANIFEST_FIELD} and "
+                f"{PREFIX_FIELD}. Put the fields of single photos into the manifest",
             )
         elif filename is None:
             raise InvalidRequest(
-                "no_file", f"The field {name!r} is no file: curl -F {name}=@PATH (with the @)."
+                "no_file",
+                f"The field {name!r} is not a file. Send it as curl -F {name}=@PATH (with the @).",
             )
         elif name == FILES_FIELD:
             if len(self.batch.files) == self._settings.max_batch_photos:
@@ -196,7 +205,7 @@ class _BatchPartHandler:
                 raise _conflicting_sources_error("two archives")
             self._file = self.batch.archive = BatchFile(_display_name(filename), new_archive_key())
         if self.batch.archive and (self.batch.files or self.batch.manifest is not None):
-            raise _conflicting_sources_error("an archive and something else")
+            raise _conflicting_sources_error("an archive and another source")
 
     def data(self, piece: bytes) -> None:
         if self._name == MANIFEST_FIELD:
@@ -228,11 +237,11 @@ class _BatchPartHandler:
             self._write_queue.append((self._file, None))
 
     def write(self) -> None:
-        """Write what has come since the last call."""
+        """Validates and stores the bytes received since the last call."""
         while self._write_queue:
             file, piece = self._write_queue.popleft()
             if file.error is not None:
-                continue  # read past
+                continue  # skip the rest of a refused file
             try:
                 self._finish(file) if piece is None else self._write(file, piece)
             except PlacewiseError as error:
@@ -242,27 +251,27 @@ class _BatchPartHandler:
                 file.error = error
 
     def _write(self, file: BatchFile, piece: bytes) -> None:
-        if self._inspector is None:
-            self._inspector = self._new_inspector(file)
-        self._inspector.add(piece)
+        if self._validator is None:
+            self._validator = self._new_validator(file)
+        self._validator.add(piece)
         if self._writer is None:
             self._writer = self._store.writer(file.key)
         self._writer.write(piece)
 
     def _finish(self, file: BatchFile) -> None:
-        if self._inspector is None or self._writer is None:
+        if self._validator is None or self._writer is None:
             raise InvalidRequest("empty_file", f"The file {file.name!r} is empty.")
-        self._inspector.end()
+        self._validator.end()
         self._writer.commit()
-        file.size_bytes, file.sha256 = self._inspector.size_bytes, self._inspector.sha256
-        self._inspector = self._writer = None
+        file.size_bytes, file.sha256 = self._validator.size_bytes, self._validator.sha256
+        self._validator = self._writer = None
 
     def _abort_write(self) -> None:
         if self._writer is not None:
             self._writer.abort()
-        self._inspector = self._writer = None
+        self._validator = self._writer = None
 
-    def _new_inspector(self, file: BatchFile) -> StreamValidator:
+    def _new_validator(self, file: BatchFile) -> StreamValidator:
         if file is self.batch.archive:
             limit = self._settings.max_archive_size
             return StreamValidator(
@@ -271,10 +280,11 @@ class _BatchPartHandler:
         return StreamValidator(self._settings.max_file_size, check_photo_signature)
 
 
-def too_many_photos_error(most: int) -> PlacewiseError:
+def too_many_photos_error(limit: int) -> PlacewiseError:
+    """Builds the 413 error for a batch of more than `limit` photos."""
     return TooLarge(
         "too_many_photos",
-        f"A batch has at most {most} photos (MAX_BATCH_PHOTOS). Send several.",
+        f"The batch has more than {limit} photos (MAX_BATCH_PHOTOS). Split it into several.",
     )
 
 
@@ -282,28 +292,27 @@ def _check_archive_signature(begin: bytes) -> None:
     if detect_archive_format(begin) is None:
         raise UnsupportedMedia(
             "unsupported_archive",
-            f"By its content this is not {ACCEPTED_ARCHIVES}. Single photos belong into the "
+            f"By its content the file is not {ACCEPTED_ARCHIVES}. Send single photos in the "
             f"field {FILES_FIELD!r}.",
         )
 
 
 def _display_name(filename: str) -> str:
-    """What the client calls the file, for people and for its line in the manifest."""
+    """The client's file name without control characters; manifest lines refer to it."""
     return "".join(c for c in filename if c.isprintable())[:1000] or "photo"
 
 
 def _conflicting_sources_error(what: str) -> PlacewiseError:
     return InvalidRequest(
         "several_sources",
-        f"The form has {what}. A batch is photos ({FILES_FIELD!r}), to which one "
-        f"{MANIFEST_FIELD!r} may be "
-        f"added; or one {ARCHIVE_FIELD!r}, with its table in it; or one {MANIFEST_FIELD!r} "
-        "of keys; or one "
-        f"{PREFIX_FIELD!r} of keys.",
+        f"The form has {what}. A batch is one of: photos ({FILES_FIELD!r}) with an optional "
+        f"{MANIFEST_FIELD!r}; one {ARCHIVE_FIELD!r}, which may contain a table; one "
+        f"{MANIFEST_FIELD!r} of keys; one {PREFIX_FIELD!r} of keys.",
     )
 
 
 def _manifest_too_large_error() -> PlacewiseError:
     return TooLarge(
-        "manifest_too_large", f"A manifest has at most {MAX_MANIFEST_BYTES} bytes. Send several."
+        "manifest_too_large",
+        f"The manifest is larger than {MAX_MANIFEST_BYTES} bytes. Split it into several.",
     )

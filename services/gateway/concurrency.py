@@ -1,4 +1,4 @@
-"""A limit on calls of one kind that are under way: in all, of one key, and of one address."""
+"""Concurrency limits for requests: in total, per API key and per client address."""
 
 from __future__ import annotations
 
@@ -14,51 +14,63 @@ from shared.errors import TooManyRequests
 
 
 class ConcurrencyLimit:
-    """Counts the calls that hold a place. For the event loop only."""
+    """Limits concurrent requests of one kind. Must be used on the event loop only."""
 
     def __init__(
         self, what: str, code: str, *, total: int, per_caller: int, retry_after_seconds: int
     ) -> None:
-        """`what` names the calls in the refusal, with the settings of both limits."""
+        """Creates the limit.
+
+        Args:
+            what: Names the requests, and the settings of both limits, in error messages.
+            code: Error code of the refusal.
+            total: Limit for all callers together.
+            per_caller: Limit for one API key, and for one client address.
+            retry_after_seconds: Sent as `Retry-After`.
+        """
         self._what = what
         self._code = code
         self._total = total
         self._per_caller = per_caller
         self._retry_after_seconds = retry_after_seconds
-        self._of_caller: Counter[str] = Counter()
+        self._count_by_caller: Counter[str] = Counter()
         self.count = 0
 
     @contextlib.contextmanager
     def hold(self, request: Request) -> Iterator[None]:
-        """A place for the call, as long as the block lasts. TooManyRequests when there is none."""
+        """Counts the request while the block runs.
+
+        Raises:
+            TooManyRequests: The total limit or the limit of the caller is reached.
+        """
         callers = _callers(request)
         if self.count >= self._total:
-            raise self._refusal(f"{self._total} {self._what} are under way already.")
+            raise self._refusal(f"The server is already handling {self._total} {self._what}.")
         for caller in callers:
-            if self._of_caller[caller] >= self._per_caller:
+            if self._count_by_caller[caller] >= self._per_caller:
                 raise self._refusal(
-                    f"{self._per_caller} {self._what} of this {caller.partition(' ')[0]} are under "
-                    "way already."
+                    f"The server is already handling {self._per_caller} {self._what} of this "
+                    f"{caller.partition(' ')[0]}."
                 )
         self.count += 1
-        self._of_caller.update(callers)
+        self._count_by_caller.update(callers)
         try:
             yield
         finally:
             self.count -= 1
-            self._of_caller.subtract(callers)
-            self._of_caller += Counter()  # forgets who holds none
+            self._count_by_caller.subtract(callers)
+            self._count_by_caller += Counter()  # removes callers whose count is 0
 
     def _refusal(self, detail: str) -> TooManyRequests:
         return TooManyRequests(
             self._code,
-            f"{detail} Call again in a moment.",
+            f"{detail} Try again in a moment.",
             retry_after_seconds=self._retry_after_seconds,
         )
 
 
 def _callers(request: Request) -> list[str]:
-    """The call's key and address. ADMIN_KEY is no row of the catalog, and counts by address."""
+    """The request's key and address. ADMIN_KEY has no key id, so it is counted by address only."""
     key_id = get_caller(request).key_id
     callers = [] if key_id is None else [f"key {key_id}"]
     if request.client is not None:

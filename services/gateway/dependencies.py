@@ -1,13 +1,10 @@
-"""What every route can reach, and the parameters that every call understands.
+"""Dependencies of the routes: `GatewayContext`, path and query parameters, and the job notifier.
 
-One look at the job table for all requests that wait for a job's end, or for its next change.
+`JobNotifier` implements long polling (`Prefer: wait=N`, `?wait=N`) and the event streams. It polls
+the job table once for all waiting requests, so it can poll often without loading the database.
 
-Requests that each looked for themselves would have to look rarely; this one may look often, so that
-an answer does not lie there for long.
-
-Waiting for a job inside a request: `Prefer: wait=N`, `?wait=N` and the event stream.
-
-A misspelt parameter is refused: as a filter it would silently let everything pass.
+`reject_unknown_query_parameters` refuses misspelt query parameters: FastAPI ignores them, and a
+misspelt filter would match every photo.
 """
 
 from __future__ import annotations
@@ -40,14 +37,14 @@ from shared.jobs import Job, Wakeups
 from shared.search_api.protocol import SearchBackend
 from shared.storage import ObjectStore
 
-NOTIFIER_POLL_SECONDS = 0.02  # while someone waits for an end
-CHANGE_LOOK_SECONDS = 0.25  # while someone waits for a change
-LOOK_SHARE = 10  # a look that takes long is taken seldom: one part in so many of the time
-# Of a server that stops: most queries end within it, and the others still get an answer.
+NOTIFIER_POLL_SECONDS = 0.02  # poll interval while a request waits for the end of a job
+CHANGE_POLL_SECONDS = 0.25  # poll interval while a request waits for a change of a job
+POLL_COST_DIVISOR = 10  # polling takes at most one tenth of the time: slow polls become rare
+# Requests may wait this long after the shutdown has begun. Most queries end within this time.
 SHUTDOWN_WAIT_SECONDS = 5.0
 
-# What changes when a job does. Less than the whole row: it is read often, and of many jobs.
-MARKS = (
+# The columns that show a job's progress. Only these are polled: it happens often, for many jobs.
+WATCHED_COLUMNS = (
     Job.state,
     Job.stage,
     Job.waiting_for,
@@ -57,101 +54,118 @@ MARKS = (
     Job.progress_failed,
     Job.attempts,
 )
-Mark = tuple[Any, ...]
-"""The values of MARKS; () for a job that nobody has looked at."""
+WatchedState = tuple[Any, ...]
+"""The values of WATCHED_COLUMNS; () for a job that the caller has not seen yet."""
 
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """A job after a change, and the mark to wait with for the next one."""
+    """A job after a change, and the state to pass to the next `wait_for_change`."""
 
     job: Job
-    mark: Mark
+    state: WatchedState
 
 
 @dataclass(eq=False, slots=True)
 class _Waiter:
     job_id: UUID
-    mark: Mark | None
-    """What its request has seen of the job; None where only the end counts."""
+    last_seen: WatchedState | None
+    """The state that the request knows; None if it waits for the end of the job."""
     future: asyncio.Future[Change | None]
 
 
 class JobNotifier:
-    """Used from one event loop; looks only while someone waits."""
+    """Notifies requests of the changes and the end of jobs.
+
+    Must be used from one event loop. Polls only while requests are waiting.
+    """
 
     def __init__(self, catalog: Catalog) -> None:
         self._catalog = catalog
         self._waiters: set[_Waiter] = set()
-        self._looks: asyncio.Task[None] | None = None
-        self._next_change_look = 0.0
+        self._poll_task: asyncio.Task[None] | None = None
+        self._next_change_poll = 0.0
         self._shutdown_deadline = math.inf
 
     def begin_shutdown(self) -> None:
-        """The server stops: nobody waits for a change any more, and for an end not longer than
-        LAST_SECONDS from now."""
+        """Releases the waiting requests before the server stops.
+
+        Those that wait for a change are released now, those that wait for the end of a job after
+        SHUTDOWN_WAIT_SECONDS at the latest.
+        """
         self._shutdown_deadline = time.monotonic() + SHUTDOWN_WAIT_SECONDS
-        _release(waiter for waiter in self._waiters if waiter.mark is not None)
+        _release(waiter for waiter in self._waiters if waiter.last_seen is not None)
 
     async def wait_until_finished(self, job_id: UUID, seconds: float) -> None:
-        """Returns when the job has ended or is gone, at the latest after so many seconds.
+        """Waits until the job has ended or been deleted, at most `seconds`.
 
-        Raises what the catalog raises while it is away.
+        Raises:
+            SQLAlchemyError: The catalog can't be reached.
         """
-        left = min(seconds, self._shutdown_deadline - time.monotonic())
+        timeout = min(seconds, self._shutdown_deadline - time.monotonic())
         try:
-            await self._wait(job_id, None, left)
+            await self._wait(job_id, None, timeout)
         except TimeoutError:
             return
 
-    async def wait_for_change(self, job_id: UUID, mark: Mark, seconds: float) -> Change | None:
-        """The job once it differs from `mark`; None when it is gone or the server stops.
+    async def wait_for_change(
+        self, job_id: UUID, last_seen: WatchedState, seconds: float
+    ) -> Change | None:
+        """Waits until the state of the job differs from `last_seen`.
 
-        Raises TimeoutError after so many seconds, and what the catalog raises while it is away.
+        Returns:
+            The changed job; None if it was deleted or the server is stopping.
+
+        Raises:
+            TimeoutError: The job has not changed within `seconds`.
+            SQLAlchemyError: The catalog can't be reached.
         """
         if self._shutdown_deadline < math.inf:
             return None
-        return await self._wait(job_id, mark, seconds)
+        return await self._wait(job_id, last_seen, seconds)
 
-    async def _wait(self, job_id: UUID, mark: Mark | None, seconds: float) -> Change | None:
-        waiter = _Waiter(job_id, mark, asyncio.get_running_loop().create_future())
+    async def _wait(
+        self, job_id: UUID, last_seen: WatchedState | None, seconds: float
+    ) -> Change | None:
+        waiter = _Waiter(job_id, last_seen, asyncio.get_running_loop().create_future())
         self._waiters.add(waiter)
-        if self._looks is None:
-            self._looks = asyncio.create_task(self._look_while_awaited())
+        if self._poll_task is None:
+            self._poll_task = asyncio.create_task(self._poll_while_awaited())
         try:
             return await asyncio.wait_for(waiter.future, seconds)
         finally:
             self._waiters.discard(waiter)
 
-    async def _look_while_awaited(self) -> None:
+    async def _poll_while_awaited(self) -> None:
         pause = NOTIFIER_POLL_SECONDS
         try:
             while self._waiters:
                 await asyncio.sleep(pause)
-                began = time.monotonic()
-                await self._pending_poll(began)
-                took = time.monotonic() - began
-                ends = any(waiter.mark is None for waiter in self._waiters)
-                least = NOTIFIER_POLL_SECONDS if ends else CHANGE_LOOK_SECONDS
-                pause = max(least, LOOK_SHARE * took)
+                started = time.monotonic()
+                await self._poll(started)
+                elapsed = time.monotonic() - started
+                awaits_end = any(waiter.last_seen is None for waiter in self._waiters)
+                interval = NOTIFIER_POLL_SECONDS if awaits_end else CHANGE_POLL_SECONDS
+                pause = max(interval, POLL_COST_DIVISOR * elapsed)
         finally:
-            self._looks = None
+            self._poll_task = None
 
-    async def _pending_poll(self, now: float) -> None:
-        """Wake whose job has ended, or has changed."""
+    async def _poll(self, now: float) -> None:
+        """Wakes the waiters whose jobs have ended or changed."""
         due = set(self._waiters)
-        if now >= self._next_change_look:
-            self._next_change_look = now + CHANGE_LOOK_SECONDS
+        if now >= self._next_change_poll:
+            self._next_change_poll = now + CHANGE_POLL_SECONDS
         else:
-            due = {waiter for waiter in due if waiter.mark is None}
+            due = {waiter for waiter in due if waiter.last_seen is None}
         if not due:
             return
         try:
-            marks = await run_in_threadpool(_marks, self._catalog, {w.job_id for w in due})
-            ready = {waiter for waiter in due if _is_ready(waiter, marks.get(waiter.job_id))}
-            changed = {waiter.job_id for waiter in ready if waiter.mark is not None}
-            jobs = await run_in_threadpool(_jobs, self._catalog, changed) if changed else {}
-        except Exception as error:  # whoever waits raises it
+            job_ids = {waiter.job_id for waiter in due}
+            states = await run_in_threadpool(_load_watched_states, self._catalog, job_ids)
+            ready = {waiter for waiter in due if _is_ready(waiter, states.get(waiter.job_id))}
+            changed = {waiter.job_id for waiter in ready if waiter.last_seen is not None}
+            jobs = await run_in_threadpool(_load_jobs, self._catalog, changed) if changed else {}
+        except Exception as error:  # raised by the waiting requests
             for waiter in due:
                 if not waiter.future.done():
                     waiter.future.set_exception(error)
@@ -159,7 +173,7 @@ class JobNotifier:
         for waiter in ready:
             if not waiter.future.done():
                 job = jobs.get(waiter.job_id)
-                waiter.future.set_result(None if job is None else Change(job, marks[job.id]))
+                waiter.future.set_result(None if job is None else Change(job, states[job.id]))
         if now >= self._shutdown_deadline:
             _release(self._waiters)
 
@@ -170,33 +184,34 @@ def _release(waiters: Iterable[_Waiter]) -> None:
             waiter.future.set_result(None)
 
 
-def _is_ready(waiter: _Waiter, mark: Mark | None) -> bool:
-    """Has the job ended or changed? `mark` is None for one that is gone."""
-    if mark is None:
+def _is_ready(waiter: _Waiter, state: WatchedState | None) -> bool:
+    """Whether the job has ended or changed; `state` is None for a deleted job."""
+    if state is None:
         return True
-    return mark[0] not in UNFINISHED_STATES if waiter.mark is None else mark != waiter.mark
+    if waiter.last_seen is None:
+        return state[0] not in UNFINISHED_STATES
+    return state != waiter.last_seen
 
 
-def _marks(catalog: Catalog, job_ids: set[UUID]) -> dict[UUID, Mark]:
-    """Of the jobs that are there."""
+def _load_watched_states(catalog: Catalog, job_ids: set[UUID]) -> dict[UUID, WatchedState]:
     with catalog.read() as session:
-        rows = session.execute(select(Job.id, *MARKS).where(Job.id.in_(job_ids)))
+        rows = session.execute(select(Job.id, *WATCHED_COLUMNS).where(Job.id.in_(job_ids)))
         return {row[0]: tuple(row[1:]) for row in rows}
 
 
-def _jobs(catalog: Catalog, job_ids: set[UUID]) -> dict[UUID, Job]:
+def _load_jobs(catalog: Catalog, job_ids: set[UUID]) -> dict[UUID, Job]:
     with catalog.read() as session:
         jobs = session.scalars(select(Job).where(Job.id.in_(job_ids)))
         return {job.id: job for job in jobs}
 
 
 API_PREFIX = "/api/v1"
-NO_NUL_PATTERN = r"^[^\x00]*$"  # PostgreSQL has no text with a NUL
+NO_NUL_PATTERN = r"^[^\x00]*$"  # PostgreSQL's text type can't store NUL
 
 
 @dataclass(frozen=True, slots=True)
 class GatewayContext:
-    """The ports that the gateway speaks to."""
+    """The stores, clients and settings that the routes use."""
 
     catalog: Catalog
     store: ObjectStore
@@ -205,7 +220,7 @@ class GatewayContext:
     settings: Settings
     authenticator: Authenticator
     registry: CollectorRegistry = field(default_factory=CollectorRegistry)
-    """Of the process's figures: in the embedded Placewise, of all of its parts."""
+    """Metrics of the process; in the embedded server, of all its services."""
     started_monotonic: float = field(default_factory=time.monotonic)
     job_notifier: JobNotifier = field(init=False)
     connections: Connections = field(init=False)
@@ -225,18 +240,22 @@ def _uuid_or_not_found(noun: str):  # type: ignore[no-untyped-def]
         try:
             return UUID(str(value))
         except ValueError:
-            # What is no id can't be the id of anything: 404, like any other unknown one.
+            # A malformed id can't exist either: 404, as for any other unknown id.
             raise NotFound(f"{noun}_not_found", f"There is no {noun} {value!r}.") from None
 
     return BeforeValidator(parse)
 
 
 def parse_cursor(cursor: str | None) -> UUID | None:
-    """The id that a page ended with; 422 for a cursor that no call has given."""
+    """Parses the cursor of a page: the id of the last row of the previous page.
+
+    Raises:
+        Unprocessable: `invalid_field`, if `cursor` is not a UUID.
+    """
     try:
         return UUID(cursor) if cursor else None
     except ValueError:
-        raise invalid_field_error("cursor", "is not one that this call has given") from None
+        raise invalid_field_error("cursor", "is not a cursor that this endpoint returned") from None
 
 
 GatewayDep = Annotated[GatewayContext, Depends(get_gateway_context)]
@@ -244,7 +263,7 @@ MapName = Annotated[
     str,
     Query(
         alias="map",
-        description="The map that is meant.",
+        description="The map to use.",
         min_length=1,
         max_length=100,
         pattern=NO_NUL_PATTERN,
@@ -259,53 +278,62 @@ WebhookId = Annotated[UUID, _uuid_or_not_found("webhook")]
 
 
 def parse_prefer_wait(request: Request, max_seconds: int) -> float:
-    """Seconds from `Prefer: wait=N` (RFC 7240), at most `max_seconds`; 0 when not asked."""
-    found = re.search(r"(?:^|[,;\s])wait\s*=\s*\"?(\d+)", request.headers.get("prefer", ""))
-    return min(float(found[1]), max_seconds) if found else 0.0
+    """Seconds from `Prefer: wait=N` (RFC 7240), at most `max_seconds`; 0 without the header."""
+    match = re.search(r"(?:^|[,;\s])wait\s*=\s*\"?(\d+)", request.headers.get("prefer", ""))
+    return min(float(match[1]), max_seconds) if match else 0.0
 
 
 def load_job(gateway: GatewayContext, job_id: UUID) -> Job | None:
+    """Loads a job; None if it does not exist."""
     with gateway.catalog.read() as session:
         return session.get(Job, job_id)
 
 
 async def wait_for_job(gateway: GatewayContext, job_id: UUID, seconds: float) -> Job | None:
-    """The job once it has ended, or as it is when the time is up; None when it is gone."""
+    """Waits at most `seconds` for the end of the job; returns None if the job was deleted."""
     await gateway.job_notifier.wait_until_finished(job_id, seconds)
     return await run_in_threadpool(load_job, gateway, job_id)
 
 
-# Clients send it with every call, also with the few that mean no map.
+# Clients send `map` with every request, also to the few endpoints that do not use it.
 ALWAYS_ALLOWED = frozenset({"map"})
 
-# By function and method: to describe a call takes some ten milliseconds.
+# Cached by endpoint function and method: generating the OpenAPI operation takes about 10 ms.
 _documented_by_route: dict[tuple[Callable[..., Any], str], frozenset[str] | None] = {}
 
 
 async def reject_unknown_query_parameters(request: Request) -> None:
-    """422 (`invalid_field_error`) names a query parameter that the call's description does not."""
+    """Dependency that rejects query parameters that the OpenAPI operation does not declare.
+
+    Raises:
+        Unprocessable: `invalid_field`, with the name of the unknown parameter.
+    """
     if not request.query_params:
         return
     route: APIRoute = request.scope["route"]
-    call = route.endpoint, request.method.lower()
-    if call not in _documented_by_route:
-        _documented_by_route[call] = _documented_parameters(route, request.method.lower())
-    known = _documented_by_route[call]
-    if known is None:  # such as HEAD, which the description leaves out
+    operation = route.endpoint, request.method.lower()
+    if operation not in _documented_by_route:
+        _documented_by_route[operation] = _documented_parameters(route, request.method.lower())
+    known = _documented_by_route[operation]
+    if known is None:  # such as HEAD, which the OpenAPI schema leaves out
         return
     for name in request.query_params:
         if name not in known:
-            raise invalid_field_error(name, f"is unknown; known are {', '.join(sorted(known))}")
+            raise invalid_field_error(
+                name, f"is unknown; this endpoint takes {', '.join(sorted(known))}"
+            )
 
 
 def _documented_parameters(route: APIRoute, method: str) -> frozenset[str] | None:
-    """What the route takes after the question mark; None for a method without a description."""
-    described = get_openapi(title="", version="", routes=[route])["paths"]
-    call = described.get(route.path_format, {}).get(method)
-    if call is None:
+    """The query parameters of the operation; None if the OpenAPI schema does not contain it."""
+    paths = get_openapi(title="", version="", routes=[route])["paths"]
+    operation = paths.get(route.path_format, {}).get(method)
+    if operation is None:
         return None
     return ALWAYS_ALLOWED | {
-        parameter["name"] for parameter in call.get("parameters", ()) if parameter["in"] == "query"
+        parameter["name"]
+        for parameter in operation.get("parameters", ())
+        if parameter["in"] == "query"
     }
 
 

@@ -1,17 +1,20 @@
-"""`Idempotency-Key`: a call that is repeated under its key is done once and answered the same.
+"""Idempotent requests: a request repeated with its `Idempotency-Key` is executed once.
 
-A route takes part with one dependency, and one line in the transaction that makes its effect:
+The repeated request gets the stored response of the first one. A route supports this with a
+dependency, and by storing its response in the transaction that executes the request:
 
-    def route(gateway: GatewayDep, once: OnceDep, ...) -> Answer:
+    def route(gateway: GatewayDep, idempotent: IdempotentDep, ...) -> MapResponse:
         with gateway.catalog.write() as session:
             ...
-            once.keep(session, 201, answer)
+            idempotent.store_response(session, 201, response)
 
-A form's bytes are known only once they have come: there it is `IdempotentFormDep`, and
-`await once.begin_form(gateway.store, received)` after `store_form_file`.
+The content of a multipart form is known only after it has been received: its routes use
+`IdempotentFormDep`, and `await idempotent.claim_form(gateway.store, received)` after
+`store_form_file`.
 
-Kept are answers to what was done, and refusals (4xx) that would be the same again; never a 5xx, nor
-what depends on who asks and when (401, 403, 408, 429). A call without a key costs nothing.
+Stored are responses of executed requests, and 4xx responses that a repetition would get again;
+never a 5xx, nor responses that depend on the caller and the time (401, 403, 408, 429). A request
+without the header costs nothing.
 """
 
 from __future__ import annotations
@@ -48,46 +51,47 @@ from shared.storage import ObjectStore
 IDEMPOTENCY_HEADER = "Idempotency-Key"
 REPLAYED_HEADER = "Idempotent-Replayed"
 IDEMPOTENCY_KEY_PATTERN = r"[!-~]{1,255}"
-LEASE_SECONDS = 30.0  # more than passes between a whole request and its committed effect
+LEASE_SECONDS = 30.0  # longer than it takes to execute a received request and commit
 UNSTORED_STATUSES = (401, 403, 408, 429)
 
 IdempotencyKeyHeader = Annotated[
     str | None,
     Header(
         alias=IDEMPOTENCY_HEADER,
-        description="a new one for each call (a UUID, say): repeated with it, the call is done "
-        "once and answered the same, for 24 hours; 1 to 255 printable ASCII characters",
+        description="a unique value per request, such as a UUID: a request repeated with the same "
+        "key within 24 hours is executed once and gets the same response; 1 to 255 printable ASCII "
+        "characters",
     ),
 ]
 
 
 class IdempotentReplay(Exception):
-    """The call was done already; this is its answer."""
+    """Raised for a request that was already executed; carries its stored response."""
 
-    def __init__(self, answer: StoredResponse) -> None:
-        super().__init__(answer.status)
-        self.stored_response = answer
+    def __init__(self, stored_response: StoredResponse) -> None:
+        super().__init__(stored_response.status)
+        self.stored_response = stored_response
 
 
 async def replay_response(request: Request, replay: Exception) -> Response:
-    """The handler of Replay."""
+    """Exception handler of `IdempotentReplay`."""
     assert isinstance(replay, IdempotentReplay)
-    kept = replay.stored_response
+    stored = replay.stored_response
     return Response(
-        kept.body,
-        kept.status,
-        {**kept.headers, REPLAYED_HEADER: "true"},
-        media_type="application/problem+json" if kept.status >= 400 else "application/json",
+        stored.body,
+        stored.status,
+        {**stored.headers, REPLAYED_HEADER: "true"},
+        media_type="application/problem+json" if stored.status >= 400 else "application/json",
     )
 
 
 class IdempotentRequest:
-    """One request under its key; without one, everything here does nothing."""
+    """A request with an `Idempotency-Key`; without the header, all methods do nothing."""
 
     def __init__(self, gateway: GatewayContext, request: Request, key: str | None) -> None:
         if key is not None and not re.fullmatch(IDEMPOTENCY_KEY_PATTERN, key):
             raise invalid_field_error(
-                IDEMPOTENCY_HEADER, "has 1 to 255 printable ASCII characters and no blanks"
+                IDEMPOTENCY_HEADER, "must have 1 to 255 printable ASCII characters without spaces"
             )
         self._gateway = gateway
         self._request = request
@@ -98,7 +102,10 @@ class IdempotentRequest:
     async def claim_form(
         self, store: ObjectStore, received: StoredUpload, *, life_seconds: float | None = None
     ) -> None:
-        """`begin` with what a form said. Received bytes that the call won't need are removed."""
+        """Claims the key for the content of a form.
+
+        Deletes the received file from `store` if the request is refused or was already executed.
+        """
         content = [received.filename, received.sha256, received.fields]
         try:
             await run_in_threadpool(self.claim_key, content, life_seconds)
@@ -107,26 +114,34 @@ class IdempotentRequest:
             raise
 
     def claim_key(self, content: Any, life_seconds: float | None = None) -> None:
-        """The call is this one's to do from here on. `content` is what it says, as JSON.
+        """Claims the key: from here on only this request is executed under it.
 
-        Raises Replay when it was done already, and as `claim_idempotency_key` does.
+        Args:
+            content: The content of the request, serializable as JSON.
+            life_seconds: How long the response is stored, at most; None for the setting.
+
+        Raises:
+            IdempotentReplay: The request was already executed.
+            PlacewiseError: Those of `claim_idempotency_key`.
         """
         if self._key is None:
             return
         request = self._request
-        asked = [item for item in request.query_params.multi_items() if item[0] != "map"]
-        said = [request.url.path, sorted(asked), content]
-        made = RequestIdentity(
+        params = [item for item in request.query_params.multi_items() if item[0] != "map"]
+        fingerprinted = [request.url.path, sorted(params), content]
+        identity = RequestIdentity(
             scope=_key_scope(request),
             key=self._key,
             call=f"{request.method} {request.scope['route'].path_format}",
-            fingerprint=hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest(),
+            fingerprint=hashlib.sha256(
+                json.dumps(fingerprinted, sort_keys=True).encode()
+            ).hexdigest(),
         )
         life = self._gateway.settings.idempotency_key_seconds
         with self._gateway.catalog.write() as session:
             claimed = claim_idempotency_key(
                 session,
-                made,
+                identity,
                 lease_seconds=LEASE_SECONDS,
                 life_seconds=min(life, life_seconds or life),
             )
@@ -138,33 +153,35 @@ class IdempotentRequest:
         self,
         session: Session,
         status: int,
-        answer: BaseModel,
+        body: BaseModel,
         headers: dict[str, str] | None = None,
     ) -> None:
-        """What the call is answered, in the transaction that makes its effect. Kept again, it
-        replaces what was kept before."""
+        """Stores the response, in the transaction that executes the request.
+
+        A response that was stored before is replaced.
+        """
         if self._token is not None:
-            kept = StoredResponse(status, headers or {}, answer.model_dump_json())
-            store_response(session, self._token, kept)
+            stored = StoredResponse(status, headers or {}, body.model_dump_json())
+            store_response(session, self._token, stored)
             self._response_stored = True
 
     def store_job_response(self, session: Session, job: Job) -> None:
-        """The 202 of a job that this transaction queues."""
-        started = to_job_accepted(job, _map_name(self._request))
+        """Stores the 202 response for a job that this transaction queues."""
+        accepted = to_job_accepted(job, _map_name(self._request))
         self.store_response(
-            session, 202, started, {"Location": started.status_url, "Retry-After": "1"}
+            session, 202, accepted, {"Location": accepted.status_url, "Retry-After": "1"}
         )
 
     def replace_response(
-        self, status: int, answer: BaseModel, headers: dict[str, str] | None = None
+        self, status: int, body: BaseModel, headers: dict[str, str] | None = None
     ) -> None:
-        """`keep` in a transaction of its own, once an effect that was kept has come further."""
+        """Replaces the stored response in a transaction of its own."""
         if self._token is not None:
             with self._gateway.catalog.write() as session:
-                self.store_response(session, status, answer, headers)
+                self.store_response(session, status, body, headers)
 
     def store_refusal(self, error: PlacewiseError) -> None:
-        """The call is refused, and would be again."""
+        """Stores the refusal of a request, unless a repetition might succeed."""
         if (
             self._token is None
             or self._response_stored
@@ -173,14 +190,14 @@ class IdempotentRequest:
         ):
             return
         response = problem_response(error, self._request)
-        kept = StoredResponse(error.status, {}, bytes(response.body).decode())
-        # Whoever took the call over meanwhile has the last word.
+        stored = StoredResponse(error.status, {}, bytes(response.body).decode())
+        # Conflict: a repetition took over the expired lease, and its response counts.
         with contextlib.suppress(Conflict), self._gateway.catalog.write() as session:
-            store_response(session, self._token, kept)
+            store_response(session, self._token, stored)
             self._response_stored = True
 
     def release_key(self) -> None:
-        """Give back a key under which nothing was done."""
+        """Releases the key if no response was stored under it."""
         if self._token is not None and not self._response_stored:
             with self._gateway.catalog.write() as session:
                 release_idempotency_key(session, self._token)
@@ -189,30 +206,30 @@ class IdempotentRequest:
 async def idempotent_form_request(
     request: Request, gateway: GatewayDep, key: IdempotencyKeyHeader = None
 ) -> AsyncIterator[IdempotentRequest]:
-    """A call whose content is known later: the route calls `begin_form`."""
-    once = IdempotentRequest(gateway, request, key)
+    """Dependency for streamed bodies: the route calls `claim_form` or `claim_key` itself."""
+    idempotent = IdempotentRequest(gateway, request, key)
     try:
-        yield once
+        yield idempotent
     except PlacewiseError as error:
-        await run_in_threadpool(once.store_refusal, error)
+        await run_in_threadpool(idempotent.store_refusal, error)
         raise
     finally:
-        await run_in_threadpool(once.release_key)
+        await run_in_threadpool(idempotent.release_key)
 
 
 async def idempotent_request(
     request: Request, idempotent: Annotated[IdempotentRequest, Depends(idempotent_form_request)]
 ) -> IdempotentRequest:
-    """A call with a JSON body, or none: begun already."""
+    """Dependency for requests with a JSON body or none; claims the key."""
     body = await request.body()
     await run_in_threadpool(idempotent.claim_key, hashlib.sha256(body).hexdigest())
     return idempotent
 
 
 def _key_scope(request: Request) -> str:
-    """Whose key it is: the caller's, in one map."""
-    whose = [get_caller(request).identity, _map_name(request)]
-    return hashlib.sha256(json.dumps(whose).encode()).hexdigest()
+    """Namespace of the idempotency key: the caller and the map, hashed."""
+    scope = [get_caller(request).identity, _map_name(request)]
+    return hashlib.sha256(json.dumps(scope).encode()).hexdigest()
 
 
 def _map_name(request: Request) -> str:

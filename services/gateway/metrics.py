@@ -1,6 +1,7 @@
-"""What Prometheus reads of a gateway: its calls, what it receives, and the queue in the catalog.
+"""Prometheus metrics of the gateway: requests, uploads, connections and the job queue.
 
-How many jobs there are in which state, and how old the oldest is: for the figures.
+`GET /metrics` serves them. The number of jobs by kind and state, and the age of the oldest, are
+read from the catalog and are therefore the same on every gateway.
 """
 
 from __future__ import annotations
@@ -30,13 +31,16 @@ from shared.catalog.session import Catalog
 from shared.telemetry.metrics_server import METRICS_CONTENT_TYPE
 
 QUEUE_POLL_SECONDS = 5.0
-POLL_COST_DIVISOR = 20  # a look that takes long is taken seldom: one part in so many of the time
+POLL_COST_DIVISOR = 20  # polling takes at most 1/20 of the time: slow polls become rare
 COUNTED_STATES = (JobState.QUEUED, JobState.RUNNING, JobState.FAILED)
 
 
 @dataclass(frozen=True, slots=True)
 class JobCount:
-    """The jobs of one kind in one state; `waiting` are those that no worker may take yet."""
+    """Number of jobs of one kind in one state, and the age of the oldest.
+
+    The state `waiting` is added for queued jobs that no worker may claim yet.
+    """
 
     kind: str
     state: str
@@ -45,7 +49,7 @@ class JobCount:
 
 
 class QueueMetrics:
-    """A look that is shared by all who ask within LOOK_SECONDS. Thread-safe."""
+    """Job counts, cached for QUEUE_POLL_SECONDS. Thread-safe."""
 
     def __init__(self, catalog: Catalog) -> None:
         self._catalog = catalog
@@ -54,40 +58,42 @@ class QueueMetrics:
         self._next_poll = 0.0
 
     def job_counts(self) -> Sequence[JobCount] | None:
-        """None while the catalog is away."""
+        """Returns the job counts; None while the catalog is unreachable."""
         with self._lock:
-            began = time.monotonic()
-            if began < self._next_poll:
+            started = time.monotonic()
+            if started < self._next_poll:
                 return self._cached
             try:
                 with self._catalog.read() as session:
                     self._cached = count_jobs(session)
             except SQLAlchemyError:
                 self._cached = None
-            took = time.monotonic() - began
-            self._next_poll = began + max(QUEUE_POLL_SECONDS, POLL_COST_DIVISOR * took)
+            elapsed = time.monotonic() - started
+            self._next_poll = started + max(QUEUE_POLL_SECONDS, POLL_COST_DIVISOR * elapsed)
             return self._cached
 
 
 def count_jobs(session: Session) -> list[JobCount]:
-    """Of all maps. The index of a map's jobs by state serves it: those that succeeded, by far the
-    most, are not looked at."""
+    """Counts the jobs of all maps by kind and state.
+
+    Succeeded jobs, by far the most, are excluded, so that the index on (map, state) is used.
+    """
     state = case((Job.waiting_for.is_not(None), literal_column("'waiting'")), else_=Job.state)
-    found = session.execute(
+    rows = session.execute(
         select(Job.kind, state, func.count(), func.min(Job.created_at), db_now())
         .join_from(Map, Job, and_(Job.map_id == Map.id, Job.state.in_(COUNTED_STATES)))
         .group_by(Job.kind, state)
         .order_by(Job.kind, state)
     )
     return [
-        JobCount(kind, now_state, count, max(0.0, (now - oldest).total_seconds()))
-        for kind, now_state, count, oldest, now in found
+        JobCount(kind, counted_state, count, max(0.0, (now - oldest).total_seconds()))
+        for kind, counted_state, count, oldest, now in rows
     ]
 
 
 router = APIRouter(tags=["operations"])
 
-# From a probe to the longest `Prefer: wait`.
+# From a health probe to the longest `Prefer: wait`.
 LATENCY_BUCKETS_SECONDS = (
     0.005,
     0.01,
@@ -107,62 +113,64 @@ METRIC_PREFIX = "placewise_gateway"
 
 
 class GatewayMetrics:
-    """One gateway's figures. Labels are route templates, never paths: there are few of them."""
+    """Metrics of one gateway. Labels are route templates, not paths, to bound their cardinality."""
 
     def __init__(self, gateway: GatewayContext, admission: AdmissionControl) -> None:
         registry = gateway.registry
         self._requests = Counter(
             f"{METRIC_PREFIX}_requests",
-            "Calls by route and by the answer's status.",
+            "Requests by route and response status.",
             ["method", "route", "status"],
             registry=registry,
         )
         self._seconds = Histogram(
             f"{METRIC_PREFIX}_request_seconds",
-            "Seconds from a call to the first byte of its answer.",
+            "Seconds from the request to the first byte of the response.",
             ["method", "route"],
             buckets=LATENCY_BUCKETS_SECONDS,
             registry=registry,
         )
         self._received = Counter(
             f"{METRIC_PREFIX}_received_bytes",
-            "Bytes of the bodies of calls: uploads and query photos, nearly all of them.",
+            "Bytes of request bodies, mainly uploads and query photos.",
             ["route"],
             registry=registry,
         )
         self._in_flight = Gauge(
             f"{METRIC_PREFIX}_requests_under_way",
-            "Calls whose answer has not ended, streams of events too.",
+            "Requests in flight, including event streams.",
             registry=registry,
         )
         registry.register(_LoadCollector(gateway, admission))
-        registry.register(_Connections(gateway.connections, admission))
+        registry.register(_ConnectionCollector(gateway.connections, admission))
 
     def on_request_start(self) -> None:
+        """Counts a request in flight."""
         self._in_flight.inc()
 
-    def on_request_end(self, call: RequestRecord) -> None:
+    def on_request_end(self, record: RequestRecord) -> None:
+        """Records a finished request."""
         self._in_flight.dec()
-        self._requests.labels(call.method, call.route, str(call.status)).inc()
-        if call.first_byte_seconds is not None:
-            self._seconds.labels(call.method, call.route).observe(call.first_byte_seconds)
-        if call.received_bytes:
-            self._received.labels(call.route).inc(call.received_bytes)
+        self._requests.labels(record.method, record.route, str(record.status)).inc()
+        if record.first_byte_seconds is not None:
+            self._seconds.labels(record.method, record.route).observe(record.first_byte_seconds)
+        if record.received_bytes:
+            self._received.labels(record.route).inc(record.received_bytes)
 
 
 class _LoadCollector(Collector):
-    """Read at each scrape: the queue (every gateway tells the same), and what this one receives."""
+    """Collects the job queue, the uploads of this gateway and the free disk space per scrape."""
 
     def __init__(self, gateway: GatewayContext, admission: AdmissionControl) -> None:
         self._queue_metrics = QueueMetrics(gateway.catalog)
         self._admission = admission
 
     def describe(self) -> Iterable[Metric]:
-        return []  # or registering would look at the catalog
+        return []  # otherwise registering would call `collect` and query the catalog
 
     def collect(self) -> Iterable[Metric]:
         receiving = GaugeMetricFamily(
-            f"{METRIC_PREFIX}_receiving", "Files that are being received.", labels=["kind"]
+            f"{METRIC_PREFIX}_receiving", "Files being received.", labels=["kind"]
         )
         for kind in UploadKind:
             receiving.add_metric([kind.name.lower()], self._admission.active_uploads(kind))
@@ -171,26 +179,26 @@ class _LoadCollector(Collector):
         if free is not None:
             yield GaugeMetricFamily(
                 f"{METRIC_PREFIX}_disk_free_bytes",
-                "Of the disks that Placewise writes to itself.",
+                "Free bytes of the local disks that Placewise writes to.",
                 free,
             )
         queue = self._queue_metrics.job_counts()
         yield GaugeMetricFamily(
             f"{METRIC_PREFIX}_catalog_up",
-            "1 where the catalog could be asked.",
+            "1 if the catalog is reachable.",
             float(queue is not None),
         )
         if queue is None:
             return
         jobs = GaugeMetricFamily(
             f"{METRIC_PREFIX}_jobs",
-            "Jobs that are not finished, and failed ones that are kept. Waiting: for a vocabulary, "
-            "for descriptors, for search, for disk space.",
+            "Unfinished and failed jobs. State `waiting`: for a vocabulary, descriptors, search or "
+            "disk space.",
             labels=["kind", "state"],
         )
         oldest = GaugeMetricFamily(
             f"{METRIC_PREFIX}_oldest_job_seconds",
-            "Seconds since the oldest job of this kind and state was made.",
+            "Age of the oldest job of this kind and state, in seconds.",
             labels=["kind", "state"],
         )
         for group in queue:
@@ -200,12 +208,12 @@ class _LoadCollector(Collector):
         yield oldest
 
 
-class _Connections(Collector):
-    """Read at each scrape: the gateway's open connections, and those that it closed."""
+class _ConnectionCollector(Collector):
+    """Collects the open connections, the event streams and the closed connections per scrape."""
 
-    def __init__(self, connections: Connections, room: AdmissionControl) -> None:
+    def __init__(self, connections: Connections, admission: AdmissionControl) -> None:
         self._connections = connections
-        self._room = room
+        self._admission = admission
 
     def collect(self) -> Iterable[Metric]:
         yield GaugeMetricFamily(
@@ -213,12 +221,12 @@ class _Connections(Collector):
         )
         yield GaugeMetricFamily(
             f"{METRIC_PREFIX}_event_streams",
-            "Event streams under way.",
-            self._room.event_streams.count,
+            "Open event streams.",
+            self._admission.event_streams.count,
         )
         closed = CounterMetricFamily(
             f"{METRIC_PREFIX}_connections_closed",
-            "Connections that were refused, or closed because of a limit.",
+            "Connections refused or closed because of a limit.",
             labels=["reason"],
         )
         for reason, count in self._connections.closed.items():
@@ -228,6 +236,6 @@ class _Connections(Collector):
 
 @router.get("/metrics", operation_id="metrics", response_class=Response)
 def read_metrics(request: Request) -> Response:
-    """Prometheus' text format; on METRICS_PORT the same without a key."""
+    """Metrics in the Prometheus text format. METRICS_PORT serves the same without a key."""
     registry: CollectorRegistry = request.app.state.gateway.registry
     return Response(generate_latest(registry), media_type=METRICS_CONTENT_TYPE)

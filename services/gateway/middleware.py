@@ -1,14 +1,11 @@
-"""What every answer says to browsers, whoever makes it: a route, a refusal, a fault.
+"""ASGI middleware: security headers, the body size limit and the handler of unexpected exceptions.
 
-A route may say something else of itself: the page on `/` and the descriptions do.
-
-A limit on bodies that are read whole: JSON. Forms with files, and manifests, have theirs as they
-stream.
-
-What nobody has foreseen becomes a 500 that says nothing but where to look.
-
-It stands inside of what adds headers. The framework's own handler of unforeseen errors stands
-outside of everything, and its answer would lack them.
+`SecurityHeadersMiddleware` sets headers on every response, errors included, unless the route has
+set them itself, as the web page on `/` and the API documentation do. `BodySizeLimitMiddleware`
+limits bodies that are read into memory (JSON); multipart bodies and manifests are limited by their
+streaming parsers. `ExceptionHandlerMiddleware` must be inside the middleware that adds headers:
+Starlette's own handler of unexpected exceptions is outside of all middleware, so its responses
+would lack them.
 """
 
 from __future__ import annotations
@@ -25,7 +22,7 @@ from shared.errors import TooLarge
 from shared.http.problem_details import handle_unexpected_error, problem_response
 
 SECURITY_HEADERS = {
-    # An answer of the API is no page: where a browser shows one, nothing in it may run or load.
+    # API responses are not pages: when a browser displays one, it must not run or load anything.
     "Content-Security-Policy": "default-src 'none'; frame-ancestors 'none'",
     "X-Content-Type-Options": "nosniff",
     "X-Frame-Options": "DENY",
@@ -33,12 +30,12 @@ SECURITY_HEADERS = {
     "Cross-Origin-Opener-Policy": "same-origin",
     "Cross-Origin-Resource-Policy": "same-origin",
 }
-# What one key may see is for no cache that others share. Pictures say how long they may be kept.
+# Responses depend on the API key, so shared caches must not store them. Image routes set their own.
 PRIVATE_CACHE_CONTROL = "private, no-store"
 
 
 class SecurityHeadersMiddleware:
-    """Adds what an answer does not say itself."""
+    """Adds the security headers, and `Cache-Control` below `/api`, that a response does not set."""
 
     def __init__(self, app: ASGIApp, settings: Settings) -> None:
         self._app = app
@@ -46,7 +43,7 @@ class SecurityHeadersMiddleware:
         if settings.hsts_seconds:
             self._headers["Strict-Transport-Security"] = f"max-age={settings.hsts_seconds}"
         if settings.allowed_origins:
-            # CORS decides who may read; the browser must not refuse them before it does.
+            # CORS decides which origins may read; this header must not block them earlier.
             self._headers["Cross-Origin-Resource-Policy"] = "cross-origin"
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -54,26 +51,29 @@ class SecurityHeadersMiddleware:
             await self._app(scope, receive, send)
             return
 
-        async def add(message: Message) -> None:
+        async def send_with_headers(message: Message) -> None:
             if message["type"] == "http.response.start":
-                said = MutableHeaders(scope=message)
+                headers = MutableHeaders(scope=message)
                 for name, value in self._headers.items():
-                    said.setdefault(name, value)
+                    headers.setdefault(name, value)
                 if scope["path"].startswith(API_PREFIX):
-                    said.setdefault("Cache-Control", PRIVATE_CACHE_CONTROL)
+                    headers.setdefault("Cache-Control", PRIVATE_CACHE_CONTROL)
             await send(message)
 
-        await self._app(scope, receive, add)
+        await self._app(scope, receive, send_with_headers)
 
 
 MAX_JSON_BYTES = 1_000_000
 
 
 class BodySizeLimitMiddleware:
-    """Answers 413 (`body_too_large`) to a JSON body over the limit, without reading its rest."""
+    """Responds 413 (`body_too_large`) to bodies over MAX_JSON_BYTES without reading the rest.
+
+    Multipart bodies are exempt.
+    """
 
     def __init__(self, app: ASGIApp, exempt_paths: Container[str] = ()) -> None:
-        """Paths in `exempt_paths` have a limit of their own for every kind of body."""
+        """`exempt_paths` are routes that limit all their bodies themselves."""
         self._app = app
         self._exempt_paths = exempt_paths
 
@@ -83,23 +83,23 @@ class BodySizeLimitMiddleware:
             return
         size = 0
 
-        async def counted() -> Message:
+        async def counted_receive() -> Message:
             nonlocal size
             message = await receive()
             size += len(message.get("body", b""))
-            # To the route it looks as if the client had gone; what it answers is replaced.
+            # The route sees a client disconnect; its response is replaced by the 413.
             return message if size <= MAX_JSON_BYTES else {"type": "http.disconnect"}
 
-        async def guarded(message: Message) -> None:
+        async def guarded_send(message: Message) -> None:
             if size <= MAX_JSON_BYTES:
                 await send(message)
             elif message["type"] == "http.response.start":
                 error = TooLarge(
-                    "body_too_large", f"A body that is no form has at most {MAX_JSON_BYTES} bytes."
+                    "body_too_large", f"The body is larger than {MAX_JSON_BYTES} bytes."
                 )
                 await problem_response(error, Request(scope))(scope, receive, send)
 
-        await self._app(scope, counted, guarded)
+        await self._app(scope, counted_receive, guarded_send)
 
 
 def _is_multipart(scope: Scope) -> bool:
@@ -110,7 +110,10 @@ def _is_multipart(scope: Scope) -> bool:
 
 
 class ExceptionHandlerMiddleware:
-    """Answers for a route that has failed before it began to answer."""
+    """Converts unhandled exceptions into an opaque 500 with the request id.
+
+    If the response has already started, the exception is raised again and closes the connection.
+    """
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app
@@ -119,17 +122,17 @@ class ExceptionHandlerMiddleware:
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
-        begun = False
+        response_started = False
 
-        async def watched(message: Message) -> None:
-            nonlocal begun
-            begun = begun or message["type"] == "http.response.start"
+        async def watched_send(message: Message) -> None:
+            nonlocal response_started
+            response_started = response_started or message["type"] == "http.response.start"
             await send(message)
 
         try:
-            await self._app(scope, receive, watched)
+            await self._app(scope, receive, watched_send)
         except Exception as error:
-            answer = await handle_unexpected_error(Request(scope), error)
-            if begun:  # half an answer can't be taken back: the connection ends with it
+            response = await handle_unexpected_error(Request(scope), error)
+            if response_started:
                 raise
-            await answer(scope, receive, send)
+            await response(scope, receive, send)

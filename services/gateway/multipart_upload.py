@@ -1,9 +1,8 @@
-"""Taking a multipart body apart while it arrives: its grammar and its limits, not its meaning.
+"""Streaming parser of multipart/form-data bodies, and the upload of a single file.
 
-One file of a form, stored while it arrives: bounded memory, counted, hashed.
-
-The file's bytes go straight into the object store; a body that is too large, or whose file is no
-photo, is refused as soon as that is seen, without reading the rest.
+`store_form_file` writes the file of a form to the object store while it is received: with bounded
+memory, counted and hashed. Starlette's `request.form()` would spool the whole body to disk first.
+A body that is too large, or whose file is not a photo, is refused without reading the rest.
 """
 
 from __future__ import annotations
@@ -21,25 +20,25 @@ from shared.ingest.validation import StoredUpload, StreamValidator, base_name, f
 from shared.storage import ObjectStore, ObjectWriter
 
 MAX_FIELDS_BYTES = 256 * 1024  # all text fields together
-# What a body may hold beside its files: boundaries, part headers and the text fields.
+# Allowed size of a body without its files: boundaries, part headers and text fields.
 OVERHEAD_BYTES = MAX_FIELDS_BYTES + 64 * 1024
 
 
 class PartHandler(Protocol):
-    """Who takes the parts; what it raises ends the reading."""
+    """Receives the parts of a form; exceptions that it raises abort the parsing."""
 
     def begin(self, name: str, filename: str | None) -> None:
-        """A part begins; `filename` is None for one that is no file."""
+        """A part begins; `filename` is None if it is not a file."""
 
     def data(self, piece: bytes) -> None:
         """The next bytes of the part."""
 
     def end(self) -> None:
-        """The part is whole."""
+        """The part is complete."""
 
 
 class MultipartFormParser:
-    """A form that is fed piece by piece and calls `parts`."""
+    """Incremental parser of a multipart form; passes the parts to a `PartHandler`."""
 
     def __init__(
         self,
@@ -48,10 +47,18 @@ class MultipartFormParser:
         max_bytes: int,
         too_large: Callable[[], Exception],
     ) -> None:
-        """`max_bytes` of body, for which `too_large` makes the refusal.
+        """Creates the parser for the body of a request.
 
-        Raises InvalidRequest (`no_file`, `malformed_body`), UnsupportedMedia (`unsupported_body`),
-        and the refusal of a body that is declared to be too large.
+        Args:
+            request: Its headers give the boundary and the declared size.
+            handler: Receives the parts.
+            max_bytes: Maximum size of the body.
+            too_large: Builds the exception for a larger body.
+
+        Raises:
+            InvalidRequest: `no_file`, `malformed_body`.
+            UnsupportedMedia: `unsupported_body`.
+            Exception: That of `too_large`, if Content-Length exceeds `max_bytes`.
         """
         self._max_bytes = max_bytes
         self._too_large = too_large
@@ -79,8 +86,8 @@ class MultipartFormParser:
             raise too_large()
 
     def feed(self, piece: bytes) -> None:
-        """The next bytes of the body."""
-        # Part headers and what follows the form count, too: no body goes on for ever.
+        """Parses the next bytes of the body."""
+        # The whole body counts, with part headers and the epilogue: it can't be endless.
         self._body_bytes += len(piece)
         if self._body_bytes > self._max_bytes:
             raise self._too_large()
@@ -90,9 +97,9 @@ class MultipartFormParser:
             raise malformed_body_error(str(error)) from error
 
     def finish(self) -> None:
-        """The body has ended: is it whole?"""
+        """Raises InvalidRequest (`malformed_body`) if the body is incomplete."""
         if not self._ended:
-            raise malformed_body_error("it ends before its last boundary")
+            raise malformed_body_error("the body ends before the last boundary")
 
     def _on_part_begin(self) -> None:
         self._disposition = b""
@@ -124,11 +131,12 @@ class MultipartFormParser:
 
 
 def malformed_body_error(reason: str) -> PlacewiseError:
+    """Builds the 400 error for a body that can't be parsed."""
     return InvalidRequest("malformed_body", f"The multipart body can't be read: {reason}.")
 
 
 def body_media_type(request: Request) -> str:
-    """The body's media type, in small letters and without parameters; "" when none is said."""
+    """Returns the media type of the body in lower case, without parameters; "" if not given."""
     media_type, _ = parse_options_header(request.headers.get("content-type", ""))
     return media_type.decode("latin-1").lower()
 
@@ -137,20 +145,22 @@ def _parse_boundary(request: Request) -> bytes:
     media_type, options = parse_options_header(request.headers.get("content-type", ""))
     if media_type != b"multipart/form-data":
         if not media_type:
-            raise InvalidRequest("no_file", "The request has no body: curl -F file=@PHOTO.")
+            raise InvalidRequest(
+                "no_file", "The request has no body. Send a form: curl -F file=@PHOTO."
+            )
         raise UnsupportedMedia(
             "unsupported_body",
-            f"Send the photo as multipart/form-data (curl -F file=@PHOTO), "
+            "Send the photo as multipart/form-data (curl -F file=@PHOTO), "
             f"not as {media_type.decode('latin-1')}.",
         )
     boundary = options.get(b"boundary", b"")
     if not 0 < len(boundary) <= 70:
-        raise malformed_body_error("its boundary is missing or too long")
+        raise malformed_body_error("the boundary is missing or too long")
     return boundary
 
 
 FILE_FIELD = "file"
-# What is handed to the store at once: each time costs a change of thread.
+# Size of one write to the store: each write is a switch to a worker thread.
 STORE_WRITE_BYTES = 512 * 1024
 
 
@@ -163,13 +173,25 @@ async def store_form_file(
     *,
     too_large: Callable[[int], PlacewiseError] = file_too_large_error,
 ) -> StoredUpload:
-    """The form's file, stored under `key`, with its text fields.
+    """Stores the file of a form in the object store while it is received.
 
-    `check_begin` sees the first bytes before anything else is read and may raise; `too_large` makes
-    the refusal of more than `max_bytes`. Raises InvalidRequest (no multipart body, no file, an
-    empty file), TooLarge (`file_too_large_error`), and UnsupportedMedia for another kind of
-    body. Nothing
-    is left in the store when it raises.
+    Nothing is left in the store if it raises.
+
+    Args:
+        request: The request whose body is read.
+        store: The object store.
+        key: Object key of the file.
+        max_bytes: Maximum size of the file.
+        check_begin: Called with the first bytes before the rest is read; may raise.
+        too_large: Builds the exception for a file of more than `max_bytes`.
+
+    Returns:
+        The stored file, with the text fields of the form.
+
+    Raises:
+        InvalidRequest: No multipart body, no file, several files or an empty file.
+        TooLarge: `file_too_large`, `fields_too_large`.
+        UnsupportedMedia: The body is not multipart/form-data.
     """
     parts = _SingleFileHandler(StreamValidator(max_bytes, check_begin, too_large=too_large))
     form = MultipartFormParser(
@@ -186,8 +208,8 @@ async def store_form_file(
         form.finish()
         parts.require_file()
         rest = parts.take_pending()
-        whole = rest if writer is None else None
-        if whole == b"":
+        small_file = rest if writer is None else None
+        if small_file == b"":
             raise InvalidRequest("empty_file", f"The file in the field {FILE_FIELD!r} is empty.")
         await run_in_threadpool(_finish_object, store, key, writer, rest)
     except BaseException:
@@ -201,12 +223,12 @@ async def store_form_file(
         sha256=parts.file.sha256,
         begin=parts.file.begin,
         fields=parts.fields,
-        whole=whole,
+        whole=small_file,
     )
 
 
 def _finish_object(store: ObjectStore, key: str, writer: ObjectWriter | None, rest: bytes) -> None:
-    """Write what is left, and make the object visible."""
+    """Writes the remaining bytes and makes the object visible."""
     if writer is None:
         store.put(key, rest)
         return
@@ -217,8 +239,14 @@ def _finish_object(store: ObjectStore, key: str, writer: ObjectWriter | None, re
 def multipart_schema(
     file: str, required: Sequence[str] = (), **fields: dict[str, Any]
 ) -> dict[str, Any]:
-    """The OpenAPI description of a form with a file, and of `fields`, of which some are `required`,
-    too: FastAPI sees only a stream.
+    """Returns the OpenAPI request body of a form with a file, for `openapi_extra`.
+
+    FastAPI can't derive it, because the routes read the body as a stream.
+
+    Args:
+        file: Description of the file.
+        required: Required text fields.
+        fields: JSON schemas of the text fields.
     """
     properties = {
         FILE_FIELD: {"type": "string", "format": "binary", "description": file},
@@ -231,7 +259,7 @@ def multipart_schema(
 
 
 class _SingleFileHandler:
-    """Collects the text fields, passes on the file's bytes."""
+    """Collects the text fields and buffers the bytes of the file."""
 
     def __init__(self, file: StreamValidator) -> None:
         self.file = file
@@ -245,14 +273,14 @@ class _SingleFileHandler:
         self._pending: list[bytes] = []
 
     def take_pending(self) -> bytes:
-        """The file's bytes since the last call."""
+        """Returns the bytes of the file since the last call."""
         data = b"".join(self._pending)
         self._pending.clear()
         self.pending_bytes = 0
         return data
 
     def require_file(self) -> None:
-        """Was there a file in the form?"""
+        """Raises InvalidRequest (`no_file`) if the form has no file."""
         if not self._file_seen:
             raise InvalidRequest(
                 "no_file",
@@ -267,10 +295,10 @@ class _SingleFileHandler:
         if name != FILE_FIELD:
             raise InvalidRequest(
                 "no_file",
-                f"A file came in the field {name!r}; it belongs into {FILE_FIELD!r}.",
+                f"The file is in the form field {name!r}; it is expected in {FILE_FIELD!r}.",
             )
         if self._file_seen:
-            raise InvalidRequest("several_files", "This call takes one file; several came.")
+            raise InvalidRequest("several_files", "The form has several files; send one.")
         self._file_seen = True
         self.filename = base_name(filename)
 
@@ -282,7 +310,10 @@ class _SingleFileHandler:
             return
         self._fields_bytes += len(piece)
         if self._fields_bytes > MAX_FIELDS_BYTES:
-            raise TooLarge("fields_too_large", "The form's text fields are too long.")
+            raise TooLarge(
+                "fields_too_large",
+                f"The text fields of the form have more than {MAX_FIELDS_BYTES} bytes.",
+            )
         self._value += piece
 
     def end(self) -> None:

@@ -1,8 +1,8 @@
-"""How much a key may do: calls in a minute, bytes in a day.
+"""Rate limits and quotas of API keys: requests per minute and uploaded bytes per day.
 
-Counted where every gateway sees it: in Redis; in this process when embedded. While Redis is away
-nothing is counted and every call is let through: limits protect a service from too much, and are
-no reason to be away with it.
+The counters are in Redis, shared by all gateways, or in memory in the embedded server. While Redis
+is unreachable, all requests are let through: the limits protect the service from overload and must
+not make it unavailable.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ from shared.http.problem_details import problem_response
 
 log = logging.getLogger(__name__)
 
-REDIS_TIMEOUT_SECONDS = 0.25  # longest wait for Redis: a call is worth more than its count
-REDIS_RETRY_SECONDS = 5.0  # in which a Redis that was away is not asked again
+REDIS_TIMEOUT_SECONDS = 0.25  # short: a slow Redis must not delay requests
+REDIS_RETRY_SECONDS = 5.0  # after a failure, before Redis is tried again
 KEY_PREFIX = "placewise:limits"
 
 
 @dataclass(frozen=True, slots=True)
 class RateLimit:
-    """One limit of one key. `name` is the policy's in the RateLimit headers."""
+    """A limit of a key; `name` is the policy name in the RateLimit headers."""
 
     name: str
     window: RateLimitItem
@@ -44,7 +44,10 @@ class RateLimit:
 
 
 class RateLimiter:
-    """Counts what keys do. Thread-safe; blocks for REDIS_SECONDS at most."""
+    """Counts requests and uploaded bytes per key.
+
+    Thread-safe; blocks for REDIS_TIMEOUT_SECONDS at most.
+    """
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
@@ -53,34 +56,47 @@ class RateLimiter:
         self._redis_retry_at = 0.0
 
     def count_request(self, caller: Caller) -> dict[str, str]:
-        """Count a call; what its answer says of the limit. TooManyRequests
-        (`too_many_requests`)."""
-        most = caller.limits.requests_per_minute or self._settings.key_requests_per_minute
-        if caller.key_id is None or most is None:
+        """Counts a request against the limit per minute.
+
+        Returns:
+            The RateLimit headers of the response; empty without a limit.
+
+        Raises:
+            TooManyRequests: `too_many_requests`.
+        """
+        limit = caller.limits.requests_per_minute or self._settings.key_requests_per_minute
+        if caller.key_id is None or limit is None:
             return {}
         quota = RateLimit(
             "requests",
-            RateLimitItemPerMinute(most),
+            RateLimitItemPerMinute(limit),
             "too_many_requests",
-            f"This key may make {most} calls a minute.",
+            f"This key is limited to {limit} requests per minute.",
         )
         return self._hit(caller, quota, 1)
 
     def count_upload_bytes(self, caller: Caller, size_bytes: int) -> dict[str, str]:
-        """Count what is about to be sent. TooManyRequests (`upload_quota_reached`)."""
-        most = self.daily_upload_bytes(caller)
-        if most is None or not size_bytes:
+        """Counts bytes that are about to be sent against the daily quota.
+
+        Returns:
+            The RateLimit headers of the response; empty without a quota.
+
+        Raises:
+            TooManyRequests: `upload_quota_reached`.
+        """
+        limit = self.daily_upload_bytes(caller)
+        if limit is None or not size_bytes:
             return {}
         quota = RateLimit(
             "upload-bytes",
-            RateLimitItemPerDay(most),
+            RateLimitItemPerDay(limit),
             "upload_quota_reached",
-            f"This key may send {most} bytes a day, and this call has {size_bytes}.",
+            f"This key is limited to {limit} bytes per day; this request has {size_bytes}.",
         )
         return self._hit(caller, quota, size_bytes)
 
     def daily_upload_bytes(self, caller: Caller) -> int | None:
-        """Bytes that the caller may send in a day; None for any number."""
+        """Returns the daily quota of the caller in bytes; None if it is unlimited."""
         if caller.key_id is None:
             return None
         return caller.limits.upload_bytes_per_day or self._settings.key_upload_bytes_per_day
@@ -90,24 +106,25 @@ class RateLimiter:
             return {}
         names = (quota.name, str(caller.key_id))
         try:
-            taken = self._counter.hit(quota.window, *names, cost=cost)
+            allowed = self._counter.hit(quota.window, *names, cost=cost)
             reset_at, remaining = self._counter.get_window_stats(quota.window, *names)
         except StorageError as error:
             if not self._redis_retry_at:
-                log.warning("keys are not limited while Redis is away: %s", error.storage_error)
+                log.warning(
+                    "rate limits are off while Redis is unreachable: %s", error.storage_error
+                )
             self._redis_retry_at = time.monotonic() + REDIS_RETRY_SECONDS
             return {}
         if self._redis_retry_at:
             self._redis_retry_at = 0.0
-            log.warning("Redis is back: keys are limited again")
+            log.warning("Redis is reachable again: rate limits are on")
         seconds = max(1, math.ceil(reset_at - time.time()))
         headers = _rate_limit_headers(quota, remaining, seconds)
-        if not taken:
+        if not allowed:
             raise TooManyRequests(
                 quota.code,
-                f"{quota.message} Come again after the time in Retry-After, or ask an admin "
-                "for a key "
-                "with a higher limit.",
+                f"{quota.message} Retry after the seconds in Retry-After, or ask an admin for a "
+                "key with a higher limit.",
                 retry_after_seconds=seconds,
                 limit=quota.window.amount,
                 remaining=remaining,
@@ -116,7 +133,7 @@ class RateLimiter:
 
 
 class RateLimitMiddleware:
-    """Lets a call through while its key's limits do, and says in the answer how far they are."""
+    """Applies the rate limits of the key and adds the RateLimit headers to the response."""
 
     def __init__(self, app: ASGIApp, limiter: RateLimiter) -> None:
         self._app = app
@@ -129,42 +146,42 @@ class RateLimitMiddleware:
             return
         try:
             size_bytes = self._content_length(caller, Headers(scope=scope))
-            said = await run_in_threadpool(self._count_call, caller, size_bytes)
+            rate_limit_headers = await run_in_threadpool(self._count, caller, size_bytes)
         except PlacewiseError as error:
             await problem_response(error, Request(scope))(scope, receive, send)
             return
 
-        async def tell(message: Message) -> None:
+        async def send_with_headers(message: Message) -> None:
             if message["type"] == "http.response.start":
-                MutableHeaders(scope=message).update(said)
+                MutableHeaders(scope=message).update(rate_limit_headers)
             await send(message)
 
-        await self._app(scope, receive, tell)
+        await self._app(scope, receive, send_with_headers)
 
-    def _count_call(self, caller: Caller, size_bytes: int) -> dict[str, str]:
-        said = self._limiter.count_request(caller)
+    def _count(self, caller: Caller, size_bytes: int) -> dict[str, str]:
+        headers = self._limiter.count_request(caller)
         self._limiter.count_upload_bytes(caller, size_bytes)
-        return said
+        return headers
 
     def _content_length(self, caller: Caller, headers: Headers) -> int:
-        """Bytes of the body, as the head of the call says. LengthRequired where that is to be
-        counted and not said."""
-        said = headers.get("content-length")
-        if said is not None:
-            if not said.isdecimal():
-                raise InvalidRequest("malformed_body", "Content-Length is no number.")
-            return int(said)
+        """Size of the body by its headers; LengthRequired if a quota applies and it is unknown."""
+        content_length = headers.get("content-length")
+        if content_length is not None:
+            if not content_length.isdecimal():
+                raise InvalidRequest(
+                    "malformed_body", f"Content-Length is not a number: {content_length[:100]!r}."
+                )
+            return int(content_length)
         if "transfer-encoding" in headers and self._limiter.daily_upload_bytes(caller) is not None:
             raise LengthRequired(
                 "length_required",
-                "The bytes that this key sends are counted: say how many there are in "
-                "Content-Length.",
+                "This key has a daily upload quota: send the size of the body in Content-Length.",
             )
         return 0
 
 
 def _rate_limit_headers(quota: RateLimit, remaining: int, seconds: int) -> dict[str, str]:
-    """As the IETF's draft-ietf-httpapi-ratelimit-headers-10 has them."""
+    """Response headers by draft-ietf-httpapi-ratelimit-headers-10."""
     window = quota.window.get_expiry()
     return {
         "RateLimit-Policy": f'"{quota.name}";q={quota.window.amount};w={window}',

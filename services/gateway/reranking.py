@@ -1,8 +1,9 @@
-"""Answers whose first photos an extractor has looked at closely: `rerank=N` and `explain=true`.
+"""Reranking and explanations of similarity searches: `rerank=N` and `explain=true`.
 
-The search tier is asked as always. What it finds becomes a compare job of the highest priority,
-with the rest of the answer in its params; the call waits a while for it. The job's result is joined
-with live photos anew, so that what was deleted meanwhile is in no answer.
+The hits of the search become a compare job of the highest priority, with the rest of the response
+in its params; an extractor compares them with the query patch by patch. The request waits for a
+while for the job. Its result is joined with live photos again, so that photos deleted in the
+meantime are not returned.
 """
 
 from __future__ import annotations
@@ -41,11 +42,11 @@ from shared.search_api.comparison import (
 from shared.storage.keys import comparison_key
 
 COMPARE_JOB_PARAM = "compare_job_id"
-"""In the params of a describe job: the job that compares its photo."""
+"""Params key of a describe job: the id of the compare job of its photo."""
 
 
 class CompareJobParams(BaseModel):
-    """What a compare job carries: what is asked of the extractor, and the rest of the answer."""
+    """Params of a compare job: the request to the extractor, and the rest of the response."""
 
     model_config = ConfigDict(frozen=True)
 
@@ -57,7 +58,11 @@ class CompareJobParams(BaseModel):
 def check_comparison_supported(
     gateway: GatewayContext, map_name: str, search_params: SearchParams
 ) -> None:
-    """Unprocessable (`not_rerankable`, `not_explainable`) for what the map's extractor can't do."""
+    """Checks that the extractor of the map supports the requested comparison.
+
+    Raises:
+        Unprocessable: `not_rerankable`, `not_explainable`.
+    """
     if not search_params.needs_comparison:
         return
     with gateway.catalog.read() as session:
@@ -76,7 +81,7 @@ def start_comparison_of_stored_photo(
     search_params: SearchParams,
     idempotent: IdempotentRequest,
 ) -> Job:
-    """Search for a stored photo, and queue the comparison."""
+    """Searches with a stored photo and queues a compare job for the hits."""
     job, history = _build_compare_job(gateway, query, search_params, None)
     with gateway.catalog.write() as session:
         session.add_all([job, history])
@@ -89,19 +94,19 @@ def start_comparison_of_stored_photo(
 def start_comparison_of_query_photo(
     gateway: GatewayContext, describe_job: Job, query: SimilarityQuery, search_params: SearchParams
 ) -> Job:
-    """The one comparison of a described query photo: the one that there is, or else a new one."""
+    """Returns the compare job of a described query photo, and creates it if there is none yet."""
     with gateway.catalog.read() as session:
-        found = _find_compare_job(session, describe_job)
-    if found is not None:
-        return found
+        existing = _find_compare_job(session, describe_job)
+    if existing is not None:
+        return existing
     job, history = _build_compare_job(gateway, query, search_params, describe_job.id)
     with gateway.catalog.write() as session:
         current = session.get(Job, describe_job.id, with_for_update=True, populate_existing=True)
         if current is None:
             raise query_expired_error()
-        found = _find_compare_job(session, current)
-        if found is not None:  # another call was first
-            return found
+        existing = _find_compare_job(session, current)
+        if existing is not None:  # created by a concurrent request
+            return existing
         current.params = {**current.params, COMPARE_JOB_PARAM: str(job.id)}
         session.add_all([job, history])
     gateway.hints.send(WakeupQueue.QUERY)
@@ -109,37 +114,40 @@ def start_comparison_of_query_photo(
 
 
 def comparison_response(gateway: GatewayContext, job: Job, map_name: str) -> SimilarityResponse:
-    """The answer of a compare job that has succeeded; Gone (`query_expired_error`) once it has
-    gone."""
+    """Builds the response from the result of a succeeded compare job.
+
+    Raises:
+        Gone: `query_expired`, if the result was deleted.
+    """
     params = CompareJobParams.model_validate(job.params)
     try:
         data = gateway.store.get(comparison_key(job.id))
     except NotFound:
         raise query_expired_error() from None
     candidates = CompareResult.model_validate_json(data).candidates
-    scores = {one.photo_id: one for one in params.request.candidates}
+    searched = {candidate.photo_id: candidate for candidate in params.request.candidates}
     with gateway.catalog.read() as session:
-        photos = get_live_photos(session, scores)
-    live = [one for one in candidates if one.photo_id in photos]
+        photos = get_live_photos(session, searched)
+    live = [candidate for candidate in candidates if candidate.photo_id in photos]
     assert job.finished_at is not None
-    took_ms = (job.finished_at - job.created_at).total_seconds() * 1000
+    elapsed_ms = (job.finished_at - job.created_at).total_seconds() * 1000
     return params.frame.model_copy(
-        update={"processing_time_ms": params.frame.processing_time_ms + took_ms}
+        update={"processing_time_ms": params.frame.processing_time_ms + elapsed_ms}
     ).with_photos(
         SimilarPhotoResponse(
-            similarity_score=scores[one.photo_id].score,
-            weighted_score=scores[one.photo_id].weighted_score,
-            rerank_score=one.rerank_score,
-            explanation=_explanation_response(one),
-            **PhotoResponse.fields_of(photos[one.photo_id], map_name),
+            similarity_score=searched[candidate.photo_id].score,
+            weighted_score=searched[candidate.photo_id].weighted_score,
+            rerank_score=candidate.rerank_score,
+            explanation=_explanation_response(candidate),
+            **PhotoResponse.fields_of(photos[candidate.photo_id], map_name),
         )
-        for one in live[: params.top_k]
+        for candidate in live[: params.top_k]
     )
 
 
 def _find_compare_job(session: Session, describe_job: Job) -> Job | None:
-    known = describe_job.params.get(COMPARE_JOB_PARAM)
-    return session.get(Job, UUID(known)) if known else None
+    job_id = describe_job.params.get(COMPARE_JOB_PARAM)
+    return session.get(Job, UUID(job_id)) if job_id else None
 
 
 def _build_compare_job(
@@ -148,9 +156,8 @@ def _build_compare_job(
     search_params: SearchParams,
     describe_job_id: UUID | None,
 ) -> tuple[Job, Search]:
-    """A job to be queued, and the history's row: of each question one, however often its answer is
-    fetched."""
-    found = run_similarity_search(gateway, query, search_params)
+    """Searches, and builds the compare job and the history row; neither is added to a session."""
+    result = run_similarity_search(gateway, query, search_params)
     params = CompareJobParams(
         request=CompareRequest(
             query_photo_id=query.photo_id,
@@ -159,14 +166,14 @@ def _build_compare_job(
                 RerankCandidate(
                     photo_id=hit.photo_id, score=hit.score, weighted_score=hit.weighted_score
                 )
-                for hit in found.hits
+                for hit in result.hits
             ),
             rerank=search_params.rerank or 0,
             explain=search_params.top_k if search_params.explain else 0,
-            word_weights=found.word_weights,
+            word_weights=result.word_weights,
         ),
         top_k=search_params.top_k,
-        frame=found.response_without_photos,
+        frame=result.response_without_photos,
     )
     job = Job(
         id=new_id(),
@@ -176,7 +183,7 @@ def _build_compare_job(
         generation_id=query.generation.id,
         params=params.model_dump(mode="json"),
     )
-    return job, found.history_row
+    return job, result.history_row
 
 
 def _explanation_response(candidate: RerankedCandidate) -> ExplanationResponse | None:

@@ -1,4 +1,7 @@
-"""What the API answers. Times are UTC with an offset; ids are UUIDv7; sizes are bytes."""
+"""Response models of the API, and helpers that build URLs and 202 responses.
+
+Times are UTC with an offset, ids are UUIDv7, sizes are bytes.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +30,7 @@ class PhotoResponse(ResponseModel):
     """A stored photo."""
 
     image_id: UUID
-    image_path: str = Field(description="path of the photo's bytes on this server")
+    image_path: str = Field(description="URL path of the image on this server")
     original_filename: str
     upload_time: datetime
     file_size: int
@@ -46,6 +49,7 @@ class PhotoResponse(ResponseModel):
 
     @classmethod
     def fields_of(cls, photo: Photo, map_name: str) -> dict[str, Any]:
+        """Returns the values of the fields for `photo`, for the constructors of subclasses."""
         image_url = url_in_map(f"/uploads/{photo.id}/image", map_name)
         return {
             "image_id": photo.id,
@@ -78,62 +82,65 @@ class PhotoDetailResponse(PhotoResponse):
 
 
 class ClusterShareResponse(ResponseModel):
-    cluster: int = Field(description="of the generation's vocabulary, from 0")
-    share: float = Field(description="what it adds to the similarity")
+    cluster: int = Field(description="index in the vocabulary of the generation, from 0")
+    share: float = Field(description="its contribution to the similarity")
 
 
 class ExplanationResponse(ResponseModel):
-    """Where a similarity comes from, as shares that add up to it."""
+    """Contributions of clusters and patches to a similarity; they add up to it."""
 
     clusters: list[ClusterShareResponse] | None = Field(
-        description="of those that both photos use, largest share first; null without a vocabulary"
+        description="clusters that both photos use, largest share first; null without a vocabulary"
     )
-    rows: int = Field(description="of the grid of the query's patches")
-    columns: int
+    rows: int = Field(description="rows of the query's patch grid")
+    columns: int = Field(description="columns of the query's patch grid")
     overlay: str = Field(
-        description="data URI of a PNG with one pixel for each patch of the query: orange speaks "
-        "for the match, violet against it, transparent for neither. Stretch it over the query "
-        "photo without smoothing"
+        description="data URI of a PNG with one pixel per patch of the query: orange patches "
+        "raise the similarity, violet ones lower it, transparent ones do neither. Scale it to the "
+        "query photo without interpolation"
     )
-    full_share: float = Field(description="the share of a patch that is drawn opaque")
+    full_share: float = Field(description="the share at which a patch is drawn fully opaque")
 
 
 class SimilarPhotoResponse(PhotoResponse):
     similarity_score: float = Field(description="cosine similarity in [-1, 1]")
     weighted_score: float | None = Field(
         None,
-        description="cosine similarity to the query with weighted words, by which the answer is "
-        "ranked; null where it is ranked by `similarity_score`",
+        description="cosine similarity with word weights, if the result is ranked by it; null if "
+        "it is ranked by `similarity_score`",
     )
     rerank_score: float | None = Field(
         None,
-        description="with `rerank`: the similarity, raised by half of the share of patches that "
-        "match the query's and have moved alike (0 to 1); null where a photo was not compared",
+        description="with `rerank`: the similarity plus half of the share (0 to 1) of patches that "
+        "match the query's with a consistent displacement; null if the photo was not compared",
     )
     explanation: ExplanationResponse | None = Field(
-        None, description="with `explain=true`, from the patches of the query"
+        None, description="with `explain=true`: contributions of clusters and patches"
     )
 
 
 class EstimateResponse(ResponseModel):
-    """Which place the answer points to, and how far to believe it."""
+    """Estimate of the place that the query photo shows, with a confidence."""
 
-    in_map: bool | None = Field(
-        None, description="false: not in this map; null: that can't be told yet"
-    )
+    in_map: bool | None = Field(None, description="false: not in this map; null: not known yet")
     latitude: float | None = None
     longitude: float | None = None
-    radius_m: float | None = Field(None, description="right means: within so many metres")
+    radius_m: float | None = Field(
+        None,
+        description="tolerance in metres: the estimate is right if the true position is within it",
+    )
     place: str | None = None
     confidence: float | None = Field(
-        None, description="P(right), learnt from labelled queries; null while uncalibrated"
+        None,
+        description="probability of being right, calibrated on labelled queries; null while "
+        "uncalibrated",
     )
     calibration: str = Field("uncalibrated", description="`calibrated` or `uncalibrated`")
     reason: str
 
 
 class SimilarityResponse(ResponseModel):
-    """The most similar photos, best first, never the query itself."""
+    """The most similar photos, best first, without the query itself."""
 
     query_file_id: UUID | None = Field(description="null when the query photo is not stored")
     query_filename: str
@@ -142,28 +149,28 @@ class SimilarityResponse(ResponseModel):
     similar_images: list[SimilarPhotoResponse]
     estimate: EstimateResponse
     vocabulary: str = Field(
-        description="`own`: learnt on this map's photos; `foreign`: on photos of elsewhere; "
+        description="`own`: fitted on this map's photos; `foreign`: fitted on other photos; "
         "`none`: the extractor uses none"
     )
     word_weights: str = Field(
         description="`applied`: ranked by `weighted_score`; `none`: the generation has no weights, "
-        "or the query none of the words that have one; `off`: turned off by the call or by "
-        "WORD_WEIGHTS"
+        "or the query has no words with weights; `off`: disabled by the request or by WORD_WEIGHTS"
     )
     generation_id: UUID
     certificate: str = Field(
-        description="`exhaustive`: every row was compared exactly; `bound`: none that was left out "
-        "can be in the answer; `statistical`: the same but for a chance of 1 in 10^8; `none`: the "
+        description="`exhaustive`: every row was compared exactly; `bound`: no skipped row can "
+        "be in the result; `statistical`: the same with an error probability of 1e-8; `none`: the "
         "search ended early, or a part of the map could not be searched (`missing`)"
     )
     certified_k: int = Field(
         0,
-        description="so many of the first photos are certain: all, unless it ended early; 0 where "
-        "a part of the map is missing",
+        description="how many of the first photos are certain: all, unless the search ended early; "
+        "0 if a part of the map is missing",
     )
     max_z: float | None = Field(
         None,
-        description="largest error of an estimate from codes, in standard deviations; null without",
+        description="largest error of a similarity estimated from codes, in standard deviations; "
+        "null without codes",
     )
     rows_scanned: int
     rows_reranked: int
@@ -172,18 +179,20 @@ class SimilarityResponse(ResponseModel):
         False, description="true: `missing` names parts of the map that could not be searched"
     )
     missing: list[str] = Field(
-        description="what could not be searched: chunks (`chunks/....npy`) that can't be read, and "
-        "shards (`shard 1/3`) of which no search worker answers"
+        description="what could not be searched: unreadable chunks (`chunks/....npy`) and shards "
+        "without a search worker (`shard 1/3`)"
     )
 
     def with_photos(self, photos: Iterable[SimilarPhotoResponse]) -> SimilarityResponse:
-        """The same answer with these photos."""
+        """Returns a copy of the response with these photos."""
         images = list(photos)
         return self.model_copy(update={"similar_images": images, "total_similar": len(images)})
 
 
 class MetadataSearchResponse(ResponseModel):
-    total_found: int = Field(description="all that match, not only this page; at most 10,000")
+    total_found: int = Field(
+        description="number of all matches, not only of this page; at most 10,000"
+    )
     total_is_exact: bool = Field(description="false: there may be more than `total_found`")
     images: list[PhotoResponse]
     next_cursor: str | None
@@ -201,15 +210,15 @@ class JobResponse(ResponseModel):
     kind: JobKind
     state: JobState
     stage: str | None = Field(
-        description="of a model change: sample, cluster, describe, "
-        "load; of a batch: list, store, describe"
+        description="model changes: `sample`, `cluster`, `describe`, `load`; batches: `list`, "
+        "`store`, `describe`"
     )
     waiting_for: str | None = Field(
-        description="what has to be there before the job can go on: `vocabulary`, `descriptors`, "
-        "`search`, or of a batch `disk_space`"
+        description="what must become available before the job can continue: `vocabulary`, "
+        "`descriptors`, `search`, or for batches `disk_space`"
     )
     awaited: list[str] | None = Field(
-        description="the search workers that it waits for, once they take longer than a minute"
+        description="search workers that the job has been waiting for longer than a minute"
     )
     progress: JobProgress
     attempts: int
@@ -222,12 +231,12 @@ class JobResponse(ResponseModel):
     status_url: str
     result_url: str | None
     request_id: str | None = Field(
-        description="`X-Request-ID` of the call that made it; logs of every service carry it"
+        description="`X-Request-ID` of the request that created the job, as in the logs"
     )
 
     @classmethod
     def of(cls, job: Job, map_name: str) -> JobResponse:
-        query = job.kind in QUERY_JOBS
+        is_query = job.kind in QUERY_JOBS
         return cls(
             job_id=job.id,
             kind=JobKind(job.kind),
@@ -242,13 +251,13 @@ class JobResponse(ResponseModel):
             ),
             attempts=job.attempts,
             file_id=job.photo_id,
-            result=None if query else job.result,
+            result=None if is_query else job.result,
             error=job.error,
             created_at=job.created_at,
             started_at=job.started_at,
             finished_at=job.finished_at,
             status_url=job_url(job.id, map_name),
-            result_url=job_url(job.id, map_name, "/result") if query else None,
+            result_url=job_url(job.id, map_name, "/result") if is_query else None,
             request_id=job.request_id,
         )
 
@@ -259,7 +268,7 @@ class JobsResponse(ResponseModel):
 
 
 class JobAcceptedResponse(ResponseModel):
-    """202: the work is queued; poll `status_url`."""
+    """202: the job is queued; poll `status_url`."""
 
     job_id: UUID
     status: JobState
@@ -275,7 +284,7 @@ class UploadResponse(ResponseModel):
     upload_time: datetime
     status: JobState
     status_url: str
-    already_there: bool = Field(description="the map has these bytes; none were stored")
+    already_there: bool = Field(description="the map already has these bytes; nothing was stored")
     message: str
 
 
@@ -292,9 +301,9 @@ class VocabularyResponse(ResponseModel):
     dimension: int
     sha256: str
     provenance: dict[str, Any] = Field(
-        description="what it was learnt with: `backbone`, `backbone_fingerprint`, `layer`, "
-        "`facet`, `preprocessing`, and of a fit `photos`, `seed` and more; `learnt_with: unknown` "
-        "where the imported file does not say"
+        description="features that it was fitted on: `backbone`, `backbone_fingerprint`, `layer`, "
+        "`facet`, `preprocessing`, and for a fit `photos`, `seed` and more; `learnt_with: unknown` "
+        "if the imported file does not contain them"
     )
     created_at: datetime
 
@@ -315,10 +324,10 @@ class GenerationResponse(ResponseModel):
     generation_id: UUID
     state: GenerationState
     extractor: str
-    dimension: int = Field(description="of its descriptors, after PCA where there is one")
-    pca_from: int | None = Field(description="their dimension before PCA; null without")
+    dimension: int = Field(description="of its descriptors, after PCA if there is one")
+    pca_from: int | None = Field(description="dimension before PCA; null without PCA")
     vocabulary_id: UUID | None
-    photos: int = Field(description="live photos that have a descriptor in it")
+    photos: int = Field(description="live photos with a descriptor in this generation")
     spec: dict[str, Any]
     created_at: datetime
     activated_at: datetime | None
@@ -342,18 +351,19 @@ class GenerationResponse(ResponseModel):
 
 
 def url_in_map(path: str, map_name: str) -> str:
-    """URL of a call of the API that finds what belongs to the map: with `?map=` unless the map is
-    the default one."""
+    """Returns the URL path of an endpoint, with `?map=` unless the map is the default one."""
     return f"{API_PREFIX}{path}" + (
         "" if map_name == DEFAULT_MAP else f"?{urlencode({'map': map_name})}"
     )
 
 
-def job_url(job_id: UUID, map_name: str, part: str = "") -> str:
-    return url_in_map(f"/jobs/{job_id}{part}", map_name)
+def job_url(job_id: UUID, map_name: str, suffix: str = "") -> str:
+    """Returns the URL path of a job, or of one of its subresources such as `/result`."""
+    return url_in_map(f"/jobs/{job_id}{suffix}", map_name)
 
 
 def to_job_accepted(job: Job, map_name: str) -> JobAcceptedResponse:
+    """Builds the body of the 202 response for a job."""
     return JobAcceptedResponse(
         job_id=job.id,
         status=JobState(job.state),
@@ -363,8 +373,8 @@ def to_job_accepted(job: Job, map_name: str) -> JobAcceptedResponse:
 
 
 def accept_job(response: Response, job: Job, map_name: str) -> JobAcceptedResponse:
-    """What a 202 says of its job, in the body and in the headers of `response`."""
-    started = to_job_accepted(job, map_name)
-    response.headers["Location"] = started.status_url
+    """Builds the body of the 202 response for a job, and sets its headers on `response`."""
+    accepted = to_job_accepted(job, map_name)
+    response.headers["Location"] = accepted.status_url
     response.headers["Retry-After"] = "1"
-    return started
+    return accepted

@@ -1,6 +1,7 @@
-"""The filters of both similarity calls and of the metadata search, read from the query.
+"""Query parameters of the searches: photo filters and the ranking parameters.
 
-What of a ranking is asked for: the parameters that both similarity calls take.
+`FilterDep` parses the filters of the similarity searches and of the metadata search;
+`SearchParamsDep` adds the ranking parameters of the similarity searches.
 """
 
 from __future__ import annotations
@@ -25,7 +26,8 @@ MAX_IDS_CHARACTERS = 40_000
 
 def parse_photo_filter(
     near: Annotated[
-        str | None, Query(description="LAT,LON,RADIUS_M: taken within so many metres of a point")
+        str | None,
+        Query(description="LAT,LON,RADIUS_M: photos taken within RADIUS_M metres of the point"),
     ] = None,
     box: Annotated[
         str | None,
@@ -38,19 +40,24 @@ def parse_photo_filter(
         str | None, Query(description="ISO 8601; no offset means UTC")
     ] = None,
     place: Annotated[
-        str | None, Query(max_length=MAX_TEXT_CHARACTERS, description="exactly this label")
+        str | None,
+        Query(max_length=MAX_TEXT_CHARACTERS, description="photos with exactly this label"),
     ] = None,
     tags: Annotated[
-        str | None, Query(max_length=5000, description="separated by commas: all are wanted")
+        str | None, Query(max_length=5000, description="separated by commas; photos must have all")
     ] = None,
     ids: Annotated[
         str | None,
-        Query(max_length=MAX_IDS_CHARACTERS, description="separated by commas: only these photos"),
+        Query(max_length=MAX_IDS_CHARACTERS, description="photo ids, separated by commas"),
     ] = None,
 ) -> PhotoFilter:
-    """The filter that the query parameters describe; 422 names the one that can't be read."""
+    """Parses the filter from the query parameters.
+
+    Raises:
+        Unprocessable: `invalid_field`, with the name of the invalid parameter.
+    """
     if place is not None and "\0" in place:
-        raise invalid_field_error("place", "holds a NUL character")
+        raise invalid_field_error("place", "contains a NUL character")
     return PhotoFilter(
         near=_parse_circle(near) if near is not None else None,
         box=_parse_box(box) if box is not None else None,
@@ -69,7 +76,7 @@ def _parse_circle(text: str) -> Circle:
     latitude, longitude, radius_m = _parse_numbers("near", text, "LAT,LON,RADIUS_M")
     _check_coordinates("near", latitude, longitude)
     if radius_m < 0:
-        raise invalid_field_error("near", f"its radius, {radius_m:g} m, is negative")
+        raise invalid_field_error("near", f"the radius {radius_m:g} m is negative")
     return Circle(latitude=latitude, longitude=longitude, radius_m=radius_m)
 
 
@@ -79,7 +86,7 @@ def _parse_box(text: str) -> Box:
     _check_coordinates("box", north, east)
     if south > north:
         raise invalid_field_error(
-            "box", f"its south, {south:g}, lies north of its north, {north:g}"
+            "box", f"the southern latitude {south:g} is greater than the northern {north:g}"
         )
     return Box(south=south, west=west, north=north, east=east)
 
@@ -91,7 +98,7 @@ def _parse_numbers(field: str, text: str, form: str) -> list[float]:
     except ValueError:
         numbers = []
     if len(numbers) != len(form.split(",")) or not all(map(math.isfinite, numbers)):
-        raise invalid_field_error(field, f"{text!r} is not {form}")
+        raise invalid_field_error(field, f"{text!r} does not have the form {form}")
     return numbers
 
 
@@ -103,19 +110,22 @@ def _check_coordinates(field: str, latitude: float, longitude: float) -> None:
 
 
 def _parse_ids(text: str) -> tuple[UUID, ...]:
-    found = []
+    ids = []
     for part in text.split(","):
         try:
-            found.append(UUID(part.strip()))
+            ids.append(UUID(part.strip()))
         except ValueError:
-            raise invalid_field_error("ids", f"{part.strip()!r} is no photo's id") from None
-    if len(found) > MAX_IDS:
-        raise invalid_field_error("ids", f"at most {MAX_IDS} ids")
-    return tuple(found)
+            raise invalid_field_error("ids", f"{part.strip()!r} is not a photo id (UUID)") from None
+    if len(ids) > MAX_IDS:
+        raise invalid_field_error("ids", f"has {len(ids)} ids; at most {MAX_IDS} are allowed")
+    return tuple(ids)
 
 
 class SearchParams(BaseModel):
-    """What of the ranking is asked for. Kept with the job of a photo that is described first."""
+    """Parameters of a similarity search.
+
+    Stored as JSON in the job of a query photo, which is described before the search runs.
+    """
 
     model_config = ConfigDict(frozen=True)
 
@@ -131,36 +141,38 @@ class SearchParams(BaseModel):
 
     @property
     def needs_comparison(self) -> bool:
-        """Whether an extractor has to look at what the search finds."""
+        """Whether an extractor must compare the query with the found photos."""
         return self.rerank is not None or self.explain
 
 
-TopK = Annotated[int, Query(ge=1, le=100, description="How many photos to answer.")]
+TopK = Annotated[int, Query(ge=1, le=100, description="Maximum number of photos to return.")]
 MinScore = Annotated[
     float | None,
-    Query(ge=-1, le=1, description="Leave out photos less similar than this."),
+    Query(ge=-1, le=1, description="Minimum cosine similarity of the returned photos."),
 ]
 ModeParam = Annotated[
     Mode,
     Query(
         alias="mode",
-        description="How to search: `auto`, whichever reads least; `dense`, every row; "
-        "`deterministic`, leaving nothing to chance. The photos are the same.",
+        description="Search algorithm. `auto`: the one that reads the fewest rows; `dense`: scans "
+        "every row; `deterministic`: uses no probabilistic bounds. All return the same photos.",
     ),
 ]
 MaxRows = Annotated[
     int | None,
-    Query(ge=0, description="End the search once so many rows were read, and say so."),
+    Query(
+        ge=0, description="Stop the search after reading this many rows; `certificate` reports it."
+    ),
 ]
 MaxSeconds = Annotated[
     float | None,
-    Query(gt=0, description="End the search after so long, and say so."),
+    Query(gt=0, description="Stop the search after this many seconds; `certificate` reports it."),
 ]
 UseWordWeights = Annotated[
     bool,
     Query(
         alias="word_weights",
-        description="Rank by the map's word weights, where it has any.",
+        description="Rank by the word weights of the map, if it has any.",
     ),
 ]
 Rerank = Annotated[
@@ -168,11 +180,12 @@ Rerank = Annotated[
     Query(
         ge=1,
         le=MAX_RERANK_CANDIDATES,
-        description="Look at the first N photos patch by patch, and order them by what is seen.",
+        description="Compare the first N photos with the query patch by patch, and rerank them.",
     ),
 ]
 Explain = Annotated[
-    bool, Query(description="Say of each photo which clusters and patches make it similar.")
+    bool,
+    Query(description="Return the clusters and patches that contribute to each similarity."),
 ]
 
 
@@ -187,6 +200,7 @@ def parse_search_params(
     most_rows: MaxRows = None,
     most_seconds: MaxSeconds = None,
 ) -> SearchParams:
+    """Dependency that collects the query parameters of a similarity search."""
     return SearchParams(
         top_k=top_k,
         min_score=min_score,

@@ -1,11 +1,10 @@
-"""From a reference to a descriptor to an answer: ask the search tier, join with live photos.
+"""Similarity searches: query the search tier, join the hits with live photos, estimate the place.
 
-Results are joined by photo id, never by position: a photo that was deleted a moment ago falls out
-here, and the search is asked again for more until k live ones are found or there are no more.
+Hits are joined with the catalog by photo id. Photos that have just been deleted are dropped, and
+the search is repeated with a larger k until k live photos are found or there are no more.
 
-Whether an answer is ranked by word weights, and what its scores mean then.
-
-From the ranking of a similarity search to the answer's estimate.
+The module also selects the word weights that a search ranks by (`select_ranking_weights`), and
+computes the place estimate and its confidence from the ranking (`estimate_place`).
 """
 
 from __future__ import annotations
@@ -57,21 +56,21 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class RankingWeights:
-    """What a search is asked with, and what that says of its answer."""
+    """Word weights of a search, and the calibration that belongs to them."""
 
     generation: Generation
     record: WordWeights | None
     values: tuple[float, ...]
-    """Empty: rank by the plain cosine."""
+    """One weight per word; () to rank by the plain cosine similarity."""
 
     def state(self, hits: Sequence[SearchHit]) -> str:
-        """`applied`, `none` or `off`."""
+        """Returns the response field `word_weights`: `applied`, `none` or `off`."""
         if self.values:
             return "applied" if self._ranked_by_weights(hits) else "none"
         return "off" if self.record and self.record.applied else "none"
 
     def calibration(self, hits: Sequence[SearchHit]) -> Calibration | None:
-        """What the generation's evaluations have learnt of rankings like this one."""
+        """Returns the calibration for this kind of ranking; None if there is none."""
         if self.values and self.record and self._ranked_by_weights(hits):
             return self.record.calibration
         stored = self.generation.calibration
@@ -84,14 +83,14 @@ class RankingWeights:
 def select_ranking_weights(
     generation: Generation, enabled: bool, settings: Settings
 ) -> RankingWeights:
-    """Those of the generation, unless the call or the settings turn them off."""
+    """Selects the word weights of the generation, unless the request or a setting disables them."""
     record = parse_word_weights(generation.word_weights)
-    on = enabled and settings.word_weights
-    return RankingWeights(generation, record, record.applied if record and on else ())
+    enabled = enabled and settings.word_weights
+    return RankingWeights(generation, record, record.applied if record and enabled else ())
 
 
 def locate_hits(hits: Sequence[SearchHit], photos: Mapping[UUID, Photo]) -> list[RankedPhoto]:
-    """Hits with the places of their photos."""
+    """Joins hits with the locations of their photos."""
     return [RankedPhoto(hit.ranked_by, _photo_location(photos[hit.photo_id])) for hit in hits]
 
 
@@ -101,18 +100,20 @@ def estimate_place(
     unfiltered_ranking: Sequence[RankedPhoto],
     radius_m: float,
 ) -> EstimateResponse:
-    """Where the ranking points to, and what the generation's evaluations say of that place.
+    """Estimates the place that a ranking points to.
 
-    `calibration` is what rankings of this kind, plain or by word weights, have taught.
-    `unfiltered_ranking`
-    is the ranking without a filter: the place has to stand up to all others, as it had to when the
-    evaluations learnt what is in the map.
+    Args:
+        calibration: Calibration of this kind of ranking (plain, or by word weights), if any.
+        ranking: The hits of the search, best first.
+        unfiltered_ranking: The hits without the filter. The evidence for the place is computed
+            from them, because the calibration was learnt without filters.
+        radius_m: Photos within this radius in metres show the same place.
     """
     state = calibration.state if calibration else "uncalibrated"
     evidence = compute_evidence(unfiltered_ranking, radius_m, ranking[0].spot) if ranking else None
     if evidence is None:
         reason = (
-            "No photo of the map passes the filter."
+            "No photo of the map matches the filter."
             if not ranking
             else "The most similar photo has neither coordinates nor a place."
         )
@@ -143,14 +144,14 @@ def estimate_place(
 def _estimate_reason(accepted: bool | None, support: float, calibration: Calibration | None) -> str:
     if accepted is None or calibration is None or calibration.support_threshold is None:
         return (
-            "Whether the place is in the map can't be told yet: first an evaluation has to see at "
+            "Whether the place is in the map is not known yet: this needs an evaluation with at "
             "least 20 photos with coordinates or places (POST /api/v1/evaluations)."
         )
     compared = (
-        f"The first ten photos support the place by {support:.4f}; of photos that are not in the "
-        f"map one in twenty reaches {calibration.support_threshold:.4f}."
+        f"The support of the first ten photos for the place is {support:.4f}; 5 % of the queries "
+        f"outside the map reach {calibration.support_threshold:.4f}."
     )
-    return compared if accepted else f"Not in this map, as far as can be told. {compared}"
+    return compared if accepted else f"Probably not in this map. {compared}"
 
 
 def _photo_location(photo: Photo) -> PhotoLocation:
@@ -159,7 +160,7 @@ def _photo_location(photo: Photo) -> PhotoLocation:
 
 @dataclass(frozen=True, slots=True)
 class SimilarityQuery:
-    """What is compared, with what, and what the answer says about it."""
+    """The descriptor to search with, the generation to search in, and fields of the response."""
 
     map_id: UUID
     map_name: str
@@ -174,29 +175,34 @@ class SimilarityQuery:
 
 @dataclass(frozen=True, slots=True)
 class SimilarityResult:
-    """What the search tier has found: the answer but for its photos, and their scores."""
+    """Result of a search: the response without photos, the hits and the history row."""
 
     response_without_photos: SimilarityResponse
-    """Without photos."""
+    """All fields of the response except the photos."""
     hits: list[SearchHit]
-    """Live, wanted, most similar first: `top_k`, or as many more as are to be reranked."""
+    """Live photos, most similar first: `top_k`, or more if more are to be reranked."""
     photos: dict[UUID, Photo]
     word_weights: tuple[float, ...]
-    """By which the hits are ranked, one for each word; () for the plain ranking."""
+    """The weights that the hits are ranked by, one per word; () for the plain ranking."""
     history_row: Search
-    """The row to be added."""
+    """Row of the search history; the caller adds it to a session."""
 
 
 def query_from_photo(gateway: GatewayContext, map_name: str, photo_id: UUID) -> SimilarityQuery:
-    """A stored photo as a query; 404 for an unknown one, 409 while it is not searchable."""
+    """Creates the query for a stored photo.
+
+    Raises:
+        NotFound: `map_not_found`, `photo_not_found`.
+        Conflict: `not_searchable`, if the photo has no descriptor yet.
+    """
     with gateway.catalog.read() as session:
         map_ = get_map(session, map_name)
         photo = get_photo(session, map_.id, photo_id)
         generation = active_generation(session, map_.id)
-        found = find_descriptor(session, generation.id, photo.id) if generation else None
-        if generation is None or found is None:
+        located = find_descriptor(session, generation.id, photo.id) if generation else None
+        if generation is None or located is None:
             raise _not_searchable_error(session, photo, map_name)
-        descriptor, chunk = found
+        descriptor, chunk = located
         return SimilarityQuery(
             map_id=map_.id,
             map_name=map_.name,
@@ -211,7 +217,11 @@ def query_from_photo(gateway: GatewayContext, map_name: str, photo_id: UUID) -> 
 
 
 def query_from_job(gateway: GatewayContext, job: Job) -> SimilarityQuery:
-    """A described query photo; 410 when what it was described into has gone."""
+    """Creates the query for a described query photo.
+
+    Raises:
+        Gone: `query_expired`, if the generation of its descriptor was deleted.
+    """
     result: dict[str, Any] = job.result or {}
     with gateway.catalog.read() as session:
         map_ = session.get_one(Map, job.map_id)
@@ -219,7 +229,7 @@ def query_from_job(gateway: GatewayContext, job: Job) -> SimilarityQuery:
         if generation is None:
             raise Gone(
                 "query_expired",
-                "The query's generation is gone. Ask with the photo again.",
+                "The generation of the query was deleted. Send the photo again.",
             )
         return SimilarityQuery(
             map_id=map_.id,
@@ -237,60 +247,62 @@ def query_from_job(gateway: GatewayContext, job: Job) -> SimilarityQuery:
 def find_similar(
     gateway: GatewayContext, query: SimilarityQuery, search_params: SearchParams
 ) -> SimilarityResponse:
-    """The most similar live photos that are wanted, without the query itself, and the place that
-    they point to; noted in the history."""
-    found = run_similarity_search(gateway, query, search_params)
+    """Finds the most similar live photos and the place estimate, and adds the search history row.
+
+    The query itself is not among the photos. If the disk of the catalog is full, the history row is
+    left out.
+    """
+    result = run_similarity_search(gateway, query, search_params)
     try:
         with gateway.catalog.write() as session:
-            session.add(found.history_row)
+            session.add(result.history_row)
     except SQLAlchemyError as error:
         if not isinstance(to_unavailable(error), StorageFull):
             raise
-        log.warning("the disk of the catalog is full: the search is not added to the history")
-    return found.response_without_photos.with_photos(
+        log.warning("the search is not added to the history: the disk of the catalog is full")
+    return result.response_without_photos.with_photos(
         SimilarPhotoResponse(
             similarity_score=hit.score,
             weighted_score=hit.weighted_score,
-            **PhotoResponse.fields_of(found.photos[hit.photo_id], query.map_name),
+            **PhotoResponse.fields_of(result.photos[hit.photo_id], query.map_name),
         )
-        for hit in found.hits
+        for hit in result.hits
     )
 
 
 def run_similarity_search(
     gateway: GatewayContext, query: SimilarityQuery, search_params: SearchParams
 ) -> SimilarityResult:
-    """Ask the search tier. Whoever answers with what it has found adds the history's row."""
+    """Queries the search tier and computes the estimate. The caller adds the history row."""
     started = time.perf_counter()
     weights = select_ranking_weights(query.generation, search_params.word_weights, gateway.settings)
-    shown = max(search_params.top_k, search_params.rerank or 0)
-    # The estimate looks deeper than most answers, and also at what is below the least score.
-    run_similarity_search = partial(
-        _search_live_photos, gateway, query, search_params, weights=weights.values
-    )
-    hits, photos, response = run_similarity_search(search_params.photos, max(shown, EVIDENCE_DEPTH))
-    ranking = everything = locate_hits(hits, photos)
+    depth = max(search_params.top_k, search_params.rerank or 0)
+    # The estimate needs EVIDENCE_DEPTH hits, also those below `min_score`.
+    search = partial(_search_live_photos, gateway, query, search_params, weights=weights.values)
+    hits, photos, response = search(search_params.photos, max(depth, EVIDENCE_DEPTH))
+    ranking = unfiltered_ranking = locate_hits(hits, photos)
     if not search_params.photos.is_empty:
-        everything = locate_hits(*run_similarity_search(NO_FILTER, EVIDENCE_DEPTH)[:2])
-    found = estimate_place(
-        weights.calibration(hits), ranking, everything, gateway.settings.estimate_radius_m
+        unfiltered_ranking = locate_hits(*search(NO_FILTER, EVIDENCE_DEPTH)[:2])
+    estimate = estimate_place(
+        weights.calibration(hits), ranking, unfiltered_ranking, gateway.settings.estimate_radius_m
     )
-    similar = hits[:shown]
+    similar = hits[:depth]
     if search_params.min_score is not None and weights.values:
-        # The least score is of the plain cosine: there may be more of them far down the ranking.
-        similar, photos, response = run_similarity_search(
-            search_params.photos, shown, min_score=search_params.min_score
+        # `min_score` applies to the plain cosine similarity, but the ranking is by weighted scores:
+        # matching photos may be anywhere in it.
+        similar, photos, response = search(
+            search_params.photos, depth, min_score=search_params.min_score
         )
     elif search_params.min_score is not None:
         similar = [hit for hit in similar if hit.score >= search_params.min_score]
-    took_ms = (time.perf_counter() - started) * 1000
-    frame = SimilarityResponse(
+    elapsed_ms = (time.perf_counter() - started) * 1000
+    response_without_photos = SimilarityResponse(
         query_file_id=query.photo_id,
         query_filename=query.filename,
-        processing_time_ms=took_ms,
+        processing_time_ms=elapsed_ms,
         total_similar=0,
         similar_images=[],
-        estimate=found,
+        estimate=estimate,
         vocabulary=query.vocabulary,
         word_weights=weights.state(hits),
         generation_id=query.generation.id,
@@ -310,18 +322,24 @@ def run_similarity_search(
         query_filename=query.filename,
         top_k=search_params.top_k,
         results=min(len(similar), search_params.top_k),
-        processing_ms=took_ms,
+        processing_ms=elapsed_ms,
         best_score=hits[0].score if hits else None,
-        in_map=found.in_map,
+        in_map=estimate.in_map,
     )
     weighted = any(hit.weighted_score is not None for hit in similar)
-    return SimilarityResult(frame, similar, photos, weights.values if weighted else (), history)
+    return SimilarityResult(
+        response_without_photos,
+        similar,
+        photos,
+        weights.values if weighted else (),
+        history,
+    )
 
 
 def _count_certified(hits: list[SearchHit], response: SearchResponse) -> int:
-    """How many of the first of these hits the search is certain of."""
-    sure = {hit.photo_id for hit in response.hits[: response.certified_k]}
-    return sum(1 for _ in itertools.takewhile(lambda hit: hit.photo_id in sure, hits))
+    """Number of leading hits that the search guarantees."""
+    certain = {hit.photo_id for hit in response.hits[: response.certified_k]}
+    return sum(1 for _ in itertools.takewhile(lambda hit: hit.photo_id in certain, hits))
 
 
 def _search_live_photos(
@@ -334,7 +352,7 @@ def _search_live_photos(
     weights: tuple[float, ...],
     min_score: float | None = None,
 ) -> tuple[list[SearchHit], dict[UUID, Photo], SearchResponse]:
-    """The first `depth` live photos, fewer when there are no more."""
+    """Returns the first `depth` live photos; fewer if there are no more."""
     k = depth
     while True:
         response = gateway.search.search(
@@ -363,18 +381,18 @@ def _search_live_photos(
 
 
 def _not_searchable_error(session: Session, photo: Photo, map_name: str) -> Conflict:
-    """Why the photo can't be asked with, and what to wait for."""
+    """Builds the 409 error: why the photo has no descriptor, and which job to poll."""
     job = session.get(Job, photo.job_id) if photo.job_id else None
     extra: dict[str, Any] = {"file_id": str(photo.id)}
     if job is None:
-        return Conflict("not_searchable", "The photo is not described yet.", **extra)
+        return Conflict("not_searchable", "The photo has no descriptor yet.", **extra)
     status_url = job_url(job.id, map_name)
     extra |= {"job_id": str(job.id), "status_url": status_url, "state": job.state}
     if job.state == JobState.FAILED:
         reason = (job.error or {}).get("detail", "no reason is stored")
         detail = f"The photo could not be described: {reason}"
     elif job.waiting_for:
-        detail = f"The photo is not searchable yet: its job waits for a {job.waiting_for}."
+        detail = f"The photo is not searchable yet: its job is waiting for {job.waiting_for}."
     else:
         detail = f"The photo is not searchable yet: its job is {job.state}. Poll {status_url}."
     return Conflict("not_searchable", detail, **extra)

@@ -1,9 +1,11 @@
-"""Files that browsers load: read once, compressed once, named by their content.
+"""The web page on `/`, the API documentation on `/docs` and `/redoc`, and their static assets.
 
-The page on `/`, the descriptions of the API on `/docs` and `/redoc`, and what they load.
+All assets come from this server: Leaflet, Swagger UI and ReDoc are files of installed packages. The
+only other origin that a page may load from is that of MAP_TILES.
 
-Everything comes from this server: Leaflet, Swagger UI and ReDoc are files of installed packages.
-The one foreign address that a page may load from is that of MAP_TILES.
+Assets are read and compressed once, and revalidated by an ETag of their content. Starlette's
+StaticFiles derives the ETag from the file's modification time, which differs between replicas, and
+does not serve precompressed files.
 """
 
 from __future__ import annotations
@@ -26,7 +28,7 @@ from services.web import PAGE_FOLDER
 from shared.config.settings import Settings
 from shared.errors import NotFound
 
-# Our own: the table of one machine differs from the next, and a module of a wrong type is not run.
+# Not `mimetypes`: its table depends on the machine, and browsers refuse modules of a wrong type.
 MEDIA_TYPES = {
     ".css": "text/css; charset=utf-8",
     ".html": "text/html; charset=utf-8",
@@ -36,41 +38,46 @@ MEDIA_TYPES = {
     ".svg": "image/svg+xml",
 }
 COMPRESSIBLE_SUFFIXES = frozenset({".css", ".html", ".js", ".json", ".svg"})
-# Kept by the browser, but asked for each time: a 304 is small, and a new release shows at once.
+# Browsers cache, but revalidate each time: a 304 is small, and a new release is visible at once.
 CACHE_CONTROL = "no-cache"
 
 
 @dataclass(frozen=True, slots=True)
 class StaticAsset:
-    """One file as it is sent."""
+    """A static file, with its gzip-compressed body."""
 
     media_type: str
     body: bytes
     gzipped_body: bytes | None
-    """The body in gzip; None where that gains nothing."""
+    """The gzip-compressed body; None for formats that are compressed already."""
     digest: str
-    """Hexadecimal digest of the body."""
+    """First 32 hexadecimal digits of the SHA-256 of the body."""
 
     @classmethod
     def from_bytes(cls, suffix: str, body: bytes) -> StaticAsset:
-        """KeyError for a suffix that MEDIA_TYPES does not know."""
+        """Creates an asset; raises KeyError for a suffix that is not in MEDIA_TYPES."""
         zipped = gzip.compress(body, 9, mtime=0) if suffix in COMPRESSIBLE_SUFFIXES else None
         return cls(MEDIA_TYPES[suffix], body, zipped, hashlib.sha256(body).hexdigest()[:32])
 
     def to_response(self, request: Request, headers: dict[str, str]) -> Response:
-        """200, or 304 to a browser that has this very content."""
+        """Builds the response: 200, or 304 if the browser has the same content."""
         zipped = self.gzipped_body if _accepts_gzip(request) else None
         tag = f'"{self.digest}{"-gzip" if zipped else ""}"'
-        own = {"Cache-Control": CACHE_CONTROL, "ETag": tag, "Vary": "Accept-Encoding", **headers}
+        all_headers = {
+            "Cache-Control": CACHE_CONTROL,
+            "ETag": tag,
+            "Vary": "Accept-Encoding",
+            **headers,
+        }
         if tag in request.headers.get("if-none-match", ""):
-            return Response(status_code=304, headers=own)
+            return Response(status_code=304, headers=all_headers)
         if zipped:
-            own["Content-Encoding"] = "gzip"
-        return Response(zipped or self.body, media_type=self.media_type, headers=own)
+            all_headers["Content-Encoding"] = "gzip"
+        return Response(zipped or self.body, media_type=self.media_type, headers=all_headers)
 
 
 def load_assets(folder: Path) -> Iterator[tuple[str, StaticAsset]]:
-    """Every file below the folder whose kind browsers load, by its path from there."""
+    """Yields the files below `folder` with a suffix in MEDIA_TYPES, with their relative paths."""
     for path in sorted(folder.rglob("*")):
         if path.suffix in MEDIA_TYPES:
             yield (
@@ -80,13 +87,13 @@ def load_assets(folder: Path) -> Iterator[tuple[str, StaticAsset]]:
 
 
 def _accepts_gzip(request: Request) -> bool:
-    offered = request.headers.get("accept-encoding", "").replace(" ", "").split(",")
-    return any(one in ("gzip", "gzip;q=1.0") for one in offered)
+    encodings = request.headers.get("accept-encoding", "").replace(" ", "").split(",")
+    return any(encoding in ("gzip", "gzip;q=1.0") for encoding in encodings)
 
 
 ASSET_PREFIX = "/console/"
 HTML_PAGES = ("index.html", "docs.html", "redoc.html")
-# From packages: the folder's name on this server, the package, the folder in it, and its files.
+# Assets of installed packages: URL folder, package, folder in the package, file names.
 VENDORED_PACKAGES = (
     ("leaflet", "xstatic.pkg.leaflet", "data", ("leaflet.js", "leaflet.css")),
     (
@@ -96,56 +103,56 @@ VENDORED_PACKAGES = (
         ("swagger-ui-bundle.js", "swagger-ui.css", "redoc.standalone.js"),
     ),
 )
-# Swagger UI and ReDoc write style elements and run their search in a worker of a blob.
+# Swagger UI and ReDoc insert style elements and run their search in a worker from a blob URL.
 API_DOCS_CSP = "; style-src 'self' 'unsafe-inline'; worker-src blob:"
 
 
 def create_web_page_router(settings: Settings) -> APIRouter:
-    """The routes of the page."""
+    """Creates the routes of the web page, the API documentation and the assets."""
     assets = dict(_load_page_assets())
     pages = {name: assets.pop(name) for name in HTML_PAGES}
     assets["settings.json"] = StaticAsset.from_bytes(
         ".json", json.dumps(_page_settings(settings)).encode()
     )
 
-    of_page = _page_headers(settings)
-    policy = of_page["Content-Security-Policy"]
-    of_descriptions = {**of_page, "Content-Security-Policy": policy + API_DOCS_CSP}
+    page_headers = _page_headers(settings)
+    policy = page_headers["Content-Security-Policy"]
+    docs_headers = {**page_headers, "Content-Security-Policy": policy + API_DOCS_CSP}
     router = APIRouter()
 
     @router.head("/", include_in_schema=False)
     @router.get("/", operation_id="service", response_model=ServiceResponse, tags=["operations"])
-    def first(request: Request) -> Response:
-        """What this is and where to look; to browsers, which ask for HTML, the page."""
+    def root(request: Request) -> Response:
+        """Name, version and links of the service as JSON; the web page for browsers."""
         if "text/html" in request.headers.get("accept", ""):
-            answer = pages["index.html"].to_response(request, of_page)
+            response = pages["index.html"].to_response(request, page_headers)
         else:
-            answer = Response(service_info().model_dump_json(), media_type="application/json")
-        answer.headers["Vary"] = "Accept, Accept-Encoding"
-        return answer
+            response = Response(service_info().model_dump_json(), media_type="application/json")
+        response.headers["Vary"] = "Accept, Accept-Encoding"
+        return response
 
     @router.api_route("/docs", methods=["GET", "HEAD"], include_in_schema=False)
     def docs(request: Request) -> Response:
-        return pages["docs.html"].to_response(request, of_descriptions)
+        return pages["docs.html"].to_response(request, docs_headers)
 
     @router.api_route("/redoc", methods=["GET", "HEAD"], include_in_schema=False)
     def redoc(request: Request) -> Response:
-        return pages["redoc.html"].to_response(request, of_descriptions)
+        return pages["redoc.html"].to_response(request, docs_headers)
 
     @router.api_route(
         ASSET_PREFIX + "{path:path}", methods=["GET", "HEAD"], include_in_schema=False
     )
     def asset(request: Request, path: str) -> Response:
-        found = assets.get(path)
-        if found is None:
+        static_asset = assets.get(path)
+        if static_asset is None:
             raise NotFound("path_not_found", f"There is no {ASSET_PREFIX}{path}.")
-        return found.to_response(request, {"X-Content-Type-Options": "nosniff"})
+        return static_asset.to_response(request, {"X-Content-Type-Options": "nosniff"})
 
     return router
 
 
 def _page_settings(settings: Settings) -> dict[str, str | int | None]:
-    """Open to everyone, before any key: nothing of what is stored."""
+    """Settings of the page. Served without a key: must not expose stored data."""
     return {
         "map_tiles": settings.map_tiles,
         "map_attribution": settings.map_attribution,
@@ -154,13 +161,13 @@ def _page_settings(settings: Settings) -> dict[str, str | int | None]:
 
 
 def _page_headers(settings: Settings) -> dict[str, str]:
-    pictures = ["'self'", "blob:", "data:"]
+    image_sources = ["'self'", "blob:", "data:"]
     if settings.map_tiles is not None:
         tiles = urlsplit(settings.map_tiles)
-        pictures.append(f"{tiles.scheme}://{tiles.netloc}")
+        image_sources.append(f"{tiles.scheme}://{tiles.netloc}")
     policy = {
         "default-src": "'self'",
-        "img-src": " ".join(pictures),
+        "img-src": " ".join(image_sources),
         "base-uri": "'none'",
         "form-action": "'self'",
         "frame-ancestors": "'none'",
@@ -168,7 +175,7 @@ def _page_headers(settings: Settings) -> dict[str, str]:
     }
     return {
         "Content-Security-Policy": "; ".join(f"{name} {value}" for name, value in policy.items()),
-        # Tile servers want to know whose map it is, not which photo it shows.
+        # Tile servers require the origin of the page, but must not see which photo it shows.
         "Referrer-Policy": "strict-origin-when-cross-origin",
         "X-Content-Type-Options": "nosniff",
     }
@@ -176,12 +183,12 @@ def _page_headers(settings: Settings) -> dict[str, str]:
 
 @functools.cache
 def _load_page_assets() -> dict[str, StaticAsset]:
-    """All that pages load, by its path on this server: read, and compressed, once."""
-    found = dict(load_assets(PAGE_FOLDER))
-    for folder, package, inner, names in VENDORED_PACKAGES:
-        there = Path(str(files(package))) / inner
+    """All assets by their URL path below ASSET_PREFIX."""
+    assets = dict(load_assets(PAGE_FOLDER))
+    for url_folder, package, package_folder, names in VENDORED_PACKAGES:
+        source = Path(str(files(package))) / package_folder
         for name in names:
-            found[f"{folder}/{name}"] = StaticAsset.from_bytes(
-                Path(name).suffix, (there / name).read_bytes()
+            assets[f"{url_folder}/{name}"] = StaticAsset.from_bytes(
+                Path(name).suffix, (source / name).read_bytes()
             )
-    return found
+    return assets

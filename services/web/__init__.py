@@ -1,7 +1,7 @@
-"""The page: static files, without a build step. `services/gateway/web_page.py` serves them.
+"""The web page: static files without a build step, served by `services/gateway/web_page.py`.
 
-`page/` is what the browser gets: plain ES modules, one style sheet, and no library but Leaflet,
-which a package brings.
+`page/` contains plain ES modules and one style sheet. The only library is Leaflet, which comes from
+an installed package.
 """
 
 from __future__ import annotations
@@ -9,4 +9,4 @@ from __future__ import annotations
 from pathlib import Path
 
 PAGE_FOLDER = Path(__file__).parent / "page"
-"""index.html, docs.html, redoc.html, and below them what those load from `/console/`."""
+"""Contains index.html, docs.html, redoc.html, and the assets that they load from `/console/`."""

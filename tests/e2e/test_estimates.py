@@ -120,7 +120,7 @@ def test_an_evaluation_lets_answers_say_whether_the_place_is_in_the_map(
     assert len(refused) >= 14, "about one in twenty is accepted"
     for estimate in refused:
         assert (estimate["latitude"], estimate["place"], estimate["radius_m"]) == (None,) * 3
-        assert estimate["reason"].startswith("Not in this map")
+        assert estimate["reason"].startswith("Probably not in this map")
     history = got(server.client.get("/api/v1/searches", params={"map": "streets"}))["searches"]
     assert [search["in_map"] for search in history][::-1] == [
         None,
@@ -134,7 +134,7 @@ def test_a_filter_that_nothing_passes_gives_no_place_and_says_so(
     answer = ask(server, "streets", re_encoded(streets[0]), near="-80,7,1000")
     assert answer["similar_images"] == []
     assert answer["estimate"]["latitude"] is None
-    assert "passes the filter" in answer["estimate"]["reason"]
+    assert "matches the filter" in answer["estimate"]["reason"]
     narrowed = ask(server, "streets", re_encoded(streets[0]), box="4.5,6,6.5,8")
     assert sorted(found["latitude"] for found in narrowed["similar_images"]) == [5, 6]
 

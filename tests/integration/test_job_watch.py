@@ -10,7 +10,7 @@ import pytest
 from sqlalchemy.exc import OperationalError
 
 from services.gateway import dependencies as job_watch
-from services.gateway.dependencies import Change, JobNotifier, Mark
+from services.gateway.dependencies import Change, JobNotifier, WatchedState
 from shared.catalog.schema import migrate
 from shared.catalog.session import Catalog
 from shared.ids import new_id
@@ -77,13 +77,13 @@ def test_stopping_server_lets_nobody_wait_for_long(
 
 
 def count_looks(monkeypatch: pytest.MonkeyPatch, looks: list[set[UUID]]) -> None:
-    real = job_watch._marks
+    real = job_watch._load_watched_states
 
-    def counted(catalog: Catalog, job_ids: set[UUID]) -> dict[UUID, Mark]:
+    def counted(catalog: Catalog, job_ids: set[UUID]) -> dict[UUID, WatchedState]:
         looks.append(job_ids)
         return real(catalog, job_ids)
 
-    monkeypatch.setattr(job_watch, "_marks", counted)
+    monkeypatch.setattr(job_watch, "_load_watched_states", counted)
 
 
 def test_all_that_wait_share_one_look(
@@ -117,19 +117,19 @@ def test_all_event_streams_share_one_look_and_wake_at_their_jobs_change(
     looks: list[set[UUID]] = []
     read: list[set[UUID]] = []
     count_looks(monkeypatch, looks)
-    real = job_watch._jobs
+    real = job_watch._load_jobs
 
     def counted(catalog: Catalog, job_ids: set[UUID]) -> dict[UUID, Job]:
         read.append(job_ids)
         return real(catalog, job_ids)
 
-    monkeypatch.setattr(job_watch, "_jobs", counted)
-    monkeypatch.setattr(job_watch, "CHANGE_LOOK_SECONDS", 0.1)
+    monkeypatch.setattr(job_watch, "_load_jobs", counted)
+    monkeypatch.setattr(job_watch, "CHANGE_POLL_SECONDS", 0.1)
 
     async def scenario() -> None:
         watch = JobNotifier(catalog)
         seen = await asyncio.gather(*(watch.wait_for_change(job, (), LONG) for job in jobs))
-        marks = {change.job.id: change.mark for change in seen if change}
+        marks = {change.job.id: change.state for change in seen if change}
         looks.clear()
         read.clear()
         waits = [
@@ -157,7 +157,7 @@ def test_all_event_streams_share_one_look_and_wake_at_their_jobs_change(
 def test_who_waits_for_a_change_is_told_when_the_catalog_is_away_and_when_time_is_up(
     catalog: Catalog, jobs: list[UUID], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def fail(catalog: Catalog, job_ids: set[UUID]) -> dict[UUID, Mark]:
+    def fail(catalog: Catalog, job_ids: set[UUID]) -> dict[UUID, WatchedState]:
         raise OperationalError("select", {}, Exception("away"))
 
     async def wait(seconds: float) -> Change | None:
@@ -165,7 +165,7 @@ def test_who_waits_for_a_change_is_told_when_the_catalog_is_away_and_when_time_i
 
     with pytest.raises(TimeoutError):
         asyncio.run(wait(0.001))
-    monkeypatch.setattr(job_watch, "_marks", fail)
+    monkeypatch.setattr(job_watch, "_load_watched_states", fail)
     with pytest.raises(OperationalError):
         asyncio.run(wait(LONG))
 

@@ -259,7 +259,7 @@ def test_support_over_the_threshold_is_in_the_map_and_under_it_is_not() -> None:
     assert (inside.in_map, outside.in_map) == (True, False)
     assert inside.latitude is not None
     assert (outside.latitude, outside.longitude, outside.radius_m, outside.place) == (None,) * 4
-    assert outside.reason.startswith("Not in this map")
+    assert outside.reason.startswith("Probably not in this map")
 
 
 def test_labelled_queries_give_a_confidence() -> None:
@@ -271,7 +271,7 @@ def test_labelled_queries_give_a_confidence() -> None:
 
 
 def test_nothing_found_and_nothing_known_are_told_apart() -> None:
-    assert answer(None).reason == "No photo of the map passes the filter."
+    assert answer(None).reason == "No photo of the map matches the filter."
     assert (
         "neither coordinates nor a place"
         in answer(None, (0.9, PhotoLocation(None, None, None))).reason

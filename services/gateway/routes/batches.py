@@ -1,4 +1,4 @@
-"""`POST /upload/batch`: many photos in, one job; `GET /jobs/{job_id}/items`: each of them."""
+"""Routes of batch uploads: `POST /upload/batch` and `GET /jobs/{job_id}/items`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from services.gateway.admission import (
     CHECK_PHOTO_QUOTA,
     AdmissionDep,
     UploadKind,
-    photo_limit,
+    get_photo_limit,
 )
 from services.gateway.authentication import READ, WRITE, Caller, get_caller
 from services.gateway.batch_upload import (
@@ -62,7 +62,7 @@ BATCH_UPLOAD_PATH = "/upload/batch"
 _BINARY_SCHEMA = {"type": "string", "format": "binary"}
 _MANIFEST_SCHEMA = {
     "type": "string",
-    "description": "JSONL: `filename` (of a file of the form) or `key` (of an object below "
+    "description": "JSON lines: `filename` (of a file of the form) or `key` (of an object below "
     "IMPORT_PREFIX), and any of the fields of `POST /upload`",
 }
 REQUEST_BODY = {
@@ -85,8 +85,8 @@ REQUEST_BODY = {
                         MANIFEST_FIELD: _MANIFEST_SCHEMA,
                         PREFIX_FIELD: {
                             "type": "string",
-                            "description": "every photo below it: a folder below IMPORT_PREFIX, "
-                            "or the same as s3://S3_BUCKET/...",
+                            "description": "imports all photos below this key prefix, which must "
+                            "be below IMPORT_PREFIX; also accepted as s3://S3_BUCKET/...",
                         },
                     },
                 }
@@ -98,19 +98,19 @@ REQUEST_BODY = {
 
 
 class BatchAcceptedResponse(JobAcceptedResponse):
-    """202: `items_url` tells of each photo."""
+    """202: poll `status_url`; `items_url` lists the photos."""
 
     items_url: str
 
 
 class BatchItemResponse(ResponseModel):
-    number: int = Field(description="from 1, in the order in which the photos came")
+    number: int = Field(description="from 1, in upload order")
     name: str
     state: JobState = Field(description="`succeeded`: searchable")
     file_id: UUID | None
     job_id: UUID | None = Field(description="the job that describes the photo")
-    already_there: bool = Field(description="the map had these bytes; none were stored")
-    line: int | None = Field(description="of the manifest, where it speaks of the photo")
+    already_there: bool = Field(description="the map already had these bytes; nothing was stored")
+    line: int | None = Field(description="line of the photo in the manifest, if any")
     error: dict[str, Any] | None = Field(description="an RFC 9457 problem")
 
     @classmethod
@@ -148,19 +148,21 @@ async def upload_batch(
     admission: AdmissionDep,
     map_name: MapName = DEFAULT_MAP,
 ) -> BatchAcceptedResponse:
-    """Bring in many photos: files of a form, one archive, or objects that lie in the store, named
-    one by one or by their prefix.
+    """Upload many photos: files of a form, one archive, or objects in the store.
 
-    One job counts them. Each photo is taken as `POST /upload` takes it; one that is refused is an
-    item that has failed, and the others go on.
+    Objects in the store are named by a manifest of their keys or by a prefix. One job shows the
+    progress. Each photo is processed as by `POST /upload`; a refused photo becomes a failed item
+    and does not affect the others.
     """
     with admission.admit_upload(UploadKind.UPLOAD, request):
         received = await parse_batch_upload(request, gateway.store, gateway.settings)
-    whose = _caller_params(get_caller(request), gateway.settings)
-    started = await run_in_threadpool(_queue_batch, gateway, map_name, received, whose, idempotent)
-    response.headers["Location"] = started.status_url
+    caller_params = _caller_params(get_caller(request), gateway.settings)
+    accepted = await run_in_threadpool(
+        _queue_batch, gateway, map_name, received, caller_params, idempotent
+    )
+    response.headers["Location"] = accepted.status_url
     response.headers["Retry-After"] = "1"
-    return started
+    return accepted
 
 
 @router.get(
@@ -177,17 +179,17 @@ def read_batch_items(
     cursor: Annotated[str | None, Query()] = None,
     map_name: MapName = DEFAULT_MAP,
 ) -> BatchItemsResponse:
-    """The photos of a batch, in their order; an archive's once it was looked through."""
+    """List the photos of a batch, in upload order; of an archive, after it has been listed."""
     after = _parse_item_cursor(cursor)
     with gateway.catalog.read() as session:
         job = get_job(session, get_map(session, map_name).id, job_id)
         if job.kind != JobKind.BATCH:
-            raise Conflict("no_items", f"The job {job.id} ({job.kind}) is no batch.")
-        found = list_batch_items(session, job.id, state or [], limit + 1, after)
-    page = found[:limit]
+            raise Conflict("no_items", f"The job {job.id} ({job.kind}) is not a batch.")
+        items = list_batch_items(session, job.id, state or [], limit + 1, after)
+    page = items[:limit]
     return BatchItemsResponse(
         items=[BatchItemResponse.of(item) for item in page],
-        next_cursor=str(page[-1].number) if len(found) > limit else None,
+        next_cursor=str(page[-1].number) if len(items) > limit else None,
     )
 
 
@@ -195,7 +197,7 @@ def _parse_item_cursor(cursor: str | None) -> int:
     if cursor is None:
         return 0
     if not (cursor.isascii() and cursor.isdigit() and len(cursor) < 10):
-        raise invalid_field_error("cursor", "is not one that this call has given")
+        raise invalid_field_error("cursor", "is not a cursor that this endpoint returned")
     return int(cursor)
 
 
@@ -212,82 +214,88 @@ def _queue_batch(
         with gateway.catalog.write() as session:
             map_id = get_map(session, map_name).id
             job = create_batch(session, map_id, source, {**params, **caller_params})
-            if source not in (BatchSource.ARCHIVE, BatchSource.PREFIX):  # the steward lists those
+            # The steward lists the items of archives and prefixes.
+            if source not in (BatchSource.ARCHIVE, BatchSource.PREFIX):
                 add_batch_items(session, job, rows)
             session.flush()
             session.refresh(job)
-            answer = to_job_accepted(job, map_name)
+            job_accepted = to_job_accepted(job, map_name)
             items_url = job_url(job.id, map_name, "/items")
-            started = BatchAcceptedResponse(**answer.model_dump(), items_url=items_url)
-            headers = {"Location": started.status_url, "Retry-After": "1"}
-            idempotent.store_response(session, 202, started, headers)
-            return started
+            accepted = BatchAcceptedResponse(**job_accepted.model_dump(), items_url=items_url)
+            headers = {"Location": accepted.status_url, "Retry-After": "1"}
+            idempotent.store_response(session, 202, accepted, headers)
+            return accepted
     except (PlacewiseError, IdempotentReplay):
-        # Only what is certainly refused: after a lost connection the row may be committed.
+        # Not for other exceptions: after a lost connection the row may have been committed.
         discard_batch_upload(gateway.store, received)
         raise
 
 
 def _caller_params(caller: Caller, settings: Settings) -> dict[str, Any]:
-    """What the steward has to know of the caller, as parameters of the job."""
+    """Job params with the caller's key and photo limit, which the steward applies."""
     if caller.key_id is None:
         return {}
-    limited = photo_limit(caller, settings)
-    return {"key_id": str(caller.key_id), "max_photos": limited[1] if limited else None}
+    key_limit = get_photo_limit(caller, settings)
+    return {"key_id": str(caller.key_id), "max_photos": key_limit[1] if key_limit else None}
 
 
 def _plan_items(
     gateway: GatewayContext, received: BatchUpload
 ) -> tuple[list[dict[str, Any]], BatchSource, dict[str, Any]]:
-    """The batch's items as columns of BatchItem, where they come from, and its parameters."""
+    """Returns the items as column values of BatchItem, their source, and the job params."""
     if received.archive is not None:
         archive = received.archive
         return [], BatchSource.ARCHIVE, {"object_key": archive.key, "filename": archive.name}
     if received.files:
-        said = read_jsonl_manifest(received.manifest or b"", "the manifest")
-        return list(_form_file_items(received.files, said)), BatchSource.FILES, {}
+        entries = read_jsonl_manifest(received.manifest or b"", "the manifest")
+        return list(_form_file_items(received.files, entries)), BatchSource.FILES, {}
     if received.prefix is not None:
         return (
             [],
             BatchSource.PREFIX,
             {"prefix": validate_prefix(received.prefix, gateway.settings)},
         )
-    said = read_jsonl_manifest(received.manifest or b"", "the manifest", (KEY_FIELD,))
-    _validate_keys(said, gateway.settings.import_prefix)
-    if not said:
-        raise Unprocessable("no_photos", "The manifest has no line.")
-    if len(said) > gateway.settings.max_batch_photos:
+    entries = read_jsonl_manifest(received.manifest or b"", "the manifest", (KEY_FIELD,))
+    _validate_keys(entries, gateway.settings.import_prefix)
+    if not entries:
+        raise Unprocessable("no_photos", "The manifest has no lines.")
+    if len(entries) > gateway.settings.max_batch_photos:
         raise too_many_photos_error(gateway.settings.max_batch_photos)
     rows = [
-        {"name": one.name, "object_key": one.name, "fields": one.fields, "line": one.line}
-        for one in said
+        {
+            "name": entry.name,
+            "object_key": entry.name,
+            "fields": entry.fields,
+            "line": entry.line,
+        }
+        for entry in entries
     ]
     return rows, BatchSource.KEYS, {}
 
 
 def _form_file_items(
-    files: list[BatchFile], manifest_lines: list[ManifestEntry]
+    files: list[BatchFile], entries: list[ManifestEntry]
 ) -> Iterator[dict[str, Any]]:
-    times = Counter(file.name for file in files)
-    strange = [
-        (one.line, f"the form has no file {one.name!r}")
-        for one in manifest_lines
-        if not times[one.name]
+    count_by_name = Counter(file.name for file in files)
+    errors = [
+        (entry.line, f"the form has no file {entry.name!r}")
+        for entry in entries
+        if not count_by_name[entry.name]
     ]
-    strange += [
-        (one.line, f"{times[one.name]} files of the form are called {one.name!r}")
-        for one in manifest_lines
-        if times[one.name] > 1
+    errors += [
+        (entry.line, f"{count_by_name[entry.name]} files of the form are called {entry.name!r}")
+        for entry in entries
+        if count_by_name[entry.name] > 1
     ]
-    if strange:
-        raise bad_lines_error("bad_manifest", "the manifest", sorted(strange)[:MAX_REPORTED_LINES])
-    by_name = {one.name: one for one in manifest_lines}
+    if errors:
+        raise bad_lines_error("bad_manifest", "the manifest", sorted(errors)[:MAX_REPORTED_LINES])
+    by_name = {entry.name: entry for entry in entries}
     for file in files:
-        line = by_name.get(file.name)
+        entry = by_name.get(file.name)
         item: dict[str, Any] = {
             "name": file.name,
-            "fields": line.fields if line else {},
-            "line": line.line if line else None,
+            "fields": entry.fields if entry else {},
+            "line": entry.line if entry else None,
         }
         if file.error is None:
             item |= {
@@ -300,15 +308,23 @@ def _form_file_items(
 
 
 def validate_prefix(value: str, settings: Settings) -> str:
-    """The folder of keys that is meant; 422 unless the operator has given it free."""
+    """Returns the key prefix to import, ending with `/`.
+
+    Args:
+        value: A prefix below IMPORT_PREFIX, or the same as `s3://S3_BUCKET/...`.
+        settings: The settings.
+
+    Raises:
+        Unprocessable: `invalid_field`, if it is another bucket or not below IMPORT_PREFIX.
+    """
     prefix = value
     if value.startswith("s3://"):
         bucket, _, prefix = value.removeprefix("s3://").partition("/")
         if settings.s3_endpoint is None or bucket != settings.s3_bucket:
             raise invalid_field_error(
                 PREFIX_FIELD,
-                f"names the bucket {bucket!r}, which is not this Placewise's own. Copy the photos "
-                f"below {settings.import_prefix} of its store",
+                f"names the bucket {bucket!r}, but only the bucket of this server can be imported "
+                f"from. Copy the photos below {settings.import_prefix} of it",
             )
     prefix = prefix.rstrip("/") + "/"
     if not (prefix.startswith(settings.import_prefix) and is_valid_key(prefix[:-1])):
@@ -318,12 +334,12 @@ def validate_prefix(value: str, settings: Settings) -> str:
     return prefix
 
 
-def _validate_keys(manifest_lines: list[ManifestEntry], prefix: str) -> None:
-    """Only what the operator has given free: all else in the store is someone's photo."""
-    bad = [
-        (one.line, f"{KEY_FIELD} is not below {prefix} (IMPORT_PREFIX)")
-        for one in manifest_lines
-        if not (one.name.startswith(prefix) and is_valid_key(one.name))
+def _validate_keys(entries: list[ManifestEntry], prefix: str) -> None:
+    """Only objects below IMPORT_PREFIX may be imported: others may be photos of other maps."""
+    errors = [
+        (entry.line, f"{KEY_FIELD} is not below {prefix} (IMPORT_PREFIX)")
+        for entry in entries
+        if not (entry.name.startswith(prefix) and is_valid_key(entry.name))
     ]
-    if bad:
-        raise bad_lines_error("bad_manifest", "the manifest", bad[:MAX_REPORTED_LINES])
+    if errors:
+        raise bad_lines_error("bad_manifest", "the manifest", errors[:MAX_REPORTED_LINES])

@@ -1,6 +1,7 @@
-"""`/evaluations`: how often the right place comes first, measured on a live map.
+"""Routes of recall evaluations (`/evaluations`) and of word weights.
 
-`/generations/{id}/word-weights`: which words of the vocabulary tell the map's places apart.
+`/generations/{generation_id}/word-weights` fits weights for the words of the vocabulary by how well
+they distinguish the places of the map.
 """
 
 from __future__ import annotations
@@ -46,12 +47,12 @@ router = APIRouter(tags=["evaluations"])
 
 
 class EvaluationRequest(BaseModel):
-    """What to measure; {} is a good choice."""
+    """Options of an evaluation; the defaults suit most maps."""
 
     model_config = ConfigDict(extra="forbid")
 
     sample: int = Field(
-        1000, ge=1, le=1_000_000, description="photos of the map to ask with, at most"
+        1000, ge=1, le=1_000_000, description="maximum number of photos of the map to query with"
     )
     seed: int = Field(0, ge=0, le=2**31 - 1)
 
@@ -59,13 +60,13 @@ class EvaluationRequest(BaseModel):
 class EvaluationResponse(ResponseModel):
     evaluation_id: UUID
     generation_id: UUID
-    automatic: bool = Field(description="made because the map had changed")
-    searchable: int = Field(description="photos that could be found then")
+    automatic: bool = Field(description="started automatically after a change of the map")
+    searchable: int = Field(description="number of searchable photos at that time")
     figures: dict[str, Any] = Field(
-        description="`leave_one_out`: the map's own photos asked, themselves left out; "
-        "`labelled_queries`: photos of role `query`; R@k is the share, of those that the map has "
-        "another photo of, with a right one among the first k; `with_word_weights`: the same, "
-        "ranked by the generation's word weights, null where it has none"
+        description="`leave_one_out`: queries with the map's own photos, each without itself; "
+        "`labelled_queries`: queries with the photos of role `query`; R@k is the share of queries "
+        "with a right photo among the first k, of those that have a right photo in the map; "
+        "`with_word_weights`: the same, ranked by the word weights; null if there are none"
     )
     evaluated_at: datetime
 
@@ -100,8 +101,11 @@ def start_evaluation(
     options: EvaluationRequest | None = None,
     map_name: MapName = DEFAULT_MAP,
 ) -> JobAcceptedResponse:
-    """Measure the active generation: leave-one-out on the map's own photos whose place is known,
-    and recall on its labelled queries. The job's `result` has the figures."""
+    """Evaluate the recall of the active generation.
+
+    It is measured by leave-one-out on the map's own photos with a known place, and on its labelled
+    queries. The `result` of the job contains the metrics.
+    """
     params = (options or EvaluationRequest.model_validate({})).model_dump()
     with gateway.catalog.write() as session:
         map_ = get_map(session, map_name)
@@ -129,14 +133,14 @@ def read_evaluations(
     cursor: Annotated[str | None, Query()] = None,
     map_name: MapName = DEFAULT_MAP,
 ) -> EvaluationsResponse:
-    """Newest first, those made by themselves as well: before and after a vocabulary, in numbers."""
+    """List evaluations, newest first, including automatic ones."""
     before = parse_cursor(cursor)
     with gateway.catalog.read() as session:
-        found = list_evaluations(session, get_map(session, map_name).id, limit + 1, before)
-    page = found[:limit]
+        evaluations = list_evaluations(session, get_map(session, map_name).id, limit + 1, before)
+    page = evaluations[:limit]
     return EvaluationsResponse(
         evaluations=[EvaluationResponse.of(evaluation) for evaluation in page],
-        next_cursor=str(page[-1].id) if len(found) > limit else None,
+        next_cursor=str(page[-1].id) if len(evaluations) > limit else None,
     )
 
 
@@ -148,13 +152,16 @@ def queue_evaluation_job(
     kind: JobKind,
     params: dict[str, Any],
 ) -> Job:
-    """A job that asks the generation with the map's own photos; Conflict (`nothing_to_evaluate`)
-    where none of them has a place."""
+    """Queues a job that queries the generation with the map's own photos.
+
+    Raises:
+        Conflict: `nothing_to_evaluate`, if no described photo has a place.
+    """
     if generation is None or not has_geotagged(session, generation.id, PhotoRole.DATABASE):
         raise Conflict(
             "nothing_to_evaluate",
-            "The map has no described photo with coordinates or a place. Upload some, and wait "
-            "for their jobs.",
+            "The map has no described photo with coordinates or a place. Upload photos with "
+            "coordinates or places, and wait for their jobs.",
         )
     job = Job(id=new_id(), map_id=map_id, kind=kind, priority=Priority.EVALUATION, params=params)
     session.add(job)
@@ -164,41 +171,43 @@ def queue_evaluation_job(
 
 
 class WordWeightsRequest(BaseModel):
-    """How to learn them; {} is a good choice."""
+    """Options of the fit; the defaults suit most maps."""
 
     model_config = ConfigDict(extra="forbid")
 
     sample: int = Field(
-        1000, ge=1, le=1_000_000, description="photos of the map to try them on, at most"
+        1000, ge=1, le=1_000_000, description="maximum number of photos to validate on"
     )
-    seed: int = Field(0, ge=0, le=2**31 - 1, description="decides pairs, halves and sample")
+    seed: int = Field(
+        0, ge=0, le=2**31 - 1, description="seed of the pairs, the halves and the sample"
+    )
 
 
 class WordWeightsResponse(ResponseModel):
     generation_id: UUID
     outcome: Outcome = Field(
-        description="`kept`: searches rank by them; `not kept`: recall did not rise by more than "
-        "chance; `not enough pairs`"
+        description="`kept`: searches rank by the weights; `not kept`: recall did not improve "
+        "significantly; `not enough pairs`"
     )
     reason: str
     taught_by: str = Field(description="`coordinates` or `places`")
-    near_pairs: int = Field(description="pairs of photos of one place that have taught")
-    far_pairs: int = Field(description="pairs of photos of two places that have taught")
+    near_pairs: int = Field(description="training pairs of photos of the same place")
+    far_pairs: int = Field(description="training pairs of photos of different places")
     seed: int
-    searchable: int = Field(description="photos that could be found then")
+    searchable: int = Field(description="number of searchable photos at that time")
     held_out: HeldOut | None = Field(
-        description="photos asked with what the half of the map without them has taught: recall "
-        "`without` weights and `weighted`"
+        description="cross-validation in two halves of the map: recall `without` weights and "
+        "`weighted`, on photos that the weights were not fitted on"
     )
-    weights: list[float] = Field(description="one for each word of the vocabulary, in its order")
+    weights: list[float] = Field(description="one per word of the vocabulary, in its order")
 
     @classmethod
     def of(cls, generation_id: UUID, record: WordWeights) -> WordWeightsResponse:
-        said: dict[str, Any] = record.model_dump(exclude={"calibration"})
-        return cls(generation_id=generation_id, **said)
+        fields: dict[str, Any] = record.model_dump(exclude={"calibration"})
+        return cls(generation_id=generation_id, **fields)
 
 
-GenerationIdPath = Annotated[GenerationId, PathParameter(description="of the map")]
+GenerationIdPath = Annotated[GenerationId, PathParameter(description="a generation of the map")]
 
 
 @router.post(
@@ -216,8 +225,10 @@ def start_word_weights_fit(
     options: WordWeightsRequest | None = None,
     map_name: MapName = DEFAULT_MAP,
 ) -> JobAcceptedResponse:
-    """Learn from the map's own places which words of its vocabulary to trust; keep the weights
-    where they raise recall on photos that have not taught them."""
+    """Fit word weights on the map's own places.
+
+    The weights are used only if they improve recall on photos that they were not fitted on.
+    """
     params = (options or WordWeightsRequest.model_validate({})).model_dump()
     with gateway.catalog.write() as session:
         map_ = get_map(session, map_name)
@@ -225,11 +236,13 @@ def start_word_weights_fit(
         if generation.state != GenerationState.ACTIVE:
             raise Conflict(
                 "generation_not_active",
-                f"The generation is {generation.state}: no search asks it, so nothing can be "
-                "tried. GET /api/v1/generations names the active one.",
+                f"The generation is {generation.state}, so it can't be searched and weights can't "
+                "be validated. Use the active one (GET /api/v1/generations).",
             )
         if reason := word_weights_unavailable_reason(session, generation):
-            raise Conflict("no_word_weights", f"This generation gets no word weights: {reason}.")
+            raise Conflict(
+                "no_word_weights", f"Word weights can't be fitted for this generation: {reason}."
+            )
         params["generation_id"] = str(generation.id)
         job = queue_evaluation_job(
             session, idempotent, map_.id, generation, JobKind.WORD_WEIGHTS, params
@@ -246,14 +259,14 @@ def start_word_weights_fit(
 def read_word_weights(
     gateway: GatewayDep, generation_id: GenerationIdPath, map_name: MapName = DEFAULT_MAP
 ) -> WordWeightsResponse:
-    """What the map's places have taught; 404 before that."""
+    """Get the fitted word weights; 404 if none were fitted."""
     with gateway.catalog.read() as session:
         generation = get_generation(session, get_map(session, map_name).id, generation_id)
     record = parse_word_weights(generation.word_weights)
     if record is None:
         raise NotFound(
             "word_weights_not_found",
-            f"The generation {generation_id} has learnt no word weights. Have them learnt: POST "
+            f"The generation {generation_id} has no word weights. Fit them: POST "
             f"/api/v1/generations/{generation_id}/word-weights.",
         )
     return WordWeightsResponse.of(generation_id, record)

@@ -1,7 +1,7 @@
-"""`/generations/{generation_id}/descriptors`: the rows of a generation, for other programs.
+"""Route that exports the descriptors of a generation as a tar archive.
 
-A tar, because rows and what they belong to must be of one moment. It is streamed: one chunk is in
-memory at a time.
+One archive holds the descriptors and the table of their photos, so that both are from the same
+snapshot. It is streamed with one chunk in memory at a time.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from shared.storage.chunks import read_chunk
 
 router = APIRouter(tags=["models"])
 
-SPOOL_BYTES = 8 * 1024 * 1024  # of a table; more goes to a temporary file
+SPOOL_BYTES = 8 * 1024 * 1024  # larger tables are spooled to a temporary file
 STREAM_READ_BYTES = 256 * 1024
 CSV_COLUMNS = (
     "row",
@@ -55,7 +55,7 @@ TAR_RESPONSE: dict[int | str, dict[str, Any]] = {
 
 @dataclass(frozen=True, slots=True)
 class _ChunkRows:
-    """The live rows of one chunk."""
+    """The rows of live photos in one chunk."""
 
     object_key: str
     sha256: str
@@ -74,17 +74,19 @@ def export_descriptors(
     generation_id: GenerationId,
     map_name: MapName = DEFAULT_MAP,
 ) -> StreamingResponse:
-    """Every live photo's descriptor: `descriptors.npy`, (photos, dimension) float32, each row of
-    length 1; in the same order `photos.csv` and `names.txt`.
+    """Download the descriptors of all live photos as a tar archive.
+
+    `descriptors.npy` has the shape (photos, dimension) and the type float32, with L2-normalised
+    rows; `photos.csv` and `names.txt` are in the same order.
     """
     with contextlib.ExitStack() as files, gateway.catalog.read() as session:
         generation = get_generation(session, get_map(session, map_name).id, generation_id)
         table = files.enter_context(tempfile.SpooledTemporaryFile(SPOOL_BYTES))
         names = files.enter_context(tempfile.SpooledTemporaryFile(SPOOL_BYTES))
-        parts = _write_tables(session, generation, table, names)
-        header = _npy_header(sum(len(part.rows) for part in parts), generation.dimension)
-        files = files.pop_all()  # now the stream's, which closes them
-    rows = sum(len(part.rows) for part in parts)
+        chunks = _write_tables(session, generation, table, names)
+        header = _npy_header(sum(len(chunk.rows) for chunk in chunks), generation.dimension)
+        files = files.pop_all()  # closed by `stream`
+    rows = sum(len(chunk.rows) for chunk in chunks)
     size = len(header) + rows * generation.dimension * np.dtype(np.float32).itemsize
     members = [("photos.csv", table.tell()), ("names.txt", names.tell()), ("descriptors.npy", size)]
 
@@ -95,13 +97,13 @@ def export_descriptors(
                 (
                     _read_blocks(table),
                     _read_blocks(names),
-                    _stream_rows(gateway.store, header, parts),
+                    _stream_rows(gateway.store, header, chunks),
                 ),
                 strict=True,
             ):
-                about = tarfile.TarInfo(name)
-                about.size, about.mtime = size_bytes, int(generation.created_at.timestamp())
-                yield about.tobuf(tarfile.GNU_FORMAT)
+                entry = tarfile.TarInfo(name)
+                entry.size, entry.mtime = size_bytes, int(generation.created_at.timestamp())
+                yield entry.tobuf(tarfile.GNU_FORMAT)
                 yield from content
                 yield bytes(-size_bytes % tarfile.BLOCKSIZE)
             yield bytes(2 * tarfile.BLOCKSIZE)
@@ -111,7 +113,7 @@ def export_descriptors(
         stream(),
         media_type="application/x-tar",
         headers={
-            # Whoever receives less knows that it is not whole.
+            # So that clients can detect an incomplete download.
             "Content-Length": str(length + 2 * tarfile.BLOCKSIZE),
             "Content-Disposition": f'attachment; filename="descriptors-{generation.id}.tar"',
         },
@@ -121,10 +123,11 @@ def export_descriptors(
 def _write_tables(
     session: Session, generation: Generation, table: IO[bytes], names: IO[bytes]
 ) -> list[_ChunkRows]:
-    parts: list[_ChunkRows] = []
+    """Writes photos.csv to `table` and names.txt to `names`; returns the rows to export."""
+    chunks: list[_ChunkRows] = []
     number = 0
     for chunk in list_live_chunks(session, generation.id):
-        found = session.execute(
+        photo_rows = session.execute(
             select(
                 Descriptor.row,
                 Photo.id,
@@ -142,36 +145,36 @@ def _write_tables(
         ).all()
         lines = io.StringIO(newline="")
         writer = csv.writer(lines)
-        if not parts:
+        if not chunks:
             writer.writerow(CSV_COLUMNS)
-        for _, photo_id, name, latitude, longitude, heading, at, place, role in found:
-            taken = at.isoformat() if at else None
+        for _, photo_id, name, latitude, longitude, heading, captured_at, place, role in photo_rows:
+            captured = captured_at.isoformat() if captured_at else None
             writer.writerow(
-                [number, photo_id, name, latitude, longitude, heading, taken, place, str(role)]
+                [number, photo_id, name, latitude, longitude, heading, captured, place, str(role)]
             )
-            # A name is one line, whatever the file was called.
+            # A file name may contain line breaks.
             names.write(" ".join(name.splitlines()).encode() + b"\n")
             number += 1
         table.write(lines.getvalue().encode())
-        parts.append(_ChunkRows(chunk.object_key, chunk.sha256, [row[0] for row in found]))
-    if not parts:
+        chunks.append(_ChunkRows(chunk.object_key, chunk.sha256, [row[0] for row in photo_rows]))
+    if not chunks:
         table.write(",".join(CSV_COLUMNS).encode() + b"\r\n")
-    return parts
+    return chunks
 
 
 def _npy_header(rows: int, dimension: int) -> bytes:
     buffer = io.BytesIO()
-    about = {"descr": "<f4", "fortran_order": False, "shape": (rows, dimension)}
-    np.lib.format.write_array_header_1_0(buffer, about)
+    header = {"descr": "<f4", "fortran_order": False, "shape": (rows, dimension)}
+    np.lib.format.write_array_header_1_0(buffer, header)
     return buffer.getvalue()
 
 
-def _stream_rows(store: ObjectStore, header: bytes, parts: list[_ChunkRows]) -> Iterator[bytes]:
+def _stream_rows(store: ObjectStore, header: bytes, chunks: list[_ChunkRows]) -> Iterator[bytes]:
     yield header
-    for part in parts:
-        if part.rows:
-            rows = read_chunk(store, part.object_key, part.sha256)
-            for row in part.rows:
+    for chunk in chunks:
+        if chunk.rows:
+            rows = read_chunk(store, chunk.object_key, chunk.sha256)
+            for row in chunk.rows:
                 yield rows[row].tobytes()
 
 

@@ -1,4 +1,4 @@
-"""`/livez`, `/readyz`, `/api/v1/health`: does the process live, can it serve, how are its parts."""
+"""Liveness and readiness probes (`/livez`, `/readyz`) and the health of each component."""
 
 from __future__ import annotations
 
@@ -50,17 +50,24 @@ class ComponentStatus(ResponseModel):
 
 
 class LoadResponse(ResponseModel):
-    """How full things are; a full one is refused more (429, 507), and is not unhealthy."""
+    """Load and limits of this gateway.
 
-    waiting_jobs: int = Field(description="without queries, and what a model change queued")
+    At a limit, requests are refused (429, 507), but the service is not unhealthy.
+    """
+
+    waiting_jobs: int = Field(description="queued jobs, without queries and jobs of model changes")
     max_queued_jobs: int
     waiting_queries: int
     max_queued_queries: int
-    finished_per_second: float = Field(description="photos, over the last minute")
-    receiving_uploads: int = Field(description="by this gateway, now")
+    finished_per_second: float = Field(
+        description="processed photos per second, over the last minute"
+    )
+    receiving_uploads: int = Field(description="uploads being received by this gateway")
     receiving_queries: int
     max_concurrent_uploads: int
-    free_bytes: int | None = Field(description="of this machine's disk; null: nothing lies there")
+    free_bytes: int | None = Field(
+        description="free bytes of the local disk; null if nothing is stored on it"
+    )
     min_free_bytes: int
 
 
@@ -69,11 +76,11 @@ class HealthResponse(ResponseModel):
     version: str
     uptime_seconds: float
     parts: dict[str, ComponentStatus]
-    load: LoadResponse | None = Field(description="null while the catalog is away")
+    load: LoadResponse | None = Field(description="null while the catalog is unreachable")
 
 
 def service_info() -> ServiceResponse:
-    """What this is and where to look."""
+    """Returns the name and version of the service, and its links."""
     return ServiceResponse(
         service="Placewise",
         version=VERSION,
@@ -89,16 +96,20 @@ def service_info() -> ServiceResponse:
 @probe_router.head("/livez", include_in_schema=False)
 @probe_router.get("/livez", operation_id="livez", response_model=ProbeResponse)
 def livez() -> ProbeResponse:
-    """The process answers; nothing else is looked at."""
+    """Liveness probe: 200 while the process responds. It checks nothing else."""
     return ProbeResponse(status="alive")
 
 
 @probe_router.head("/readyz", include_in_schema=False)
 @probe_router.get("/readyz", operation_id="readyz", response_model=ProbeResponse)
-def readyz(gateway: GatewayDep, room: AdmissionDep, response: Response) -> ProbeResponse:
-    """503 while a part that every call needs is away. What is only degraded is ready: without some
-    shards or chunks the rest still answers, and on a full disk photos can be deleted."""
-    ready = all(part.status != "unhealthy" for part in _check_components(gateway, room).values())
+def readyz(gateway: GatewayDep, admission: AdmissionDep, response: Response) -> ProbeResponse:
+    """Readiness probe: 503 while a component that every request needs is unavailable.
+
+    Degraded components are ready: the other shards and chunks can be searched, and photos can be
+    deleted while the disk is full.
+    """
+    components = _check_components(gateway, admission)
+    ready = all(component.status != "unhealthy" for component in components.values())
     response.status_code = 200 if ready else 503
     return ProbeResponse(status="ready" if ready else "not ready")
 
@@ -106,30 +117,32 @@ def readyz(gateway: GatewayDep, room: AdmissionDep, response: Response) -> Probe
 @router.head("/health", include_in_schema=False, dependencies=[READ])
 @router.get("/health", operation_id="health", response_model=HealthResponse, dependencies=[READ])
 def read_health(gateway: GatewayDep, admission: AdmissionDep, response: Response) -> HealthResponse:
-    """The state of each part; 503 when one is away, or `degraded`: chunks or shards of the map
-    can't be searched, or uploads are refused because the disk is full."""
-    parts = _check_components(gateway, admission)
-    states = {part.status for part in parts.values()}
-    response.status_code = 200 if states == {"healthy"} else 503
+    """Get the health of each component; 503 unless all are healthy.
+
+    `degraded`: chunks or shards can't be searched, or uploads are refused because the disk is full.
+    """
+    components = _check_components(gateway, admission)
+    statuses = {component.status for component in components.values()}
+    response.status_code = 200 if statuses == {"healthy"} else 503
     return HealthResponse(
-        status=next(state for state in STATUSES_WORST_FIRST if state in states),
+        status=next(status for status in STATUSES_WORST_FIRST if status in statuses),
         version=VERSION,
         uptime_seconds=time.monotonic() - gateway.started_monotonic,
-        parts=parts,
+        parts=components,
         load=_load_response(gateway.settings, admission)
-        if parts["catalog"].status == "healthy"
+        if components["catalog"].status == "healthy"
         else None,
     )
 
 
 def _load_response(settings: Settings, admission: AdmissionControl) -> LoadResponse:
-    waiting = admission.queue_depth()
+    depth = admission.queue_depth()
     return LoadResponse(
-        waiting_jobs=waiting.jobs,
+        waiting_jobs=depth.jobs,
         max_queued_jobs=settings.max_queued_jobs,
-        waiting_queries=waiting.queries,
+        waiting_queries=depth.queries,
         max_queued_queries=settings.max_queued_queries,
-        finished_per_second=waiting.finished_per_second,
+        finished_per_second=depth.finished_per_second,
         receiving_uploads=admission.active_uploads(UploadKind.UPLOAD),
         receiving_queries=admission.active_uploads(UploadKind.QUERY),
         max_concurrent_uploads=settings.max_concurrent_uploads,
@@ -139,11 +152,11 @@ def _load_response(settings: Settings, admission: AdmissionControl) -> LoadRespo
 
 
 def _check_components(
-    gateway: GatewayContext, room: AdmissionControl
+    gateway: GatewayContext, admission: AdmissionControl
 ) -> dict[str, ComponentStatus]:
     return {
         "catalog": _check_catalog(gateway),
-        "object_store": _check_object_store(gateway, room),
+        "object_store": _check_object_store(gateway, admission),
         "search": _check_search(gateway),
     }
 
@@ -154,15 +167,15 @@ def _check_catalog(gateway: GatewayContext) -> ComponentStatus:
             session.scalar(select(Map.id).limit(1))
     except SQLAlchemyError as error:
         unavailable = to_unavailable(error)
-        detail = unavailable.detail if unavailable else "the catalog can't be reached"
+        detail = unavailable.detail if unavailable else "the catalog is unreachable"
         return ComponentStatus(status="unhealthy", detail=detail)
     return ComponentStatus(status="healthy")
 
 
-def _check_object_store(gateway: GatewayContext, room: AdmissionControl) -> ComponentStatus:
+def _check_object_store(gateway: GatewayContext, admission: AdmissionControl) -> ComponentStatus:
     try:
         gateway.store.check()
-        room.disk.check()
+        admission.disk.check()
     except StorageFull as error:
         return ComponentStatus(status="degraded", detail=f"uploads are refused: {error.detail}")
     except PlacewiseError as error:
@@ -175,17 +188,17 @@ def _check_search(gateway: GatewayContext) -> ComponentStatus:
         status = gateway.search.status()
     except PlacewiseError as error:
         return ComponentStatus(status="unhealthy", detail=error.detail)
-    wrong = []
+    problems = []
     if status.away:
-        wrong.append(f"no search worker answers for: {', '.join(status.away)}")
+        problems.append(f"no search worker is available for: {', '.join(status.away)}")
     if status.missing:
         named = ", ".join(status.missing[:MAX_NAMED_CHUNKS])
         more = len(status.missing) - MAX_NAMED_CHUNKS
-        wrong.append(
+        problems.append(
             f"{len(status.missing)} chunks can't be read: {named}"
             + (f" and {more} more" if more > 0 else "")
-            + " (placewise verify --repair)"
+            + " (repair them with placewise verify --repair)"
         )
-    if wrong:
-        return ComponentStatus(status="degraded", detail="; ".join(wrong))
+    if problems:
+        return ComponentStatus(status="degraded", detail="; ".join(problems))
     return ComponentStatus(status="healthy", detail=f"{status.rows} rows in memory")

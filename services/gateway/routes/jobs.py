@@ -1,4 +1,4 @@
-"""`/jobs`: what is being done, and how far it is."""
+"""Routes of `/jobs`: status, long polling, event streams, cancel and retry."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ from shared.jobs.wakeups import queue_for_priority
 
 router = APIRouter(tags=["jobs"])
 
-CATALOG_RETRY_SECONDS = 1.0  # between two looks while the catalog is away
-HEARTBEAT_SECONDS = 15.0  # a comment line, so that proxies keep a silent stream open
+CATALOG_RETRY_SECONDS = 1.0  # between two polls while the catalog is unreachable
+HEARTBEAT_SECONDS = 15.0  # interval of comment lines, so that proxies do not close idle streams
 
 
 @router.get("/jobs", operation_id="list_jobs", response_model=JobsResponse, dependencies=[READ])
@@ -49,15 +49,15 @@ def read_jobs(
     cursor: Annotated[str | None, Query()] = None,
     map_name: MapName = DEFAULT_MAP,
 ) -> JobsResponse:
-    """Newest first. The `reindex` jobs of a model change under way are listed only by `kind`."""
+    """List jobs, newest first. `reindex` jobs of a running model change need `kind=reindex`."""
     before = parse_cursor(cursor)
     with gateway.catalog.read() as session:
         map_id = get_map(session, map_name).id
-        found = list_jobs(session, map_id, state or [], kind or [], limit + 1, before)
-    page = found[:limit]
+        jobs = list_jobs(session, map_id, state or [], kind or [], limit + 1, before)
+    page = jobs[:limit]
     return JobsResponse(
-        jobs=[JobResponse.of(read_job_status, map_name) for read_job_status in page],
-        next_cursor=str(page[-1].id) if len(found) > limit else None,
+        jobs=[JobResponse.of(job, map_name) for job in page],
+        next_cursor=str(page[-1].id) if len(jobs) > limit else None,
     )
 
 
@@ -67,20 +67,20 @@ def read_jobs(
 async def read_job_status(
     gateway: GatewayDep,
     job_id: JobId,
-    wait: Annotated[float, Query(ge=0, description="seconds to wait for the end")] = 0.0,
+    wait: Annotated[float, Query(ge=0, description="seconds to wait for the end of the job")] = 0.0,
     map_name: MapName = DEFAULT_MAP,
 ) -> JobResponse:
-    """One job; `?wait=20` answers when it ends, or after 20 seconds as it is then."""
-    found = await run_in_threadpool(_load_job_of_map, gateway, map_name, job_id)
-    if wait and found.state in UNFINISHED_STATES:
+    """Get one job. `?wait=20` waits up to 20 seconds for its end (long polling)."""
+    job = await run_in_threadpool(_load_job_of_map, gateway, map_name, job_id)
+    if wait and job.state in UNFINISHED_STATES:
         seconds = min(wait, gateway.settings.max_wait_seconds)
-        found = await wait_for_job(gateway, job_id, seconds) or found
-    return JobResponse.of(found, map_name)
+        job = await wait_for_job(gateway, job_id, seconds) or job
+    return JobResponse.of(job, map_name)
 
 
-async def _event_stream(request: Request, room: AdmissionDep) -> AsyncIterator[None]:
-    """A place among the event streams, until the answer has ended."""
-    with room.event_streams.hold(request):
+async def _hold_event_stream(request: Request, admission: AdmissionDep) -> AsyncIterator[None]:
+    """Dependency that counts an event stream until its response has ended."""
+    with admission.event_streams.hold(request):
         yield
 
 
@@ -89,18 +89,20 @@ async def _event_stream(request: Request, room: AdmissionDep) -> AsyncIterator[N
     operation_id="job_events",
     response_class=StreamingResponse,
     responses={200: {"content": {"text/event-stream": {}}, "description": "`progress` events"}},
-    dependencies=[READ, Depends(_event_stream, scope="request")],
+    dependencies=[READ, Depends(_hold_event_stream, scope="request")],
 )
 async def stream_job_events(
     gateway: GatewayDep,
     job_id: JobId,
     map_name: MapName = DEFAULT_MAP,
 ) -> StreamingResponse:
-    """Server-sent events: a `progress` event with the job at every change, until it ends. Where
-    too many are sent already (429, `too_many_event_streams`), poll the job."""
-    found = await run_in_threadpool(_load_job_of_map, gateway, map_name, job_id)
+    """Stream server-sent events: a `progress` event with the job at every change, until it ends.
+
+    If too many streams are open (429, `too_many_event_streams`), poll the job instead.
+    """
+    job = await run_in_threadpool(_load_job_of_map, gateway, map_name, job_id)
     return StreamingResponse(
-        _events(gateway, job_id, JobResponse.of(found, map_name), map_name),
+        _events(gateway, job_id, JobResponse.of(job, map_name), map_name),
         media_type="text/event-stream",
         headers={"Cache-Control": "no-store", "X-Accel-Buffering": "no"},
     )
@@ -115,23 +117,23 @@ async def stream_job_events(
 def cancel_job_by_id(
     gateway: GatewayDep, job_id: JobId, idempotent: IdempotentDep, map_name: MapName = DEFAULT_MAP
 ) -> JobResponse:
-    """End a job at once; what a worker computes for it meanwhile is thrown away."""
+    """Cancel a job immediately. Results that a worker is still computing are discarded."""
 
-    def end(session: Session) -> JobResponse:
-        found = get_job(session, get_map(session, map_name).id, job_id, lock=True)
-        if found.kind in MODEL_CHANGE_JOBS:
-            cancel_model_change(session, found)
-        elif found.kind == JobKind.BATCH:
-            cancel_batch(session, found)
+    def cancel(session: Session) -> JobResponse:
+        job = get_job(session, get_map(session, map_name).id, job_id, lock=True)
+        if job.kind in MODEL_CHANGE_JOBS:
+            cancel_model_change(session, job)
+        elif job.kind == JobKind.BATCH:
+            cancel_batch(session, job)
         else:
-            cancel_job(found)
+            cancel_job(job)
         session.flush()
-        session.refresh(found)
-        answer = JobResponse.of(found, map_name)
-        idempotent.store_response(session, 200, answer)
-        return answer
+        session.refresh(job)
+        response = JobResponse.of(job, map_name)
+        idempotent.store_response(session, 200, response)
+        return response
 
-    return gateway.catalog.run(end)
+    return gateway.catalog.run(cancel)
 
 
 @router.post(
@@ -143,19 +145,19 @@ def cancel_job_by_id(
 def retry_job_by_id(
     gateway: GatewayDep, job_id: JobId, idempotent: IdempotentDep, map_name: MapName = DEFAULT_MAP
 ) -> JobResponse:
-    """Queue a failed or cancelled job again; of a batch, the items that have failed."""
+    """Queue a failed or cancelled job again; for a batch, only its failed items."""
     with gateway.catalog.write() as session:
-        found = get_job(session, get_map(session, map_name).id, job_id, lock=True)
-        if found.kind == JobKind.BATCH:
-            retry_batch(session, found)
+        job = get_job(session, get_map(session, map_name).id, job_id, lock=True)
+        if job.kind == JobKind.BATCH:
+            retry_batch(session, job)
         else:
-            retry_job(session, found)
+            retry_job(session, job)
         session.flush()
-        session.refresh(found)
-        answer = JobResponse.of(found, map_name)
-        idempotent.store_response(session, 200, answer)
-    gateway.hints.send(queue_for_priority(found.priority))
-    return answer
+        session.refresh(job)
+        response = JobResponse.of(job, map_name)
+        idempotent.store_response(session, 200, response)
+    gateway.hints.send(queue_for_priority(job.priority))
+    return response
 
 
 def _load_job_of_map(gateway: GatewayContext, map_name: str, job_id: UUID) -> Job:
@@ -166,8 +168,8 @@ def _load_job_of_map(gateway: GatewayContext, map_name: str, job_id: UUID) -> Jo
 async def _events(
     gateway: GatewayContext, job_id: UUID, job: JobResponse, map_name: str
 ) -> AsyncIterator[str]:
-    """The stream of a job that is now as `job` says."""
-    number, mark, sent = 0, (), ""
+    """Yields the event stream of a job, beginning with its current state `job`."""
+    number, last_seen, sent = 0, (), ""
     while True:
         if (text := job.model_dump_json()) != sent:
             sent, number = text, number + 1
@@ -176,15 +178,17 @@ async def _events(
             return
         while True:
             try:
-                change = await gateway.job_notifier.wait_for_change(job_id, mark, HEARTBEAT_SECONDS)
+                change = await gateway.job_notifier.wait_for_change(
+                    job_id, last_seen, HEARTBEAT_SECONDS
+                )
                 break
             except TimeoutError:
-                yield ": still here\n\n"
+                yield ": heartbeat\n\n"
             except SQLAlchemyError as error:
                 if to_unavailable(error) is None:
                     raise
-                yield ": the catalog is away\n\n"
+                yield ": the catalog is unreachable\n\n"
                 await asyncio.sleep(CATALOG_RETRY_SECONDS)
         if change is None:
             return
-        job, mark = JobResponse.of(change.job, map_name), change.mark
+        job, last_seen = JobResponse.of(change.job, map_name), change.state

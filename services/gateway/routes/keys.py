@@ -1,4 +1,4 @@
-"""`/keys`: who may call. An admin's calls."""
+"""Routes of API keys: list, create and revoke. They need the scope `admin`."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ KeyLimit = Annotated[int | None, Field(ge=1, le=2**53)]
 
 
 class CreateKeyRequest(BaseModel):
-    """The key to make. A limit that is left out is the one of the server's settings."""
+    """The key to create. Omitted limits are those of the server's settings."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -35,7 +35,7 @@ class CreateKeyRequest(BaseModel):
         gt=0,
         le=MAX_KEY_DAYS,
         allow_inf_nan=False,
-        description="until it expires; null: never",
+        description="days until it expires; null: never",
     )
     requests_per_minute: Annotated[int | None, Field(ge=1, le=10**9)] = None
     upload_bytes_per_day: KeyLimit = None
@@ -45,30 +45,31 @@ class CreateKeyRequest(BaseModel):
 class KeyResponse(ResponseModel):
     id: UUID
     name: str
-    prefix: str = Field(description="the key's first characters")
+    prefix: str = Field(description="first characters of the key")
     scopes: list[Scope]
     requests_per_minute: int | None
     upload_bytes_per_day: int | None
     max_photos: int | None
     created_at: datetime
     expires_at: datetime | None
-    last_used_at: datetime | None = Field(description="to the minute")
+    last_used_at: datetime | None = Field(description="accurate to a minute")
     revoked_at: datetime | None
 
     @classmethod
     def fields_of(cls, key: ApiKey) -> dict[str, object]:
+        """Returns the values of the fields for `key`, for the constructors of subclasses."""
         return {name: getattr(key, name) for name in KeyResponse.model_fields}
 
 
 class CreatedKeyResponse(KeyResponse):
-    key: str = Field(description="the key itself: it is shown this once")
+    key: str = Field(description="the secret key; it is shown only once")
 
 
 @router.get(
     "/keys", operation_id="list_keys", response_model=list[KeyResponse], dependencies=[ADMIN]
 )
 def read_keys(gateway: GatewayDep) -> list[KeyResponse]:
-    """Every key that was ever made, newest first; the keys themselves are kept nowhere."""
+    """List all keys, newest first, including revoked ones. The secrets are not stored."""
     with gateway.catalog.read() as session:
         return [
             KeyResponse.model_validate(KeyResponse.fields_of(key)) for key in list_api_keys(session)
@@ -83,21 +84,24 @@ def read_keys(gateway: GatewayDep) -> list[KeyResponse]:
     dependencies=[ADMIN],
 )
 def create_key(gateway: GatewayDep, body: CreateKeyRequest) -> CreatedKeyResponse:
-    """Make a key. It stands in this answer and nowhere else, so this call takes no
-    `Idempotency-Key`: when the answer got lost, revoke the key and make another one."""
+    """Create a key. The secret is shown only in this response and is not stored.
+
+    Therefore this endpoint does not support `Idempotency-Key`: if the response is lost, revoke the
+    key and create another one.
+    """
     limits = KeyLimits(body.requests_per_minute, body.upload_bytes_per_day, body.max_photos)
     life_seconds = None if body.days is None else body.days * DAY_SECONDS
     with gateway.catalog.write() as session:
-        made, key = create_api_key(
+        api_key, secret = create_api_key(
             session, body.name, set(body.scopes), life_seconds=life_seconds, limits=limits
         )
-        return CreatedKeyResponse.model_validate({**KeyResponse.fields_of(made), "key": key})
+        return CreatedKeyResponse.model_validate({**KeyResponse.fields_of(api_key), "key": secret})
 
 
 @router.delete(
     "/keys/{key_id}", operation_id="revoke_key", response_model=KeyResponse, dependencies=[ADMIN]
 )
 def revoke_key_by_id(gateway: GatewayDep, key_id: KeyId) -> KeyResponse:
-    """From now on the key opens nothing, on no gateway. It stays in the list."""
+    """Revoke a key. All gateways refuse it at once; it stays in the list."""
     with gateway.catalog.write() as session:
         return KeyResponse.model_validate(KeyResponse.fields_of(revoke_api_key(session, key_id)))

@@ -1,4 +1,4 @@
-"""`/maps`: named databases of photos, each with its own extractor, vocabulary and generation."""
+"""Routes of maps: named photo databases, each with its own extractor and active generation."""
 
 from __future__ import annotations
 
@@ -45,7 +45,10 @@ class CreateMapRequest(BaseModel):
 
     name: str = Field(json_schema_extra={"pattern": MAP_NAME_PATTERN})
     extractor: str | None = Field(
-        None, max_length=200, pattern=NO_NUL_PATTERN, description="left out: the configured one"
+        None,
+        max_length=200,
+        pattern=NO_NUL_PATTERN,
+        description="omitted: the default of the server",
     )
 
     @field_validator("name")
@@ -53,7 +56,7 @@ class CreateMapRequest(BaseModel):
     def _validate_name(cls, name: str) -> str:
         if not re.fullmatch(MAP_NAME_PATTERN, name):
             raise ValueError(
-                "a map's name has up to 100 letters, digits, `.`, `_` and `-`, and begins with a "
+                "a map name must have 1 to 100 letters, digits, `.`, `_` and `-`, and begin with a "
                 "letter or digit"
             )
         return name
@@ -62,15 +65,19 @@ class CreateMapRequest(BaseModel):
 class MapResponse(ResponseModel):
     name: str
     extractor: str
-    version: int = Field(description="grows with every change of what can be found")
+    version: int = Field(description="incremented by every change of the searchable photos")
     photos: int
     searchable: int
     labelled_queries: int
-    counted_at: datetime = Field(description="when the three counts above were made")
+    counted_at: datetime = Field(description="when the three counts above were computed")
     generation_id: UUID | None
-    vocabulary: str | None = Field(description="own, foreign, none; null before the first photo")
-    dimension: int | None = Field(description="of its descriptors; null before the first photo")
-    pca_from: int | None = Field(description="their dimension before PCA; null without")
+    vocabulary: str | None = Field(
+        description="`own`, `foreign` or `none`; null before the first photo"
+    )
+    dimension: int | None = Field(
+        description="dimension of its descriptors; null before the first photo"
+    )
+    pca_from: int | None = Field(description="dimension before PCA; null without PCA")
     created_at: datetime
 
 
@@ -84,7 +91,7 @@ class DeletedMapResponse(ResponseModel):
     "/maps", operation_id="list_maps", response_model=list[MapResponse], dependencies=[READ]
 )
 def read_maps(gateway: GatewayDep) -> list[MapResponse]:
-    """Every map, by name."""
+    """List all maps by name."""
     with gateway.catalog.read() as session:
         return [_map_response(session, map_) for map_ in list_maps(session)]
 
@@ -99,22 +106,22 @@ def read_maps(gateway: GatewayDep) -> list[MapResponse]:
 def create_new_map(
     gateway: GatewayDep, body: CreateMapRequest, idempotent: IdempotentDep
 ) -> MapResponse:
-    """Make an empty map; 409 when the name is taken."""
+    """Create an empty map; 409 if the name exists already."""
     settings = gateway.settings
     try:
-        recipe = settings.recipe(body.extractor or settings.new_map_extractor)
+        config = settings.recipe(body.extractor or settings.new_map_extractor)
     except Misconfigured as error:
         raise invalid_field_error("extractor", error.detail) from None
     with gateway.catalog.write() as session:
-        check_model_registered(session, recipe)
-        answer = _map_response(session, create_map(session, body.name, recipe.name))
-        idempotent.store_response(session, 201, answer)
-    return answer
+        check_model_registered(session, config)
+        response = _map_response(session, create_map(session, body.name, config.name))
+        idempotent.store_response(session, 201, response)
+    return response
 
 
 @router.get("/maps/{name}", operation_id="get_map", response_model=MapResponse, dependencies=[READ])
 def read_map(gateway: GatewayDep, name: MapNamePath) -> MapResponse:
-    """One map."""
+    """Get one map."""
     with gateway.catalog.read() as session:
         return _map_response(session, get_map(session, name))
 
@@ -126,7 +133,10 @@ def read_map(gateway: GatewayDep, name: MapNamePath) -> MapResponse:
     dependencies=[WRITE],
 )
 def delete_map(gateway: GatewayDep, name: MapNamePath) -> DeletedMapResponse:
-    """Gone with all its photos at once; its bytes follow. `default` is made anew, empty."""
+    """Delete a map with all its photos. An empty map `default` is created again.
+
+    Searches do not return its photos any more; their bytes are deleted in the background.
+    """
 
     def remove(session: Session) -> None:
         map_ = lock_map(session, get_map(session, name).id)
@@ -141,14 +151,14 @@ def delete_map(gateway: GatewayDep, name: MapNamePath) -> DeletedMapResponse:
 
 def _map_response(session: Session, map_: Map) -> MapResponse:
     generation = active_generation(session, map_.id)
-    figures, counted_at = get_map_statistics(session, map_.id)
+    statistics, counted_at = get_map_statistics(session, map_.id)
     return MapResponse(
         name=map_.name,
         extractor=map_.extractor,
         version=map_.version,
-        photos=figures.photos,
-        searchable=figures.searchable,
-        labelled_queries=figures.labelled_queries,
+        photos=statistics.photos,
+        searchable=statistics.searchable,
+        labelled_queries=statistics.labelled_queries,
         counted_at=counted_at,
         generation_id=generation.id if generation else None,
         vocabulary=vocabulary_standing(session, generation) if generation else None,

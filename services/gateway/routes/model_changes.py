@@ -1,4 +1,4 @@
-"""`/vocabularies` and `/generations`: what a map's descriptors are made with, and changing it."""
+"""Routes of vocabularies and generations, and of the jobs that change a map's model."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ router = APIRouter(tags=["model changes"])
 
 
 class FitVocabularyRequest(BaseModel):
-    """How to learn the vocabulary; {} is a good choice."""
+    """Options of the fit; the defaults suit most maps."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -53,15 +53,15 @@ class FitVocabularyRequest(BaseModel):
         None,
         ge=1,
         le=MAX_CLUSTERS,
-        description="null: as many as the extractor's name says (64 unless it says otherwise); "
-        "fewer are made when the photos bear fewer",
+        description="null: the number in the extractor's name, or 64; fewer are fitted if the "
+        "photos have too few features",
     )
-    sample: int = Field(1000, ge=1, le=1_000_000, description="photos to learn from, at most")
+    sample: int = Field(1000, ge=1, le=1_000_000, description="maximum number of photos to fit on")
     seed: int = Field(0, ge=0, le=2**31 - 1)
 
 
 class StartGenerationRequest(BaseModel):
-    """What the new generation is made with."""
+    """Extractor, vocabulary or PCA dimension of the new generation."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -69,20 +69,20 @@ class StartGenerationRequest(BaseModel):
         None,
         max_length=200,
         pattern=NO_NUL_PATTERN,
-        description="another extractor, such as gsv:NAME of a model that was added; null: the "
-        "map's own",
+        description="another extractor, such as gsv:NAME for an added model; null: the map's "
+        "extractor",
     )
     vocabulary_id: UUID | None = Field(
         None,
-        description="null for extractors without one, with `pca`, and for the one that comes with "
-        "another `extractor`",
+        description="null for extractors without a vocabulary, with `pca`, and to use the "
+        "vocabulary that is shipped with `extractor`",
     )
     pca: int | None = Field(
         None,
         ge=1,
         le=MAX_PCA_DIMENSION,
-        description="bring the map's descriptors to so many dimensions; their vocabulary stays. "
-        "null: whole descriptors",
+        description="reduce the map's descriptors to this many dimensions, with the same "
+        "vocabulary; null: full descriptors",
     )
 
 
@@ -100,16 +100,16 @@ def start_vocabulary_fit(
     options: FitVocabularyRequest | None = None,
     map_name: MapName = DEFAULT_MAP,
 ) -> JobAcceptedResponse:
-    """Learn a vocabulary from the map's own photos and switch to it.
+    """Fit a vocabulary on the map's own photos and switch to it.
 
-    All photos are described again in the background while search goes on; the job has succeeded
-    when the new generation answers.
+    All photos are described again in the background while searches continue. The job succeeds when
+    the new generation is active.
     """
     params = (options or FitVocabularyRequest.model_validate({})).model_dump()
     with gateway.catalog.write() as session:
         map_id = get_map(session, map_name).id
         if not has_live_photo(session, map_id, PhotoRole.DATABASE):
-            raise Conflict("no_photos", "The map has no photos to learn from. Upload some first.")
+            raise Conflict("no_photos", "The map has no photos to fit on. Upload photos first.")
         job = start_model_change(session, map_id, JobKind.FIT, params)
         idempotent.store_job_response(session, job)
     return _model_change_response(gateway, response, job, map_name)
@@ -134,10 +134,10 @@ async def start_vocabulary_import(
     admission: AdmissionDep,
     map_name: MapName = DEFAULT_MAP,
 ) -> JobAcceptedResponse:
-    """Bring a vocabulary, a `.npz` or `.npy` file, and switch to it.
+    """Import a vocabulary from a `.npz` or `.npy` file and switch to it.
 
-    The extractor checks it; one that does not fit, or that a `.npz` says was learnt from other
-    features than the extractor makes, ends the job as `failed` with the reason.
+    The extractor validates it. The job fails with the reason if the shape does not match, or if by
+    its metadata a `.npz` was fitted on other features than the extractor computes.
     """
     with admission.admit_upload(UploadKind.UPLOAD, request):
         received = await store_form_file(
@@ -161,10 +161,10 @@ async def start_vocabulary_import(
 def read_vocabularies(
     gateway: GatewayDep, map_name: MapName = DEFAULT_MAP
 ) -> list[VocabularyResponse]:
-    """The map's vocabularies, newest first, with their provenance."""
+    """List the vocabularies of a map, newest first, with their provenance."""
     with gateway.catalog.read() as session:
-        found = list_vocabularies(session, get_map(session, map_name).id)
-    return [VocabularyResponse.of(vocabulary) for vocabulary in found]
+        vocabularies = list_vocabularies(session, get_map(session, map_name).id)
+    return [VocabularyResponse.of(vocabulary) for vocabulary in vocabularies]
 
 
 @router.get(
@@ -186,18 +186,20 @@ def read_vocabulary_file(
     vocabulary_id: UUID,
     map_name: MapName = DEFAULT_MAP,
 ) -> Response:
-    """The vocabulary as the file that `POST /vocabularies/import` takes elsewhere: `.npz` with its
-    provenance, or `.npy` (`application/octet-stream`) where that is unknown.
+    """Download a vocabulary as a file for `POST /vocabularies/import`.
+
+    It is a `.npz` with its provenance, or a `.npy` (`application/octet-stream`) if the provenance
+    is unknown.
     """
     with gateway.catalog.read() as session:
-        found = get_vocabulary(session, get_map(session, map_name).id, vocabulary_id)
+        vocabulary = get_vocabulary(session, get_map(session, map_name).id, vocabulary_id)
     data, suffix = encode_vocabulary_file(
-        gateway.store.get(found.object_key), found.sha256, found.provenance
+        gateway.store.get(vocabulary.object_key), vocabulary.sha256, vocabulary.provenance
     )
     return Response(
         data,
         media_type="application/zip" if suffix == ".npz" else "application/octet-stream",
-        headers={"Content-Disposition": f'attachment; filename="{found.id}{suffix}"'},
+        headers={"Content-Disposition": f'attachment; filename="{vocabulary.id}{suffix}"'},
     )
 
 
@@ -210,7 +212,7 @@ def read_vocabulary_file(
 def read_generations(
     gateway: GatewayDep, map_name: MapName = DEFAULT_MAP
 ) -> list[GenerationResponse]:
-    """The map's generations, newest first."""
+    """List the generations of a map, newest first."""
     with gateway.catalog.read() as session:
         return [
             GenerationResponse.of(generation, estimate_described(session, generation.id))
@@ -232,17 +234,18 @@ def start_generation(
     body: Annotated[StartGenerationRequest, Field()],
     map_name: MapName = DEFAULT_MAP,
 ) -> JobAcceptedResponse:
-    """Describe all photos anew with a vocabulary that the map has or with another extractor, and
-    switch to it; or shorten their descriptors by PCA whitening, fitted on those that the map has,
-    and switch to these.
+    """Create a generation with another vocabulary, extractor or dimension, and switch to it.
+
+    All photos are described again with a vocabulary of the map or with another extractor. With
+    `pca`, the existing descriptors are reduced by PCA whitening that is fitted on them.
     """
-    recipe = _validate_new_extractor(gateway.settings, body)
+    config = _validate_new_extractor(gateway.settings, body)
     with gateway.catalog.write() as session:
         map_id = get_map(session, map_name).id
         if body.pca is not None:
             job = _queue_pca(session, map_id, body.pca, body.vocabulary_id)
         else:
-            job = _queue_switch(session, map_id, recipe, body.vocabulary_id)
+            job = _queue_switch(session, map_id, config, body.vocabulary_id)
         idempotent.store_job_response(session, job)
     return _model_change_response(gateway, response, job, map_name)
 
@@ -250,38 +253,38 @@ def start_generation(
 def _validate_new_extractor(
     settings: Settings, body: StartGenerationRequest
 ) -> ExtractorConfig | None:
-    """The extractor that is asked for; 422 for one that can't be had, or not with the rest."""
+    """The requested extractor, or None; 422 if it is unknown or conflicts with other fields."""
     if body.extractor is None:
         return None
     if body.pca is not None:
         raise invalid_field_error(
-            "pca", "is fitted on descriptors that are there: switch to the extractor first"
+            "pca", "is fitted on existing descriptors: switch to the extractor first"
         )
     try:
-        recipe = settings.recipe(body.extractor)
+        config = settings.recipe(body.extractor)
     except Misconfigured as error:
         raise invalid_field_error("extractor", error.detail) from None
-    if recipe.needs_vocabulary:
-        if body.vocabulary_id is None and recipe.shipped_vocabulary is None:
+    if config.needs_vocabulary:
+        if body.vocabulary_id is None and config.shipped_vocabulary is None:
             raise invalid_field_error(
                 "vocabulary_id",
-                f"no vocabulary comes with {recipe.name}: name one that the map has "
-                "(GET /api/v1/vocabularies), or fit one in a map of its own",
+                f"is required, because {config.name} is shipped without a vocabulary: use one of "
+                "the map (GET /api/v1/vocabularies), or fit one in a separate map",
             )
     elif body.vocabulary_id is not None:
-        raise invalid_field_error("vocabulary_id", f"{recipe.name} uses none: leave it out")
-    return recipe
+        raise invalid_field_error("vocabulary_id", f"{config.name} uses no vocabulary: omit it")
+    return config
 
 
 def _queue_switch(
-    session: Session, map_id: UUID, recipe: ExtractorConfig | None, vocabulary_id: UUID | None
+    session: Session, map_id: UUID, config: ExtractorConfig | None, vocabulary_id: UUID | None
 ) -> Job:
     params: dict[str, Any] = {"vocabulary_id": str(vocabulary_id) if vocabulary_id else None}
     if vocabulary_id is not None:
         get_vocabulary(session, map_id, vocabulary_id)
-    if recipe is not None:
-        check_model_registered(session, recipe)
-        params["extractor"] = recipe.name
+    if config is not None:
+        check_model_registered(session, config)
+        params["extractor"] = config.name
     return start_model_change(session, map_id, JobKind.SWITCH, params)
 
 
@@ -290,12 +293,12 @@ def _queue_pca(session: Session, map_id: UUID, pca: int, vocabulary_id: UUID | N
     if vocabulary_id is not None and vocabulary_id != source.vocabulary_id:
         raise invalid_field_error(
             "vocabulary_id",
-            "PCA is fitted on the descriptors that answer: leave it out, or switch"
-            " to that vocabulary first",
+            "can't be combined with `pca`, which is fitted on the active descriptors: omit it, or "
+            "switch to that vocabulary first",
         )
     if pca > source.dimension:
         raise invalid_field_error(
-            "pca", f"the map's descriptors have {source.dimension} dimensions"
+            "pca", f"{pca} is more than the {source.dimension} dimensions of the map's descriptors"
         )
     return start_model_change(session, map_id, JobKind.PCA, {"pca": pca})
 

@@ -1,7 +1,7 @@
-"""`/models`: models that were trained elsewhere and added, for maps to be described with.
+"""Routes of the model registry: add, list and remove trained models.
 
-The gateway stores what comes and queues a job; it never opens a checkpoint. An extractor checks it
-(`services.extractor.added_models`).
+The gateway stores an uploaded checkpoint and queues a job, but never loads it: an extractor
+validates it (`services.extractor.added_models`).
 """
 
 from __future__ import annotations
@@ -47,14 +47,14 @@ MODEL_FORM_FIELDS: dict[str, dict[str, Any]] = {
     "name": {
         "type": "string",
         "pattern": MODEL_NAME_PATTERN,
-        "description": "what maps call it: gsv:NAME. Given once, it never means other weights",
+        "description": "maps use the model as gsv:NAME; a name is never reused for other weights",
     },
     "licence": {
         "type": "string",
         "maxLength": MAX_LICENCE_CHARACTERS,
-        "description": "of the weights",
+        "description": "licence of the weights",
     },
-    "note": {"type": "string", "maxLength": MAX_NOTE_CHARACTERS, "description": "for people"},
+    "note": {"type": "string", "maxLength": MAX_NOTE_CHARACTERS, "description": "free text"},
 }
 
 router = APIRouter(tags=["models"])
@@ -66,18 +66,18 @@ ModelNamePath = Annotated[
 
 class ModelResponse(ResponseModel):
     name: str
-    extractor: str = Field(description="what maps are described with: gsv:NAME")
-    fingerprint: str = Field(description="sha256 of its configuration and weights")
-    dimension: int = Field(description="numbers in one descriptor")
-    image_size: tuple[int, int] = Field(description="height and width that photos are brought to")
-    config: dict[str, Any] = Field(description="backbone and aggregator, as it was trained")
-    size_bytes: int = Field(description="of its file in the object store")
-    sha256: str = Field(description="of that file")
+    extractor: str = Field(description="extractor name that maps use: gsv:NAME")
+    fingerprint: str = Field(description="SHA-256 of its configuration and weights")
+    dimension: int = Field(description="dimension of its descriptors")
+    image_size: tuple[int, int] = Field(description="height and width that photos are resized to")
+    config: dict[str, Any] = Field(description="configuration of backbone and aggregator")
+    size_bytes: int = Field(description="size of its file in the object store")
+    sha256: str = Field(description="SHA-256 of that file")
     licence: str
     note: str | None
-    about: dict[str, Any] = Field(description="the file it came in, and how it was trained")
+    about: dict[str, Any] = Field(description="source file and training details")
     added_at: datetime
-    maps: list[str] = Field(description="maps that are described with it")
+    maps: list[str] = Field(description="maps that use it")
 
     @classmethod
     def of(cls, session: Session, model: Model) -> ModelResponse:
@@ -131,11 +131,11 @@ async def upload_model(
     admission: AdmissionDep,
     map_name: MapName = DEFAULT_MAP,
 ) -> JobAcceptedResponse:
-    """Add a trained model: send a checkpoint, and a `name` for it.
+    """Add a trained model: upload its checkpoint with a `name`.
 
-    An extractor checks it, in a job of the map: that it can be read without executing anything,
-    that its weights are finite and make a descriptor of a photo. One that can't be used ends the
-    job as `failed` with the reason, and so does a name that belongs to other weights.
+    An extractor validates it in a job of the map: it must be readable without executing code, its
+    weights must be finite, and it must produce a descriptor. The job fails with the reason if the
+    checkpoint can't be used or the name belongs to other weights.
     """
     with admission.admit_upload(UploadKind.UPLOAD, request):
         received = await store_form_file(
@@ -146,7 +146,7 @@ async def upload_model(
             too_large=_checkpoint_too_large_error,
         )
     try:
-        said = _parse_model_fields(received.fields)
+        fields = _parse_model_fields(received.fields)
     except PlacewiseError:
         await run_in_threadpool(gateway.store.delete, received.key)
         raise
@@ -155,7 +155,7 @@ async def upload_model(
         "object_key": received.key,
         "filename": received.filename,
         "checkpoint_sha256": received.sha256,
-        **said,
+        **fields,
     }
     job = await run_in_threadpool(_queue_add_model, gateway, map_name, params, idempotent)
     gateway.hints.send()
@@ -166,17 +166,17 @@ async def upload_model(
     "/models", operation_id="list_models", response_model=ModelsResponse, dependencies=[READ]
 )
 def read_models(gateway: GatewayDep) -> ModelsResponse:
-    """Every model that was added, by name."""
+    """List the added models by name."""
     with gateway.catalog.read() as session:
-        found = [ModelResponse.of(session, model) for model in list_registered_models(session)]
-    return ModelsResponse(models=found)
+        models = [ModelResponse.of(session, model) for model in list_registered_models(session)]
+    return ModelsResponse(models=models)
 
 
 @router.get(
     "/models/{name}", operation_id="get_model", response_model=ModelResponse, dependencies=[READ]
 )
 def read_model(gateway: GatewayDep, name: ModelNamePath) -> ModelResponse:
-    """One model."""
+    """Get one model."""
     with gateway.catalog.read() as session:
         return ModelResponse.of(session, get_registered_model(session, name))
 
@@ -188,9 +188,9 @@ def read_model(gateway: GatewayDep, name: ModelNamePath) -> ModelResponse:
     dependencies=[ADMIN],
 )
 def delete_model(gateway: GatewayDep, name: ModelNamePath) -> RemovedModelResponse:
-    """Remove a model; 409 (`model_in_use`) while a map is described with it.
+    """Remove a model; 409 (`model_in_use`) while a map uses it.
 
-    Its name stays taken, unless the same weights are added again.
+    Its name can be used again only for the same weights.
     """
     new_map_extractor = gateway.settings.new_map_extractor
     gateway.catalog.run(lambda session: remove_model(session, name, new_map_extractor))
@@ -200,16 +200,21 @@ def delete_model(gateway: GatewayDep, name: ModelNamePath) -> RemovedModelRespon
 
 
 def _parse_model_fields(fields: dict[str, str]) -> dict[str, str | None]:
-    """The name, the licence and the note that the form gives; 422 for what can't be taken."""
+    """Validates and returns the fields `name`, `licence` and `note` of the form."""
     for field in fields.keys() - MODEL_FORM_FIELDS.keys():
-        raise invalid_field_error(field, f"is none of {', '.join(MODEL_FORM_FIELDS)}")
+        raise invalid_field_error(field, f"is unknown; valid are {', '.join(MODEL_FORM_FIELDS)}")
     name = fields.get("name", "")
     if not re.fullmatch(MODEL_NAME_PATTERN, name):
         raise invalid_field_error("name", MODEL_NAME_RULE)
-    for field, most in (("licence", MAX_LICENCE_CHARACTERS), ("note", MAX_NOTE_CHARACTERS)):
+    for field, max_characters in (
+        ("licence", MAX_LICENCE_CHARACTERS),
+        ("note", MAX_NOTE_CHARACTERS),
+    ):
         value = fields.get(field, "")
-        if len(value) > most or "\x00" in value:
-            raise invalid_field_error(field, f"has up to {most} characters, none of them NUL")
+        if len(value) > max_characters or "\x00" in value:
+            raise invalid_field_error(
+                field, f"must have at most {max_characters} characters, without NUL"
+            )
     return {
         "name": name,
         "licence": fields.get("licence") or None,

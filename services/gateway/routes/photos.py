@@ -1,4 +1,4 @@
-"""`/uploads/{file_id}` and `/search`: one photo, and photos by what is known of them."""
+"""Routes of stored photos: read, update, delete, image, thumbnail and metadata search."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ router = APIRouter(tags=["photos"])
 
 STREAM_READ_BYTES = 256 * 1024
 IMAGE_RESPONSE: dict[int | str, dict[str, Any]] = {
-    200: {"content": {"image/*": {}}, "description": "The picture."}
+    200: {"content": {"image/*": {}}, "description": "The image."}
 }
 
 
@@ -58,14 +58,14 @@ IMAGE_RESPONSE: dict[int | str, dict[str, Any]] = {
 def read_photo(
     gateway: GatewayDep, file_id: FileId, map_name: MapName = DEFAULT_MAP
 ) -> PhotoDetailResponse:
-    """What is known of one photo."""
+    """Get the metadata of a photo and the state of its job."""
     with gateway.catalog.read() as session:
-        found = get_photo(session, get_map(session, map_name).id, file_id)
-        return _photo_detail_response(session, found, map_name)
+        photo = get_photo(session, get_map(session, map_name).id, file_id)
+        return _photo_detail_response(session, photo, map_name)
 
 
 class PhotoUpdate(BaseModel):
-    """What to change; what is left out stays, null clears."""
+    """Fields to update: omitted fields are unchanged, null clears a field."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -79,22 +79,22 @@ class PhotoUpdate(BaseModel):
     role: PhotoRole | None = None
 
     def to_columns(self) -> dict[str, Any]:
-        """The photo's columns that are said, with their new values."""
-        said = self.model_dump(exclude_unset=True)
-        if said.get("captured_at") is not None:
-            said["captured_at"] = parse_time("captured_at", said["captured_at"])
-        if said.get("heading") is not None:
-            said["heading"] %= 360
-        if "place" in said:
-            said["place"] = (said["place"] or "").strip() or None
-        if "tags" in said:
-            said["tags"] = parse_tags(said["tags"] or [])
-        if "metadata" in said:
-            said["attributes"] = said.pop("metadata") or {}
-            check_metadata(said["attributes"])
-        if "role" in said:
-            said["role"] = said["role"] or PhotoRole.DATABASE
-        return said
+        """Returns the new values of the photo's columns, for the fields that are set."""
+        columns = self.model_dump(exclude_unset=True)
+        if columns.get("captured_at") is not None:
+            columns["captured_at"] = parse_time("captured_at", columns["captured_at"])
+        if columns.get("heading") is not None:
+            columns["heading"] %= 360
+        if "place" in columns:
+            columns["place"] = (columns["place"] or "").strip() or None
+        if "tags" in columns:
+            columns["tags"] = parse_tags(columns["tags"] or [])
+        if "metadata" in columns:
+            columns["attributes"] = columns.pop("metadata") or {}
+            check_metadata(columns["attributes"])
+        if "role" in columns:
+            columns["role"] = columns["role"] or PhotoRole.DATABASE
+        return columns
 
 
 @router.patch(
@@ -109,17 +109,17 @@ def patch_photo(
     patch: PhotoUpdate,
     map_name: MapName = DEFAULT_MAP,
 ) -> PhotoDetailResponse:
-    """Change where, when and what of a photo; its descriptor stays."""
+    """Update the metadata of a photo. Its descriptor is unchanged."""
     columns = patch.to_columns()
     with gateway.catalog.write() as session:
         map_ = lock_map(session, get_map(session, map_name).id)
-        found = get_photo(session, map_.id, file_id)
+        photo = get_photo(session, map_.id, file_id)
         for name, value in columns.items():
-            setattr(found, name, value)
-        check_coordinate_pair(found.latitude, found.longitude)
-        found.changed_version = increment_map_version(session, map_.id)
+            setattr(photo, name, value)
+        check_coordinate_pair(photo.latitude, photo.longitude)
+        photo.changed_version = increment_map_version(session, map_.id)
         session.flush()
-        return _photo_detail_response(session, found, map_name)
+        return _photo_detail_response(session, photo, map_name)
 
 
 @router.delete(
@@ -131,18 +131,18 @@ def patch_photo(
 def delete_photo(
     gateway: GatewayDep, file_id: FileId, map_name: MapName = DEFAULT_MAP
 ) -> DeletedPhotoResponse:
-    """Gone from every answer at once; the bytes follow within seconds."""
+    """Delete a photo. No search returns it any more; its bytes are deleted within seconds."""
 
     def remove(session: Session) -> str:
         map_ = lock_map(session, get_map(session, map_name).id)
-        found = get_photo(session, map_.id, file_id)
-        mark_photo_deleted(session, found, increment_map_version(session, map_.id))
-        cancel_jobs(session, Job.photo_id == found.id)
-        return found.filename
+        photo = get_photo(session, map_.id, file_id)
+        mark_photo_deleted(session, photo, increment_map_version(session, map_.id))
+        cancel_jobs(session, Job.photo_id == photo.id)
+        return photo.filename
 
     filename = gateway.catalog.run(remove)
     return DeletedPhotoResponse(
-        success=True, message=f"{filename} is deleted.", deleted_file_id=file_id
+        success=True, message=f"The photo {filename} is deleted.", deleted_file_id=file_id
     )
 
 
@@ -159,20 +159,20 @@ def read_image(
     file_id: FileId,
     map_name: MapName = DEFAULT_MAP,
 ) -> Response:
-    """The photo's bytes as they were uploaded."""
+    """Get the original bytes of a photo."""
     with gateway.catalog.read() as session:
-        found = get_photo(session, get_map(session, map_name).id, file_id)
-    etag = f'"{found.sha256}"'
+        photo = get_photo(session, get_map(session, map_name).id, file_id)
+    etag = f'"{photo.sha256}"'
     if request.headers.get("if-none-match") == etag:
         return Response(status_code=304, headers={"ETag": etag})
     return StreamingResponse(
-        _read_blocks(gateway.store.open(found.object_key)),
-        media_type=found.media_type,
+        _read_blocks(gateway.store.open(photo.object_key)),
+        media_type=photo.media_type,
         headers={
-            "Content-Length": str(found.size_bytes),
-            "Content-Disposition": f"inline; filename*=UTF-8''{quote(found.filename)}",
+            "Content-Length": str(photo.size_bytes),
+            "Content-Disposition": f"inline; filename*=UTF-8''{quote(photo.filename)}",
             "ETag": etag,
-            "Cache-Control": "private, no-cache",  # kept by this browser, and asked for each time
+            "Cache-Control": "private, no-cache",  # browsers may cache, but must revalidate
         },
     )
 
@@ -187,15 +187,15 @@ def read_image(
 def read_thumbnail(
     gateway: GatewayDep, file_id: FileId, map_name: MapName = DEFAULT_MAP
 ) -> Response:
-    """A small JPEG without any metadata; it is there once the photo has been described."""
+    """Get a small JPEG without metadata; it exists once the photo has been described."""
     with gateway.catalog.read() as session:
-        found = get_photo(session, get_map(session, map_name).id, file_id)
+        photo = get_photo(session, get_map(session, map_name).id, file_id)
     try:
-        data = gateway.store.get(thumbnail_key(found.id))
+        data = gateway.store.get(thumbnail_key(photo.id))
     except NotFound:
         raise NotFound(
             "thumbnail_not_found",
-            "The photo has no thumbnail yet: it is not described.",
+            "The photo has no thumbnail yet, because it has not been described.",
         ) from None
     return Response(data, media_type="image/jpeg")
 
@@ -210,22 +210,24 @@ def search_photos_by_metadata(
     gateway: GatewayDep,
     photos: FilterDep,
     filename: Annotated[
-        str | None, Query(max_length=255, description="part of the name, case ignored")
+        str | None, Query(max_length=255, description="part of the file name, case-insensitive")
     ] = None,
     upload_after: Annotated[str | None, Query(description="ISO 8601; no offset means UTC")] = None,
     upload_before: Annotated[str | None, Query(description="ISO 8601; no offset means UTC")] = None,
     min_file_size: Annotated[int | None, Query(ge=0, le=2**62)] = None,
     max_file_size: Annotated[int | None, Query(ge=0, le=2**62)] = None,
-    role: Annotated[PhotoRole | None, Query(description="left out: of both roles")] = None,
+    role: Annotated[
+        PhotoRole | None, Query(description="photos with this role; omitted: all")
+    ] = None,
     limit: Annotated[int, Query(ge=1, le=1000)] = 100,
-    cursor: Annotated[str | None, Query(description="`next_cursor` of the page before")] = None,
+    cursor: Annotated[str | None, Query(description="`next_cursor` of the previous page")] = None,
     map_name: MapName = DEFAULT_MAP,
 ) -> MetadataSearchResponse:
-    """Photos by what is known of them, newest first, a page at a time."""
+    """Search photos by their metadata, newest first, with a cursor."""
     started = time.perf_counter()
     if filename is not None and "\0" in filename:
-        raise invalid_field_error("filename", "holds a NUL character")
-    wanted = MetadataFilter(
+        raise invalid_field_error("filename", "contains a NUL character")
+    metadata_filter = MetadataFilter(
         filename=filename,
         upload_after=parse_time("upload_after", upload_after) if upload_after else None,
         upload_before=parse_time("upload_before", upload_before) if upload_before else None,
@@ -237,33 +239,33 @@ def search_photos_by_metadata(
     after = _decode_cursor(cursor) if cursor else None
     with gateway.catalog.read() as session:
         map_id = get_map(session, map_name).id
-        found, total = search_photos(session, map_id, wanted, limit + 1, after)
-    page = found[:limit]
+        matches, total = search_photos(session, map_id, metadata_filter, limit + 1, after)
+    page = matches[:limit]
     return MetadataSearchResponse(
         total_found=total,
         total_is_exact=total < MAX_COUNTED_MATCHES,
         images=[PhotoResponse(**PhotoResponse.fields_of(item, map_name)) for item in page],
-        next_cursor=_encode_cursor(page[-1]) if len(found) > limit else None,
+        next_cursor=_encode_cursor(page[-1]) if len(matches) > limit else None,
         query_time_ms=(time.perf_counter() - started) * 1000,
     )
 
 
-def _photo_detail_response(session: Session, found: Photo, map_name: str) -> PhotoDetailResponse:
-    generation = active_generation(session, found.map_id)
-    searchable = generation is not None and find_descriptor(session, generation.id, found.id)
+def _photo_detail_response(session: Session, photo: Photo, map_name: str) -> PhotoDetailResponse:
+    generation = active_generation(session, photo.map_id)
+    searchable = generation is not None and find_descriptor(session, generation.id, photo.id)
     return PhotoDetailResponse(
-        **PhotoResponse.fields_of(found, map_name),
-        job_id=found.job_id,
-        media_type=found.media_type,
-        sha256=found.sha256,
+        **PhotoResponse.fields_of(photo, map_name),
+        job_id=photo.job_id,
+        media_type=photo.media_type,
+        sha256=photo.sha256,
         searchable=bool(searchable),
     )
 
 
 def _read_blocks(file: BinaryIO) -> Iterator[bytes]:
     with file:
-        while piece := file.read(STREAM_READ_BYTES):
-            yield piece
+        while block := file.read(STREAM_READ_BYTES):
+            yield block
 
 
 def _encode_cursor(last: Photo) -> str:
@@ -275,4 +277,4 @@ def _decode_cursor(cursor: str) -> tuple[datetime, UUID]:
         uploaded_at, photo_id = base64.urlsafe_b64decode(cursor.encode()).decode().split(" ")
         return parse_time("cursor", uploaded_at), UUID(photo_id)
     except (ValueError, binascii.Error):
-        raise invalid_field_error("cursor", "is not one that this call has given") from None
+        raise invalid_field_error("cursor", "is not a cursor that this endpoint returned") from None

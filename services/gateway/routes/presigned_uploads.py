@@ -1,12 +1,12 @@
-"""`/uploads/presign`: photos that callers send straight to the bucket.
+"""Routes of presigned uploads: clients send photos directly to the bucket.
 
 ```
-POST /uploads/presign ─> a URL ─> PUT the bytes to incoming/<upload> ─> POST .../complete
-                                                                           │
-    originals/<new>  <─ copied by the store, and only then looked at ──────┘
+POST /uploads/presign ─> URL ─> PUT the bytes to incoming/<upload id> ─> POST .../complete
+                                                                            │
+    originals/<key>  <─ copied within the bucket, then validated ───────────┘
 ```
-A URL stays good until it expires, so what it leads to may change at any moment: what is checked,
-described and acknowledged is the copy.
+The URL can be used until it expires, so the object in `incoming/` may change at any time. Only the
+copy is validated, described and acknowledged.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from services.gateway.admission import (
     CHECK_PHOTO_QUOTA,
     AdmissionDep,
     UploadKind,
-    place_for_photo,
+    reserve_photo_quota,
 )
 from services.gateway.authentication import WRITE, get_caller
 from services.gateway.dependencies import (
@@ -73,14 +73,14 @@ FILE_FIELDS = ("filename", "file_size", "sha256")
 
 
 class PresignRequest(PhotoUpdate):
-    """The file that will be sent, and what the form of `POST /upload` says of a photo."""
+    """The file to be sent, and the photo fields of `POST /upload`."""
 
     filename: str = Field(min_length=1, max_length=255, pattern=NO_NUL_PATTERN)
-    file_size: int = Field(gt=0, le=2**62, description="bytes")
-    sha256: str = Field(pattern="^[0-9a-f]{64}$", description="of the bytes, hexadecimal")
+    file_size: int = Field(gt=0, le=2**62, description="size in bytes")
+    sha256: str = Field(pattern="^[0-9a-f]{64}$", description="SHA-256 of the file, hexadecimal")
 
     def photo_fields(self) -> dict[str, Any]:
-        """What is said of the photo, as JSON."""
+        """Returns the fields of the photo, without those of the file, as JSON values."""
         return self.model_dump(mode="json", exclude=set(FILE_FIELDS), exclude_none=True)
 
 
@@ -109,19 +109,17 @@ def create_presigned_upload(
     idempotent: IdempotentDep,
     map_name: MapName = DEFAULT_MAP,
 ) -> PresignResponse:
-    """An address to which the photo's bytes can be sent without passing this server.
+    """Create a presigned URL for uploading a photo directly to the bucket.
 
-    Only where Placewise keeps its objects in a bucket (S3_ENDPOINT). Nothing is stored until the
-    upload is completed.
+    This requires a server that stores its objects in a bucket (S3_ENDPOINT). The photo is stored
+    when the upload is completed.
     """
     store = _require_presigning_store(gateway)
     limit = gateway.settings.max_file_size
     if body.file_size > limit:
         raise file_too_large_error(limit)
-    said = body.photo_fields()
-    _parse_photo_fields(
-        said
-    )  # what can't be understood is refused now, not after the bytes were sent
+    fields = body.photo_fields()
+    _parse_photo_fields(fields)  # refuses invalid fields before the file is sent
     request.app.state.rate_limiter.count_upload_bytes(get_caller(request), body.file_size)
     upload_id = new_id()
     seconds = gateway.settings.presign_seconds
@@ -138,12 +136,12 @@ def create_presigned_upload(
             filename=base_name(body.filename),
             size_bytes=body.file_size,
             sha256=body.sha256,
-            said=said,
+            said=fields,
             expires_at=db_now_plus(seconds),
         )
         session.add(upload)
         session.flush()
-        answer = PresignResponse(
+        response = PresignResponse(
             upload_id=upload_id,
             method="PUT",
             url=put.url,
@@ -151,8 +149,8 @@ def create_presigned_upload(
             complete_url=url_in_map(f"/uploads/presign/{upload_id}/complete", map_name),
             expires_at=upload.expires_at,
         )
-        idempotent.store_response(session, 201, answer)
-    return answer
+        idempotent.store_response(session, 201, response)
+    return response
 
 
 @router.post(
@@ -168,26 +166,32 @@ async def complete_presigned_upload(
     response: Response,
     gateway: GatewayDep,
     admission: AdmissionDep,
-    upload_id: Annotated[UploadId, PathParameter(description="as presigning answered it")],
+    upload_id: Annotated[
+        UploadId, PathParameter(description="from the response of `POST /uploads/presign`")
+    ],
     map_name: MapName = DEFAULT_MAP,
 ) -> UploadResponse:
-    """The bytes were sent: check and store the photo. Answers as `POST /upload` does; completed
-    again, it answers the same again."""
+    """Complete a presigned upload: validate the sent file and store the photo.
+
+    The responses are those of `POST /upload`. A repeated request gets the same response again.
+    """
     key = new_original_key()
     with admission.admit_upload(UploadKind.UPLOAD, request):
         key_id = get_caller(request).key_id
-        place = place_for_photo(request, gateway.settings)
+        quota = reserve_photo_quota(request, gateway.settings)
         stored = await run_in_threadpool(
-            _complete_upload, gateway, map_name, upload_id, key, key_id, place
+            _complete_upload, gateway, map_name, upload_id, key, key_id, quota
         )
 
-    def replace(said: UploadOutcome) -> None:
+    def replace_response(outcome: UploadOutcome) -> None:
         with gateway.catalog.write() as session:
             upload = session.get(PresignedUpload, upload_id)
             if upload is not None:  # its map may have been deleted during the wait
-                upload.status, upload.answer = said.status, said.body.model_dump_json()
+                upload.status, upload.answer = outcome.status, outcome.body.model_dump_json()
 
-    return await respond_to_upload(request, response, gateway, map_name, stored, key, replace)
+    return await respond_to_upload(
+        request, response, gateway, map_name, stored, key, replace_response
+    )
 
 
 def _complete_upload(
@@ -196,29 +200,28 @@ def _complete_upload(
     upload_id: UUID,
     key: str,
     key_id: UUID | None,
-    place: AbstractContextManager[None],
+    quota: AbstractContextManager[None],
 ) -> StoreResult:
-    """The photo, whose bytes lie under `key` unless the map had them. Raises Replay for an upload
-    that was completed before."""
+    """Stores the photo under `key`; IdempotentReplay if the upload was completed before."""
     store = _require_presigning_store(gateway)
     with gateway.catalog.read() as session:
         upload = get_presigned_upload(session, get_map(session, map_name).id, upload_id)
     _replay_if_completed(upload)
-    sent = incoming_key(upload_id)
+    source_key = incoming_key(upload_id)
     try:
-        _check_object_size(store.head(sent), upload)
-        store.copy(sent, key)
+        _check_object_size(store.head(source_key), upload)
+        store.copy(source_key, key)
     except NotFound:
-        # Not there yet; or not any more, because another call has completed it since we looked.
+        # Not sent yet, or already deleted by a concurrent request that has completed the upload.
         with gateway.catalog.read() as session:
             _replay_if_completed(get_presigned_upload(session, upload.map_id, upload_id))
         raise _upload_incomplete_error(upload) from None
 
-    def keep(session: Session, stored: StoreResult) -> StoreResult:
+    def store_response(session: Session, stored: StoreResult) -> StoreResult:
         locked = get_presigned_upload(session, upload.map_id, upload_id, lock=True)
         _replay_if_completed(locked)
-        said = UploadOutcome.of(stored, stored.job, key, map_name)
-        locked.status, locked.answer = said.status, said.body.model_dump_json()
+        outcome = UploadOutcome.of(stored, stored.job, key, map_name)
+        locked.status, locked.answer = outcome.status, outcome.body.model_dump_json()
         return stored
 
     try:
@@ -230,55 +233,55 @@ def _complete_upload(
         incoming = ValidatedPhoto(
             received, media_type, header, _parse_photo_fields(upload.said), key_id
         )
-        with place:
-            stored = store_photo(gateway.catalog, gateway.hints, map_name, incoming, keep)
+        with quota:
+            stored = store_photo(gateway.catalog, gateway.hints, map_name, incoming, store_response)
     except (PlacewiseError, IdempotentReplay):
         store.delete(key)
         raise
     if stored.photo.object_key != key:
         store.delete(key)
-    # Acknowledged already; what stays here is collected.
+    # The photo is acknowledged already; garbage collection deletes the object if this fails.
     with contextlib.suppress(Unavailable):
-        store.delete(sent)
+        store.delete(source_key)
     return stored
 
 
 def _verify_copied_object(
     store: PresigningStore, key: str, upload: PresignedUpload
 ) -> StoredUpload:
-    """The stored bytes as a form would have brought them; Unprocessable (`sha256_differs`)."""
+    """Reads and hashes the copied object; Unprocessable (`sha256_differs`) for another file."""
     digest, begin, size = hashlib.sha256(), b"", 0
     with store.open(key) as file:
-        while piece := file.read(HASH_READ_BYTES):
+        while block := file.read(HASH_READ_BYTES):
             if not size:
-                begin = piece[:PHOTO_SIGNATURE_BYTES]
-            digest.update(piece)
-            size += len(piece)
+                begin = block[:PHOTO_SIGNATURE_BYTES]
+            digest.update(block)
+            size += len(block)
     if digest.hexdigest() != upload.sha256:
         raise Unprocessable(
             "sha256_differs",
-            f"The bytes that were sent have the SHA-256 {digest.hexdigest()}, not {upload.sha256}. "
-            "Send the announced file again to the same URL, or begin another upload.",
+            f"The file that was sent has the SHA-256 {digest.hexdigest()}, not {upload.sha256}. "
+            "Send the announced file again to the same URL, or start a new upload.",
         )
     return StoredUpload(key, upload.filename, size, upload.sha256, begin)
 
 
-def _check_object_size(found: ObjectInfo | None, upload: PresignedUpload) -> None:
-    """Unprocessable (`size_differs`), and NotFound where there is nothing."""
-    if found is None:
-        raise NotFound("object_not_found", "Nothing was sent.")
-    if found.size_bytes != upload.size_bytes:
+def _check_object_size(info: ObjectInfo | None, upload: PresignedUpload) -> None:
+    """Raises NotFound if there is no object, and Unprocessable (`size_differs`)."""
+    if info is None:
+        raise NotFound("object_not_found", "No file was sent.")
+    if info.size_bytes != upload.size_bytes:
         raise Unprocessable(
             "size_differs",
-            f"{found.size_bytes} bytes were sent, and {upload.size_bytes} announced. Send the "
-            "announced file again to the same URL, or begin another upload.",
+            f"The file that was sent has {info.size_bytes} bytes, not {upload.size_bytes}. Send "
+            "the announced file again to the same URL, or start a new upload.",
         )
 
 
 def _upload_incomplete_error(upload: PresignedUpload) -> Conflict:
     return Conflict(
         "upload_incomplete",
-        f"Nothing was sent for the upload {upload.id} yet: PUT the bytes to its URL first.",
+        f"No file was sent for the upload {upload.id} yet. PUT it to the URL of the upload first.",
     )
 
 
@@ -306,6 +309,6 @@ def _require_presigning_store(gateway: GatewayContext) -> PresigningStore:
         return gateway.store
     raise Conflict(
         "no_direct_uploads",
-        "This Placewise keeps its photos in a folder, to which nobody can send them directly. "
-        "Use POST /api/v1/upload.",
+        "Presigned uploads need a bucket (S3_ENDPOINT), but this server stores its photos in a "
+        "folder. Use POST /api/v1/upload.",
     )

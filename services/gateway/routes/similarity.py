@@ -1,4 +1,4 @@
-"""`POST /similarity` and `POST /similarity/{file_id}`: which known place is this?"""
+"""Routes of the similarity search: by stored photo, by uploaded photo, and results of jobs."""
 
 from __future__ import annotations
 
@@ -55,9 +55,12 @@ from shared.storage.keys import query_key
 router = APIRouter(tags=["similarity"])
 
 COMPARISON_PENDING: dict[int | str, dict[str, Any]] = {
-    202: {"model": JobAcceptedResponse, "description": "Being compared; poll, then fetch."}
+    202: {
+        "model": JobAcceptedResponse,
+        "description": "The job is queued. Poll it, then get its result.",
+    }
 }
-# Of a failed job's error; everything else is the photo's fault.
+# Exception class by the status of a failed job's error; other errors are due to the photo (422).
 ERROR_BY_STATUS = {kind.status: kind for kind in (NotFound, Conflict, Gone)}
 
 
@@ -78,14 +81,14 @@ async def search_by_stored_photo(
     search_params: SearchParamsDep,
     map_name: MapName = DEFAULT_MAP,
 ) -> Any:
-    """The photos most similar to a stored one, without itself.
+    """Find the photos most similar to a stored photo, without that photo.
 
-    With `rerank` or `explain` an extractor looks at them: 202 with a job where that takes longer
-    than COMPARE_WAIT_SECONDS, or than N seconds with `Prefer: wait=N`. Poll `status_url`, then GET
-    `result_url`.
+    With `rerank` or `explain` an extractor compares the photos. If this takes longer than
+    COMPARE_WAIT_SECONDS, or than N seconds with `Prefer: wait=N`, the response is 202 with a job:
+    poll `status_url`, then GET `result_url`.
     """
 
-    def ask() -> SimilarityResponse | Job:
+    def search() -> SimilarityResponse | Job:
         if not search_params.needs_comparison:
             return find_similar(
                 gateway, query_from_photo(gateway, map_name, file_id), search_params
@@ -97,12 +100,12 @@ async def search_by_stored_photo(
             gateway, query_from_photo(gateway, map_name, file_id), search_params, idempotent
         )
 
-    asked = await run_in_threadpool(ask)
-    if isinstance(asked, SimilarityResponse):
-        return asked
+    result = await run_in_threadpool(search)
+    if isinstance(result, SimilarityResponse):
+        return result
     settings = gateway.settings
     wait = parse_prefer_wait(request, settings.max_wait_seconds) or settings.compare_wait_seconds
-    return await _wait_for_result(gateway, response, asked, map_name, wait)
+    return await _wait_for_result(gateway, response, result, map_name, wait)
 
 
 @router.post(
@@ -110,9 +113,12 @@ async def search_by_stored_photo(
     operation_id="similar_to_upload",
     response_model=SimilarityResponse,
     responses={
-        202: {"model": JobAcceptedResponse, "description": "Being described; poll, then fetch."}
+        202: {
+            "model": JobAcceptedResponse,
+            "description": "The job is queued. Poll it, then get its result.",
+        }
     },
-    openapi_extra=multipart_schema("the photo to ask with"),
+    openapi_extra=multipart_schema("the query photo"),
     dependencies=[READ, ADMIT_QUERY],
 )
 async def search_by_uploaded_photo(
@@ -124,11 +130,11 @@ async def search_by_uploaded_photo(
     search_params: SearchParamsDep,
     map_name: MapName = DEFAULT_MAP,
 ) -> Any:
-    """The photos most similar to one that is not stored.
+    """Find the photos most similar to an uploaded photo that is not stored.
 
-    202 with a job: poll `status_url`, then GET `result_url`. With `Prefer: wait=N` the answer
-    itself (200) when it takes no longer than N seconds. Repeated under an `Idempotency-Key`, it is
-    answered with the 202 of its job.
+    The response is 202 with a job: poll `status_url`, then GET `result_url`. With `Prefer: wait=N`
+    it is 200 with the result if that takes at most N seconds. A request repeated with its
+    `Idempotency-Key` gets the 202 of the first one.
     """
     await run_in_threadpool(check_comparison_supported, gateway, map_name, search_params)
     job_id = new_id()
@@ -160,17 +166,17 @@ async def search_by_uploaded_photo(
 async def read_similarity_result(
     response: Response, gateway: GatewayDep, job_id: JobId, map_name: MapName = DEFAULT_MAP
 ) -> Any:
-    """The answer to a query whose job has succeeded; 409 before that.
+    """Get the result of a succeeded query job; 409 while it is unfinished.
 
-    A query photo that is described and was asked with `rerank` or `explain` is now compared: 202
-    with that job where it takes longer than COMPARE_WAIT_SECONDS.
+    For an uploaded photo with `rerank` or `explain`, the comparison starts now. If it takes longer
+    than COMPARE_WAIT_SECONDS, the response is 202 with its job.
     """
 
-    def find() -> Job:
+    def load() -> Job:
         with gateway.catalog.read() as session:
             return get_job(session, get_map(session, map_name).id, job_id)
 
-    job = await run_in_threadpool(find)
+    job = await run_in_threadpool(load)
     if job.kind not in QUERY_JOBS:
         raise Conflict("no_result", f"The job {job.id} ({job.kind}) has no similarity result.")
     if job.state in UNFINISHED_STATES:
@@ -187,19 +193,19 @@ async def read_similarity_result(
 async def _wait_for_result(
     gateway: GatewayContext, response: Response, job: Job, map_name: str, wait_seconds: float
 ) -> SimilarityResponse | JSONResponse:
-    """What the query's job and the one that follows it come to within the time; else a 202."""
+    """Waits for the query's job and its compare job, if any; 202 with the job when time is up."""
     deadline = time.monotonic() + wait_seconds
     while True:
-        left = deadline - time.monotonic()
-        if job.state in UNFINISHED_STATES and left > 0:
-            waited = await wait_for_job(gateway, job.id, left)
-            if waited is None:
+        remaining = deadline - time.monotonic()
+        if job.state in UNFINISHED_STATES and remaining > 0:
+            current = await wait_for_job(gateway, job.id, remaining)
+            if current is None:
                 raise query_expired_error()
-            job = waited
+            job = current
         if job.state in UNFINISHED_STATES:
-            started = accept_job(response, job, map_name)
-            # As a response of its own: the route's model is that of the 200.
-            return JSONResponse(started.model_dump(mode="json"), 202, dict(response.headers))
+            accepted = accept_job(response, job, map_name)
+            # An explicit response, because the response model of the route is that of the 200.
+            return JSONResponse(accepted.model_dump(mode="json"), 202, dict(response.headers))
         result = await run_in_threadpool(_result_or_next_job, gateway, job, map_name)
         if isinstance(result, SimilarityResponse):
             return result
@@ -217,7 +223,7 @@ def _queue_query(
     try:
         check_photo_signature(received.begin)
         for name in received.fields:
-            raise invalid_field_error(name, "is unknown here; filters belong into the address")
+            raise invalid_field_error(name, "is unknown; send filters as query parameters")
         with received.open(gateway.store) as file:
             read_photo_header(file, gateway.settings.max_image_pixels)
         with gateway.catalog.write() as session:
@@ -241,20 +247,20 @@ def _queue_query(
 def _result_or_next_job(
     gateway: GatewayContext, job: Job, map_name: str
 ) -> SimilarityResponse | Job:
-    """The answer of an ended job, or the job that goes on with it."""
+    """The result of a finished job, or the compare job that continues it."""
     if job.state == JobState.SUCCEEDED:
         if job.kind == JobKind.COMPARE:
             return comparison_response(gateway, job, map_name)
-        wanted = SearchParams.model_validate(job.params["wanted"])
+        search_params = SearchParams.model_validate(job.params["wanted"])
         query = query_from_job(gateway, job)
-        if wanted.needs_comparison:
-            return start_comparison_of_query_photo(gateway, job, query, wanted)
-        return find_similar(gateway, query, wanted)
+        if search_params.needs_comparison:
+            return start_comparison_of_query_photo(gateway, job, query, search_params)
+        return find_similar(gateway, query, search_params)
     if job.state == JobState.CANCELLED:
         raise Conflict("job_cancelled", f"The job {job.id} was cancelled.", job_id=str(job.id))
     error = job.error or {}
-    kind = ERROR_BY_STATUS.get(error.get("status", 0), Unprocessable)
-    raise kind(
+    error_class = ERROR_BY_STATUS.get(error.get("status", 0), Unprocessable)
+    raise error_class(
         error.get("code", "query_failed"),
         error.get("detail", "The photo could not be described."),
         job_id=str(job.id),

@@ -1,7 +1,4 @@
-"""`/searches`: what was asked of a map.
-
-`/database/stats`: how much there is, and how much was asked.
-"""
+"""Routes of the search history (`/searches`) and of a map's statistics (`/database/stats`)."""
 
 from __future__ import annotations
 
@@ -32,7 +29,7 @@ class SearchHistoryEntry(ResponseModel):
     top_k: int
     results: int
     best_score: float | None
-    in_map: bool | None = Field(description="what the estimate said")
+    in_map: bool | None = Field(description="`estimate.in_map` of the response")
     processing_time_ms: float
     searched_at: datetime
 
@@ -69,14 +66,14 @@ def read_searches(
     cursor: Annotated[str | None, Query()] = None,
     map_name: MapName = DEFAULT_MAP,
 ) -> SearchHistoryResponse:
-    """Similarity searches, newest first; kept for SEARCH_HISTORY_DAYS."""
+    """List similarity searches, newest first. They are kept for SEARCH_HISTORY_DAYS."""
     with gateway.catalog.read() as session:
         map_id = get_map(session, map_name).id
-        found = list_searches(session, map_id, limit + 1, parse_cursor(cursor))
-    page = found[:limit]
+        searches = list_searches(session, map_id, limit + 1, parse_cursor(cursor))
+    page = searches[:limit]
     return SearchHistoryResponse(
         searches=[SearchHistoryEntry.of(search) for search in page],
-        next_cursor=str(page[-1].id) if len(found) > limit else None,
+        next_cursor=str(page[-1].id) if len(searches) > limit else None,
     )
 
 
@@ -98,7 +95,7 @@ class StatsResponse(ResponseModel):
     avg_processing_time_ms: float | None
     max_processing_time_ms: float | None
     jobs: dict[str, int]
-    counted_at: datetime = Field(description="when the figures were counted")
+    counted_at: datetime = Field(description="when the statistics were computed")
 
 
 @router.get(
@@ -108,12 +105,15 @@ class StatsResponse(ResponseModel):
     dependencies=[READ],
 )
 def read_stats(gateway: GatewayDep, map_name: MapName = DEFAULT_MAP) -> StatsResponse:
-    """Figures of one map; search times are those of the last seven days. Those of a map with more
-    than 10,000 photos, jobs or searches may be as old as `counted_at` says."""
+    """Get statistics of a map. Search times cover the last seven days.
+
+    For maps with more than 10,000 photos, jobs or searches, the statistics are cached; `counted_at`
+    shows their age.
+    """
     with gateway.catalog.read() as session:
         map_ = get_map(session, map_name)
         generation = active_generation(session, map_.id)
-        figures, counted_at = get_map_statistics(session, map_.id)
+        statistics, counted_at = get_map_statistics(session, map_.id)
         chunks, chunk_bytes = 0, 0
         if generation is not None:
             chunks, chunk_bytes = session.execute(
@@ -124,20 +124,20 @@ def read_stats(gateway: GatewayDep, map_name: MapName = DEFAULT_MAP) -> StatsRes
         return StatsResponse(
             map=map_.name,
             map_version=map_.version,
-            total_images=figures.photos,
-            searchable_images=figures.searchable,
-            labelled_queries=figures.labelled_queries,
+            total_images=statistics.photos,
+            searchable_images=statistics.searchable,
+            labelled_queries=statistics.labelled_queries,
             total_chunks=chunks,
-            total_storage_bytes=int(chunk_bytes) + figures.photo_bytes,
+            total_storage_bytes=int(chunk_bytes) + statistics.photo_bytes,
             feature_dimension=generation.dimension if generation else None,
             max_images_per_chunk=gateway.settings.slot_rows,
             extractor=generation.extractor if generation else map_.extractor,
             vocabulary=vocabulary_standing(session, generation) if generation else None,
-            total_searches=figures.searches,
-            recent_uploads_24h=figures.uploads_24h,
-            recent_searches_24h=figures.searches_24h,
-            avg_processing_time_ms=figures.average_ms,
-            max_processing_time_ms=figures.longest_ms,
-            jobs=figures.jobs,
+            total_searches=statistics.searches,
+            recent_uploads_24h=statistics.uploads_24h,
+            recent_searches_24h=statistics.searches_24h,
+            avg_processing_time_ms=statistics.average_ms,
+            max_processing_time_ms=statistics.longest_ms,
+            jobs=statistics.jobs,
             counted_at=counted_at,
         )

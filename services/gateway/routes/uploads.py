@@ -1,4 +1,4 @@
-"""`POST /upload`: one photo in."""
+"""Route for uploading a photo: `POST /upload`."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from services.gateway.admission import (
     CHECK_PHOTO_QUOTA,
     AdmissionDep,
     UploadKind,
-    place_for_photo,
+    reserve_photo_quota,
 )
 from services.gateway.authentication import WRITE, get_caller
 from services.gateway.dependencies import (
@@ -49,18 +49,18 @@ UPLOAD_FORM = multipart_schema(
     longitude={"type": "number", "minimum": -180, "maximum": 180},
     heading={"type": "number", "minimum": 0, "maximum": 360},
     captured_at={"type": "string", "format": "date-time"},
-    place={**_TEXT_SCHEMA, "description": "a label, where coordinates say little"},
+    place={**_TEXT_SCHEMA, "description": "a label, for places without useful coordinates"},
     tags={**_TEXT_SCHEMA, "description": "separated by commas"},
     metadata={**_TEXT_SCHEMA, "description": "a JSON object"},
     role={
         "type": "string",
         "enum": list(PhotoRole),
-        "description": "`query`: a labelled query, never found; evaluations ask with it",
+        "description": "`query`: a labelled query for evaluations, never returned by searches",
     },
 )
 
 UPLOAD_RESPONSES: dict[int | str, dict[str, Any]] = {
-    200: {"model": UploadResponse, "description": "The map has these bytes already."},
+    200: {"model": UploadResponse, "description": "The map already has these bytes."},
     201: {"model": UploadResponse, "description": "Searchable (with `Prefer: wait=N`)."},
 }
 
@@ -82,10 +82,11 @@ async def upload_photo(
     admission: AdmissionDep,
     map_name: MapName = DEFAULT_MAP,
 ) -> UploadResponse:
-    """Store a photo and queue its description. EXIF fills what the form leaves out.
+    """Store a photo and queue the job that describes it.
 
-    202 with the job to poll; with `Prefer: wait=N`, 201 once the photo is searchable. The same
-    bytes again give the existing photo (200), or queue it again after a failed job (202).
+    Fields that the form leaves out are read from EXIF. The response is 202 with the job to poll;
+    with `Prefer: wait=N`, 201 once the photo is searchable. If the map already has the same bytes,
+    the existing photo is returned (200), or queued again after a failed job (202).
     """
     with admission.admit_upload(UploadKind.UPLOAD, request):
         received = await store_form_file(
@@ -97,28 +98,28 @@ async def upload_photo(
         )
     await idempotent.claim_form(gateway.store, received)
 
-    def keep(session: Session, stored: StoreResult) -> StoreResult:
-        said = UploadOutcome.of(stored, stored.job, received.key, map_name)
-        idempotent.store_response(session, said.status, said.body, said.headers)
+    def store_response(session: Session, stored: StoreResult) -> StoreResult:
+        outcome = UploadOutcome.of(stored, stored.job, received.key, map_name)
+        idempotent.store_response(session, outcome.status, outcome.body, outcome.headers)
         return stored
 
     key_id = get_caller(request).key_id
-    place = place_for_photo(request, gateway.settings)
+    quota = reserve_photo_quota(request, gateway.settings)
     stored = await run_in_threadpool(
-        _store_upload, gateway, map_name, received, key_id, place, keep
+        _store_upload, gateway, map_name, received, key_id, quota, store_response
     )
 
-    def replace(said: UploadOutcome) -> None:
-        idempotent.replace_response(said.status, said.body, said.headers)
+    def replace_response(outcome: UploadOutcome) -> None:
+        idempotent.replace_response(outcome.status, outcome.body, outcome.headers)
 
     return await respond_to_upload(
-        request, response, gateway, map_name, stored, received.key, replace
+        request, response, gateway, map_name, stored, received.key, replace_response
     )
 
 
 @dataclass(frozen=True, slots=True)
 class UploadOutcome:
-    """What an upload is answered."""
+    """Response to an upload."""
 
     status: int
     headers: dict[str, str]
@@ -126,11 +127,18 @@ class UploadOutcome:
 
     @classmethod
     def of(cls, stored: StoreResult, job: Job | None, key: str, map_name: str) -> UploadOutcome:
-        """`job` as it is now, and the `key` of the bytes that came."""
+        """Builds the response.
+
+        Args:
+            stored: The stored or existing photo.
+            job: Its job in the current state, if any.
+            key: Object key of the received bytes.
+            map_name: Map of the photo.
+        """
         status_url = url_in_map(
             f"/jobs/{job.id}" if job else f"/uploads/{stored.photo.id}", map_name
         )
-        answer = UploadResponse(
+        body = UploadResponse(
             file_id=stored.photo.id,
             job_id=job.id if job else None,
             filename=stored.photo.filename,
@@ -142,10 +150,10 @@ class UploadOutcome:
             message=_outcome_message(stored, job),
         )
         if not stored.queued or job is None:
-            return cls(200, {"Location": status_url}, answer)
+            return cls(200, {"Location": status_url}, body)
         if job.state == JobState.SUCCEEDED:
-            return cls(201, {"Location": status_url}, answer)
-        return cls(202, {"Location": status_url, "Retry-After": "1"}, answer)
+            return cls(201, {"Location": status_url}, body)
+        return cls(202, {"Location": status_url, "Retry-After": "1"}, body)
 
 
 async def respond_to_upload(
@@ -157,23 +165,29 @@ async def respond_to_upload(
     key: str,
     on_described: Callable[[UploadOutcome], None],
 ) -> UploadResponse:
-    """What is answered to an upload that was kept, after the wait that the request prefers.
+    """Builds the response to an upload, after waiting for its job if the request prefers it.
 
-    `key` is that of the bytes that came; `on_described` is told when the photo was described
-    meanwhile,
-    to answer so again.
+    Args:
+        request: Its `Prefer: wait=N` sets how long to wait.
+        response: Gets the status and the headers.
+        gateway: The gateway context.
+        map_name: Map of the photo.
+        stored: The stored or existing photo.
+        key: Object key of the received bytes.
+        on_described: Called in a worker thread with the 201 response if the photo was described
+            within the wait, to store it for repetitions of the request.
     """
     job = stored.job
     wait = parse_prefer_wait(request, gateway.settings.max_wait_seconds)
     if wait and stored.queued and job is not None:
         response.headers["Preference-Applied"] = f"wait={wait:g}"
         job = await wait_for_job(gateway, job.id, wait)
-    said = UploadOutcome.of(stored, job, key, map_name)
-    if said.status == 201:
-        await run_in_threadpool(on_described, said)
-    response.status_code = said.status
-    response.headers.update(said.headers)
-    return said.body
+    outcome = UploadOutcome.of(stored, job, key, map_name)
+    if outcome.status == 201:
+        await run_in_threadpool(on_described, outcome)
+    response.status_code = outcome.status
+    response.headers.update(outcome.headers)
+    return outcome.body
 
 
 def _store_upload(
@@ -181,18 +195,18 @@ def _store_upload(
     map_name: str,
     received: StoredUpload,
     key_id: UUID | None,
-    place: AbstractContextManager[None],
-    keep: BeforeCommit,
+    quota: AbstractContextManager[None],
+    before_commit: BeforeCommit,
 ) -> StoreResult:
-    """Check what came and acknowledge it; whatever is not kept leaves no bytes behind."""
+    """Validates and stores the photo; deletes the received bytes if they are not used."""
     try:
         incoming = validate_photo(
             gateway.store, received, gateway.settings.max_image_pixels, key_id
         )
-        with place:
-            stored = store_photo(gateway.catalog, gateway.hints, map_name, incoming, keep)
+        with quota:
+            stored = store_photo(gateway.catalog, gateway.hints, map_name, incoming, before_commit)
     except PlacewiseError:
-        # Only what is certainly refused: after a lost connection the row may be committed.
+        # Not for other exceptions: after a lost connection the row may have been committed.
         gateway.store.delete(received.key)
         raise
     if stored.photo.object_key != received.key:
@@ -202,10 +216,10 @@ def _store_upload(
 
 def _outcome_message(stored: StoreResult, job: Job | None) -> str:
     if not stored.queued:
-        return "The map has this photo already."
+        return "The map already has this photo."
     if job is None or job.state in UNFINISHED_STATES:
-        return "Stored; it is described in the background."
+        return "The photo is stored. It is being described in the background."
     if job.state == JobState.SUCCEEDED:
-        return "Stored and searchable."
+        return "The photo is stored and searchable."
     reason = (job.error or {}).get("detail", "")
-    return f"Stored, but its job is {job.state}. {reason}".strip()
+    return f"The photo is stored, but its job is {job.state}. {reason}".strip()

@@ -1,4 +1,4 @@
-"""`/webhooks`: who is told what happens. An admin's calls."""
+"""Routes of webhooks and their delivery logs. They need the scope `admin`."""
 
 from __future__ import annotations
 
@@ -33,7 +33,9 @@ class CreateWebhookRequest(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
     url: str = Field(
-        min_length=1, max_length=2000, description="HTTPS, at a public address; no redirect"
+        min_length=1,
+        max_length=2000,
+        description="an HTTPS URL with a public address; redirects are not followed",
     )
     events: list[EventKind] = Field(min_length=1, max_length=100)
 
@@ -55,17 +57,17 @@ class WebhookResponse(ResponseModel):
 
 
 class CreatedWebhookResponse(WebhookResponse):
-    secret: str = Field(description="signs what is sent; it is shown this once")
+    secret: str = Field(description="signs the events; it is shown only once")
 
 
 class DeliveryResponse(ResponseModel):
     id: UUID
-    event_id: UUID = Field(description="`webhook-id` is `msg_` and this, in every try")
+    event_id: UUID = Field(description="sent as `webhook-id: msg_<event_id>` in every attempt")
     event: EventKind
     state: DeliveryState
     attempts: int
     next_attempt_at: datetime | None
-    last_status: int | None = Field(description="HTTP status of the last answer")
+    last_status: int | None = Field(description="HTTP status of the last response")
     last_error: str | None
     created_at: datetime
     ended_at: datetime | None
@@ -99,7 +101,7 @@ class DeliveriesResponse(ResponseModel):
     dependencies=[ADMIN],
 )
 def read_webhooks(gateway: GatewayDep) -> list[WebhookResponse]:
-    """Newest first, without their secrets."""
+    """List webhooks, newest first, without their secrets."""
     with gateway.catalog.read() as session:
         return [WebhookResponse.of(webhook) for webhook in list_webhooks(session)]
 
@@ -112,19 +114,21 @@ def read_webhooks(gateway: GatewayDep) -> list[WebhookResponse]:
     dependencies=[ADMIN],
 )
 def register_webhook(gateway: GatewayDep, body: CreateWebhookRequest) -> CreatedWebhookResponse:
-    """Events are POSTed to the URL, signed with the answer's secret. It is shown this once, so this
-    call takes no `Idempotency-Key`."""
+    """Create a webhook: events are POSTed to the URL, signed with the returned secret.
+
+    The secret is shown only once, so this endpoint does not support `Idempotency-Key`.
+    """
     allow_private = gateway.settings.webhook_private_addresses
     target = parse_webhook_url(body.url, allow_private=allow_private)
     try:
-        # For whoever mistypes; what the name means when something is sent is looked up then.
+        # Catches typing errors early. The host is resolved and checked again for each delivery.
         resolve_webhook_target(target, allow_private=allow_private)
     except PlacewiseError as error:
         raise invalid_field_error("url", error.detail) from error
     with gateway.catalog.write() as session:
-        made = create_webhook(session, body.url, body.events)
-        answer = WebhookResponse.of(made)
-        return CreatedWebhookResponse(**answer.model_dump(), secret=made.secret)
+        webhook = create_webhook(session, body.url, body.events)
+        fields = WebhookResponse.of(webhook).model_dump()
+        return CreatedWebhookResponse(**fields, secret=webhook.secret)
 
 
 @router.delete(
@@ -134,7 +138,7 @@ def register_webhook(gateway: GatewayDep, body: CreateWebhookRequest) -> Created
     dependencies=[ADMIN],
 )
 def remove_webhook_by_id(gateway: GatewayDep, webhook_id: WebhookId) -> WebhookResponse:
-    """Nothing is sent to it any more, also not what waits; its log goes with it."""
+    """Delete a webhook, its pending deliveries and its delivery log."""
     with gateway.catalog.write() as session:
         return WebhookResponse.of(delete_webhook(session, webhook_id))
 
@@ -151,12 +155,13 @@ def read_deliveries(
     limit: Annotated[int, Query(ge=1, le=1000)] = 50,
     cursor: Annotated[str | None, Query()] = None,
 ) -> DeliveriesResponse:
-    """What was sent and what waits, newest first; kept for JOB_RETENTION_DAYS."""
+    """List the deliveries of a webhook, newest first, kept for JOB_RETENTION_DAYS."""
     before = parse_cursor(cursor)
     with gateway.catalog.read() as session:
-        found = list_deliveries(session, get_webhook(session, webhook_id).id, limit + 1, before)
-    page = found[:limit]
+        webhook = get_webhook(session, webhook_id)
+        deliveries = list_deliveries(session, webhook.id, limit + 1, before)
+    page = deliveries[:limit]
     return DeliveriesResponse(
         deliveries=[DeliveryResponse.of(delivery) for delivery in page],
-        next_cursor=str(page[-1].id) if len(found) > limit else None,
+        next_cursor=str(page[-1].id) if len(deliveries) > limit else None,
     )
