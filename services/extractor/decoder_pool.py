@@ -72,7 +72,7 @@ class DecoderPool:
     def _start_pool(self) -> ProcessPool:
         return ProcessPool(
             max_workers=self._settings.decode_processes,
-            # Fork would copy a process that holds torch's threads and locks.
+            # Forking is not safe in a process with torch's threads and locks.
             context=multiprocessing.get_context("spawn"),
             initializer=limit_memory,
             initargs=[self._settings.decode_memory_bytes],

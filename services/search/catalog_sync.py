@@ -160,15 +160,16 @@ def with_int8_codes(
     folder: Path,
     memory_budget: MemoryBudget,
     old: Snapshot,
-    made: Mapping[UUID, Int8Codes],
+    built: Mapping[UUID, Int8Codes],
 ) -> Snapshot:
     """Return the snapshot with int8 codes of every chunk.
 
-    Codes in `made`, by chunk id, are used; the others are loaded or computed.
+    Codes in `built`, by chunk id, are used; the others are loaded or computed.
     """
     loader = generation_loader(store, folder, old.generation_id)
     return _apply_memory_budget(
-        memory_budget, replace(old, chunks=tuple(_attach_int8(loader, c, made) for c in old.chunks))
+        memory_budget,
+        replace(old, chunks=tuple(_attach_int8(loader, c, built) for c in old.chunks)),
     )
 
 
@@ -216,12 +217,12 @@ def _attach_int8_to_all(loader: ChunkLoader, chunks: list[LoadedChunk]) -> list[
 
 
 def _attach_int8(
-    loader: ChunkLoader, chunk: LoadedChunk, made: Mapping[UUID, Int8Codes]
+    loader: ChunkLoader, chunk: LoadedChunk, built: Mapping[UUID, Int8Codes]
 ) -> LoadedChunk:
     stored = chunk.stored
     if stored is None or stored.int8 is not None:
         return chunk
-    codes = made.get(chunk.chunk_id) or loader.load_int8_codes(chunk.object_key, stored)
+    codes = built.get(chunk.chunk_id) or loader.load_int8_codes(chunk.object_key, stored)
     return replace(chunk, int8=codes, stored=replace(stored, int8=codes))
 
 

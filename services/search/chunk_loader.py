@@ -363,10 +363,10 @@ def memory_parts(chunks: Sequence[LoadedChunk]) -> list[tuple[str, int]]:
     return [*sizes.items(), ("rows", sum(chunk.rows.nbytes for chunk in chunks))]
 
 
-def _in_memory(stored: NDArray[Number], now: NDArray[Number], wanted: bool) -> NDArray[Number]:
-    if not wanted:
+def _in_memory(stored: NDArray[Number], loaded: NDArray[Number], resident: bool) -> NDArray[Number]:
+    if not resident:
         return stored
-    return np.array(stored) if now is stored else now
+    return np.array(stored) if loaded is stored else loaded
 
 
 def _write_durably(target: Path, data: bytes) -> None:

@@ -105,7 +105,7 @@ class Int8CodeBuilder:
                 build = _Int8Build(sum(len(chunk.rows) for chunk in snapshot.chunks))
                 self._builds[snapshot.generation_id] = build
                 threading.Thread(
-                    target=self._build, args=(snapshot, build), name="make-int8", daemon=True
+                    target=self._build, args=(snapshot, build), name="build-int8", daemon=True
                 ).start()
         return build
 

@@ -160,19 +160,19 @@ class _SnapshotCollector(Collector):
             "Version of the map in the snapshot.",
             labels=["generation"],
         )
-        for generation_id, number in status.versions.items():
-            version.add_metric([str(generation_id)], number)
+        for generation_id, version_number in status.versions.items():
+            version.add_metric([str(generation_id)], version_number)
         yield version
-        behind = GaugeMetricFamily(
+        lag_versions = GaugeMetricFamily(
             f"{prefix}_snapshot_lag_versions", "Versions behind the map.", labels=["generation"]
         )
-        seconds = GaugeMetricFamily(
+        lag_seconds = GaugeMetricFamily(
             f"{prefix}_snapshot_lag_seconds",
             "Seconds since the snapshot was last known to be current.",
             labels=["generation"],
         )
         for generation_id, lag in status.lags.items():
-            behind.add_metric([str(generation_id)], lag.versions)
-            seconds.add_metric([str(generation_id)], lag.seconds)
-        yield behind
-        yield seconds
+            lag_versions.add_metric([str(generation_id)], lag.versions)
+            lag_seconds.add_metric([str(generation_id)], lag.seconds)
+        yield lag_versions
+        yield lag_seconds

@@ -412,8 +412,8 @@ class _Estimates:
         if not len(self.rows):
             return np.zeros(len(rows), bool)
         positions = np.minimum(self.rows.searchsorted(rows), len(self.rows) - 1)
-        found: NDArray[np.bool_] = self.rows[positions] == rows
-        return found
+        estimated: NDArray[np.bool_] = self.rows[positions] == rows
+        return estimated
 
     def select(self, rows: Indices) -> _Estimates:
         """Estimates of the given rows, which all must have one."""

@@ -165,7 +165,7 @@ class HttpSearchClient:
         )
 
     def __enter__(self) -> Self:
-        self._workers.look()
+        self._workers.refresh()
         self._refresh_thread.start()
         return self
 
@@ -183,13 +183,13 @@ class HttpSearchClient:
 
     def _refresh_workers(self) -> None:
         while not self._stop.wait(REFRESH_SECONDS):
-            self._workers.look()
+            self._workers.refresh()
 
     def search(self, request: SearchRequest) -> SearchResponse:
         deadline = time.monotonic() + self._timeout_seconds
         layout = self._workers.layout(request.generation_id, request.min_version)
         if not layout:  # no worker has answered yet
-            self._workers.look()
+            self._workers.refresh()
             layout = self._workers.layout(request.generation_id, request.min_version)
         calls = {
             # In the request's context, so that its id and trace are propagated.
@@ -210,7 +210,7 @@ class HttpSearchClient:
         """Poll the workers and merge their states; Unavailable (`search_unavailable`) if none
         answers.
         """
-        self._workers.look()
+        self._workers.refresh()
         statuses, unreachable = self._workers.statuses()
         if not statuses:
             raise Unavailable("search_unavailable", "No search worker answers.")
@@ -241,7 +241,7 @@ class HttpSearchClient:
                     return call_search(self._http, url, request, seconds)
                 except WorkerUnavailable as error:
                     log.info("a call for %s failed, trying the next worker: %s", shard.name, error)
-                    self._workers.failed(url)
+                    self._workers.mark_down(url)
                 except Unavailable as error:
                     log.debug("%s: %s: %s", shard.name, url, error.detail)
                     if error.code in RETRYABLE_CODES:

@@ -21,8 +21,7 @@ from pydantic import BaseModel, ValidationError
 from shared.config.shards import Shard
 from shared.errors import PlacewiseError, error_from_response
 from shared.search_api.protocol import SearchRequest, SearchResponse, SearchStatus
-from shared.telemetry.tracing import REQUEST_ID_HEADER as REQUEST_HEADER
-from shared.telemetry.tracing import current_request_id, current_traceparent
+from shared.telemetry.tracing import REQUEST_ID_HEADER, current_request_id, current_traceparent
 
 log = logging.getLogger(__name__)
 
@@ -85,7 +84,7 @@ def _call(
     headers = {"Content-Type": "application/json"} if content is not None else {}
     request_id = current_request_id()
     if request_id is not None:
-        headers[REQUEST_HEADER] = request_id
+        headers[REQUEST_ID_HEADER] = request_id
     traceparent = current_traceparent()
     if traceparent is not None:
         headers["traceparent"] = traceparent
@@ -145,7 +144,7 @@ class WorkerDirectory:
     def close(self) -> None:
         self._status_executor.shutdown()
 
-    def look(self) -> None:
+    def refresh(self) -> None:
         """Poll all workers concurrently; takes as long as the slowest of them."""
         for _ in self._status_executor.map(self._refresh, self._workers):
             pass
@@ -167,7 +166,7 @@ class WorkerDirectory:
             worker.is_up, worker.silent = status is not None, silent
             worker.status = status or worker.status
 
-    def failed(self, url: str) -> None:
+    def mark_down(self, url: str) -> None:
         """Mark a worker as down until the next poll, so that others are preferred."""
         with self._lock:
             for worker in self._workers:

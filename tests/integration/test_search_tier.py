@@ -16,7 +16,7 @@ from starlette.testclient import TestClient
 from services.gateway.app import create_app
 from services.gateway.authentication import LocalhostAuthenticator
 from services.gateway.dependencies import GatewayContext
-from services.search import service as search_app
+from services.search import service as search_service
 from services.steward.evaluation_search import GeotaggedPhoto
 from services.steward.map_evaluation import MapEvaluation
 from shared.catalog.chunks import Chunk, Descriptor
@@ -369,7 +369,7 @@ def test_a_worker_is_ready_once_it_has_loaded_what_answers(
     assert 0 <= lag["seconds"] < 5
 
     with monkeypatch.context() as patched:
-        patched.setattr(search_app, "MAX_READY_LAG_SECONDS", 0.0)
+        patched.setattr(search_service, "MAX_READY_LAG_SECONDS", 0.0)
         status, body = ready()
         assert status == 503
         assert re.search("is 0 versions behind, last current .* s ago", body["reasons"][0])
