@@ -233,9 +233,7 @@ class ModelImporter:
         self._commit(job, registration)
 
     def _commit(self, job: Job, registration: ModelRegistration) -> None:
-        """Add the row and end the job; without its row, the stored file is an orphan to be
-        deleted.
-        """
+        """Add the catalog row and end the job; a file without its row is deleted as an orphan."""
         token = job.lease_token
         assert token is not None, "a claimed job carries a token"
         with self._catalog.write() as session:

@@ -181,15 +181,18 @@ class IncrementalFit(Protocol):
     """A fit that runs step by step and can be saved between two steps."""
 
     @property
-    def done(self) -> bool: ...
+    def done(self) -> bool:
+        """Whether no step is left."""
 
     @property
     def progress(self) -> tuple[int, int]:
         """Steps done, and total steps."""
 
-    def save(self) -> bytes: ...
+    def save(self) -> bytes:
+        """Serialise the state between two steps."""
 
-    def resume(self, data: bytes) -> None: ...
+    def resume(self, data: bytes) -> None:
+        """Restore a saved state."""
 
 
 def time_slice() -> Iterator[None]:

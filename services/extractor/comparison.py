@@ -58,8 +58,9 @@ log = logging.getLogger(__name__)
 
 
 class CandidateFeatures:
-    """Computes candidates' local features; with LOCAL_FEATURES=keep, stores them under
-    `features/`.
+    """Computes candidates' local features, and stores them with LOCAL_FEATURES=keep.
+
+    Stored features are the objects under `features/`.
     """
 
     def __init__(self, store: ObjectStore, decoders: DecoderPool, settings: Settings) -> None:

@@ -47,9 +47,7 @@ class DecoderPool:
     def decode(
         self, photos: Sequence[bytes], preprocessing: Preprocessing
     ) -> list[DecodedPhoto | PlacewiseError]:
-        """Decode photos; each result is the decoded photo, or the error that explains the
-        failure.
-        """
+        """Decode photos; each result is a decoded photo, or the error that explains the failure."""
         with self._restart_lock:  # batches and model changes decode from different threads
             if not self._pool.active:
                 log.error("the decoder pool broke; starting a new one")

@@ -45,9 +45,7 @@ class JobFailureHandler:
 
     @contextlib.contextmanager
     def handling_failures(self, jobs: list[Job], result: DrainStats) -> Iterator[None]:
-        """Handle exceptions of the block by updating the jobs; failed jobs are counted in
-        `result`.
-        """
+        """Handle the block's exceptions by updating the jobs; count failed ones in `result`."""
         kind = JobKind(jobs[0].kind)
         try:
             yield

@@ -87,9 +87,11 @@ class ExtractorMetrics:
         registry.register(_DeviceMemoryCollector())
 
     def observe_claim(self, kind: JobKind, jobs: int) -> None:
+        """Record the size of a claimed batch."""
         self._batch_jobs.labels(kind).observe(jobs)
 
     def count_outcome(self, kind: JobKind, outcome: str, jobs: int = 1) -> None:
+        """Count jobs with an outcome."""
         self._jobs.labels(kind, outcome).inc(jobs)
 
     def observe_batch(
@@ -107,13 +109,16 @@ class ExtractorMetrics:
             self.observe_stage(stage, took)
 
     def observe_stage(self, name: str, seconds: float) -> None:
+        """Record the duration of a stage."""
         self._stage_seconds.labels(name.replace(" ", "_")).observe(seconds)
 
     def observe_model_load(self, seconds: float) -> None:
+        """Record the duration of loading an extractor."""
         self._load_seconds.observe(seconds)
 
     @contextlib.contextmanager
     def measure_drain(self) -> Iterator[None]:
+        """Measure the duration of the block as a drain."""
         started = time.perf_counter()
         self._draining.set(1)
         try:
@@ -124,6 +129,8 @@ class ExtractorMetrics:
 
 
 class _DeviceMemoryCollector(Collector):
+    """GPU memory, read at each scrape."""
+
     def collect(self) -> Iterable[Metric]:
         used = GaugeMetricFamily(
             f"{METRIC_PREFIX}_device_used_bytes",

@@ -41,9 +41,7 @@ class LruCache(Generic[Key, Value]):
         self._values: OrderedDict[Key, Value] = OrderedDict()
 
     def get(self, key: Key, make: Callable[[], Value]) -> Value:
-        """Return the key's value, computing and storing it if absent; errors of `make`
-        propagate.
-        """
+        """Return the key's value, computed by `make` if absent; errors of `make` propagate."""
         if key not in self._values:
             self._values[key] = make()
         self._values.move_to_end(key)
@@ -73,6 +71,7 @@ class DescriptorPipeline:
 
     @property
     def spec(self) -> dict[str, Any]:
+        """The extractor spec of the descriptors."""
         return self.extractor.spec(self.centres, self.projection)
 
 

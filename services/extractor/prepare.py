@@ -95,8 +95,7 @@ def unprojected_spec(target: ResolvedGeneration) -> dict[str, Any]:
 
 @dataclass(slots=True)
 class DescribeBatch:
-    """Claimed jobs of one kind, map and generation, while they are prepared, described and
-    published.
+    """Claimed jobs of one kind, map and generation, from their preparation to publication.
 
     Attributes:
         jobs: All jobs of the batch.

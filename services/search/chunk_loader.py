@@ -77,8 +77,9 @@ class MappedFile:
         return len(self.memory)
 
     def prefetch(self, begin: int, size_bytes: int) -> None:
-        """Advise the system that these bytes are read next; many requests at once cost little more
-        than one.
+        """Advise the system that these bytes are read next.
+
+        Advising many ranges before reading them costs little more than a single read.
         """
         first = begin - begin % mmap.PAGESIZE
         self.memory.madvise(mmap.MADV_WILLNEED, first, begin + size_bytes - first)
@@ -147,6 +148,7 @@ class MappedFileCache:
         return mapped
 
     def evict(self, name: str) -> None:
+        """Delete the file of this name, if it exists."""
         (self._folder / name).unlink(missing_ok=True)
 
     def evict_except(self, names: Collection[str]) -> None:

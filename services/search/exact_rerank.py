@@ -36,6 +36,7 @@ class RowBlocks:
 
     @classmethod
     def of(cls, chunks: Sequence[LoadedChunk]) -> RowBlocks:
+        """Create them from chunks, one block each."""
         return cls(
             dimension=chunks[0].rows.shape[1],
             first_rows=np.cumsum([0, *(len(chunk.rows) for chunk in chunks)]),
@@ -98,6 +99,7 @@ class SearchBudget:
     """Deadline on the clock of time.monotonic()."""
 
     def is_exhausted(self, rows: int) -> bool:
+        """Whether `rows` rows compared exactly, or the time, have reached the limit."""
         if self.max_rows is not None and rows >= self.max_rows:
             return True
         return self.deadline is not None and time.monotonic() >= self.deadline

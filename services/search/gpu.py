@@ -303,9 +303,7 @@ def _score_all_rows(
     queries: NDArray[np.float32],
     torch_device: torch.device,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return the scores of all rows for b queries, (b, n) float64, and the bounds of their
-    errors.
-    """
+    """Return scores of all rows for b queries, (b, n) float64, and bounds of their errors."""
     count = len(queries)
     if row_format == FLOAT16:
         columns, errors, accumulation_error = _float16_query_columns(queries)

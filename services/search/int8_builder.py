@@ -40,18 +40,14 @@ class _Int8Build:
     error: OSError | None = None
 
     def seconds_left(self) -> float:
-        """Estimate the remaining seconds from the rows done so far: between 1 and
-        MAX_RETRY_SECONDS.
-        """
+        """Estimated remaining time: at least 1 and at most MAX_RETRY_SECONDS."""
         elapsed = time.monotonic() - self.started
         remaining = elapsed * (self.rows - self.done) / max(1, self.done)
         return min(max(remaining, 1.0), MAX_RETRY_SECONDS)
 
 
 class Int8CodeBuilder:
-    """Builds int8 codes, one build at a time for each generation, in its own thread;
-    thread-safe.
-    """
+    """Builds int8 codes in background threads, one for each generation; thread-safe."""
 
     def __init__(
         self,

@@ -1,9 +1,9 @@
 """Exact top-k by int8 codes: a proven bound excludes every row that is not compared exactly.
 
 1. The product of each row's code with the query's code is its score to within a bound
-(`shared.codes.int8_codes`). The k-th highest score minus bound is a floor of the k-th exact score.
+   (`shared.codes.int8_codes`). The k-th highest score minus bound is a floor of the result.
 2. Rows whose score plus bound reaches the floor are compared exactly, the highest first, until no
-other row can reach the k-th exact score.
+   other row can reach the k-th exact score.
 
 Nothing is probabilistic: every error is bounded by the lengths of the rounding residuals.
 """

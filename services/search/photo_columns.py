@@ -42,9 +42,7 @@ class PhotoColumns:
 
     @classmethod
     def of(cls, rows: int, photos_by_row: Iterable[tuple[int, PhotoFilterValues]]) -> PhotoColumns:
-        """Build the columns of `rows` rows from (row, photo) pairs; rows without a photo
-        are dead.
-        """
+        """Build columns of `rows` rows from (row, photo) pairs; rows without a photo are dead."""
         columns = cls(
             photo_id=np.full(rows, None, dtype=object),
             findable=np.zeros(rows, dtype=bool),
@@ -73,10 +71,12 @@ class PhotoColumns:
 
     @cached_property
     def rows_by_tag(self) -> Mapping[str, NDArray[np.int64]]:
+        """Ascending rows of each tag."""
         return _group_rows((tag, row) for row, tags in enumerate(self.tags) for tag in tags)
 
     @cached_property
     def rows_by_place(self) -> Mapping[str, NDArray[np.int64]]:
+        """Ascending rows of each place label."""
         return _group_rows(
             (place, row) for row, place in enumerate(self.place) if place is not None
         )

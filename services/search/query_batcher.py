@@ -22,6 +22,8 @@ MAX_BATCH_QUERIES = 32
 
 @dataclass(slots=True, eq=False)
 class _QueuedQuery:
+    """A query that waits for its scan."""
+
     blocks: SignCodeBlocks
     query: SignCodedQuery
     row_mask: NDArray[np.bool_]
@@ -65,9 +67,7 @@ class QueryBatcher:
         return queued.scan
 
     def _run_batch(self, leader: _QueuedQuery) -> None:
-        """Scan for the queued queries with the same blocks, then hand over to the next in the
-        queue.
-        """
+        """Scan for the queued queries with the same blocks, then wake up the next leader."""
         from services.search.sign_code_search import scan_first_level
 
         with self._lock:

@@ -74,18 +74,14 @@ class GpuResidency:
         self._failure: str | None = None
 
     def carry_over(self, new: Snapshot, old: Snapshot | None) -> Snapshot:
-        """Return the new snapshot with the GPU rows of the old one, if few rows have to be
-        copied.
-        """
+        """Return the new snapshot with the GPU rows of the old one, if few must be copied."""
         resident = old.gpu_snapshot if old is not None else None
         if resident is not None:
             resident = self._load(new, resident, MAX_SYNC_COPY_BYTES)
         return replace(new, gpu_snapshot=resident)
 
     def needs_update(self, snapshot: Snapshot) -> bool:
-        """Whether the snapshot has to be loaded onto the GPU, or dropped from there after a
-        failure.
-        """
+        """Whether the snapshot is to be loaded onto the GPU, or dropped after a failure."""
         if self._device is None or not snapshot.chunks:
             return False
         if snapshot.gpu_snapshot is not None:
@@ -93,11 +89,10 @@ class GpuResidency:
         return time.monotonic() >= self._retry_at.get(snapshot.generation_id, -math.inf)
 
     def update(self, snapshot: Snapshot) -> Snapshot:
-        """Return the snapshot with its rows on the GPU if they fit, and without them after a
-        failure.
+        """Return the snapshot with its rows on the GPU, or without them after a failure.
 
-        A failed load is not repeated for GPU_RETRY_SECONDS. Loading may take minutes: call it
-        without holding a lock.
+        Rows that do not fit, or fail to load, are tried again after GPU_RETRY_SECONDS. Loading may
+        take minutes: call it without holding a lock.
         """
         if snapshot.gpu_snapshot is not None:
             self._failure = snapshot.gpu_snapshot.failure

@@ -1,13 +1,13 @@
 """Exact top-k by sign codes: most rows are ruled out by a few bits of their codes.
 
 1. First-level scan: the first bits of every row are compared with the query's. The rows at the
-smallest Hamming distances are estimated from their whole codes; the k-th highest lower bound of
-their scores is a floor of the result.
+   smallest Hamming distances are estimated from their whole codes; the k-th highest lower bound of
+   their scores is a floor of the result.
 2. A row passes to the next level while its estimate plus BOUND_DEVIATIONS standard deviations
-reaches the floor: more bits, then all bits, then all bits weighted with the query
-(`shared.codes.sign_codes`).
+   reaches the floor: more bits, then all bits, then all bits weighted with the query
+   (`shared.codes.sign_codes`).
 3. The remaining rows are compared exactly, highest bound first. The floor rises meanwhile, and the
-first row whose bound does not reach it ends the search.
+   first row whose bound does not reach it ends the search.
 
 The scores are exact. That no row is missed relies on the bound: an error of more than
 BOUND_DEVIATIONS standard deviations of a random rotation has a probability of 1 in 10^9 for a row.
@@ -110,6 +110,7 @@ class SignCodedQuery:
 
     @classmethod
     def of(cls, row: NDArray[np.float32], row_rotation: Rotation) -> SignCodedQuery:
+        """Rotate and quantize a (dimension,) row of any length but 0."""
         rotated = row_rotation.rotate(row[np.newaxis])[0]
         bits = np.empty(row_rotation.padded // WORD_BITS, np.uint64)
         planes = np.empty((PLANES, len(bits)), np.uint64)
@@ -235,11 +236,10 @@ def compile_kernels() -> None:
 
 
 def hamming_deviation(bits: int, padded: int) -> float:
-    """Upper bound of the standard deviation of the cosine from `bits` of `padded` signs of both
-    rows.
+    """Upper bound of the standard deviation of a cosine estimated from `bits` of `padded` signs.
 
-    (pi / 2) sqrt((1 - (2 / pi)^2 bits / padded) / bits): the signs of one rotation are dependent,
-    the more so the more of them are compared.
+    (pi / 2) sqrt((1 - (2 / pi)^2 bits / padded) / bits), with the signs of both rows: the signs of
+    one rotation are dependent, the more so the more of them are compared.
     """
     return math.pi / 2 * math.sqrt((1 - (2 / math.pi) ** 2 * bits / padded) / bits)
 

@@ -51,6 +51,7 @@ class Snapshot:
 
     @cached_property
     def live_rows(self) -> int:
+        """Number of searchable rows."""
         return int(self.photos.findable.sum())
 
     @property
@@ -60,10 +61,12 @@ class Snapshot:
 
     @property
     def row_bytes(self) -> int:
+        """Size of all rows in bytes."""
         return sum(chunk.rows.nbytes for chunk in self.chunks)
 
     @cached_property
     def held(self) -> LoadedGeneration:
+        """The loaded generation as `SearchStatus` reports it."""
         return LoadedGeneration(rows=len(self.photos), dimension=self.dimension, parts=self.parts)
 
     @cached_property

@@ -198,9 +198,7 @@ class SearchWorker:
             stop.wait(self._settings.search_follow_seconds)
 
     def sync(self, states: Collection[GenerationState] = SYNCED_STATES) -> None:
-        """Sync every generation of these states to its map's version, and drop deleted
-        generations.
-        """
+        """Sync every generation of these states to its map's version; drop deleted generations."""
         read_at = time.monotonic()
         current = read_generation_versions(self._catalog)
         self.replication_lag.record_catalog_read(current, read_at)
@@ -313,9 +311,7 @@ class SearchWorker:
     def _sync_generation(
         self, generation_id: UUID, version: int, damaged: Snapshot | None = None
     ) -> Snapshot | None:
-        """Return the generation's snapshot at this version or a later one; never `damaged`
-        itself.
-        """
+        """Return a snapshot of this version or a later one that is not `damaged`."""
         with self._snapshots_lock:
             load_lock = self._load_locks.setdefault(generation_id, threading.Lock())
         with load_lock:
@@ -349,9 +345,7 @@ class SearchWorker:
         return any(chunk.was_changed() for chunk in snapshot.chunks)
 
     def _update_gpu(self, generation_id: UUID) -> None:
-        """Load the generation onto the GPU, or drop it from there after a failure; queries
-        go on.
-        """
+        """Load the generation onto the GPU, or drop it after a failure; queries continue."""
         snapshot = self._snapshots.get(generation_id)
         if snapshot is None or not self._residency.needs_update(snapshot):
             return

@@ -186,6 +186,7 @@ class HttpSearchClient:
             self._workers.refresh()
 
     def search(self, request: SearchRequest) -> SearchResponse:
+        """Search all shards and merge the responses."""
         deadline = time.monotonic() + self._timeout_seconds
         layout = self._workers.layout(request.generation_id, request.min_version)
         if not layout:  # no worker has answered yet
@@ -207,8 +208,10 @@ class HttpSearchClient:
         return merge_responses(responses, request.k, unreachable)
 
     def status(self) -> SearchStatus:
-        """Poll the workers and merge their states; Unavailable (`search_unavailable`) if none
-        answers.
+        """Poll the workers and merge their states.
+
+        Raises:
+            Unavailable: `search_unavailable` if no worker answers.
         """
         self._workers.refresh()
         statuses, unreachable = self._workers.statuses()

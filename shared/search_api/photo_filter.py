@@ -72,6 +72,7 @@ class PhotoFilter(_FilterModel):
 
     @property
     def is_empty(self) -> bool:
+        """Whether the filter has no condition."""
         return self == NO_FILTER
 
 

@@ -192,6 +192,8 @@ class SearchBackend(Protocol):
     Raises `Unavailable` when it can't reach the requested version in time.
     """
 
-    def search(self, request: SearchRequest) -> SearchResponse: ...
+    def search(self, request: SearchRequest) -> SearchResponse:
+        """Return the hits of one search."""
 
-    def status(self) -> SearchStatus: ...
+    def status(self) -> SearchStatus:
+        """Return the state of the workers."""

@@ -119,6 +119,7 @@ class WorkerState:
 
     @property
     def shard(self) -> Shard | None:
+        """The shard that the worker serves; None while it is unknown."""
         return None if self.status is None else Shard.parse(self.status.shard)
 
     def version(self, generation_id: UUID) -> int:
@@ -142,6 +143,7 @@ class WorkerDirectory:
         )
 
     def close(self) -> None:
+        """Stop the polling threads."""
         self._status_executor.shutdown()
 
     def refresh(self) -> None:
