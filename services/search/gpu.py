@@ -179,8 +179,7 @@ class GpuDevice:
             GpuError: The copy failed.
         """
         row_format = next(
-            (row_format for row_format in ROW_FORMATS if self.has_room(chunks, row_format, old)),
-            None,
+            (candidate for candidate in ROW_FORMATS if self.has_room(chunks, candidate, old)), None
         )
         if row_format is None or (
             row_format == INT8 and any(chunk.int8 is None for chunk in chunks)

@@ -121,10 +121,8 @@ def int8_product(row: NDArray[np.int8], query: NDArray[np.int16]) -> np.int64:
     """Exact dot product of integers up to 127 with integers up to 127 * 128 + 63."""
     total = np.int64(0)
     for begin in range(0, query.shape[0], INT32_SAFE_TERMS):
-        row_part, query_part = (
-            row[begin : begin + INT32_SAFE_TERMS],
-            query[begin : begin + INT32_SAFE_TERMS],
-        )
+        row_part = row[begin : begin + INT32_SAFE_TERMS]
+        query_part = query[begin : begin + INT32_SAFE_TERMS]
         partial_sum = np.int32(0)
         for j in range(query_part.shape[0]):
             partial_sum = np.int32(partial_sum + np.int32(row_part[j]) * np.int32(query_part[j]))

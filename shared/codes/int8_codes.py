@@ -40,7 +40,7 @@ from shared.codes.sign_codes import ROWS_PER_BLOCK
 INT8_MAX = 127
 QUERY_MAX = 127 * 128 + 63  # so that both parts of 128 high + low are int8
 ROUNDING_MARGIN = 1e-9
-MIN_SCALE = 1e-30  # rows without a larger number become zeros, as their scale would underflow
+MIN_SCALE = 1e-30  # rows without a larger number become zeros: their scale would leave float32
 
 Bytes = NDArray[np.int8]
 Shorts = NDArray[np.int16]

@@ -82,7 +82,7 @@ _last_32 = _last_strides(32)
 
 @numba_jit(ORDERED_FASTMATH)
 def _wide_strides(x: Float32Vector, stride: int, min_stride: int) -> int:
-    """Run the stages from `stride` down to `least`, two at a time; return the next stride."""
+    """Run the stages from `stride` down to `min_stride`, two at a time; return the next stride."""
     while stride >= 2 * min_stride:
         half = stride >> 1
         for begin in range(0, x.shape[0], 2 * stride):
