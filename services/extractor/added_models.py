@@ -278,51 +278,53 @@ def training_card(checkpoint: Checkpoint) -> dict[str, Any]:
     training is kept.
     """
     try:
-        card: dict[str, Any] = _Plain().of(checkpoint.about)
+        card: dict[str, Any] = _JsonConverter().convert(checkpoint.about)
         if len(json.dumps(card)) <= MAX_CARD_CHARACTERS:
             return card
-    except _TooLong:
+    except _CardTooLong:
         pass
     lengths = {name: checkpoint.about.get(name) for name in ("epoch", "global_step")}
     card = {name: value for name, value in lengths.items() if _is_short(value)}
     return {**card, "left_out": "the hyperparameters, which are too long"}
 
 
-class _TooLong(Exception):
+class _CardTooLong(Exception):
     pass
 
 
-class _Plain:
-    """Converts values to JSON; raises _TooLong soon after MAX_CARD_CHARACTERS are exceeded.
+class _JsonConverter:
+    """Converts values to JSON; raises _CardTooLong soon after MAX_CARD_CHARACTERS are exceeded.
 
     The limit bounds the work, too: a few bytes of a pickle can reference the same long value many
     times.
     """
 
     def __init__(self) -> None:
-        self._left = MAX_CARD_CHARACTERS
+        self._remaining = MAX_CARD_CHARACTERS
 
-    def of(self, value: Any, depth: int = -1) -> Any:
-        self._take(1)
+    def convert(self, value: Any, depth: int = -1) -> Any:
+        self._spend(1)
         if isinstance(value, bool) or value is None or _is_short(value):
             return value
         if isinstance(value, float):
             return value if math.isfinite(value) else str(value)
         if depth < 4 and isinstance(value, dict):
-            return {self._text(name): self.of(member, depth + 1) for name, member in value.items()}
+            return {
+                self._text(name): self.convert(member, depth + 1) for name, member in value.items()
+            }
         if depth < 4 and isinstance(value, list | tuple):
-            return [self.of(member, depth + 1) for member in value]
+            return [self.convert(member, depth + 1) for member in value]
         return self._text(value)
 
     def _text(self, value: Any) -> str:
         if isinstance(value, str):
-            self._take(len(value))
+            self._spend(len(value))
         return _to_json_text(value)
 
-    def _take(self, characters: int) -> None:
-        self._left -= characters
-        if self._left < 0:
-            raise _TooLong
+    def _spend(self, characters: int) -> None:
+        self._remaining -= characters
+        if self._remaining < 0:
+            raise _CardTooLong
 
 
 def _is_short(value: Any) -> bool:
