@@ -50,7 +50,7 @@ class DecoderPool:
         """Decode photos; each result is a decoded photo, or the error that explains the failure."""
         with self._restart_lock:  # batches and model changes decode from different threads
             if not self._pool.active:
-                log.error("the decoder pool broke; starting a new one")
+                log.error("the decoder pool crashed, starting a new one")
                 self.close()
                 self._pool = self._start_pool()
         outcomes: list[DecodedPhoto | PlacewiseError] = []
@@ -126,4 +126,4 @@ class DecoderPool:
 
 
 def _pool_broken_error() -> Unavailable:
-    return Unavailable("decoders_broke", "The decoder processes broke; trying again.")
+    return Unavailable("decoders_broke", "The decoder processes crashed. The job will be retried.")

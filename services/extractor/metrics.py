@@ -138,7 +138,7 @@ class _DeviceMemoryCollector(Collector):
             labels=["device"],
         )
         total = GaugeMetricFamily(
-            f"{METRIC_PREFIX}_device_total_bytes", "Memory of the GPU.", labels=["device"]
+            f"{METRIC_PREFIX}_device_total_bytes", "Total memory of the GPU.", labels=["device"]
         )
         for device in gpu_memory():
             used.add_metric([device.name], device.used_bytes)

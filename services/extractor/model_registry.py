@@ -266,6 +266,6 @@ def check_spec_matches(
         "spec_differs",
         f"This worker computes other descriptors than those of generation {generation.id}: "
         + "; ".join(f"{k} is {spec.get(k)!r}, was {generation.spec.get(k)!r}" for k in differing)
-        + ". Start a model change (POST /api/v1/generations), or run the old packages.",
+        + ". Start a model change (POST /api/v1/generations), or install the old versions again.",
         generation_id=str(generation.id),
     )

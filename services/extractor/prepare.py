@@ -59,7 +59,9 @@ def read_stored_rows(
             if rows_are_valid(row[np.newaxis]).all():
                 rows[photo_id] = row
             else:
-                log.error("row %d of the chunk %s is not a unit vector", row_number, object_key)
+                log.error(
+                    "row %d of the chunk %s is not a valid descriptor", row_number, object_key
+                )
     return rows
 
 
