@@ -96,11 +96,11 @@ def _call(
         raise WorkerUnavailable(url, type(error).__name__, silent=silent) from error
     if response.is_success:
         return response.content
-    error = error_from_response(response.status_code, response.text)
+    problem = error_from_response(response.status_code, response.text)
     # A proxy's error page, or an internal error of the worker.
-    if error.code == "bad_answer" or type(error) is PlacewiseError:
-        raise WorkerUnavailable(url, error.detail)
-    raise error
+    if problem.code == "bad_answer" or type(problem) is PlacewiseError:
+        raise WorkerUnavailable(url, problem.detail)
+    raise problem
 
 
 REFRESH_SECONDS = 1.0  # polling interval
