@@ -186,7 +186,7 @@ def test_after_warming_up_nothing_is_left_to_compile() -> None:
     sign_code_search.compile_kernels()
     loops = [one for one in vars(kernels).values() if hasattr(one, "signatures")]
     before = {loop.py_func.__name__: len(loop.signatures) for loop in loops}
-    assert before["distances"] == 1
+    assert before["hamming_distances"] == 1
     rows = places(3, 400, 98_304)
     answer(snapshot_of(rows), rows[0], np.ones(400, bool), SearchOptions(300))
     assert {loop.py_func.__name__: len(loop.signatures) for loop in loops} == before

@@ -195,7 +195,7 @@ def test_codes_that_lie_beside_a_chunk_are_not_made_again(
 ) -> None:
     rows = unit_rows(MANY)
     chunk = written(store, rows)
-    monkeypatch.delattr(shared.codes.serialization, "sign_codes")
+    monkeypatch.delattr(shared.codes.serialization, "encode_signs")
     loader = ChunkLoader(store, folder)
     codes = loader.load_sign_codes(chunk.object_key, loader.load_rows(chunk))
     for level, expected in zip(codes.levels, encode_signs(rows).levels, strict=True):
@@ -211,7 +211,7 @@ def test_codes_that_are_missing_are_made_once(
         loader = ChunkLoader(store, folder)
         codes = loader.load_sign_codes(chunk.object_key, loader.load_rows(chunk))
         np.testing.assert_array_equal(codes.levels[0], encode_signs(rows).levels[0])
-        monkeypatch.delattr(shared.codes.serialization, "sign_codes", raising=False)
+        monkeypatch.delattr(shared.codes.serialization, "encode_signs", raising=False)
 
 
 @pytest.mark.parametrize("where", ["beside the chunk", "kept here"])
