@@ -13,7 +13,7 @@ import pytest
 import torch
 from sqlalchemy import select, update
 
-from services.extractor import checkpointed_steps
+from services.extractor import checkpointed_steps as new_generation_module
 from services.steward.tasks.garbage_collection import collect_job_files, collect_orphans
 from services.steward.tasks.model_changes import advance_model_changes
 from shared.catalog.generations import Generation, active_generation
@@ -408,7 +408,7 @@ def test_a_model_that_is_removed_at_the_last_moment_begins_no_generation(
     walks: Service, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     before = active(walks).id
-    real = checkpointed_steps.start_generation_with_stored_vocabulary
+    real = new_generation_module.start_generation_with_stored_vocabulary
 
     def remove_first(*arguments: Any) -> None:
         with walks.catalog.write() as session:
