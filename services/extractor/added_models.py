@@ -1,11 +1,9 @@
-"""Models that were added, loaded by whoever describes photos with them.
+"""Added models: import of trained checkpoints, local file cache, and loading.
 
-Files of added models on this machine, with their hash checked.
-
-Where objects are files already they are read where they lie. From a bucket they are fetched into a
-folder that the processes of this machine may share, up to MODEL_CACHE_BYTES.
-
-ADD_MODEL: a checkpoint that was sent becomes a model, if it can be read and used safely.
+`ModelImporter` turns an uploaded checkpoint into a model of the catalog, if it can be read and used
+safely. `AddedModelLoader` loads added models. `ModelFileCache` provides their files with verified
+hashes: a file-based object store is read in place; from a bucket, files are downloaded into a
+folder of at most MODEL_CACHE_BYTES, which the processes of this machine may share.
 """
 
 from __future__ import annotations
@@ -46,32 +44,41 @@ from shared.storage.keys import new_model_key
 log = logging.getLogger(__name__)
 
 COPY_BYTES = 1 << 20
-STALE_PARTIAL_SECONDS = 3600.0  # a file that is still being fetched then: its process was killed
+STALE_PARTIAL_SECONDS = 3600.0  # age of partial downloads whose process must have been killed
 
 
 class ModelFileCache:
+    """Least-recently-used cache of model files on this machine; processes may share its folder."""
+
     def __init__(self, store: ObjectStore, folder: Path, max_bytes: int) -> None:
-        """`folder` is made when something is fetched. `max_bytes` of models that are not in use."""
+        """Create a cache.
+
+        Args:
+            store: The object store.
+            folder: The cache's folder, created at the first download.
+            max_bytes: Maximum size of the cached files, not counting the one downloaded last.
+        """
         self._store = store
         self._folder = folder
         self._max_bytes = max_bytes
 
     def local_path(self, key: str, sha256: str) -> Path:
-        """The object as a file of this machine, to be opened soon: a later call may remove it.
+        """Return the object as a local file, to be opened at once: a later call may delete it.
 
-        Unavailable (`model_corrupt`) when it is not what was stored; NotFound and Unavailable of
-        the store.
+        Raises:
+            Unavailable: `model_corrupt` if its hash differs; also as the store raises it.
+            NotFound: As the store raises it.
         """
-        there = self._store.file(key)
-        if there is not None:
+        stored_file = self._store.file(key)
+        if stored_file is not None:
             with self._store.open(key) as opened:
                 _verify_hash(opened, key, sha256)
-            return there
+            return stored_file
         path = self._folder / f"{sha256}.safetensors"
         with contextlib.suppress(FileNotFoundError, Unavailable):
             with path.open("rb") as opened:
                 _verify_hash(opened, key, sha256)
-            os.utime(path)  # used just now
+            os.utime(path)  # marks it as recently used
             return path
         self._download(key, sha256, path)
         self._evict(path)
@@ -88,49 +95,49 @@ class ModelFileCache:
             partial.replace(path)
         finally:
             partial.unlink(missing_ok=True)
-        log.info("the model %s was fetched (%d bytes)", sha256[:12], path.stat().st_size)
+        log.info("downloaded the model %s (%d bytes)", sha256[:12], path.stat().st_size)
 
     def _evict(self, fetched: Path) -> None:
-        """Remove what was used least lately, until the rest beside `fetched` fits."""
-        long_ago = time.time() - STALE_PARTIAL_SECONDS
-        found: list[tuple[float, int, Path]] = []
+        """Delete the least recently used files until all but `fetched` fit into the limit."""
+        stale_before = time.time() - STALE_PARTIAL_SECONDS
+        files: list[tuple[float, int, Path]] = []
         for path in self._folder.iterdir():
-            with contextlib.suppress(FileNotFoundError):  # another process makes room, too
-                about = path.stat()
+            with contextlib.suppress(FileNotFoundError):  # another process may evict files, too
+                stat = path.stat()
                 if path.suffix == ".partial":
-                    if about.st_mtime < long_ago:
+                    if stat.st_mtime < stale_before:
                         path.unlink()
                 elif path != fetched:
-                    found.append((about.st_mtime, about.st_size, path))
-        room = self._max_bytes
-        for _, size_bytes, path in sorted(found, reverse=True):
-            room -= size_bytes
-            if room < 0:
+                    files.append((stat.st_mtime, stat.st_size, path))
+        remaining = self._max_bytes
+        for _, size_bytes, path in sorted(files, reverse=True):
+            remaining -= size_bytes
+            if remaining < 0:
                 path.unlink(missing_ok=True)
 
 
 def _verify_hash(source: BinaryIO, key: str, sha256: str, copy: BinaryIO | None = None) -> None:
-    """Read it whole, into `copy` if there is one; Unavailable when its hash is another."""
+    """Read `source` to its end, into `copy` if given; Unavailable if its hash differs."""
     digest = hashlib.sha256()
-    while piece := source.read(COPY_BYTES):
-        digest.update(piece)
+    while block := source.read(COPY_BYTES):
+        digest.update(block)
         if copy is not None:
-            copy.write(piece)
+            copy.write(block)
     if digest.hexdigest() != sha256:
         raise Unavailable(
             "model_corrupt",
-            f"The model {key} is not what was stored (its hash differs). Restore it from a "
+            f"The model {key} is corrupt: its hash differs. Restore it from a "
             "backup, or add the same checkpoint again under its name (POST /api/v1/models).",
         )
 
 
 def model_cache_folder(settings: Settings) -> Path:
-    """Where files of models lie for a while, when objects are no files of this machine."""
+    """Folder for downloaded model files, used when the object store is not file-based."""
     return settings.placewise_home / "model-cache"
 
 
 class AddedModelLoader:
-    """By their names; the catalog says where each lies and what it is."""
+    """Loads added models by name, as the catalog describes them."""
 
     def __init__(self, catalog: Catalog, store: ObjectStore, settings: Settings) -> None:
         self._catalog = catalog
@@ -139,57 +146,65 @@ class AddedModelLoader:
         )
 
     def load(self, name: str, device: torch.device) -> TrainedBackbone:
-        """The model `name`, its weights on the device.
+        """Load the model `name` onto the device.
 
-        Misconfigured (`model_missing`); Unavailable: `model_lost`, `model_corrupt`,
-        `model_unreadable`, and those of the store.
+        Raises:
+            Misconfigured: `model_missing`.
+            Unavailable: `model_lost`, `model_corrupt`, `model_unreadable`, and as the store raises
+                it.
         """
         with self._catalog.read() as session:
             row = get_model_for_loading(session, name)
         assert row.object_key is not None
         assert row.sha256 is not None
         try:
-            found = read_model_file(self._cache.local_path(row.object_key, row.sha256))
+            checkpoint = read_model_file(self._cache.local_path(row.object_key, row.sha256))
         except NotFound as error:
             raise Unavailable(
                 "model_lost",
-                f"The weights of the model {name!r} are gone from the object store "
+                f"The weights of the model {name!r} are missing from the object store "
                 f"({row.object_key}). Restore them from a backup, or add the same checkpoint again "
                 "under its name.",
                 model=name,
             ) from error
         return TrainedBackbone(
-            row.name, found.model, row.fingerprint, device, licence=row.licence, card=row.card
+            row.name, checkpoint.model, row.fingerprint, device, licence=row.licence, card=row.card
         )
 
 
-MAX_CARD_CHARACTERS = 20_000  # of JSON: what the training said of itself
+MAX_CARD_CHARACTERS = 20_000  # of the model card as JSON
 
 
 class ModelImporter:
-    """One piece of work, on the CPU: nothing is described with the model yet."""
+    """Imports uploaded checkpoints as models, in one step on the CPU."""
 
     def __init__(self, catalog: Catalog, store: ObjectStore, folder: Path) -> None:
-        """`folder`: that of ModelCache, which has room for large files and removes what is left
-        over.
+        """Create an importer.
+
+        Args:
+            catalog: The catalog.
+            store: The object store.
+            folder: Folder of `ModelFileCache`, for large temporary files; the cache deletes
+                leftovers.
         """
         self._catalog = catalog
         self._store = store
         self._folder = folder
 
     def import_checkpoint(self, job: Job) -> None:
-        """Check the checkpoint under `object_key`, store what describes photos, add its row.
+        """Validate the checkpoint at `object_key`, store its model file, and add its catalog row.
 
-        Unprocessable: those of `load_checkpoint`, `model_unfit`, `checkpoint_lost`; Conflict
-        (`model_name_taken`).
+        Raises:
+            Unprocessable: As `load_checkpoint` raises it; `model_unfit`, `checkpoint_lost`.
+            Conflict: `model_name_taken`.
         """
         filename = job.params["filename"]
         with self._local_file(job.params["object_key"]) as path:
             try:
                 checkpoint = load_checkpoint(path)
-            except Unprocessable as error:  # it speaks of the file as it is called here
-                said = error.detail.replace(path.name, filename)
-                raise Unprocessable(error.code, said, **error.extra) from error
+            except Unprocessable as error:  # its message names the temporary file
+                detail = error.detail.replace(path.name, filename)
+                raise Unprocessable(error.code, detail, **error.extra) from error
         card = {"source": filename, **training_card(checkpoint)}
         name = job.params["name"]
         TrainedBackbone(
@@ -202,7 +217,7 @@ class ModelImporter:
         ).check()
         data = encode_model_file(checkpoint)
         sha256 = hashlib.sha256(data).hexdigest()
-        new = ModelRegistration(
+        registration = ModelRegistration(
             name=name,
             fingerprint=checkpoint.fingerprint,
             object_key=new_model_key(sha256),
@@ -214,20 +229,20 @@ class ModelImporter:
             note=job.params["note"],
             card=card,
         )
-        self._store.put(new.object_key, data)
-        self._commit(job, new)
+        self._store.put(registration.object_key, data)
+        self._commit(job, registration)
 
-    def _commit(self, job: Job, new: ModelRegistration) -> None:
-        """The row and the job's end. A file that stays without row is an orphan, and collected."""
+    def _commit(self, job: Job, registration: ModelRegistration) -> None:
+        """Add the catalog row and end the job; a file without its row is deleted as an orphan."""
         token = job.lease_token
         assert token is not None, "a claimed job carries a token"
         with self._catalog.write() as session:
-            for mine in lock_leased_jobs(session, token, [job]):
-                model, added = register_model(session, new)
+            for owned in lock_leased_jobs(session, token, [job]):
+                model, added = register_model(session, registration)
                 succeed_job(
-                    mine,
+                    owned,
                     {
-                        "name": new.name,
+                        "name": registration.name,
                         "extractor": model.name,
                         "fingerprint": model.fingerprint,
                         "dimension": model.dimension,
@@ -238,17 +253,17 @@ class ModelImporter:
 
     @contextlib.contextmanager
     def _local_file(self, key: str) -> Iterator[Path]:
-        """The object as a file of this machine."""
-        there = self._store.file(key)
-        if there is not None:
-            yield there
+        """Yield the object as a local file, which is deleted afterwards if it was downloaded."""
+        stored_file = self._store.file(key)
+        if stored_file is not None:
+            yield stored_file
             return
         make_private_folder(self._folder)
         path = self._folder / f"{new_id()}.partial"
         try:
             with self._store.open(key) as source, create_private_file(path) as file:
-                while piece := source.read(COPY_BYTES):
-                    file.write(piece)
+                while block := source.read(COPY_BYTES):
+                    file.write(block)
             yield path
         except NotFound as error:
             raise _checkpoint_lost_error() from error
@@ -257,68 +272,73 @@ class ModelImporter:
 
 
 def training_card(checkpoint: Checkpoint) -> dict[str, Any]:
-    """What the checkpoint says of its training, as JSON that every database keeps.
+    """Return the checkpoint's training metadata as JSON that every supported database can store.
 
-    What is no JSON becomes text; of more than MOST_ABOUT_CHARACTERS only how long it was trained
-    is left.
+    Other values become text. If the JSON is longer than MAX_CARD_CHARACTERS, only the length of the
+    training is kept.
     """
     try:
-        said: dict[str, Any] = _Plain().of(checkpoint.about)
-        if len(json.dumps(said)) <= MAX_CARD_CHARACTERS:
-            return said
-    except _TooLong:
+        card: dict[str, Any] = _JsonConverter().convert(checkpoint.about)
+        if len(json.dumps(card)) <= MAX_CARD_CHARACTERS:
+            return card
+    except _CardTooLong:
         pass
     lengths = {name: checkpoint.about.get(name) for name in ("epoch", "global_step")}
-    said = {name: value for name, value in lengths.items() if _is_short(value)}
-    return {**said, "left_out": "the hyperparameters, which are too long"}
+    card = {name: value for name, value in lengths.items() if _is_short(value)}
+    return {**card, "left_out": "the hyperparameters, which are too long"}
 
 
-class _TooLong(Exception):
+class _CardTooLong(Exception):
     pass
 
 
-class _Plain:
-    """Makes values JSON. Raises _TooLong before it has made much more than MOST_ABOUT_CHARACTERS:
-    a few bytes of a pickle can name the same long value any number of times."""
+class _JsonConverter:
+    """Converts values to JSON; raises _CardTooLong soon after MAX_CARD_CHARACTERS are exceeded.
+
+    The limit bounds the work, too: a few bytes of a pickle can reference the same long value many
+    times.
+    """
 
     def __init__(self) -> None:
-        self._left = MAX_CARD_CHARACTERS
+        self._remaining = MAX_CARD_CHARACTERS
 
-    def of(self, value: Any, depth: int = -1) -> Any:
-        self._take(1)
+    def convert(self, value: Any, depth: int = -1) -> Any:
+        self._spend(1)
         if isinstance(value, bool) or value is None or _is_short(value):
             return value
         if isinstance(value, float):
             return value if math.isfinite(value) else str(value)
         if depth < 4 and isinstance(value, dict):
-            return {self._text(name): self.of(one, depth + 1) for name, one in value.items()}
+            return {
+                self._text(name): self.convert(member, depth + 1) for name, member in value.items()
+            }
         if depth < 4 and isinstance(value, list | tuple):
-            return [self.of(member, depth + 1) for member in value]
+            return [self.convert(member, depth + 1) for member in value]
         return self._text(value)
 
     def _text(self, value: Any) -> str:
         if isinstance(value, str):
-            self._take(len(value))
+            self._spend(len(value))
         return _to_json_text(value)
 
-    def _take(self, characters: int) -> None:
-        self._left -= characters
-        if self._left < 0:
-            raise _TooLong
+    def _spend(self, characters: int) -> None:
+        self._remaining -= characters
+        if self._remaining < 0:
+            raise _CardTooLong
 
 
 def _is_short(value: Any) -> bool:
-    """Is it a number that every database keeps as one?"""
+    """Whether it is an integer that every supported database stores as a number."""
     return isinstance(value, int) and value.bit_length() < 64
 
 
 def _to_json_text(value: Any) -> str:
-    # PostgreSQL keeps no NUL, and no half of a character.
+    # PostgreSQL can't store NUL characters or lone surrogates.
     text = value if isinstance(value, str) else f"<{type(value).__name__}>"
     return text.replace("\x00", "").encode("utf-8", "replace").decode("utf-8")
 
 
 def _checkpoint_lost_error() -> Unprocessable:
     return Unprocessable(
-        "checkpoint_lost", "The checkpoint is gone from the object store. Send it again."
+        "checkpoint_lost", "The checkpoint is missing from the object store. Upload it again."
     )

@@ -1,6 +1,8 @@
-"""How long a slice of a model change is, and the steps of a fit that make one up.
+"""Checkpointed steps of model changes: time-limited work, progress, and creation of generations.
 
-What model changes come to, and how they pause: the transactions under the job's lease.
+A model change runs in steps of about a second, so that queries run in between. After each step the
+state is stored and the job is released (`checkpoint_and_release`), so that any worker can run the
+next one. All transactions run under the job's lease.
 """
 
 from __future__ import annotations
@@ -36,7 +38,7 @@ from shared.storage.keys import job_work_key, new_vocabulary_key, new_whitening_
 
 
 def map_extractor(catalog: Catalog, models: ModelRegistry, job: Job) -> Extractor:
-    """The extractor of the job's map, its weights loaded."""
+    """Return the extractor of the job's map with its weights loaded."""
     with catalog.read() as session:
         active = active_generation(session, job.map_id)
         name = active.extractor if active else session.get_one(Map, job.map_id).extractor
@@ -54,14 +56,22 @@ def start_generation_with_new_vocabulary(
     *,
     progress_done: int = 0,
 ) -> None:
-    """Store the vocabulary; one transaction makes it known and begins its generation.
+    """Store a vocabulary and create its generation in one transaction.
 
-    `progress_done`: of the job, before anything is described.
+    Args:
+        catalog: The catalog.
+        store: The object store.
+        job: The model change.
+        extractor: The extractor of the generation.
+        centres: The vocabulary.
+        origin: How the vocabulary was made.
+        provenance: Details of its origin.
+        progress_done: Progress of the job before any photo is described.
     """
     key = new_vocabulary_key()
     store.put(key, encode_centres(centres))
     with catalog.write() as session:
-        for mine in lock_leased_jobs(session, get_lease_token(job), [job]):
+        for owned in lock_leased_jobs(session, get_lease_token(job), [job]):
             vocabulary = add_vocabulary(
                 session,
                 job.map_id,
@@ -73,14 +83,14 @@ def start_generation_with_new_vocabulary(
             )
             create_generation(
                 session,
-                mine,
+                owned,
                 **generation_spec_columns(
                     ensure_model_row(session, extractor),
                     DescriptorPipeline(extractor, centres),
                     vocabulary.id,
                 ),
             )
-            _set_describe_progress(session, mine, progress_done, vocabulary_id=str(vocabulary.id))
+            _set_describe_progress(session, owned, progress_done, vocabulary_id=str(vocabulary.id))
 
 
 def start_generation_with_stored_vocabulary(
@@ -90,12 +100,12 @@ def start_generation_with_stored_vocabulary(
     vocabulary_id: UUID | None,
     whitening_id: UUID | None = None,
 ) -> None:
-    """Begin the generation of a vocabulary and a whitening that the map has, or of none."""
+    """Create the generation of a stored vocabulary and whitening; None for an extractor without."""
     with catalog.write() as session:
-        for mine in lock_leased_jobs(session, get_lease_token(job), [job]):
+        for owned in lock_leased_jobs(session, get_lease_token(job), [job]):
             create_generation(
                 session,
-                mine,
+                owned,
                 **generation_spec_columns(
                     ensure_model_row(session, pipeline.extractor),
                     pipeline,
@@ -103,7 +113,7 @@ def start_generation_with_stored_vocabulary(
                     whitening_id,
                 ),
             )
-            _set_describe_progress(session, mine, 0)
+            _set_describe_progress(session, owned, 0)
 
 
 def start_whitened_generation(
@@ -116,14 +126,16 @@ def start_whitened_generation(
     *,
     progress_done: int,
 ) -> None:
-    """Store the whitening, which `pipeline` carries; one transaction makes it known and begins its
-    generation.
+    """Store a PCA whitening, which is `pipeline.projection`, and create its generation.
+
+    The catalog rows are written in one transaction. `progress_done` is the progress of the job
+    before any photo is described.
     """
     assert pipeline.projection is not None
     key = new_whitening_key()
     store.put(key, whitening_file.encode())
     with catalog.write() as session:
-        for mine in lock_leased_jobs(session, get_lease_token(job), [job]):
+        for owned in lock_leased_jobs(session, get_lease_token(job), [job]):
             whitening = add_whitening(
                 session,
                 job.map_id,
@@ -137,14 +149,14 @@ def start_whitened_generation(
             model = ensure_model_row(session, pipeline.extractor)
             create_generation(
                 session,
-                mine,
+                owned,
                 **generation_spec_columns(model, pipeline, vocabulary_id, whitening.id),
             )
-            _set_describe_progress(session, mine, progress_done, whitening_id=str(whitening.id))
+            _set_describe_progress(session, owned, progress_done, whitening_id=str(whitening.id))
 
 
 def _set_describe_progress(session: Session, job: Job, progress_done: int, **params: Any) -> None:
-    """What is left to do, beside what has been: every photo."""
+    """Extend the job's total progress by the map's live photos, which are still to be described."""
     job.params = {**job.params, **params, "done_before": progress_done}
     job.attempts = 0
     job.progress_done = progress_done
@@ -152,40 +164,43 @@ def _set_describe_progress(session: Session, job: Job, progress_done: int, **par
 
 
 def checkpoint_and_release(catalog: Catalog, job: Job, **columns: Any) -> None:
-    """The slice is done: keep its outcome and let others go first."""
+    """Store the step's outcome in the job's `columns` and return the job to the queue."""
     with catalog.write() as session:
-        for mine in lock_leased_jobs(session, get_lease_token(job), [job]):
+        for owned in lock_leased_jobs(session, get_lease_token(job), [job]):
             for name, value in columns.items():
-                setattr(mine, name, value)
-            mine.attempts = 0
-            release_job(mine)
+                setattr(owned, name, value)
+            owned.attempts = 0
+            release_job(owned)
 
 
-STEP_SECONDS = 1.0  # about the time of a batch: what a query may have to wait
-FIT_PROGRESS_UNITS = 100  # of the job's progress: the steps of its fit, in per cent
+STEP_SECONDS = 1.0  # about the time of a batch: the longest that a query has to wait
+FIT_PROGRESS_UNITS = 100  # units of job progress for the fit: its steps in per cent
 
 
 class IncrementalFit(Protocol):
-    """A fit that is done step by step, and saved between two of them."""
+    """A fit that runs step by step and can be saved between two steps."""
 
     @property
-    def done(self) -> bool: ...
+    def done(self) -> bool:
+        """Whether no step is left."""
 
     @property
     def progress(self) -> tuple[int, int]:
-        """Steps done, and all of them."""
+        """Steps done, and total steps."""
 
-    def save(self) -> bytes: ...
+    def save(self) -> bytes:
+        """Serialise the state between two steps."""
 
-    def resume(self, data: bytes) -> None: ...
+    def resume(self, data: bytes) -> None:
+        """Restore a saved state."""
 
 
 def time_slice() -> Iterator[None]:
-    """Once, however slow the first round of the loop is, and again for about a second."""
-    until = time.monotonic() + STEP_SECONDS
+    """Yield once, and then until about STEP_SECONDS have passed."""
+    deadline = time.monotonic() + STEP_SECONDS
     while True:
         yield
-        if time.monotonic() >= until:
+        if time.monotonic() >= deadline:
             return
 
 
@@ -199,27 +214,35 @@ def run_fit_steps(
     resumed_param: str,
     progress_done: int,
 ) -> bool:
-    """A slice of steps; True when the fit is done.
+    """Run steps of a fit for about STEP_SECONDS; checkpoint the job if the fit is not finished.
 
-    Else it is saved and the job goes on. `resumed_param` is the parameter of the job that says
-    that there
-    is a saved one, `progress_done` the job's progress before the fit.
+    Args:
+        catalog: The catalog.
+        store: The object store.
+        job: The model change.
+        fit: The fit, which is resumed from its checkpoint if there is one.
+        step: Runs one step of the fit.
+        resumed_param: Parameter of the job that says that a checkpoint exists.
+        progress_done: Progress of the job before the fit.
+
+    Returns:
+        Whether the fit is finished.
     """
-    saved = job_work_key(job.id, "fit.npz")
+    checkpoint_key = job_work_key(job.id, "fit.npz")
     if job.params.get(resumed_param):
-        fit.resume(store.get(saved))
+        fit.resume(store.get(checkpoint_key))
     for _ in time_slice():
         if fit.done:
             break
         step()
     if fit.done:
         return True
-    store.put(saved, fit.save())
-    done, most = fit.progress
+    store.put(checkpoint_key, fit.save())
+    done, total = fit.progress
     checkpoint_and_release(
         catalog,
         job,
         params={**job.params, resumed_param: True},
-        progress_done=progress_done + FIT_PROGRESS_UNITS * done // most,
+        progress_done=progress_done + FIT_PROGRESS_UNITS * done // total,
     )
     return False

@@ -1,14 +1,14 @@
-"""COMPARE: look closely at the photos that a search has found. One job, one query, no slices.
+"""Compare jobs: rerank the photos of a search result by local features, and explain similarities.
 
-    prepare    which generation, and the query's pixels      beside the batch before
-    compare    local features of the query and, to rerank, of the candidates, a few at a time;
-               to explain, the candidates' descriptors       on the model
-    publish    the result as an object, then the job's end
+One job compares one query, in one step:
 
-What was deleted meanwhile is left out of the result. One that another worker has taken over stores
-the same result, and can't end the job.
+    prepare    resolve the generation and decode the query, while the previous batch is described
+    compare    compute local features of the query and, to rerank, of the candidates in batches;
+               to explain, read the candidates' descriptors
+    publish    store the result as an object, then end the job
 
-Local features of compared photos: kept in the object store, or made from their pixels.
+Photos that were deleted meanwhile are left out of the result. A worker whose lease was taken over
+stores the same result, but can't end the job.
 """
 
 from __future__ import annotations
@@ -58,7 +58,10 @@ log = logging.getLogger(__name__)
 
 
 class CandidateFeatures:
-    """Reads and, with LOCAL_FEATURES=keep, writes what lies under `features/`."""
+    """Computes candidates' local features, and stores them with LOCAL_FEATURES=keep.
+
+    Stored features are the objects under `features/`.
+    """
 
     def __init__(self, store: ObjectStore, decoders: DecoderPool, settings: Settings) -> None:
         self._store = store
@@ -69,21 +72,23 @@ class CandidateFeatures:
     def load(
         self, target: ResolvedGeneration, photos: Sequence[Photo]
     ) -> Iterator[tuple[UUID, LocalFeatures]]:
-        """Each photo's features, in any order; left out, and logged by their ids, are photos that
-        can't be read or decoded any more, that the GPU can't hold, or whose features are not
-        finite. No more are held than a batch has."""
+        """Yield each photo's local features, in any order; at most one batch is held in memory.
+
+        Photos are left out, and logged by their ids, if they can't be read or decoded, are too
+        large for the GPU's memory, or have features that are not finite.
+        """
         for begin in range(0, len(photos), self._batch_size):
             missing = []
             for photo in photos[begin : begin + self._batch_size]:
-                kept = self._read_stored(target, photo.id) if self._store_enabled else None
-                if kept is None:
+                stored = self._read_stored(target, photo.id) if self._store_enabled else None
+                if stored is None:
                     missing.append(photo)
                 else:
-                    yield photo.id, kept
-            for photo_id, made in self._compute(target, missing):
+                    yield photo.id, stored
+            for photo_id, features in self._compute(target, missing):
                 if self._store_enabled:
-                    self._write_stored(target, photo_id, made)
-                yield photo_id, made
+                    self._write_stored(target, photo_id, features)
+                yield photo_id, features
 
     def _read_stored(self, target: ResolvedGeneration, photo_id: UUID) -> LocalFeatures | None:
         key = local_features_key(target.generation.id, photo_id)
@@ -94,49 +99,51 @@ class CandidateFeatures:
         try:
             return LocalFeatures.decode(data, target.extractor.backbone.width)
         except ValueError as error:
-            log.error("the object %s is damaged (%s) and is made anew", key, error)
+            log.error("the object %s is damaged (%s) and is computed again", key, error)
             return None
 
     def _compute(
         self, target: ResolvedGeneration, photos: Sequence[Photo]
     ) -> Iterator[tuple[UUID, LocalFeatures]]:
-        there, data = [], []
+        photo_ids, data = [], []
         for photo in photos:
             try:
                 data.append(self._store.get(photo.object_key))
-                there.append(photo.id)
+                photo_ids.append(photo.id)
             except NotFound:
-                log.warning("the photo %s is not compared: it was deleted, or is lost", photo.id)
+                log.warning("the photo %s is not compared: its object is missing", photo.id)
         extractor = target.extractor
         decoded = []
         for photo_id, outcome in zip(
-            there, self._decoders.decode(data, extractor.preprocessing), strict=True
+            photo_ids, self._decoders.decode(data, extractor.preprocessing), strict=True
         ):
             if isinstance(outcome, PlacewiseError):
                 _log_skipped(photo_id, outcome)
             else:
                 decoded.append((photo_id, outcome.pixels))
         features = _features_that_fit_memory(extractor, decoded)
-        for (photo_id, pixels), one in zip(decoded, features, strict=True):
-            made = LocalFeatures.from_features(one, extractor.backbone.grid(*pixels.shape[:2]))
-            if made.finite:
-                yield photo_id, made
+        for (photo_id, pixels), tensor in zip(decoded, features, strict=True):
+            local_features = LocalFeatures.from_features(
+                tensor, extractor.backbone.grid(*pixels.shape[:2])
+            )
+            if local_features.finite:
+                yield photo_id, local_features
             else:
                 _log_skipped(photo_id, not_finite_error())
 
     def _write_stored(
-        self, target: ResolvedGeneration, photo_id: UUID, made: LocalFeatures
+        self, target: ResolvedGeneration, photo_id: UUID, features: LocalFeatures
     ) -> None:
         try:
-            self._store.put(local_features_key(target.generation.id, photo_id), made.encode())
-        except StorageFull as error:  # it is only made again the next time
-            log.warning("local features are not kept: %s", error.detail)
+            self._store.put(local_features_key(target.generation.id, photo_id), features.encode())
+        except StorageFull as error:  # only a cache: it is computed again the next time
+            log.warning("local features are not stored: %s", error.detail)
 
 
 def _features_that_fit_memory(
     extractor: Extractor, decoded: list[tuple[UUID, Pixels]]
 ) -> list[torch.Tensor]:
-    """Local features of each of `decoded`, which photos that the GPU can't hold have left."""
+    """Local features of `decoded`, from which photos too large for the GPU's memory are removed."""
     while True:
         try:
             return extractor.local_features([pixels for _, pixels in decoded])
@@ -151,7 +158,7 @@ def _log_skipped(photo_id: UUID, error: PlacewiseError) -> None:
 
 @dataclass(frozen=True, slots=True)
 class PreparedComparison:
-    """A claimed compare job whose query is decoded."""
+    """A claimed compare job with its decoded query."""
 
     job: Job
     request: CompareRequest
@@ -161,7 +168,7 @@ class PreparedComparison:
 
 
 class ComparisonRunner:
-    """Does compare jobs."""
+    """Runs compare jobs."""
 
     def __init__(
         self,
@@ -178,19 +185,19 @@ class ComparisonRunner:
         self._candidates = CandidateFeatures(store, decoders, settings)
 
     def prepare(self, job: Job) -> PreparedComparison:
-        """PlacewiseError when the job can't be done: what it needs is gone, or was never there."""
-        asked = CompareRequest.model_validate(job.params["request"])
+        """Resolve the generation and decode the query; PlacewiseError if the job can't be done."""
+        request = CompareRequest.model_validate(job.params["request"])
         target = resolve_generation(self._catalog, self._store, self._models, job)
-        assert target is not None, "a compare job names a generation that has answered"
-        if asked.rerank:
+        assert target is not None, "a compare job names an existing generation"
+        if request.rerank:
             check_rerankable(target.extractor.recipe)
-        if asked.explain:
+        if request.explain:
             check_explainable(target.extractor.recipe, target.generation.spec)
-        data = self._read_query(job, asked)
+        data = self._read_query(job, request)
         (query,) = self._decoders.decode([data], target.extractor.preprocessing)
         if isinstance(query, PlacewiseError):
             raise query
-        return PreparedComparison(job, asked, target, query)
+        return PreparedComparison(job, request, target, query)
 
     def run(self, prepared: PreparedComparison) -> PublishResult:
         """Compare, store the result and end the job."""
@@ -199,14 +206,14 @@ class ComparisonRunner:
         prepared.seconds["compare"] = time.perf_counter() - started
         self._store.put(comparison_key(job.id), result.model_dump_json().encode())
         with self._catalog.write() as session:
-            mine = lock_leased_jobs(session, get_lease_token(job), [job])
-            for own in mine:
-                succeed_job(own, {"candidates": len(result.candidates)})
-        return PublishResult(succeeded=len(mine), lost=1 - len(mine))
+            owned = lock_leased_jobs(session, get_lease_token(job), [job])
+            for leased_job in owned:
+                succeed_job(leased_job, {"candidates": len(result.candidates)})
+        return PublishResult(succeeded=len(owned), lost=1 - len(owned))
 
     def _read_query(self, job: Job, request: CompareRequest) -> bytes:
         if request.query_photo_id is None:
-            assert request.query_job_id is not None, "a query is one or the other"
+            assert request.query_job_id is not None, "a query is a photo or a describe job"
             try:
                 return self._store.get(query_key(request.query_job_id))
             except NotFound as error:
@@ -216,21 +223,25 @@ class ComparisonRunner:
         return self._store.get(photo.object_key)
 
     def _compare(self, prepared: PreparedComparison) -> CompareResult:
-        asked, target = prepared.request, prepared.target
+        request, target = prepared.request, prepared.target
         (features,) = target.extractor.local_features([prepared.query.pixels])
         if not bool(features.isfinite().all()):
             raise not_finite_error()
         grid = target.extractor.backbone.grid(*prepared.query.pixels.shape[:2])
         with self._catalog.read() as session:
-            live = get_live_photos(session, [found.photo_id for found in asked.candidates])
-        there = [found for found in asked.candidates if found.photo_id in live]
-        first, rest = there[: asked.rerank], there[asked.rerank :]
+            live = get_live_photos(
+                session, [candidate.photo_id for candidate in request.candidates]
+            )
+        candidates = [candidate for candidate in request.candidates if candidate.photo_id in live]
+        to_rerank, rest = candidates[: request.rerank], candidates[request.rerank :]
         query = LocalFeatures.from_features(features, grid)
-        scores = self._rerank(target, query, first, [live[one.photo_id] for one in first])
-        # The sort is stable: of equal scores, and without one, the more similar photo comes first.
-        first.sort(key=lambda one: -scores.get(one.photo_id, -np.inf))
-        ordered = [one.photo_id for one in first + rest]
-        shares = self._explain(target, features, ordered[: asked.explain], asked.word_weights)
+        scores = self._rerank(
+            target, query, to_rerank, [live[candidate.photo_id] for candidate in to_rerank]
+        )
+        # The sort is stable: photos with equal scores, or without one, stay sorted by similarity.
+        to_rerank.sort(key=lambda candidate: -scores.get(candidate.photo_id, -np.inf))
+        ordered = [candidate.photo_id for candidate in to_rerank + rest]
+        shares = self._explain(target, features, ordered[: request.explain], request.word_weights)
         return CompareResult(
             candidates=tuple(
                 RerankedCandidate(
@@ -251,8 +262,8 @@ class ComparisonRunner:
         candidates: Sequence[RerankCandidate],
         photos: Sequence[Photo],
     ) -> dict[UUID, float]:
-        """The rerank score of each candidate that can be read, by its photo."""
-        similarity = {one.photo_id: one.ranked_by for one in candidates}
+        """Return the rerank scores of the candidates that can be read, by photo."""
+        similarity = {candidate.photo_id: candidate.ranked_by for candidate in candidates}
         device = target.extractor.backbone.device
         return {
             photo_id: rerank_score(similarity[photo_id], query, features, device)
@@ -266,33 +277,33 @@ class ComparisonRunner:
         photo_ids: Sequence[UUID],
         word_weights: Sequence[float],
     ) -> dict[UUID, SimilarityShares]:
-        """The shares of each of the photos; of none when none is asked for."""
+        """Return the similarity shares of each photo."""
         if not photo_ids:
             return {}
         generation_id = target.generation.id
-        found = read_stored_rows(self._catalog, self._store, generation_id, photo_ids)
-        if not found:
+        stored = read_stored_rows(self._catalog, self._store, generation_id, photo_ids)
+        if not stored:
             raise Gone(
                 "query_expired",
-                f"Nothing is left of these descriptors in the generation {generation_id} that "
-                "answered. Ask again.",
+                f"The descriptors of these photos in generation {generation_id} have been "
+                "deleted. Search again.",
             )
-        rows = np.stack(list(found.values()))
+        rows = np.stack(list(stored.values()))
         shares = explain_similarities(
             target.extractor.recipe, features, target.centres, rows, word_weights
         )
-        return dict(zip(found, shares, strict=True))
+        return dict(zip(stored, shares, strict=True))
 
 
-def _build_explanation(shared: SimilarityShares, grid: tuple[int, int]) -> SimilarityExplanation:
-    overlay, full_share = draw_overlay(shared.patches.reshape(grid))
+def _build_explanation(shares: SimilarityShares, grid: tuple[int, int]) -> SimilarityExplanation:
+    overlay, full_share = draw_overlay(shares.patches.reshape(grid))
     clusters = None
-    if shared.clusters is not None:
-        strongest = np.argsort(-shared.clusters, kind="stable")
+    if shares.clusters is not None:
+        by_share = np.argsort(-shares.clusters, kind="stable")
         clusters = tuple(
-            ClusterContribution(cluster=int(cluster), share=float(shared.clusters[cluster]))
-            for cluster in strongest
-            if shared.clusters[cluster]
+            ClusterContribution(cluster=int(cluster), share=float(shares.clusters[cluster]))
+            for cluster in by_share
+            if shares.clusters[cluster]
         )
     return SimilarityExplanation(
         clusters=clusters,

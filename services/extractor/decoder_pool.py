@@ -1,7 +1,8 @@
-"""Decoding in child processes with a memory limit and a time limit.
+"""Pool of decoder processes with a memory limit and a timeout for each photo.
 
-A photo that makes the decoder crash, hang or swallow memory ends its child, not the worker, and
-not the photos beside it.
+A photo that makes the decoder crash, hang or exhaust memory terminates its own process, not the
+worker, and does not affect other photos. `concurrent.futures.ProcessPoolExecutor` has no timeout
+for a running task, and a crash breaks its whole pool; `pebble.ProcessPool` replaces the process.
 """
 
 from __future__ import annotations
@@ -25,18 +26,18 @@ from shared.imaging.preprocessing import Preprocessing
 
 log = logging.getLogger(__name__)
 
-POOL_POLL_SECONDS = 1.0  # how often a waiting batch looks whether the pool still lives
+POOL_POLL_SECONDS = 1.0  # interval at which a waiting batch checks that the pool is alive
 
-# Photos of a batch that a child has before it: one under way and the next. All of them at once
-# would keep a query's photo, which comes from another thread, waiting behind the whole batch.
+# Photos of a batch scheduled per process: one running and the next. If all were scheduled at once,
+# a query's photo, which comes from another thread, would wait for the whole batch.
 SCHEDULED_PER_PROCESS = 2
 
-# A child may be killed for reasons of the machine (memory); a photo gets a second one.
+# A process may be killed for other reasons than its photo, so each photo gets a second attempt.
 MAX_DECODE_ATTEMPTS = 2
 
 
 class DecoderPool:
-    """Decodes batches of photos in parallel; results come in the order of the photos."""
+    """Decodes photos in parallel processes; results are in the order of the photos."""
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
@@ -46,10 +47,10 @@ class DecoderPool:
     def decode(
         self, photos: Sequence[bytes], preprocessing: Preprocessing
     ) -> list[DecodedPhoto | PlacewiseError]:
-        """Each photo decoded, or the reason why it can't be."""
+        """Decode photos; each result is a decoded photo, or the error that explains the failure."""
         with self._restart_lock:  # batches and model changes decode from different threads
             if not self._pool.active:
-                log.error("the decoder pool broke; starting a new one")
+                log.error("the decoder pool crashed, starting a new one")
                 self.close()
                 self._pool = self._start_pool()
         outcomes: list[DecodedPhoto | PlacewiseError] = []
@@ -62,14 +63,14 @@ class DecoderPool:
         return outcomes
 
     def close(self) -> None:
-        """End the children now."""
+        """Terminate the processes."""
         self._pool.stop()  # type: ignore[no-untyped-call]
         self._pool.join()
 
     def _start_pool(self) -> ProcessPool:
         return ProcessPool(
             max_workers=self._settings.decode_processes,
-            # Fork would copy a process that holds torch's threads and locks.
+            # Forking is not safe in a process with torch's threads and locks.
             context=multiprocessing.get_context("spawn"),
             initializer=limit_memory,
             initargs=[self._settings.decode_memory_bytes],
@@ -82,7 +83,7 @@ class DecoderPool:
                 args=[data, preprocessing, self._settings.max_image_pixels],
                 timeout=self._settings.decode_timeout_seconds,
             )
-        except RuntimeError as error:  # how pebble says that the pool no longer runs
+        except RuntimeError as error:  # raised by pebble when the pool is not running
             raise _pool_broken_error() from error
 
     def _result(
@@ -109,10 +110,10 @@ class DecoderPool:
                         f"({type(error).__name__}).",
                     )
                 future = self._schedule(data, preprocessing)
-        raise AssertionError("the last try returns")
+        raise AssertionError("the last attempt returns")
 
     def _await(self, future: ProcessFuture[DecodedPhoto]) -> DecodedPhoto:
-        """The future's result; Unavailable when the pool broke, and no result will ever come."""
+        """Return the future's result; Unavailable if the pool broke and no result will come."""
         while True:
             done, _ = wait([future], timeout=POOL_POLL_SECONDS)
             if done:
@@ -125,4 +126,4 @@ class DecoderPool:
 
 
 def _pool_broken_error() -> Unavailable:
-    return Unavailable("decoders_broke", "The decoder processes broke; trying again.")
+    return Unavailable("decoders_broke", "The decoder processes crashed. The job will be retried.")

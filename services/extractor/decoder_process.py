@@ -1,4 +1,4 @@
-"""What a decoding child does first. It imports little: photos wait for a child that starts."""
+"""Initializer of decoder processes. Imports little, because photos wait for a process to start."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ import resource
 
 from PIL import Image
 
-# Of Pillow's blocks, 16 MiB at most each, kept by a child between two photos.
+# Memory blocks, 16 MiB at most each, that Pillow keeps for reuse between photos.
 PILLOW_CACHED_BLOCKS = 8
 
 
 def limit_memory(limit_bytes: int) -> None:
-    """Of this process: what a photo needs beyond `limit_bytes` is refused to its decoder."""
+    """Limit this process's address space, so that a photo that needs more can't be decoded."""
     resource.setrlimit(resource.RLIMIT_AS, (limit_bytes, limit_bytes))
-    # Otherwise the memory of each picture comes page by page from the system, and goes back: that
-    # took almost half of the time of decoding one.
+    # Without reuse, every image's memory is mapped page by page and returned to the system, which
+    # took almost half of the decoding time.
     Image.core.set_blocks_max(PILLOW_CACHED_BLOCKS)  # type: ignore[attr-defined]

@@ -1,5 +1,6 @@
-"""What becomes of claimed jobs whose batch came to nothing: each is written to them, under their
-lease, and raised is only what can't be written.
+"""Failure handling of claimed jobs: retries, deferral and permanent failure.
+
+Each outcome is written to the jobs under their lease; only errors of that write are raised.
 """
 
 from __future__ import annotations
@@ -23,24 +24,28 @@ from shared.jobs.transitions import fail_job, release_job
 
 log = logging.getLogger(__name__)
 
-UNAVAILABLE_RETRY_SECONDS = (
-    2.0  # pause of jobs when the store or the catalog is not there right now
-)
-REFUSED_RETRY_SECONDS = 15.0  # pause of photos that need an operator first (weights missing, say)
+UNAVAILABLE_RETRY_SECONDS = 2.0  # retry delay when the store or the catalog is unavailable
+REFUSED_RETRY_SECONDS = 15.0  # retry delay of photos that need an operator (say, missing weights)
 
 
 class JobFailureHandler:
-    """Writes them to the jobs of a batch: `jobs` were claimed together, under one token."""
+    """Writes failures to the jobs of a batch, which were claimed together under one lease token."""
 
     def __init__(self, catalog: Catalog, max_attempts: int, metrics: ExtractorMetrics) -> None:
-        """`max_attempts`: so many falls of a worker over a job alone, and it fails."""
+        """Create a handler.
+
+        Args:
+            catalog: The catalog.
+            max_attempts: Crashes of a worker on a job alone after which the job fails.
+            metrics: Counts the outcomes.
+        """
         self._metrics = metrics
         self._catalog = catalog
         self._max_attempts = max_attempts
 
     @contextlib.contextmanager
     def handling_failures(self, jobs: list[Job], result: DrainStats) -> Iterator[None]:
-        """What goes wrong in the block is written to the jobs, and failed ones are counted."""
+        """Handle the block's exceptions by updating the jobs; count failed ones in `result`."""
         kind = JobKind(jobs[0].kind)
         try:
             yield
@@ -56,34 +61,34 @@ class JobFailureHandler:
             self._record_crash(jobs, error)
 
     def defer_until_vocabulary(self, jobs: list[Job]) -> None:
-        """Photos wait until the map has one; a query is told at once."""
+        """Requeue photos until the map has a vocabulary; fail queries."""
         self._metrics.count_outcome(JobKind(jobs[0].kind), "waiting", len(jobs))
         with self._catalog.write() as session:
             lock_map(session, jobs[0].map_id)
-            there = active_generation(session, jobs[0].map_id) is not None
+            has_generation = active_generation(session, jobs[0].map_id) is not None
             for job in lock_leased_jobs(session, get_lease_token(jobs[0]), jobs):
-                if job.kind == JobKind.DESCRIBE and not there:
+                if job.kind == JobKind.DESCRIBE and not has_generation:
                     fail_job(job, no_vocabulary_error().as_problem())
                 else:
-                    release_job(job, waiting_for=None if there else WaitingFor.VOCABULARY)
+                    release_job(job, waiting_for=None if has_generation else WaitingFor.VOCABULARY)
 
     def release_unstarted(self, jobs: list[Job]) -> None:
-        """Stopping: what was taken ahead goes to another worker, unharmed."""
+        """Return claimed jobs that have not started to the queue, without counting an attempt."""
         self._metrics.count_outcome(JobKind(jobs[0].kind), "given_back", len(jobs))
         with self._catalog.write() as session:
             for job in lock_leased_jobs(session, get_lease_token(jobs[0]), jobs):
                 release_job(job)
 
     def _retry_later(self, jobs: list[Job], error: Exception) -> None:
-        """Something outside the jobs is away: try again soon, and count no attempt."""
-        log.warning("%d jobs pause for %g s: %s", len(jobs), UNAVAILABLE_RETRY_SECONDS, error)
+        """Requeue jobs after a transient failure outside them, without counting an attempt."""
+        log.warning("%d jobs retried in %g s: %s", len(jobs), UNAVAILABLE_RETRY_SECONDS, error)
         with self._catalog.write() as session:
             for job in lock_leased_jobs(session, get_lease_token(jobs[0]), jobs):
                 release_job(job, after_seconds=UNAVAILABLE_RETRY_SECONDS)
                 job.error = error.as_problem() if isinstance(error, PlacewiseError) else None
 
     def _fail_or_defer(self, jobs: list[Job], error: PlacewiseError) -> int:
-        """The request can't be met. Stored photos wait for the operator, all else fails."""
+        """Fail the jobs, except stored photos, which are retried once an operator has acted."""
         log.error("%s", error.detail)
         failed = 0
         with self._catalog.write() as session:
@@ -98,7 +103,10 @@ class JobFailureHandler:
         return failed
 
     def _record_crash(self, jobs: list[Job], error: Exception) -> None:
-        """As if the worker had died: what fell in a batch is tried alone, then counted."""
+        """Handle an unexpected exception like a crash of the worker.
+
+        Jobs of a batch are retried alone; only a crash on a job alone counts as an attempt.
+        """
         with self._catalog.write() as session:
             for job in lock_leased_jobs(session, get_lease_token(jobs[0]), jobs):
                 job.claimed_together = len(jobs)
@@ -106,8 +114,9 @@ class JobFailureHandler:
 
 
 def no_vocabulary_error() -> Conflict:
+    """Error for a query to a map whose extractor needs a vocabulary that it does not have."""
     return Conflict(
         "no_vocabulary",
-        "The map's extractor needs a vocabulary and the map has none yet. Fit one on its photos "
+        "The map's extractor needs a vocabulary, but the map has none yet. Fit one on its photos "
         "(POST /api/v1/vocabularies) or import one (POST /api/v1/vocabularies/import).",
     )

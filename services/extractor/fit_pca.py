@@ -1,11 +1,13 @@
-"""PCA: fit a whitening on the map's stored rows, a slice at a time. No photo is described for it.
+"""PCA fit: fits a whitening on the map's stored descriptor rows, without describing photos.
 
-    plan      which photos' rows, and how they are cut      -> plan.json
-    gather    the next few of these rows                    -> rows-*.f32
-    reduce    steps of `shared.descriptors.pca_fit`              -> fit.npz, part-*.npz
+The stages, with their objects under `work/<job>/`:
 
-The names are objects under `work/<job>/`. Nothing of a fit is kept in the worker's memory. The
-longest step finds the variances of the sample: some seconds where it has 2,000 rows.
+    plan      choose the photos whose rows are read, and the column blocks  -> plan.json
+    gather    copy the next of these rows                                    -> rows-*.f32
+    reduce    run steps of `shared.descriptors.pca_fit`            -> fit.npz, part-*.npz
+
+No state is kept in the worker's memory. The longest step computes the variances of the sample: some
+seconds for 2,000 rows.
 """
 
 from __future__ import annotations
@@ -48,12 +50,12 @@ from shared.jobs import Job
 from shared.storage import ObjectStore
 from shared.storage.keys import job_work_key
 
-READ_BATCH_BYTES = 16_000_000  # of rows that are read together
+READ_BATCH_BYTES = 16_000_000  # of descriptor rows read at once
 SEED = 0
 
 
 class PcaFitJob:
-    """Does one slice of a PCA at a time."""
+    """Fits a PCA whitening, one step at a time."""
 
     def __init__(self, catalog: Catalog, store: ObjectStore, models: ModelRegistry) -> None:
         self._catalog = catalog
@@ -61,7 +63,7 @@ class PcaFitJob:
         self._models = models
 
     def run_step(self, job: Job) -> None:
-        """The next slice, by the job's stage; PlacewiseError when it can't go on."""
+        """Run the next step of the job's stage; PlacewiseError if it can't continue."""
         if job.stage is None:
             self._plan(job)
         elif job.stage == "gather":
@@ -70,7 +72,7 @@ class PcaFitJob:
             self._reduce(job)
 
     def _plan(self, job: Job) -> None:
-        """Choose the rows to learn from: those of database photos alone, never of queries."""
+        """Choose the rows to fit on: those of database photos, never of queries."""
         with self._catalog.read() as session:
             source = get_pca_source_generation(session, job.map_id)
             photo_ids = session.scalars(
@@ -84,10 +86,10 @@ class PcaFitJob:
                 .order_by(Descriptor.photo_id)
             ).all()
         self._check_spec_unchanged(source)
-        kept = job.params["pca"]
-        check_pca_fittable(len(photo_ids), source.dimension, kept)
-        chosen = sample_rows(len(photo_ids), sample_size(source.dimension, kept), SEED)
-        plan = [str(photo_ids[number]) for number in chosen]
+        dimension = job.params["pca"]
+        check_pca_fittable(len(photo_ids), source.dimension, dimension)
+        chosen = sample_rows(len(photo_ids), sample_size(source.dimension, dimension), SEED)
+        plan = [str(photo_ids[index]) for index in chosen]
         self._store.put(job_work_key(job.id, "plan.json"), json.dumps(plan).encode())
         checkpoint_and_release(
             self._catalog,
@@ -105,15 +107,16 @@ class PcaFitJob:
         )
 
     def _check_spec_unchanged(self, source: Generation) -> None:
-        """Conflict (`spec_differs`) where this worker would not describe photos as the rows were:
-        they and the new ones would not belong together.
+        """Conflict (`spec_differs`) if this worker computes other descriptors than the stored ones.
+
+        The projection of stored rows would then not fit new ones.
         """
-        made = self._source_pipeline(source)
-        if made.spec != source.spec:
+        pipeline = self._source_pipeline(source)
+        if pipeline.spec != source.spec:
             raise Conflict(
                 "spec_differs",
-                "The map's photos were described by other releases than this worker's. Describe "
-                "them anew first (POST /api/v1/generations with the vocabulary alone).",
+                "The map's photos were described by another release than this worker's. Reindex "
+                "them first (POST /api/v1/generations with the vocabulary alone).",
                 generation_id=str(source.id),
             )
 
@@ -125,31 +128,31 @@ class PcaFitJob:
         return self._models.pipeline_of_generation(source, vocabulary, None)
 
     def _gather(self, job: Job) -> None:
-        """The next rows of the plan, for about a second."""
+        """Copy the next rows of the plan, for about a second."""
         params = job.params
         plan = json.loads(self._store.get(job_work_key(job.id, "plan.json")))
-        at_once = max(1, READ_BATCH_BYTES // (4 * params["dimension"]))
+        batch_rows = max(1, READ_BATCH_BYTES // (4 * params["dimension"]))
         sample = self._gathered_rows(job)
-        looked_at = params["looked_at"]
+        position = params["looked_at"]
         for _ in time_slice():
-            if looked_at >= len(plan):
+            if position >= len(plan):
                 break
-            wanted = [UUID(photo_id) for photo_id in plan[looked_at : looked_at + at_once]]
-            found = read_stored_rows(self._catalog, self._store, UUID(params["source"]), wanted)
-            if found:
-                rows = np.stack([found[photo_id] for photo_id in wanted if photo_id in found])
+            photo_ids = [UUID(photo_id) for photo_id in plan[position : position + batch_rows]]
+            stored = read_stored_rows(self._catalog, self._store, UUID(params["source"]), photo_ids)
+            if stored:
+                rows = np.stack([stored[photo_id] for photo_id in photo_ids if photo_id in stored])
                 sample.add(rows[usable_rows(rows)])
-            looked_at += len(wanted)
+            position += len(photo_ids)
         checkpoint_and_release(
             self._catalog,
             job,
-            stage="gather" if looked_at < len(plan) else "reduce",
-            params={**params, "looked_at": looked_at, "rows": sample.count},
-            progress_done=looked_at,
+            stage="gather" if position < len(plan) else "reduce",
+            params={**params, "looked_at": position, "rows": sample.count},
+            progress_done=position,
         )
 
     def _reduce(self, job: Job) -> None:
-        """Steps for about a second; when they are done, the whitening and its generation."""
+        """Run steps of the fit; when it is finished, create the whitening and its generation."""
         params = job.params
         sample = self._gathered_rows(job)
         fit = PcaFit(sample, params["pca"])
@@ -171,17 +174,17 @@ class PcaFitJob:
             return
         with self._catalog.read() as session:
             source = session.get_one(Generation, UUID(params["source"]))
-        found = fit.whitening(
+        whitening = fit.whitening(
             [self._read_part(job, number) for number in range(block_count(sample))]
         )
-        made = self._source_pipeline(source)
-        whole = PcaProjection(found, made.extractor.backbone.device)
+        pipeline = self._source_pipeline(source)
+        projection = PcaProjection(whitening, pipeline.extractor.backbone.device)
         start_whitened_generation(
             self._catalog,
             self._store,
             job,
-            DescriptorPipeline(made.extractor, made.centres, whole),
-            PcaWhiteningFile(found, source.spec),
+            DescriptorPipeline(pipeline.extractor, pipeline.centres, projection),
+            PcaWhiteningFile(whitening, source.spec),
             source.vocabulary_id,
             progress_done=params["looked_at"] + FIT_PROGRESS_UNITS,
         )

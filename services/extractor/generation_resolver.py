@@ -1,10 +1,12 @@
-"""Which generation a batch is described into, with the extractor and centres that it takes.
+"""Resolution of the generation that a batch is described into, and reindexing after an upgrade.
 
-After an upgrade: maps whose descriptors this worker would make otherwise are described anew.
+`resolve_generation` returns a job's generation with its extractor, vocabulary and projection, and
+creates a map's first generation.
 
-Another release of the decoder changes pixels, and with them descriptors, a little. Rows of two
-specs never mix, so uploads would wait. Where this is the only worker, it starts the model change
-itself; among several, a person decides when all of them have been upgraded.
+Another release of the decoder changes pixels slightly, and descriptors with them. Rows of two specs
+are never mixed, so uploads would wait. A worker that is the only one starts the model change itself
+(`reindex_outdated_generations`); where there are several, an operator starts it once all of them
+are upgraded.
 """
 
 from __future__ import annotations
@@ -47,16 +49,21 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ResolvedGeneration(DescriptorPipeline):
+    """A generation with the pipeline that computes its descriptors."""
+
     generation: Generation
 
 
 def resolve_generation(
     catalog: Catalog, store: ObjectStore, models: ModelRegistry, job: Job
 ) -> ResolvedGeneration | None:
-    """Where the batch of `job` goes; None while the map has no vocabulary.
+    """Return the generation for the batch of `job`; None while the map has no vocabulary.
 
-    A job that names a generation goes there; the others go to the map's active one, which is made
-    here on first use when the extractor brings a vocabulary or needs none.
+    A job that names a generation gets that one; other jobs get the map's active one, which is
+    created on first use if the extractor ships a vocabulary or needs none.
+
+    Raises:
+        Unavailable: `spec_differs` if this worker can't reproduce the generation's spec.
     """
     with catalog.read() as session:
         if job.generation_id is not None:
@@ -70,17 +77,17 @@ def resolve_generation(
             whitening = session.get(StoredWhitening, generation.whitening_id)
         map_extractor = session.get_one(Map, job.map_id).extractor
     if generation is None:
-        first = _create_first_generation(
+        created = _create_first_generation(
             catalog, store, models.extractor(map_extractor), job.map_id
         )
-        if first is None:
+        if created is None:
             return None
-        generation, vocabulary = first
-    made = models.pipeline_of_generation(generation, vocabulary, whitening)
+        generation, vocabulary = created
+    pipeline = models.pipeline_of_generation(generation, vocabulary, whitening)
     target = ResolvedGeneration(
-        made.extractor, made.centres, made.projection, generation=generation
+        pipeline.extractor, pipeline.centres, pipeline.projection, generation=generation
     )
-    # A query is compared once and thrown away: another decoder release is close enough.
+    # A query's descriptor is not stored: another decoder release is close enough.
     check_spec_matches(generation, target, decoder_matters=job.kind not in QUERY_JOBS)
     return target
 
@@ -88,7 +95,11 @@ def resolve_generation(
 def _create_first_generation(
     catalog: Catalog, store: ObjectStore, extractor: Extractor, map_id: UUID
 ) -> tuple[Generation, Vocabulary | None] | None:
-    """The map's first generation, with the shipped vocabulary if one is needed."""
+    """Create the map's first generation, with the shipped vocabulary if one is needed.
+
+    Returns None if a vocabulary is needed and none is shipped; the existing generation if another
+    worker has created it meanwhile.
+    """
     shipped = extractor.shipped_vocabulary()
     if extractor.recipe.needs_vocabulary and shipped is None:
         return None
@@ -97,12 +108,12 @@ def _create_first_generation(
         store.put(key, encode_centres(shipped[0]))
     with catalog.write() as session:
         lock_map(session, map_id)
-        found = active_generation(session, map_id)
-        if found is not None:  # another worker was first
+        existing = active_generation(session, map_id)
+        if existing is not None:  # another worker has created it
             vocabulary = None
-            if found.vocabulary_id is not None:
-                vocabulary = session.get_one(Vocabulary, found.vocabulary_id)
-            return found, vocabulary
+            if existing.vocabulary_id is not None:
+                vocabulary = session.get_one(Vocabulary, existing.vocabulary_id)
+            return existing, vocabulary
         vocabulary, centres = None, None
         if shipped is not None:
             centres, provenance = shipped
@@ -130,14 +141,18 @@ def _create_first_generation(
         session.flush()
         wake_vocabulary_waiters(session, map_id)
         increment_map_version(session, map_id)
-    log.info("generation %s begins with %s", generation.id, extractor.recipe.name)
+    log.info("generation %s created with extractor %s", generation.id, extractor.recipe.name)
     return generation, vocabulary
 
 
 def reindex_outdated_generations(catalog: Catalog, models: ModelRegistry) -> int:
-    """Start a switch to the same vocabulary and whitening in every outdated map; how many."""
+    """Start a reindex, with the same vocabulary and whitening, of every map with an outdated spec.
+
+    Returns:
+        The number of model changes started.
+    """
     with catalog.read() as session:
-        found = session.execute(
+        active = session.execute(
             select(Generation, Vocabulary, StoredWhitening)
             .outerjoin(Vocabulary, Vocabulary.id == Generation.vocabulary_id)
             .outerjoin(StoredWhitening, StoredWhitening.id == Generation.whitening_id)
@@ -145,13 +160,13 @@ def reindex_outdated_generations(catalog: Catalog, models: ModelRegistry) -> int
             .where(Generation.state == GenerationState.ACTIVE, Map.deleted_at.is_(None))
         ).all()
     started = 0
-    for generation, vocabulary, whitening in found:
+    for generation, vocabulary, whitening in active:
         try:
-            made = models.pipeline_of_generation(generation, vocabulary, whitening)
+            pipeline = models.pipeline_of_generation(generation, vocabulary, whitening)
         except PlacewiseError as error:
             log.error("generation %s can't be checked: %s", generation.id, error.detail)
             continue
-        if spec_fingerprint(made.spec) == generation.spec_fingerprint:
+        if spec_fingerprint(pipeline.spec) == generation.spec_fingerprint:
             continue
         params = {
             "vocabulary_id": str(vocabulary.id) if vocabulary else None,
@@ -161,7 +176,7 @@ def reindex_outdated_generations(catalog: Catalog, models: ModelRegistry) -> int
             with catalog.write() as session:
                 start_model_change(session, generation.map_id, JobKind.SWITCH, params)
         except Conflict:
-            continue  # a model change is under way, and brings the new spec
-        log.warning("generation %s was made by other releases: describing anew", generation.id)
+            continue  # a model change is running and will use the new spec
+        log.warning("generation %s has an outdated spec: reindexing its map", generation.id)
         started += 1
     return started

@@ -1,6 +1,6 @@
-"""What Prometheus reads of an extractor. One process, one registry: children only decode.
+"""Prometheus metrics of an extractor, and statistics of a drain.
 
-What one drain of the extractor's worker did.
+One process has one registry: child processes only decode.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from shared.jobs import JobKind
 
 METRIC_PREFIX = "placewise_extractor"
 BATCH_SIZE_BUCKETS = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1024)
-# From a small map's rows on a GPU to a ViT-g's batch on a CPU.
+# From projecting a small batch on a GPU to describing one with a ViT-g on a CPU.
 STAGE_BUCKETS_SECONDS = (
     0.005,
     0.01,
@@ -44,58 +44,60 @@ LOAD_BUCKETS_SECONDS = (0.1, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0, 60.0, 300.0)
 
 
 class ExtractorMetrics:
-    """One worker's figures."""
+    """Prometheus metrics of one worker."""
 
     def __init__(self, registry: CollectorRegistry) -> None:
         self._batch_jobs = Histogram(
             f"{METRIC_PREFIX}_batch_jobs",
-            "Jobs in a claimed batch; its count is that of the claims.",
+            "Jobs per claimed batch.",
             ["kind"],
             buckets=BATCH_SIZE_BUCKETS,
             registry=registry,
         )
         self._jobs = Counter(
             f"{METRIC_PREFIX}_jobs",
-            "Claimed jobs by what became of them. lost: the lease was taken over, or the job was "
-            "cancelled; paused, waiting, given_back: queued again; refused: failed, or paused "
-            "until an operator acts; crashed: tried again alone.",
+            "Claimed jobs by outcome. lost: the lease was taken over, or the job was cancelled; "
+            "paused, waiting, given_back: requeued; refused: failed, or paused until an operator "
+            "acts; crashed: retried alone.",
             ["kind", "outcome"],
             registry=registry,
         )
         self._stage_seconds = Histogram(
             f"{METRIC_PREFIX}_stage_seconds",
-            "Seconds of a batch in each of its stages.",
+            "Duration of a batch's stages in seconds.",
             ["stage"],
             buckets=STAGE_BUCKETS_SECONDS,
             registry=registry,
         )
         self._load_seconds = Histogram(
             f"{METRIC_PREFIX}_model_load_seconds",
-            "Seconds that loading an extractor took; its count is that of the loads.",
+            "Duration of loading an extractor in seconds.",
             buckets=LOAD_BUCKETS_SECONDS,
             registry=registry,
         )
         self._drain_seconds = Histogram(
             f"{METRIC_PREFIX}_drain_seconds",
-            "Seconds of drains that claimed something.",
+            "Duration in seconds of drains that claimed jobs.",
             buckets=STAGE_BUCKETS_SECONDS,
             registry=registry,
         )
         self._draining = Gauge(
-            f"{METRIC_PREFIX}_draining", "1 while the worker is at work.", registry=registry
+            f"{METRIC_PREFIX}_draining", "1 while the worker processes jobs.", registry=registry
         )
         registry.register(_DeviceMemoryCollector())
 
     def observe_claim(self, kind: JobKind, jobs: int) -> None:
+        """Record the size of a claimed batch."""
         self._batch_jobs.labels(kind).observe(jobs)
 
     def count_outcome(self, kind: JobKind, outcome: str, jobs: int = 1) -> None:
+        """Count jobs with an outcome."""
         self._jobs.labels(kind, outcome).inc(jobs)
 
     def observe_batch(
         self, kind: JobKind, outcome: PublishResult, seconds: dict[str, float]
     ) -> None:
-        """A batch has come to its end; `seconds` are those of its stages."""
+        """Record the outcome of a batch and the seconds of its stages."""
         for name, jobs in (
             ("succeeded", outcome.succeeded),
             ("failed", outcome.failed),
@@ -107,13 +109,16 @@ class ExtractorMetrics:
             self.observe_stage(stage, took)
 
     def observe_stage(self, name: str, seconds: float) -> None:
+        """Record the duration of a stage."""
         self._stage_seconds.labels(name.replace(" ", "_")).observe(seconds)
 
     def observe_model_load(self, seconds: float) -> None:
+        """Record the duration of loading an extractor."""
         self._load_seconds.observe(seconds)
 
     @contextlib.contextmanager
     def measure_drain(self) -> Iterator[None]:
+        """Measure the duration of the block as a drain."""
         started = time.perf_counter()
         self._draining.set(1)
         try:
@@ -124,14 +129,16 @@ class ExtractorMetrics:
 
 
 class _DeviceMemoryCollector(Collector):
+    """GPU memory, read at each scrape."""
+
     def collect(self) -> Iterable[Metric]:
         used = GaugeMetricFamily(
             f"{METRIC_PREFIX}_device_used_bytes",
-            "GPU memory that PyTorch holds here.",
+            "GPU memory allocated by PyTorch in this process.",
             labels=["device"],
         )
         total = GaugeMetricFamily(
-            f"{METRIC_PREFIX}_device_total_bytes", "Memory of the GPU.", labels=["device"]
+            f"{METRIC_PREFIX}_device_total_bytes", "Total memory of the GPU.", labels=["device"]
         )
         for device in gpu_memory():
             used.add_metric([device.name], device.used_bytes)
@@ -142,7 +149,7 @@ class _DeviceMemoryCollector(Collector):
 
 @dataclass(slots=True)
 class DrainStats:
-    """What one drain did: this is what the operator sees."""
+    """Statistics of one drain, as logs and Flower show them."""
 
     maps: set[str] = field(default_factory=set)
     claimed: int = 0
@@ -150,10 +157,10 @@ class DrainStats:
     failed: int = 0
     seconds: defaultdict[str, float] = field(default_factory=lambda: defaultdict(float))
     interrupted: bool = False
-    """It ended before the work did."""
+    """Whether the drain stopped while there was work left."""
 
     def merge(self, other: DrainStats) -> None:
-        """Count what another one has counted, too."""
+        """Add the counts of another drain."""
         self.maps |= other.maps
         self.claimed += other.claimed
         self.succeeded += other.succeeded
@@ -162,14 +169,14 @@ class DrainStats:
             self.seconds[stage] += took
 
     def add_batch(self, outcome: PublishResult, seconds: dict[str, float]) -> None:
-        """Count what a batch came to, and the time of its stages."""
+        """Add the outcome of a batch and the seconds of its stages."""
         self.succeeded += outcome.succeeded
         self.failed += outcome.failed
         for stage, took in seconds.items():
             self.seconds[stage] += took
 
     def as_dict(self) -> dict[str, Any]:
-        """For logs and for Flower."""
+        """Return the statistics as JSON, for logs and for Flower."""
         return {
             "maps": sorted(self.maps),
             "claimed": self.claimed,

@@ -1,24 +1,14 @@
-"""Model changes, in slices: each is one short piece of work, so that a query waits for one at most.
+"""Model changes: vocabulary fits, vocabulary imports and switches, PCA fits, checkpoint imports.
 
-    add_model.py         a checkpoint that was sent; no map changes by it
-    fit_vocabulary.py    plan, describe a sample, find the centres
-    take_vocabulary.py   a file that was brought, or a vocabulary that the map has
-    fit_pca.py           gather stored rows, find their directions
-    slices.py            how long they are, and the steps of a fit
-    new_generation.py    what all of them come to
+`ModelChangeRunner` runs one short step of a model change at a time, so that a query waits for one
+step at most. Between steps the state lies in the object store under `work/<job>/`, never in the
+worker's memory, so that any worker can run the next step.
 
-Between two slices everything lies in the object store under `work/<job>/`, so that any worker can
-take the next one.
+A vocabulary fit (`VocabularyFitJob`) has three stages, with these objects under `work/<job>/`:
 
-FIT: learn a vocabulary from the map's own photos, a slice at a time.
-
-    plan      which photos, in which order             -> plan.json
-    sample    some patches of the next few of them     -> patches-*.f32
-    cluster   steps of `shared.descriptors.vocabulary_fit`             -> fit.npz
-
-The names are objects under `work/<job>/`. Nothing of a fit is kept in the worker's memory.
-
-Model changes to centres that are there: in a file that was brought, or in the map already.
+    plan      choose the photos and their order                              -> plan.json
+    sample    sample patches of the next photos                              -> patches-*.f32
+    cluster   run steps of `shared.descriptors.vocabulary_fit`               -> fit.npz
 """
 
 from __future__ import annotations
@@ -61,7 +51,7 @@ from shared.storage.keys import job_work_key
 
 
 class VocabularyFitJob:
-    """Does one slice of a fit at a time."""
+    """Fits a vocabulary on the map's own photos, one step at a time."""
 
     def __init__(
         self,
@@ -78,7 +68,7 @@ class VocabularyFitJob:
         self._settings = settings
 
     def run_step(self, job: Job) -> None:
-        """The next slice, by the job's stage; PlacewiseError when it can't go on."""
+        """Run the next step of the job's stage; PlacewiseError if it can't continue."""
         extractor = map_extractor(self._catalog, self._models, job)
         if not extractor.recipe.needs_vocabulary:
             raise Unprocessable(
@@ -94,7 +84,7 @@ class VocabularyFitJob:
             self._cluster(job, extractor)
 
     def _plan(self, job: Job, extractor: Extractor) -> None:
-        """Choose the photos to learn from: reproducible from the seed and the photos' ids."""
+        """Choose the photos to sample, reproducibly from the seed and the photos' ids."""
         with self._catalog.read() as session:
             photo_ids = session.scalars(
                 select(Photo.id)
@@ -108,7 +98,7 @@ class VocabularyFitJob:
         if not photo_ids:
             raise Conflict(
                 "no_photos",
-                "The map has no photos to learn a vocabulary from. Upload some first.",
+                "The map has no photos to fit a vocabulary on. Upload photos first.",
             )
         chosen = sample_photos(
             len(photo_ids), job.params["sample"], extractor.backbone.width, job.params["seed"]
@@ -125,19 +115,23 @@ class VocabularyFitJob:
         )
 
     def _sample(self, job: Job, extractor: Extractor) -> None:
-        """Patches of the next few photos of the plan."""
+        """Sample patches of the next photos of the plan."""
         plan = json.loads(self._store.get(job_work_key(job.id, "plan.json")))
-        begin = job.params["sampled"]
-        chosen = [UUID(photo_id) for photo_id in plan[begin : begin + self._settings.batch_photos]]
+        start = job.params["sampled"]
+        photo_ids = [
+            UUID(photo_id) for photo_id in plan[start : start + self._settings.batch_photos]
+        ]
         decoded = [
             outcome
-            for outcome in self._decoders.decode(self._read_photos(chosen), extractor.preprocessing)
+            for outcome in self._decoders.decode(
+                self._read_photos(photo_ids), extractor.preprocessing
+            )
             if not isinstance(outcome, PlacewiseError)
         ]
         if decoded:
             features = extractor.local_features([photo.pixels for photo in decoded])
-            self._patch_store(job, extractor).add(features, begin, len(plan), job.params["seed"])
-        sampled = begin + len(chosen)
+            self._patch_store(job, extractor).add(features, start, len(plan), job.params["seed"])
+        sampled = start + len(photo_ids)
         checkpoint_and_release(
             self._catalog,
             job,
@@ -151,7 +145,7 @@ class VocabularyFitJob:
         )
 
     def _read_photos(self, photo_ids: list[UUID]) -> list[bytes]:
-        """The photos that are there: a sample does not depend on those deleted since."""
+        """Return the bytes of the photos that have not been deleted since the plan."""
         with self._catalog.read() as session:
             live = get_live_photos(session, photo_ids)
         photos = []
@@ -164,7 +158,7 @@ class VocabularyFitJob:
         return photos
 
     def _cluster(self, job: Job, extractor: Extractor) -> None:
-        """Steps for about a second; when they are done, the vocabulary and its generation."""
+        """Run steps of the fit; when it is finished, create the vocabulary and its generation."""
         params = job.params
         patches = self._patch_store(job, extractor).open()
         fit = VocabularyFit(patches, params["clusters"], params["seed"])
@@ -203,7 +197,7 @@ class VocabularyFitJob:
 
 
 class VocabularySwitchJob:
-    """One slice each: nothing is calculated."""
+    """Switches a map to an imported or stored vocabulary; one step each."""
 
     def __init__(self, catalog: Catalog, store: ObjectStore, models: ModelRegistry) -> None:
         self._catalog = catalog
@@ -211,25 +205,33 @@ class VocabularySwitchJob:
         self._models = models
 
     def import_file(self, job: Job) -> None:
-        """IMPORT: the vocabulary in the file under `object_key`; Unprocessable
-        (`vocabulary_unfit`) when the map's extractor can't use it.
+        """Import the vocabulary file at `object_key`.
+
+        Raises:
+            Unprocessable: `vocabulary_unfit` if the map's extractor can't use it.
         """
         extractor = map_extractor(self._catalog, self._models, job)
-        brought = decode_vocabulary(self._store.get(job.params["object_key"]))
-        check_vocabulary_fits(brought.provenance, brought.centres, extractor)
+        imported = decode_vocabulary(self._store.get(job.params["object_key"]))
+        check_vocabulary_fits(imported.provenance, imported.centres, extractor)
         start_generation_with_new_vocabulary(
             self._catalog,
             self._store,
             job,
             extractor,
-            brought.centres,
+            imported.centres,
             VocabularyOrigin.IMPORTED,
-            {**brought.provenance, "imported_from": job.params["filename"]},
+            {**imported.provenance, "imported_from": job.params["filename"]},
         )
 
     def switch_vocabulary(self, job: Job) -> None:
-        """SWITCH: the vocabulary `vocabulary_id` of the map, or None for extractors without one;
-        with `extractor` to that one, where None takes the vocabulary that comes with it.
+        """Switch to the map's vocabulary `vocabulary_id`, or to None for an extractor without one.
+
+        With the parameter `extractor`, also switch to that extractor; None then means the
+        vocabulary that it ships with.
+
+        Raises:
+            Unprocessable: `vocabulary_unfit` if the extractor can't use the vocabulary, or needs
+                one.
         """
         if job.params.get("extractor") is None:
             extractor = map_extractor(self._catalog, self._models, job)
@@ -252,7 +254,8 @@ class VocabularySwitchJob:
             if extractor.recipe.needs_vocabulary:
                 raise Unprocessable(
                     "vocabulary_unfit",
-                    f"The extractor {extractor.recipe.name} needs a vocabulary.",
+                    f"The extractor {extractor.recipe.name} needs a vocabulary. Choose one with "
+                    "`vocabulary_id`.",
                 )
             self._start_generation(job, extractor, None, None)
             return
@@ -269,8 +272,10 @@ class VocabularySwitchJob:
         centres: ClusterCentres | None,
         vocabulary_id: UUID | None,
     ) -> None:
-        """The generation, with the whitening that the job names, if any: a renewed generation keeps
-        its own. Unprocessable (`pca_unfit`) when the descriptors have become others.
+        """Create the generation, with the whitening that the job names, if any.
+
+        A reindexed generation keeps its whitening. Unprocessable (`pca_unfit`) if the whitening was
+        fitted on other descriptors.
         """
         whitening_id = job.params.get("whitening_id")
         if whitening_id is None:
@@ -280,14 +285,16 @@ class VocabularySwitchJob:
             return
         with self._catalog.read() as session:
             stored = session.get_one(StoredWhitening, UUID(whitening_id))
-        kept = decode_whitening(self._store.get(stored.object_key))
-        kept.check_compatible(extractor.spec(centres))
-        made = DescriptorPipeline(extractor, centres, self._models.projection(stored))
-        start_generation_with_stored_vocabulary(self._catalog, job, made, vocabulary_id, stored.id)
+        whitening_file = decode_whitening(self._store.get(stored.object_key))
+        whitening_file.check_compatible(extractor.spec(centres))
+        pipeline = DescriptorPipeline(extractor, centres, self._models.projection(stored))
+        start_generation_with_stored_vocabulary(
+            self._catalog, job, pipeline, vocabulary_id, stored.id
+        )
 
 
 class ModelChangeRunner:
-    """Does one slice of a model change at a time."""
+    """Runs one step of a model change at a time."""
 
     def __init__(
         self,
@@ -298,18 +305,18 @@ class ModelChangeRunner:
         settings: Settings,
     ) -> None:
         self._fit = VocabularyFitJob(catalog, store, models, decoders, settings)
-        self._take = VocabularySwitchJob(catalog, store, models)
+        self._switch = VocabularySwitchJob(catalog, store, models)
         self._pca = PcaFitJob(catalog, store, models)
         self._add = ModelImporter(catalog, store, model_cache_folder(settings))
 
     def run_step(self, job: Job) -> None:
-        """The next piece of work of the claimed job; PlacewiseError when it can't go on."""
+        """Run the next step of the claimed job; PlacewiseError if it can't continue."""
         if job.kind == JobKind.ADD_MODEL:
             self._add.import_checkpoint(job)
         elif job.kind == JobKind.IMPORT:
-            self._take.import_file(job)
+            self._switch.import_file(job)
         elif job.kind == JobKind.SWITCH:
-            self._take.switch_vocabulary(job)
+            self._switch.switch_vocabulary(job)
         elif job.kind == JobKind.PCA:
             self._pca.run_step(job)
         else:

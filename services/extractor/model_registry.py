@@ -1,7 +1,4 @@
-"""What the worker keeps in memory: a few loaded extractors, vocabularies and whitenings.
-
-A few values that are costly to make: those used last.
-"""
+"""Model registry of a worker: LRU caches of loaded extractors, vocabularies and PCA whitenings."""
 
 from __future__ import annotations
 
@@ -34,26 +31,26 @@ Value = TypeVar("Value")
 
 
 class LruCache(Generic[Key, Value]):
-    """At most `most` values, which is 1 or more; the one that was used least lately goes first.
-    Not thread-safe.
+    """Least-recently-used cache of at most `max_size` values, at least one; not thread-safe.
+
+    Unlike `cachetools.LRUCache`, iterating over `values` does not count as a use.
     """
 
     def __init__(self, max_size: int) -> None:
-        self._most = max_size
+        self._max_size = max_size
         self._values: OrderedDict[Key, Value] = OrderedDict()
 
     def get(self, key: Key, make: Callable[[], Value]) -> Value:
-        """The key's value, made if it is not there; raises what `make` raises, and keeps nothing
-        then."""
+        """Return the key's value, computed by `make` if absent; errors of `make` propagate."""
         if key not in self._values:
             self._values[key] = make()
         self._values.move_to_end(key)
-        while len(self._values) > self._most:
+        while len(self._values) > self._max_size:
             self._values.popitem(last=False)
         return self._values[key]
 
     def values(self) -> ValuesView[Value]:
-        """Those that are there; asking for them is no use of them."""
+        """The cached values; reading them does not count as a use."""
         return self._values.values()
 
 
@@ -61,12 +58,12 @@ LoadAddedModel = Callable[[str, torch.device], Backbone]
 
 MAX_EXTRACTORS = 2  # a large backbone takes gigabytes of GPU memory
 MAX_VOCABULARIES = 16
-MAX_WHITENINGS = 2  # one from 98,304 to 512 dimensions takes 201 MB of the device's memory
+MAX_WHITENINGS = 2  # one from 98,304 to 512 dimensions takes 201 MB of device memory
 
 
 @dataclass(frozen=True, slots=True)
 class DescriptorPipeline:
-    """What makes the descriptors of a generation."""
+    """Extractor, vocabulary centres and PCA projection that compute a generation's descriptors."""
 
     extractor: Extractor
     centres: ClusterCentres | None = None
@@ -74,11 +71,12 @@ class DescriptorPipeline:
 
     @property
     def spec(self) -> dict[str, Any]:
+        """The extractor spec of the descriptors."""
         return self.extractor.spec(self.centres, self.projection)
 
 
 class ModelRegistry:
-    """Small LRU caches, shared by the thread that prepares and the one that describes."""
+    """LRU caches of models, shared by the threads that prepare and describe batches."""
 
     def __init__(
         self,
@@ -87,8 +85,14 @@ class ModelRegistry:
         load_added: LoadAddedModel,
         on_load: Callable[[float], object] = lambda seconds: None,
     ) -> None:
-        """`load_added` is that of AddedModels; `on_load` is told how many seconds the loading of an
-        extractor took."""
+        """Create empty caches.
+
+        Args:
+            store: The object store.
+            settings: The settings.
+            load_added: Loads the weights of an added model (`AddedModelLoader.load`).
+            on_load: Called with the seconds that loading an extractor took.
+        """
         self._on_load = on_load
         self._store = store
         self._load_added = load_added
@@ -96,7 +100,7 @@ class ModelRegistry:
         self._lock = threading.RLock()
         self._device = choose_device(settings.device)
         self._extractors: LruCache[str, Extractor] = LruCache(MAX_EXTRACTORS)
-        # Of what was loaded once: to run out of memory again for each time would cost photos time.
+        # Kept beyond eviction, so that a reloaded model does not run out of memory again.
         self._pass_limits: defaultdict[tuple[object, ...], BatchSizeLimit] = defaultdict(
             BatchSizeLimit
         )
@@ -104,31 +108,35 @@ class ModelRegistry:
         self._projections: LruCache[UUID, PcaProjection] = LruCache(MAX_WHITENINGS)
 
     def extractor(self, name: str, precision: Precision | None = None) -> Extractor:
-        """The extractor called `name`, its weights loaded.
+        """Return the extractor called `name` with its weights loaded.
 
-        `precision` is that of a generation that is there (see `of_generation`); left out, that of
-        new ones: PRECISION.
+        Args:
+            name: Name of the extractor.
+            precision: Precision of an existing generation (see `extractor_of_generation`); by
+                default that of new generations, PRECISION.
         """
         recipe = self._settings.recipe(name)
         if precision is None:
             precision = choose_precision(self._settings.precision, recipe, self._device)
         with self._lock:
-            found = self._extractors.get(recipe.name, lambda: self._load(recipe, precision))
-            return found.at(precision)
+            extractor = self._extractors.get(recipe.name, lambda: self._load(recipe, precision))
+            return extractor.at(precision)
 
     def extractor_of_generation(self, generation: Generation) -> Extractor:
-        """The extractor of a generation in the precision that it was begun in, whatever PRECISION
-        says and whatever device this is: rows of two precisions never mix.
+        """Return the generation's extractor in the precision that the generation was created with.
 
-        Unavailable (`spec_differs`) for a precision that this release does not know.
+        PRECISION and the device do not matter: rows of two precisions are never mixed.
+
+        Raises:
+            Unavailable: `spec_differs` if this release does not know the precision.
         """
         precision = generation.spec["precision"]
         if precision not in PRECISIONS:
             raise Unavailable(
                 "spec_differs",
-                f"Generation {generation.id} was made in {precision}, which this worker can't do: "
-                f"it knows {' and '.join(PRECISIONS)}. Upgrade it, or start a model change "
-                "(POST /api/v1/generations).",
+                f"Generation {generation.id} uses precision {precision}, which this worker does "
+                f"not support: it supports {' and '.join(PRECISIONS)}. Upgrade it, or start a "
+                "model change (POST /api/v1/generations).",
                 generation_id=str(generation.id),
             )
         return self.extractor(generation.extractor, precision)
@@ -146,7 +154,7 @@ class ModelRegistry:
                 )
         added = recipe.trained.registered if recipe.trained else None
         started = time.perf_counter()
-        made = Extractor(
+        extractor = Extractor(
             recipe,
             self._device,
             precision=precision,
@@ -155,40 +163,40 @@ class ModelRegistry:
             limit=limit,
         )
         if self._device.type == "cuda":
-            made.warm_up(self._settings.batch_photos)
+            extractor.warm_up(self._settings.batch_photos)
         self._on_load(time.perf_counter() - started)
-        return made
+        return extractor
 
     def centres(self, vocabulary: Vocabulary) -> ClusterCentres:
-        """The vocabulary's centres, checked against the catalog's hash."""
+        """Return the vocabulary's centres, verified against the catalog's hash."""
         with self._lock:
             return self._centres.get(vocabulary.id, lambda: self._read_centres(vocabulary))
 
     def _read_centres(self, vocabulary: Vocabulary) -> ClusterCentres:
-        found = decode_centres(self._store.get(vocabulary.object_key))
-        if found.sha256 != vocabulary.sha256:
+        centres = decode_centres(self._store.get(vocabulary.object_key))
+        if centres.sha256 != vocabulary.sha256:
             raise Unavailable(
                 "vocabulary_corrupt",
-                f"The vocabulary {vocabulary.id} is not what was stored (its hash differs). "
+                f"The vocabulary {vocabulary.id} is corrupt: its hash differs. "
                 "Restore it from a backup, or fit a new one.",
             )
-        return found
+        return centres
 
     def projection(self, whitening: StoredWhitening) -> PcaProjection:
-        """The whitening on the device, checked against the catalog's hash."""
+        """Return the PCA projection on the device, verified against the catalog's hash."""
         with self._lock:
             return self._projections.get(whitening.id, lambda: self._read_projection(whitening))
 
     def _read_projection(self, whitening: StoredWhitening) -> PcaProjection:
         stored = decode_whitening(self._store.get(whitening.object_key))
-        found = PcaProjection(stored.whitening, self._device)
-        if found.sha256 != whitening.sha256:
+        projection = PcaProjection(stored.whitening, self._device)
+        if projection.sha256 != whitening.sha256:
             raise Unavailable(
                 "whitening_corrupt",
-                f"The PCA whitening {whitening.id} is not what was stored (its hash differs). "
+                f"The PCA whitening {whitening.id} is corrupt: its hash differs. "
                 "Restore it from a backup, or start a model change.",
             )
-        return found
+        return projection
 
     def pipeline_of_generation(
         self,
@@ -196,9 +204,9 @@ class ModelRegistry:
         vocabulary: Vocabulary | None,
         whitening: StoredWhitening | None,
     ) -> DescriptorPipeline:
-        """What makes the generation's descriptors, of the vocabulary and whitening that it names.
+        """Return the pipeline of a generation with the vocabulary and whitening that it names.
 
-        Raises as `of_generation`, `centres` and `projection` do.
+        Raises as `extractor_of_generation`, `centres` and `projection` do.
         """
         return DescriptorPipeline(
             self.extractor_of_generation(generation),
@@ -208,13 +216,15 @@ class ModelRegistry:
 
 
 def ensure_model_row(session: Session, extractor: Extractor) -> Model:
-    """The catalog's row of the extractor's weights; Misconfigured (`model_missing`) for an added
-    model that has been removed meanwhile.
+    """Return the catalog's row of the extractor's weights, creating it if needed.
+
+    Raises:
+        Misconfigured: `model_missing` if an added model has been removed meanwhile.
     """
     backbone = extractor.backbone
     trained = extractor.recipe.trained
     if trained is not None and trained.registered is not None:
-        # Locked: from this transaction on a generation uses it, and it is removed no more.
+        # Locked, because a generation that uses it is created in this transaction.
         return get_model_for_loading(session, trained.registered, lock=True)
     return get_or_create_model(
         session, backbone.name, backbone.fingerprint, backbone.licence, backbone.card
@@ -227,7 +237,7 @@ def generation_spec_columns(
     vocabulary_id: UUID | None,
     whitening_id: UUID | None = None,
 ) -> dict[str, object]:
-    """The columns of a generation that say how its descriptors are made."""
+    """Return the columns of a generation row that define how its descriptors are computed."""
     spec = pipeline.spec
     return {
         "extractor": pipeline.extractor.recipe.name,
@@ -243,7 +253,7 @@ def generation_spec_columns(
 def check_spec_matches(
     generation: Generation, pipeline: DescriptorPipeline, *, decoder_matters: bool = True
 ) -> None:
-    """Unavailable (`spec_differs`) when this worker does not reproduce the generation's spec."""
+    """Raise Unavailable (`spec_differs`) if this worker can't reproduce the generation's spec."""
     spec = pipeline.spec
     differing = sorted(
         key
@@ -254,8 +264,8 @@ def check_spec_matches(
         return
     raise Unavailable(
         "spec_differs",
-        f"This worker would describe photos otherwise than generation {generation.id} was: "
+        f"This worker computes other descriptors than those of generation {generation.id}: "
         + "; ".join(f"{k} is {spec.get(k)!r}, was {generation.spec.get(k)!r}" for k in differing)
-        + ". Start a model change (POST /api/v1/generations), or run the old packages.",
+        + ". Start a model change (POST /api/v1/generations), or install the old versions again.",
         generation_id=str(generation.id),
     )

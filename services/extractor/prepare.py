@@ -1,11 +1,8 @@
-"""The CPU half of a batch: which generation it goes to, its bytes, its pixels.
+"""Preparation and description of batches: reading, decoding, and the forward pass.
 
-The model half of a batch: its rows.
-
-Descriptor rows that are in the store already: what a PCA is fitted on, and what it shortens.
-
-Bringing a map's photos to fewer dimensions needs no photo: the whole rows of the generation that
-answers are read and projected, where they are what would be described anew.
+`prepare_batch` reads and decodes the photos of claimed jobs on the CPU; `describe_batch` computes
+their descriptor rows. A batch that is reindexed into a generation with PCA needs no photos if the
+active generation has the same unprojected spec: its stored rows are read and projected.
 """
 
 from __future__ import annotations
@@ -43,36 +40,38 @@ log = logging.getLogger(__name__)
 def read_stored_rows(
     catalog: Catalog, store: ObjectStore, generation_id: UUID, photo_ids: Sequence[UUID]
 ) -> dict[UUID, Row]:
-    """The rows, (dimension,), of those photos that are live and described in the generation.
+    """Return the (dimension,) rows of those photos that are live and described in the generation.
 
-    A row that can't be read, or is neither of length 1 nor zero, is left out and logged: it has to
-    be described anew.
+    A row that can't be read, or whose norm is neither 1 nor 0, is left out and logged: its photo
+    has to be described again.
     """
     with catalog.read() as session:
         live = get_live_photos(session, photo_ids)
-        located = find_descriptor_rows(session, generation_id, list(live))
+        rows_by_chunk = find_descriptor_rows(session, generation_id, list(live))
     rows = {}
-    for object_key in sorted(located):
-        for number, photo_id in located[object_key]:
+    for object_key in sorted(rows_by_chunk):
+        for row_number, photo_id in rows_by_chunk[object_key]:
             try:
-                row = read_row(store, object_key, number)
+                row = read_row(store, object_key, row_number)
             except (NotFound, IndexError, ValueError) as error:
-                log.error("row %d of the chunk %s can't be read: %s", number, object_key, error)
+                log.error("row %d of the chunk %s can't be read: %s", row_number, object_key, error)
                 continue
             if rows_are_valid(row[np.newaxis]).all():
                 rows[photo_id] = row
             else:
-                log.error("row %d of the chunk %s is no descriptor any more", number, object_key)
+                log.error(
+                    "row %d of the chunk %s is not a valid descriptor", row_number, object_key
+                )
     return rows
 
 
 def read_rows_to_project(
     catalog: Catalog, store: ObjectStore, jobs: list[Job], target: ResolvedGeneration
 ) -> tuple[list[Job], Rows] | None:
-    """REINDEX jobs into a generation with PCA, and their photos' whole rows, (jobs, dimension).
+    """Return REINDEX jobs into a generation with PCA, and their unprojected (jobs, dimension) rows.
 
-    Jobs whose photo was deleted are left out. None where the photos have to be described: the
-    generation that answers was made otherwise, or lacks one of them.
+    Jobs whose photo was deleted are left out. Returns None if the photos have to be described
+    instead: the active generation has another spec, or lacks the row of a photo.
     """
     if target.projection is None or jobs[0].kind != JobKind.REINDEX:
         return None
@@ -85,24 +84,30 @@ def read_rows_to_project(
     rows = read_stored_rows(catalog, store, source.id, photo_ids)
     if live - rows.keys():
         return None
-    wanted = [(job, rows[job.photo_id]) for job in jobs if job.photo_id in rows]
-    if not wanted:
+    jobs_with_rows = [(job, rows[job.photo_id]) for job in jobs if job.photo_id in rows]
+    if not jobs_with_rows:
         return [], np.empty((0, target.projection.dimension), np.float32)
-    return [job for job, _ in wanted], np.stack([row for _, row in wanted])
+    return [job for job, _ in jobs_with_rows], np.stack([row for _, row in jobs_with_rows])
 
 
 def unprojected_spec(target: ResolvedGeneration) -> dict[str, Any]:
-    """Of the target's descriptors before they are projected."""
+    """Return the spec of the target's descriptors before the projection."""
     return target.extractor.spec(target.centres)
 
 
 @dataclass(slots=True)
 class DescribeBatch:
-    """Claimed jobs of one kind, map and generation, on their way to a chunk.
+    """Claimed jobs of one kind, map and generation, from their preparation to publication.
 
-    `ready` and `decoded` belong together; `failed` are jobs whose photo is at fault;
-    `gone` are jobs whose photo was deleted meanwhile. With `stored`, nothing was decoded: these are
-    the whole rows of `ready`, to be projected.
+    Attributes:
+        jobs: All jobs of the batch.
+        target: The generation that the batch is described into.
+        ready: Jobs to describe.
+        decoded: Their decoded photos, in the same order; empty with `stored_rows`.
+        failed: Jobs whose photo can't be described, each with the reason.
+        deleted: Jobs whose photo was deleted meanwhile.
+        stored_rows: Unprojected rows of `ready`, to be projected instead of decoding photos.
+        seconds: Duration of each stage.
     """
 
     jobs: list[Job]
@@ -123,22 +128,22 @@ class DescribeBatch:
         return JobKind(self.jobs[0].kind)
 
     def pixels(self) -> list[Pixels]:
-        """Of each of `ready`, (height, width, 3)."""
+        """Return the (height, width, 3) pixels of each job of `ready`."""
         return [decoded.pixels for decoded in self.decoded]
 
     def reject(self, index: int, error: PlacewiseError) -> None:
-        """The job at that place of `ready` goes to `failed`."""
+        """Move the job at this index of `ready` to `failed`."""
         if self.stored_rows is None:
             del self.decoded[index]
         self.failed.append((self.ready.pop(index), error))
 
     def reject_non_finite(self, rows: Rows) -> Rows:
-        """The rows that are finite; the jobs of the others go from `ready` to `failed`."""
+        """Return the rows that are finite; the jobs of the others move from `ready` to `failed`."""
         finite = np.isfinite(rows).all(axis=1)
         if finite.all():
             return rows
-        for place in reversed(np.flatnonzero(~finite).tolist()):
-            self.reject(place, not_finite_error())
+        for index in reversed(np.flatnonzero(~finite).tolist()):
+            self.reject(index, not_finite_error())
         return rows[finite]
 
 
@@ -149,14 +154,15 @@ def prepare_batch(
     jobs: list[Job],
     target: ResolvedGeneration,
 ) -> DescribeBatch:
-    """Read and decode the photos of the claimed jobs, and store their thumbnails; or read rows that
-    take their place.
+    """Read and decode the photos of the claimed jobs, and store the thumbnails of new ones.
+
+    Where possible, stored rows are read instead (`read_rows_to_project`).
     """
     batch = DescribeBatch(jobs=jobs, target=target)
     started = time.perf_counter()
-    there = read_rows_to_project(catalog, store, jobs, target)
-    if there is not None:
-        batch.ready, batch.stored_rows = there
+    rows_to_project = read_rows_to_project(catalog, store, jobs, target)
+    if rows_to_project is not None:
+        batch.ready, batch.stored_rows = rows_to_project
         batch.deleted = [job for job in jobs if job not in batch.ready]
         batch.seconds["read"] = time.perf_counter() - started
         return batch
@@ -170,7 +176,7 @@ def prepare_batch(
             else:
                 present.append((job, store.get(key)))
         except NotFound as error:
-            # Deleted between the two reads, or lost: publishing tells which, under the map's lock.
+            # Deleted since the catalog was read, or lost: `publish` checks under the map's lock.
             batch.failed.append((job, error))
     batch.seconds["read"] = time.perf_counter() - started
 
@@ -185,7 +191,7 @@ def prepare_batch(
     batch.seconds["decode"] = time.perf_counter() - started
 
     if batch.kind == JobKind.INDEX:
-        # Here and not with the chunk: the model is busy with the batch before.
+        # Stored here and not with the chunk, while the model runs the previous batch.
         started = time.perf_counter()
         for job, decoded in zip(batch.ready, batch.decoded, strict=True):
             store.put(thumbnail_key(photo_id_of(job)), decoded.thumbnail)
@@ -194,12 +200,13 @@ def prepare_batch(
 
 
 def photo_id_of(job: Job) -> UUID:
+    """Return the photo of an index or reindex job."""
     assert job.photo_id is not None, "index and reindex jobs name a photo"
     return job.photo_id
 
 
 def _photo_object_keys(catalog: Catalog, jobs: list[Job]) -> dict[UUID, str]:
-    """The key of each job's photo; deleted photos are left out."""
+    """Return the object key of each job's photo; deleted photos are left out."""
     if jobs[0].kind == JobKind.DESCRIBE:
         return {job.id: query_key(job.id) for job in jobs}
     with catalog.read() as session:
@@ -212,7 +219,10 @@ def _photo_object_keys(catalog: Catalog, jobs: list[Job]) -> dict[UUID, str]:
 
 
 def describe_batch(batch: DescribeBatch) -> Rows:
-    """A row for each of the batch's `ready`, which photos that the GPU can't hold have left."""
+    """Compute a (n, dimension) row for each job of `ready`.
+
+    Photos that are too large for the GPU's memory are moved to `failed` first.
+    """
     target = batch.target
     while batch.ready:
         started = time.perf_counter()

@@ -1,7 +1,7 @@
-"""The last step of a batch: a chunk in the object store, then one transaction that makes it true.
+"""Publication of a described batch: a chunk in the object store, then one catalog transaction.
 
-A crash between the two leaves an orphan that the steward collects. A job whose lease was taken
-over, or that was cancelled, is passed over: its row stays in the chunk as a dead row.
+A crash between the two leaves an orphaned object, which the steward deletes. A job whose lease was
+taken over, or that was cancelled, is skipped: its row stays in the chunk as a dead row.
 """
 
 from __future__ import annotations
@@ -35,16 +35,18 @@ log = logging.getLogger(__name__)
 
 @dataclass(slots=True)
 class PublishResult:
+    """Number of jobs by outcome."""
+
     succeeded: int = 0
     failed: int = 0
     lost: int = 0
-    """Taken over by another worker, or cancelled, while they were computed."""
+    """Jobs that another worker took over, or that were cancelled, meanwhile."""
 
 
 def publish(
     catalog: Catalog, store: ObjectStore, batch: DescribeBatch, rows: Rows, slot_rows: int
 ) -> PublishResult:
-    """Commit what the batch has come to; `rows` belong to `batch.ready`."""
+    """Store and commit a described batch; `rows` are those of `batch.ready`."""
     started = time.perf_counter()
     rows = batch.reject_non_finite(rows)
     if batch.kind == JobKind.DESCRIBE:
@@ -71,7 +73,7 @@ def publish(
 def _publish_photos(
     catalog: Catalog, store: ObjectStore, batch: DescribeBatch, rows: Rows, slot_rows: int
 ) -> tuple[PublishResult, str | None]:
-    """What it has come to, and the key of the chunk."""
+    """Return the outcome, and the key of the chunk."""
     generation_id = batch.target.generation.id
     chunk_id = new_id()
     written = None
@@ -89,33 +91,36 @@ def _publish_photos(
         outcome = PublishResult()
         lock_map(session, batch.jobs[0].map_id)
         generation = lock_generation(session, generation_id)
-        mine = {job.id: job for job in lock_leased_jobs(session, batch.token, batch.jobs)}
-        outcome.lost = len(batch.jobs) - len(mine)
+        owned = {job.id: job for job in lock_leased_jobs(session, batch.token, batch.jobs)}
+        outcome.lost = len(batch.jobs) - len(owned)
         if generation.state not in _accepted_generation_states(batch.kind):
-            # A model change was switched in (or given up) while the batch was computed.
-            for job in mine.values():
+            # A model change was activated or abandoned while the batch was computed.
+            for job in owned.values():
                 cancel_job(job) if batch.kind == JobKind.REINDEX else release_job(job)
             return outcome
-        live = get_live_photos(session, [photo_id_of(job) for job in mine.values()])
-        done = _already_described(session, generation_id, list(live))
-        for job in mine.values():
+        live = get_live_photos(session, [photo_id_of(job) for job in owned.values()])
+        described = _already_described(session, generation_id, list(live))
+        for job in owned.values():
             if job.photo_id not in live:
                 cancel_job(job)
-        for stale, error in batch.failed:
-            own = mine.get(stale.id)
-            if own is not None and own.photo_id in live:
-                fail_job(own, error.as_problem())
+        for claimed, error in batch.failed:
+            leased_job = owned.get(claimed.id)
+            if leased_job is not None and leased_job.photo_id in live:
+                fail_job(leased_job, error.as_problem())
                 outcome.failed += 1
-        fresh = []
-        for row, stale in enumerate(batch.ready):
-            own = mine.get(stale.id)
-            if own is None or own.photo_id not in live:
+        new_rows = []
+        for row, claimed in enumerate(batch.ready):
+            leased_job = owned.get(claimed.id)
+            if leased_job is None or leased_job.photo_id not in live:
                 continue  # a dead row
-            if own.photo_id not in done:
-                fresh.append({"photo_id": own.photo_id, "row": row})
-            succeed_job(own, {"file_id": str(own.photo_id), "generation_id": str(generation_id)})
+            if leased_job.photo_id not in described:
+                new_rows.append({"photo_id": leased_job.photo_id, "row": row})
+            succeed_job(
+                leased_job,
+                {"file_id": str(leased_job.photo_id), "generation_id": str(generation_id)},
+            )
             outcome.succeeded += 1
-        if fresh and written is not None:
+        if new_rows and written is not None:
             session.add(
                 Chunk(
                     id=chunk_id,
@@ -130,7 +135,10 @@ def _publish_photos(
             session.flush()
             session.execute(
                 insert(Descriptor),
-                [{"generation_id": generation_id, "chunk_id": chunk_id, **new} for new in fresh],
+                [
+                    {"generation_id": generation_id, "chunk_id": chunk_id, **columns}
+                    for columns in new_rows
+                ],
             )
             increment_map_version(session, generation.map_id)
         return outcome
@@ -146,20 +154,20 @@ def _publish_queries(
 
     def commit(session: Session) -> PublishResult:
         outcome = PublishResult()
-        mine = {job.id: job for job in lock_leased_jobs(session, batch.token, batch.jobs)}
-        outcome.lost = len(batch.jobs) - len(mine)
-        for stale, error in batch.failed:
-            if stale.id in mine:
-                fail_job(mine[stale.id], error.as_problem())
+        owned = {job.id: job for job in lock_leased_jobs(session, batch.token, batch.jobs)}
+        outcome.lost = len(batch.jobs) - len(owned)
+        for claimed, error in batch.failed:
+            if claimed.id in owned:
+                fail_job(owned[claimed.id], error.as_problem())
                 outcome.failed += 1
-        for stale in batch.ready:
-            if stale.id in mine:
+        for claimed in batch.ready:
+            if claimed.id in owned:
                 reference = {
                     "generation_id": str(batch.target.generation.id),
-                    "object_key": query_vector_key(stale.id),
+                    "object_key": query_vector_key(claimed.id),
                     "row": 0,
                 }
-                succeed_job(mine[stale.id], reference)
+                succeed_job(owned[claimed.id], reference)
                 outcome.succeeded += 1
         return outcome
 
@@ -173,7 +181,7 @@ def _accepted_generation_states(kind: JobKind) -> tuple[GenerationState, ...]:
 
 
 def _already_described(session: Session, generation_id: UUID, photo_ids: list[UUID]) -> set[UUID]:
-    """Photos that have their row already: described by a batch that lost its lease too late."""
+    """Photos that have a row already, committed by a batch that then lost its lease."""
     return set(
         session.scalars(
             select(Descriptor.photo_id).where(

@@ -1,7 +1,8 @@
-"""The extractor as a process of its own: a Celery worker that drains the job table when hinted.
+"""Extractor service process: a Celery worker that drains the job table on each wakeup message.
 
-One process per GPU, `--pool=solo`: a forked child could not use CUDA. A drain lasts a few seconds,
-so that the worker answers `inspect` and Flower in between, and ends soon when it is asked to stop.
+One process per GPU with `--pool=solo`, because a forked child can't use CUDA. A drain lasts a few
+seconds at most, so that the worker answers `inspect` and Flower in between, and stops soon after it
+receives SIGTERM.
 """
 
 from __future__ import annotations
@@ -38,12 +39,16 @@ def serve_extractor(
     settings: Settings,
     on_ready: Callable[[], object] = lambda: None,
 ) -> None:
-    """Work until SIGTERM. What is claimed then goes back to the queue, unharmed.
+    """Run the extractor until SIGTERM; claimed jobs are then released to the queue.
 
-    `on_ready` is called when the model is loaded and hints are listened for.
+    Args:
+        catalog: The catalog.
+        store: The object store.
+        settings: The settings.
+        on_ready: Called when the model is loaded and the worker consumes wakeups.
     """
     app = create_celery_app(settings)
-    hints = CeleryWakeups(app, settings)
+    wakeups = CeleryWakeups(app, settings)
     name = f"extractor-{socket.gethostname()}-{os.getpid()}"
     registry = CollectorRegistry()
     worker = ExtractorWorker(catalog, store, settings, name, registry=registry)
@@ -58,11 +63,11 @@ def serve_extractor(
         except SQLAlchemyError as error:
             outage.record_error(error)
             stop.wait(UNAVAILABLE_RETRY_SECONDS)
-            hints.send(WakeupQueue.BULK)  # what lies there is still to be done
+            wakeups.send(WakeupQueue.BULK)  # the queued jobs are still to be processed
             return DrainStats().as_dict()
         outage.record_success()
         if result.interrupted and not stop.is_set():
-            hints.send(WakeupQueue.BULK)
+            wakeups.send(WakeupQueue.BULK)
         elif result.claimed:
             log.info("drained: %s", result.as_dict())
         return result.as_dict()
@@ -78,20 +83,20 @@ def serve_extractor(
     def on_heartbeat(**_: object) -> None:
         heartbeat.beat()
 
-    def leave_logs_alone(**_: object) -> None:
+    def keep_logging_setup(**_: object) -> None:
         pass
 
     signals.worker_shutting_down.connect(on_shutdown, weak=False)
     signals.worker_ready.connect(on_worker_ready, weak=False)
-    # Sent every two seconds from the loop that takes hints, while it is connected to Redis.
+    # Sent every two seconds by the consumer loop while it is connected to Redis.
     signals.heartbeat_sent.connect(on_heartbeat, weak=False)
-    # Celery would set up handlers and formats of its own. (`--loglevel` has no effect then.)
-    signals.setup_logging.connect(leave_logs_alone, weak=False)
+    # Keeps Celery from installing its own handlers and formats; `--loglevel` has no effect.
+    signals.setup_logging.connect(keep_logging_setup, weak=False)
     try:
         with serve_metrics(settings, registry):
             worker.warm_up()
-            for lane in WakeupQueue:
-                hints.send(lane)  # what was queued before this worker came
+            for queue in WakeupQueue:
+                wakeups.send(queue)  # for jobs queued before this worker started
             app.worker_main(
                 [
                     "worker",
@@ -104,10 +109,10 @@ def serve_extractor(
                 ]
             )
     finally:
-        signals.setup_logging.disconnect(leave_logs_alone)
+        signals.setup_logging.disconnect(keep_logging_setup)
         signals.worker_shutting_down.disconnect(on_shutdown)
         signals.worker_ready.disconnect(on_worker_ready)
         signals.heartbeat_sent.disconnect(on_heartbeat)
         stop.set()
         worker.close()
-        hints.close()
+        wakeups.close()

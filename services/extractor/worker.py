@@ -1,18 +1,18 @@
-"""The worker: drains the job table, one batch after the other, queries first.
+"""Extractor worker: drains the job table in pipelined batches, queries first.
 
     claim ──> read, decode ──> forward pass, aggregate ──> chunk, transaction
               batch n + 1      batch n                      batch n - 1
 
-Bulk batches overlap: while one is on the model the next one is read and decoded and the one before
-is published. One is at each of the three places, no more: a batch that has been described waits
-until the one before is published. Its lease is kept through all of them, up to the transaction.
+Bulk batches are pipelined: while one runs on the model, the next one is read and decoded and the
+previous one is published. Each stage holds one batch: a described batch waits until the previous
+one is published. Its lease is renewed through all stages, up to the transaction.
 
-A query that arrives while a batch is described is described beside it; where that can't be, it goes
-before the next bulk batch, so that it waits for one batch at most. Its row is published at once, in
-the thread that described it.
+A query that arrives while a bulk batch is described is described concurrently with it; where that
+is not possible, it goes before the next bulk batch, so that it waits for one batch at most. Its row
+is published at once, by the thread that described it.
 
-Jobs that are tried alone, to find out who felled a worker, and slices of model changes overlap with
-nothing: what was described before is published first.
+Jobs that are retried alone, to isolate the job that crashed the worker, and steps of model changes
+run exclusively: whatever was described before is published first.
 """
 
 from __future__ import annotations
@@ -55,19 +55,19 @@ from shared.telemetry.heartbeat import Heartbeat
 
 log = logging.getLogger(__name__)
 
-QUERY_POLL_SECONDS = 0.1  # between two looks for queries while a bulk batch is described
-IDLE_POLL_SECONDS = 1.0  # how long a lost hint can cost
+QUERY_POLL_SECONDS = 0.1  # polling interval for queries while a bulk batch is described
+IDLE_POLL_SECONDS = 1.0  # polling interval when idle: the delay that a lost wakeup costs
 
 
 @dataclass(slots=True)
 class ClaimedJobs:
-    """Claimed jobs, the lease that keeps them, and their photos being decoded."""
+    """Claimed jobs, the lease on them, and the pending decoding of their photos."""
 
     jobs: list[Job]
     lease: contextlib.ExitStack
     preparation: Future[DescribeBatch | PreparedComparison | None] | None
-    """None inside: the map has no vocabulary yet. None itself: a slice of a model change, or a
-    checkpoint to look at."""
+    """A result of None means that the map has no vocabulary yet. The future itself is None for a
+    step of a model change and for the import of a checkpoint."""
 
     @property
     def token(self) -> UUID:
@@ -75,7 +75,10 @@ class ClaimedJobs:
 
 
 class ExtractorWorker:
-    """One per GPU (or per process on CPU). `run` until stopped, or `drain` once per hint."""
+    """Worker that describes the photos of queued jobs, one per GPU, or per process on a CPU.
+
+    Call `run` to work until stopped, or `drain` once for each wakeup.
+    """
 
     def __init__(
         self,
@@ -87,8 +90,17 @@ class ExtractorWorker:
         only_worker: bool = False,
         registry: CollectorRegistry | None = None,
     ) -> None:
-        """`only_worker`: no other can be of another release, so this one renews what is old.
-        `registry`: of the process's figures."""
+        """Create a worker.
+
+        Args:
+            catalog: The catalog.
+            store: The object store.
+            settings: The settings.
+            name: Name of the worker in its leases.
+            only_worker: Whether no other worker runs, so none can be of another release; this one
+                then reindexes outdated generations.
+            registry: Prometheus registry of the process.
+        """
         self._metrics = ExtractorMetrics(registry or CollectorRegistry())
         self._catalog = catalog
         self._store = store
@@ -104,7 +116,7 @@ class ExtractorWorker:
         )
         self._comparisons = ComparisonRunner(catalog, store, self._models, self._decoders, settings)
         self._failures = JobFailureHandler(catalog, settings.max_attempts, self._metrics)
-        # Two: a query's photo does not wait until those of the next batch are read.
+        # Two threads, so that a query's photo does not wait for the photos of the next batch.
         self._prepare_executor = ThreadPoolExecutor(max_workers=2, thread_name_prefix="prepare")
         self._query_executor = ThreadPoolExecutor(max_workers=1, thread_name_prefix="queries")
         self._publish_executor = ThreadPoolExecutor(max_workers=1, thread_name_prefix="publish")
@@ -115,13 +127,13 @@ class ExtractorWorker:
         try:
             self._models.extractor(self._settings.new_map_extractor)
         except PlacewiseError as error:
-            # Maps may use another one; photos that need this one will say the same.
+            # Not fatal: maps may use another extractor, and jobs that need this one report it.
             log.error("the extractor of new maps can't be loaded: %s", error.detail)
         if self._only_worker:
             reindex_outdated_generations(self._catalog, self._models)
 
     def run(self, stop: threading.Event, hints: InProcessWakeups) -> None:
-        """Drain whenever there is work, until `stop` is set: the embedded worker's life."""
+        """Drain whenever there is work, until `stop` is set; used by the embedded worker."""
         self.warm_up()
         outage = OutageLog("extractor")
         while not stop.is_set():
@@ -138,52 +150,52 @@ class ExtractorWorker:
                 hints.wait(IDLE_POLL_SECONDS)
 
     def close(self) -> None:
-        """End the decoders; what is claimed comes back when its lease expires."""
+        """Stop the threads and decoders; claimed jobs are requeued when their lease expires."""
         self._query_executor.shutdown(wait=True)
         self._publish_executor.shutdown(wait=True)
         self._prepare_executor.shutdown(wait=True, cancel_futures=True)
         self._decoders.close()
 
     def drain(self, stop: threading.Event, seconds: float = math.inf) -> DrainStats:
-        """Work until nothing is claimable, `stop` is set, or `seconds` have passed."""
+        """Process jobs until none is claimable, `stop` is set, or `seconds` have passed."""
         result = DrainStats()
-        ahead = self._claim_next(result)
-        if ahead is not None:
+        first = self._claim_next(result)
+        if first is not None:
             with self._metrics.measure_drain():
-                self._drain(ahead, stop, time.monotonic() + seconds, result)
+                self._drain(first, stop, time.monotonic() + seconds, result)
         return result
 
     def _drain(
         self, first: ClaimedJobs, stop: threading.Event, until: float, result: DrainStats
     ) -> None:
-        work: ClaimedJobs | None = None
-        ahead: ClaimedJobs | None = first
+        current: ClaimedJobs | None = None
+        upcoming: ClaimedJobs | None = first
 
-        def time_is_up() -> bool:
+        def out_of_time() -> bool:
             return stop.is_set() or time.monotonic() > until
 
         try:
-            while ahead is not None:
-                if time_is_up():
-                    with ahead.lease:
-                        self._failures.release_unstarted(ahead.jobs)
+            while upcoming is not None:
+                if out_of_time():
+                    with upcoming.lease:
+                        self._failures.release_unstarted(upcoming.jobs)
                     result.interrupted = True
                     break
-                work = ahead
-                # Taken before the forward pass: the next photos are decoded while it runs.
-                ahead = self._claim_next(result)
-                if not _is_query(work):
-                    # A query would wait for the batch, and for the one that is being published.
-                    while ahead is not None and _is_query(ahead) and not time_is_up():
-                        self._process_in_order(ahead, result, stop)
-                        ahead = self._claim_next(result)
-                self._process_in_order(work, result, stop)
-                if ahead is None:
-                    self._wait_for_publish(result)  # which may set jobs free again
-                    ahead = self._claim_next(result)
+                current = upcoming
+                # Claimed before the forward pass, so that its photos are decoded meanwhile.
+                upcoming = self._claim_next(result)
+                if not _is_query(current):
+                    # Otherwise the query would wait for this batch and the one being published.
+                    while upcoming is not None and _is_query(upcoming) and not out_of_time():
+                        self._process_in_order(upcoming, result, stop)
+                        upcoming = self._claim_next(result)
+                self._process_in_order(current, result, stop)
+                if upcoming is None:
+                    self._wait_for_publish(result)  # which may requeue jobs
+                    upcoming = self._claim_next(result)
         finally:
-            # The catalog may be away: what is held then comes back when its lease expires.
-            for unfinished in (work, ahead):
+            # Without the catalog, claimed jobs are requeued when their lease expires.
+            for unfinished in (current, upcoming):
                 if unfinished is not None:
                     unfinished.lease.close()
             self._wait_for_publish(result)
@@ -202,15 +214,15 @@ class ExtractorWorker:
 
     @contextlib.contextmanager
     def _answering_queries(self, result: DrainStats, stop: threading.Event) -> Iterator[None]:
-        """While the block describes a bulk batch, queries are described in another thread."""
-        done, seen = threading.Event(), DrainStats()
-        queries = self._query_executor.submit(self._poll_queries, done, stop, seen)
+        """Describe queries in another thread while the block describes a bulk batch."""
+        done, query_stats = threading.Event(), DrainStats()
+        queries = self._query_executor.submit(self._poll_queries, done, stop, query_stats)
         try:
             yield
         finally:
             done.set()
             wait([queries])
-            result.merge(seen)
+            result.merge(query_stats)
         queries.result()
 
     def _poll_queries(
@@ -218,10 +230,12 @@ class ExtractorWorker:
     ) -> None:
         while not (done.is_set() or stop.is_set()):
             with self._catalog.read() as session:
-                asked = has_claimable_jobs(session, EXTRACTOR_JOBS, Priority.QUERY, alone=False)
+                has_queries = has_claimable_jobs(
+                    session, EXTRACTOR_JOBS, Priority.QUERY, alone=False
+                )
             query = (
-                self._claim_next(result, least_priority=Priority.QUERY, alone=False)
-                if asked
+                self._claim_next(result, min_priority=Priority.QUERY, alone=False)
+                if has_queries
                 else None
             )
             if query is None:
@@ -230,17 +244,17 @@ class ExtractorWorker:
                 self._process(query, result, concurrent_jobs=1)
 
     def _claim_next(
-        self, result: DrainStats, least_priority: int | None = None, *, alone: bool = True
+        self, result: DrainStats, min_priority: int | None = None, *, alone: bool = True
     ) -> ClaimedJobs | None:
         settings = self._settings
-        self._heartbeat.beat()  # before and after each batch: a drain may last for several
+        self._heartbeat.beat()  # for each batch: a drain may last for several
         with self._catalog.write() as session:
             jobs = claim_jobs(
                 session,
                 worker=self._name,
                 limit=settings.batch_photos,
                 lease_seconds=settings.lease_seconds,
-                min_priority=least_priority,
+                min_priority=min_priority,
                 alone=alone,
                 started=False,
             )
@@ -272,9 +286,14 @@ class ExtractorWorker:
         *,
         publish_async: bool = False,
     ) -> None:
-        """`concurrent_jobs`: so many others may be under way beside it, and share the blame for
-        a fall.
-        `publish_async`: it may be published while the model has the next one.
+        """Describe and publish a batch.
+
+        Args:
+            work: The claimed jobs.
+            result: Statistics to update.
+            concurrent_jobs: Number of other jobs in progress at the same time, any of which may be
+                the cause of a crash.
+            publish_async: Whether to publish in the background while the model runs the next batch.
         """
         with work.lease:
             rows = self._describe_claimed(work, result, concurrent_jobs)
@@ -292,7 +311,7 @@ class ExtractorWorker:
     def _describe_claimed(
         self, work: ClaimedJobs, result: DrainStats, concurrent_jobs: int
     ) -> Rows | None:
-        """A row for each of the batch's `ready`; None where there is nothing to publish."""
+        """Return a row for each job of the batch's `ready`; None if there is nothing to publish."""
         with (
             job_trace_context(work.jobs, "describe"),
             self._failures.handling_failures(work.jobs, result),
@@ -314,7 +333,7 @@ class ExtractorWorker:
                 self._record_outcome(work, result, self._comparisons.run(batch), batch.seconds)
                 return None
             return describe_batch(batch)
-        return None  # what went wrong has been answered
+        return None  # the failure has been handled
 
     def _publish(self, work: ClaimedJobs, rows: Rows, result: DrainStats) -> None:
         with (
@@ -322,7 +341,7 @@ class ExtractorWorker:
             self._failures.handling_failures(work.jobs, result),
         ):
             batch = work.preparation.result() if work.preparation else None
-            assert isinstance(batch, DescribeBatch), "it was described"
+            assert isinstance(batch, DescribeBatch), "only described batches are published"
             outcome = publish(self._catalog, self._store, batch, rows, self._settings.slot_rows)
             self._record_outcome(work, result, outcome, batch.seconds)
 
@@ -343,13 +362,16 @@ class ExtractorWorker:
         return result
 
     def _wait_for_publish(self, result: DrainStats) -> None:
-        """Until nothing is being published behind the model; what it came to is counted."""
-        behind, self._pending_publish = self._pending_publish, None
-        if behind is not None:
-            result.merge(behind.result())
+        """Wait for the pending background publication and add its statistics."""
+        pending, self._pending_publish = self._pending_publish, None
+        if pending is not None:
+            result.merge(pending.result())
 
     def _mark_begun(self, work: ClaimedJobs, concurrent_jobs: int = 0) -> None:
-        """Decoding, in other processes, is done: a fall from here on may be the photos' fault."""
+        """Record that jobs have started: from here on a crash may be caused by a photo.
+
+        Decoding runs in other processes and is finished.
+        """
         with self._catalog.write() as session:
             mark_started(session, work.token, len(work.jobs) + concurrent_jobs)
 
@@ -359,5 +381,8 @@ def _is_query(work: ClaimedJobs) -> bool:
 
 
 def _runs_exclusively(work: ClaimedJobs) -> bool:
-    """Else nobody knows who felled the worker. Model changes come as a batch of one, too."""
+    """Whether nothing may run concurrently, so that a crash can be attributed to the job.
+
+    Steps of model changes come as a batch of one job and run exclusively, too.
+    """
     return work.preparation is None or work.jobs[0].alone

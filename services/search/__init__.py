@@ -1,4 +1,5 @@
-"""The search worker: follows the catalog, holds chunks in memory, answers exact cosine top-k.
+"""Search service: exact cosine top-k over the chunks of its shard, held in memory or mapped.
 
-`follow` keeps an immutable `snapshot` up to date; `scan` is the arithmetic; `worker` is the port.
+`catalog_sync` builds immutable snapshots, `executor` runs a query on one, and `worker` implements
+`SearchBackend`. `service` serves it over HTTP.
 """

@@ -1,9 +1,9 @@
-"""From one version of a map to the next: load what is new, forget what is gone.
+"""Catalog sync: brings a worker's snapshots to the current version of their maps.
 
-How far behind a worker's snapshots are, told without asking the catalog.
-
-A worker that is stuck in loading, or that can't reach the catalog, has to notice it by itself:
-what counts is when a snapshot was last known to be level with its map.
+`sync_snapshot` loads new chunks, drops removed ones and applies changes of photos.
+`ReplicationLagTracker` measures the lag without reading the catalog, so that a worker that is stuck
+in loading, or can't reach the catalog, notices its own lag: what counts is the time when a snapshot
+was last known to be current.
 """
 
 from __future__ import annotations
@@ -47,29 +47,29 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-MIN_CODED_BYTES = 64_000_000  # of rows: less is compared faster as it is
+MIN_CODED_BYTES = 64_000_000  # of rows; smaller generations are scanned faster without codes
 
 SYNCED_STATES = (GenerationState.ACTIVE, GenerationState.BUILDING)
 
 
 @dataclass(frozen=True, slots=True)
 class GenerationVersion:
-    """A generation to follow: `version` is its map's, now."""
+    """State of a generation to sync, and the current version of its map."""
 
     version: int
     state: GenerationState
 
 
 def read_generation_versions(catalog: Catalog) -> dict[UUID, GenerationVersion]:
-    """Every generation to follow."""
+    """Read the versions of all generations to sync."""
     with catalog.read() as session:
-        found = session.execute(
+        rows = session.execute(
             select(Generation.id, Map.version, Generation.state)
             .join(Map, Map.id == Generation.map_id)
             .where(Generation.state.in_(SYNCED_STATES), Map.deleted_at.is_(None))
         )
         return {
-            id_: GenerationVersion(version, GenerationState(state)) for id_, version, state in found
+            id_: GenerationVersion(version, GenerationState(state)) for id_, version, state in rows
         }
 
 
@@ -83,12 +83,23 @@ def sync_snapshot(
     unreadable: ReadRetries,
     shard: Shard = SINGLE_SHARD,
 ) -> Snapshot | None:
-    """The shard's part of the generation as it is now, reusing what `old` has loaded; None when
-    the generation is gone.
+    """Build the snapshot of the shard's part of a generation, reusing the chunks of `old`.
 
-    Reads the catalog in one consistent transaction. A chunk that can't be read, or whose hash
-    differs, is named in `missing`, and the rest is served; it is read again once `unreadable` says
-    that it is due. Files are kept below `folder`.
+    The catalog is read in one consistent transaction. A chunk that can't be read, or whose hash
+    differs, is named in `missing` and read again once `unreadable` says so; the others are served.
+
+    Args:
+        catalog: The catalog.
+        store: The object store.
+        folder: Files are cached below this folder.
+        memory_budget: Decides which parts are held in memory.
+        generation_id: The generation.
+        old: The previous snapshot, if any.
+        unreadable: Retry times of unreadable chunks.
+        shard: The shard whose chunks are loaded.
+
+    Returns:
+        The new snapshot; None if the generation no longer exists.
     """
     loader = generation_loader(store, folder, generation_id)
     with catalog.read() as session:
@@ -100,7 +111,7 @@ def sync_snapshot(
         chunks = [c for c in list_live_chunks(session, generation_id) if shard.owns(c.slot)]
         known = {c.chunk_id: c for c in old.chunks if not c.was_changed()} if old else {}
         changed = list_photos_changed_since(session, generation.map_id, old.version) if old else []
-        facts_of = {
+        filter_values = {
             chunk.id: list_live_filter_values(session, chunk.id)
             for chunk in chunks
             if chunk.id not in known and unreadable.is_due(chunk.object_key)
@@ -112,7 +123,7 @@ def sync_snapshot(
         if chunk.id in known:
             loaded.append(_apply_photo_changes(known[chunk.id], changes))
             continue
-        if chunk.id not in facts_of:
+        if chunk.id not in filter_values:
             missing.append(chunk.object_key)
             continue
         try:
@@ -122,15 +133,15 @@ def sync_snapshot(
             missing.append(chunk.object_key)
             continue
         unreadable.succeeded(chunk.object_key)
-        photos = PhotoColumns.of(len(stored.rows), facts_of[chunk.id])
+        photos = PhotoColumns.of(len(stored.rows), filter_values[chunk.id])
         loaded.append(LoadedChunk(chunk.id, chunk.object_key, stored.rows, photos, stored=stored))
     large = sum(chunk.rows.nbytes for chunk in loaded) >= MIN_CODED_BYTES
     if large:
         loaded = _with_codes(loader, loaded)
         _compile_kernels(loaded)
     loader.evict_except(loaded)
-    middle = bool(loaded) and loaded[0].rows.shape[1] < CODED_DIMENSION
-    if (middle and large) or (old is not None and old.has_int8_codes):
+    mid_dimension = bool(loaded) and loaded[0].rows.shape[1] < CODED_DIMENSION
+    if (mid_dimension and large) or (old is not None and old.has_int8_codes):
         loaded = _attach_int8_to_all(loader, loaded)
     return _apply_memory_budget(
         memory_budget,
@@ -149,47 +160,56 @@ def with_int8_codes(
     folder: Path,
     memory_budget: MemoryBudget,
     old: Snapshot,
-    made: Mapping[UUID, Int8Codes],
+    built: Mapping[UUID, Int8Codes],
 ) -> Snapshot:
-    """The same snapshot with int8 codes of every chunk: those that were made, by chunk id, and
-    others that are made now."""
+    """Return the snapshot with int8 codes of every chunk.
+
+    Codes in `built`, by chunk id, are used; the others are loaded or computed.
+    """
     loader = generation_loader(store, folder, old.generation_id)
     return _apply_memory_budget(
-        memory_budget, replace(old, chunks=tuple(_attach_int8(loader, c, made) for c in old.chunks))
+        memory_budget,
+        replace(old, chunks=tuple(_attach_int8(loader, c, built) for c in old.chunks)),
     )
 
 
-def _apply_memory_budget(memory: MemoryBudget, snapshot: Snapshot) -> Snapshot:
-    """The snapshot with what the budget allows in memory."""
+def _apply_memory_budget(memory_budget: MemoryBudget, snapshot: Snapshot) -> Snapshot:
+    """Return the snapshot with as many parts in memory as the budget allows."""
     parts = memory_parts(snapshot.chunks)
-    held = memory.allocate(snapshot.generation_id, [size_bytes for _, size_bytes in parts])
+    resident_parts = memory_budget.allocate(
+        snapshot.generation_id, [size_bytes for _, size_bytes in parts]
+    )
     return replace(
         snapshot,
-        chunks=tuple(hold_in_memory(chunk, held) for chunk in snapshot.chunks),
+        chunks=tuple(hold_in_memory(chunk, resident_parts) for chunk in snapshot.chunks),
         parts=tuple(
-            IndexPart(name=name, size_bytes=size_bytes, resident=number < held)
+            IndexPart(name=name, size_bytes=size_bytes, resident=number < resident_parts)
             for number, (name, size_bytes) in enumerate(parts)
         ),
     )
 
 
 def _with_codes(loader: ChunkLoader, chunks: list[LoadedChunk]) -> list[LoadedChunk]:
-    """The chunks with their sign codes; as they are where those can't be had now, for then every
-    row is compared, to the same answers."""
+    """Return the chunks with their sign codes, or unchanged if those can't be loaded.
+
+    Without codes every row is compared, with the same results.
+    """
     try:
         return [_attach_sign_codes(loader, chunk) for chunk in chunks]
     except (Unavailable, OSError) as error:
-        log.error("sign codes can't be loaded, search does without: %s", error)
+        log.error("sign codes can't be loaded, searching without them: %s", error)
         return chunks
 
 
 def _attach_int8_to_all(loader: ChunkLoader, chunks: list[LoadedChunk]) -> list[LoadedChunk]:
-    """The chunks with their int8 codes; all without where there is no room to keep them, for then
-    every row is compared, to the same answers."""
+    """Return the chunks with their int8 codes, or all without if there is no space for them.
+
+    Without codes every row is compared, with the same results.
+    """
     try:
         return [_attach_int8(loader, chunk, {}) for chunk in chunks]
     except OSError as error:
-        log.error("int8 codes can't be kept, search does without: %s", error)
+        log.error("int8 codes can't be stored, searching without them: %s", error)
         return [
             replace(chunk, int8=None, stored=chunk.stored and replace(chunk.stored, int8=None))
             for chunk in chunks
@@ -197,17 +217,17 @@ def _attach_int8_to_all(loader: ChunkLoader, chunks: list[LoadedChunk]) -> list[
 
 
 def _attach_int8(
-    loader: ChunkLoader, chunk: LoadedChunk, made: Mapping[UUID, Int8Codes]
+    loader: ChunkLoader, chunk: LoadedChunk, built: Mapping[UUID, Int8Codes]
 ) -> LoadedChunk:
     stored = chunk.stored
     if stored is None or stored.int8 is not None:
         return chunk
-    codes = made.get(chunk.chunk_id) or loader.load_int8_codes(chunk.object_key, stored)
+    codes = built.get(chunk.chunk_id) or loader.load_int8_codes(chunk.object_key, stored)
     return replace(chunk, int8=codes, stored=replace(stored, int8=codes))
 
 
 def _attach_sign_codes(loader: ChunkLoader, chunk: LoadedChunk) -> LoadedChunk:
-    """The chunk with its sign codes, where rows of this length have any."""
+    """Return the chunk with its sign codes, if rows of this dimension have any."""
     stored = chunk.stored
     if stored is None or stored.codes is not None or stored.rows.shape[1] < CODED_DIMENSION:
         return chunk
@@ -223,13 +243,13 @@ def _compile_kernels(chunks: Sequence[LoadedChunk]) -> None:
 
 
 def _apply_photo_changes(chunk: LoadedChunk, changes: dict[UUID, PhotoFilterValues]) -> LoadedChunk:
-    """The chunk with what has changed of its photos; itself when nothing has."""
+    """Return the chunk with changes of its photos; itself if there are none."""
     photos = chunk.photos.with_changes(changes) if changes else chunk.photos
     return chunk if photos is chunk.photos else replace(chunk, photos=photos)
 
 
 class ReplicationLagTracker:
-    """What the following threads note and the probes read."""
+    """Tracks the replication lag of each generation; thread-safe."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -237,33 +257,33 @@ class ReplicationLagTracker:
         self._synced_at: dict[UUID, float] = {}
         self._catalog_read_at: float | None = None
 
-    def record_catalog_read(self, wanted: Mapping[UUID, GenerationVersion], at: float) -> None:
-        """At `at` (monotonic) these were the generations and versions to follow."""
+    def record_catalog_read(self, current: Mapping[UUID, GenerationVersion], at: float) -> None:
+        """Record the generations and versions that the catalog had at `at` (monotonic seconds)."""
         with self._lock:
             self._catalog_read_at = at
-            self._current = dict(wanted)
-            # One that is new counts from now on; one that is gone counts no more.
-            self._synced_at = {id_: self._synced_at.get(id_, at) for id_ in wanted}
+            self._current = dict(current)
+            # The lag of new generations counts from now on; deleted ones are dropped.
+            self._synced_at = {id_: self._synced_at.get(id_, at) for id_ in current}
 
     def record_synced(self, generation_id: UUID, at: float) -> None:
-        """The snapshot has what the catalog had at `at`."""
+        """Record that the snapshot has what the catalog had at `at` (monotonic seconds)."""
         with self._lock:
             if generation_id in self._synced_at:
                 self._synced_at[generation_id] = max(at, self._synced_at[generation_id])
 
     def has_read_catalog(self) -> bool:
-        """Whether the catalog was read at all."""
+        """Whether the catalog has been read at all."""
         return self._catalog_read_at is not None
 
     def current_lags(self, loaded: Mapping[UUID, int]) -> dict[UUID, ReplicationLag]:
-        """The lag of every generation to follow; `loaded` are the snapshots' versions."""
+        """Return the lag of every generation; `loaded` are the versions of the snapshots."""
         with self._lock:
             now = time.monotonic()
             return {
                 id_: ReplicationLag(
-                    versions=max(0, wanted.version - loaded.get(id_, 0)),
+                    versions=max(0, target.version - loaded.get(id_, 0)),
                     seconds=now - self._synced_at[id_],
-                    answers=wanted.state == GenerationState.ACTIVE,
+                    answers=target.state == GenerationState.ACTIVE,
                 )
-                for id_, wanted in self._current.items()
+                for id_, target in self._current.items()
             }

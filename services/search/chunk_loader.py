@@ -1,11 +1,9 @@
-"""A chunk from its files to what search holds of it.
+"""Chunk loader: a chunk's rows and codes as memory-mapped files, or copied into memory.
 
-A chunk as a search worker has it: rows, what is known of their photos, and codes.
-
-Objects as files of this machine, mapped into memory: the operating system reads what is used.
-
-Where objects are files already, they are mapped where they lie. Elsewhere they are fetched into a
-cache folder, which any number of search workers of this machine may share.
+`MappedFileCache` maps objects with verified hashes: a file-based object store is mapped in place;
+from other stores, objects are downloaded into a cache folder, which any number of search workers of
+this machine may share. `ChunkLoader` opens the chunks of a generation, with codes that are missing
+computed from the rows. `LoadedChunk` is what a snapshot holds of a chunk.
 """
 
 from __future__ import annotations
@@ -43,31 +41,33 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 COPY_BYTES = 1 << 20
-STALE_PARTIAL_SECONDS = 3600.0  # a file that is still being written then: its writer was killed
+STALE_PARTIAL_SECONDS = 3600.0  # age of partial files whose writer must have been killed
 
-# From Python 3.13 on a mapping need not hold a file descriptor: many chunks would use them up.
+# A mapping holds a file descriptor, and many chunks would use them up; Python 3.13 can do without.
 MMAP_OPTIONS = {"trackfd": False} if sys.version_info >= (3, 13) else {}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MappedFile:
-    """A file's bytes; the file may be deleted or replaced while they are used."""
+    """A memory-mapped file, which may be deleted or replaced while it is mapped."""
 
     memory: mmap.mmap
     path: Path
     state: os.stat_result
-    """Of the file when it was mapped."""
+    """State of the file when it was mapped."""
 
     def was_changed(self) -> bool:
-        """Whether the mapped file itself was written to or truncated: what is read from the
-        mapping then is another row, or ends the process (SIGBUS). A file that was deleted or
-        replaced leaves the mapping as it was."""
+        """Whether the mapped file itself was written to or truncated.
+
+        Reading the mapping would then return other rows or terminate the process (SIGBUS). A file
+        that was deleted or replaced leaves the mapping intact.
+        """
         try:
-            now = self.path.stat()
+            current = self.path.stat()
         except OSError:
             return False
-        same = (now.st_dev, now.st_ino) == (self.state.st_dev, self.state.st_ino)
-        return same and (now.st_size, now.st_mtime_ns) != (
+        same_file = (current.st_dev, current.st_ino) == (self.state.st_dev, self.state.st_ino)
+        return same_file and (current.st_size, current.st_mtime_ns) != (
             self.state.st_size,
             self.state.st_mtime_ns,
         )
@@ -77,23 +77,28 @@ class MappedFile:
         return len(self.memory)
 
     def prefetch(self, begin: int, size_bytes: int) -> None:
-        """Say that these bytes are read next: many at once cost little more than one."""
+        """Advise the system that these bytes are read next.
+
+        Advising many ranges before reading them costs little more than a single read.
+        """
         first = begin - begin % mmap.PAGESIZE
         self.memory.madvise(mmap.MADV_WILLNEED, first, begin + size_bytes - first)
 
 
 class MappedFileCache:
-    """The store's objects as mapped files."""
+    """Maps objects of the store as files."""
 
     def __init__(self, store: ObjectStore, folder: Path) -> None:
-        """`folder` is made when something is fetched."""
+        """Create a cache in `folder`, which is created at the first download."""
         self._store = store
         self._folder = folder
 
     def map_object(self, key: str, sha256: str) -> MappedFile:
-        """The object, whose hash was checked: when it was fetched, or now where it is a file.
+        """Map an object whose hash is verified: at the download, or now for a file-based store.
 
-        Unavailable (`chunk_corrupt`) when it is another; NotFound and Unavailable of the store.
+        Raises:
+            Unavailable: `chunk_corrupt` if its hash differs; also as the store raises it.
+            NotFound: As the store raises it.
         """
         file = self._store.file(key)
         if file is None:
@@ -105,27 +110,28 @@ class MappedFileCache:
         return mapped
 
     def _cached(self, key: str, sha256: str) -> MappedFile:
-        """The object from the cache; one that was damaged there is fetched again."""
+        """Map the object from the cache; a damaged copy is downloaded again."""
         name = f"{sha256}.npy"
-        fetched = False
+        downloaded = False
 
-        def fetch(target: Path) -> None:
-            nonlocal fetched
-            fetched = True
+        def download(target: Path) -> None:
+            nonlocal downloaded
+            downloaded = True
             self._download(key, sha256, target)
 
         with contextlib.suppress(ValueError):  # an empty file can't be mapped
-            mapped = self.map_or_create(name, fetch)
-            if fetched or hashlib.sha256(mapped.memory).hexdigest() == sha256:
+            mapped = self.map_or_create(name, download)
+            if downloaded or hashlib.sha256(mapped.memory).hexdigest() == sha256:
                 return mapped
-        log.warning("the cached copy of %s is damaged, and is fetched again", key)
+        log.warning("the cached copy of %s is damaged and is downloaded again", key)
         self.evict(name)
-        return self.map_or_create(name, fetch)
+        return self.map_or_create(name, download)
 
     def map_or_create(self, name: str, make: Callable[[Path], None]) -> MappedFile:
-        """The file of this name in the folder; where there is none, `make` writes one.
+        """Map the file of this name in the folder; `make` writes it if it does not exist.
 
-        It is there whole or not at all, also after a power cut.
+        The file is created atomically and durably: it never exists in part, even after a power
+        failure.
         """
         path = self._folder / name
         with contextlib.suppress(FileNotFoundError), path.open("rb") as file:
@@ -142,28 +148,29 @@ class MappedFileCache:
         return mapped
 
     def evict(self, name: str) -> None:
+        """Delete the file of this name, if it exists."""
         (self._folder / name).unlink(missing_ok=True)
 
     def evict_except(self, names: Collection[str]) -> None:
-        """Remove what is in the folder under other names; what is mapped stays readable."""
+        """Delete the files of all other names from the folder; existing mappings stay readable."""
         if not self._folder.is_dir():
             return
-        long_ago = time.time() - STALE_PARTIAL_SECONDS
+        stale_before = time.time() - STALE_PARTIAL_SECONDS
         for path in self._folder.iterdir():
             with contextlib.suppress(FileNotFoundError):
                 if path.suffix == ".partial":
-                    unwanted = path.stat().st_mtime < long_ago
+                    stale = path.stat().st_mtime < stale_before
                 else:
-                    unwanted = path.name not in names
-                if unwanted:
+                    stale = path.name not in names
+                if stale:
                     path.unlink()
 
     def _download(self, key: str, sha256: str, target: Path) -> None:
         digest = hashlib.sha256()
         with self._store.open(key) as source, create_private_file(target) as file:
-            while piece := source.read(COPY_BYTES):
-                digest.update(piece)
-                file.write(piece)
+            while block := source.read(COPY_BYTES):
+                digest.update(block)
+                file.write(block)
             if digest.hexdigest() != sha256:
                 raise chunk_corrupt_error(key)
             file.flush()
@@ -177,34 +184,34 @@ def _map_file(descriptor: int, path: Path) -> MappedFile:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoadedChunk:
-    """A chunk's rows, (n, dimension) float32, and what is known of their photos."""
+    """A chunk's rows, (n, dimension) float32, with the columns of their photos, and codes."""
 
     chunk_id: UUID
     object_key: str
     rows: Rows
     photos: PhotoColumns
     codes: SignCodes | None = None
-    """None while search does without."""
+    """Sign codes; None while they are not in use."""
     stored: StoredChunk | None = None
-    """Where rows and codes lie on the disk; None for rows that were never there."""
+    """The mapped files; None for rows that exist in memory only."""
     int8: Int8Codes | None = None
-    """None while search does without."""
+    """Int8 codes; None while they are not in use."""
 
     def was_changed(self) -> bool:
-        """Whether its file was damaged since it was mapped (`Mapped.was_changed`)."""
+        """Whether its mapped file was changed; see `MappedFile.was_changed`."""
         return self.stored is not None and self.stored.file.was_changed()
 
     def prefetch_row(self, row: int) -> None:
-        """Say that a row is read next, where it is mapped from a file."""
+        """Advise the system that a row is read next, if it is in a mapped file."""
         if self.stored is not None and self.rows is self.stored.rows:
             size_bytes = self.rows.strides[0]
-            begin = self.stored.file.size_bytes - self.rows.nbytes  # a header goes before
+            begin = self.stored.file.size_bytes - self.rows.nbytes  # the rows follow a header
             self.stored.file.prefetch(begin + row * size_bytes, size_bytes)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StoredChunk:
-    """A chunk's files, mapped into memory."""
+    """A chunk's memory-mapped files."""
 
     file: MappedFile
     rows: Rows
@@ -213,7 +220,7 @@ class StoredChunk:
     int8: Int8Codes | None = None
 
 
-CACHED_SUFFIXES = (".npy", ".codes", ".int8")  # of a chunk's files in the folder
+CACHED_SUFFIXES = (".npy", ".codes", ".int8")  # of a chunk's files in the cache folder
 
 Number = TypeVar("Number", bound=np.generic)
 Codes = TypeVar("Codes")
@@ -223,114 +230,130 @@ class ChunkLoader:
     """Opens the chunks of one generation."""
 
     def __init__(self, store: ObjectStore, folder: Path) -> None:
-        """`folder` is the generation's own: for objects that are no files of this machine, and for
-        codes that are missing."""
+        """Create a loader.
+
+        Args:
+            store: The object store.
+            folder: Cache folder of the generation, for downloads and for computed codes.
+        """
         self._store = store
         self._files = MappedFileCache(store, folder)
 
     def load_rows(self, chunk: Chunk) -> StoredChunk:
-        """The chunk without codes. Unavailable, NotFound, OSError or ValueError: it can't be read.
+        """Map the rows of a chunk, with their hash verified; codes are not loaded.
 
-        Its hash was checked.
+        Raises:
+            Unavailable, NotFound, OSError, ValueError: The chunk can't be read.
         """
         file = self._files.map_object(chunk.object_key, chunk.sha256)
         return StoredChunk(file, decode_rows(file.memory), chunk.sha256)
 
     def load_sign_codes(self, object_key: str, stored: StoredChunk) -> SignCodes:
-        """The chunk's sign codes: those beside it, or made from its rows where there are none."""
+        """Load the chunk's sign codes: those stored beside it, or else computed from its rows."""
         from shared.codes.serialization import decode_sign_codes, encode_sign_codes
 
-        def kept(target: Path) -> None:
+        def write_stored(target: Path) -> None:
             _write_durably(target, self._store.get(codes_key(object_key)))
 
-        def made(target: Path) -> None:
+        def write_computed(target: Path) -> None:
             _write_durably(target, encode_sign_codes(stored.rows, stored.sha256))
 
-        return self._load_codes(object_key, stored, "codes", (kept, made), decode_sign_codes)
+        return self._load_codes(
+            object_key, stored, "codes", (write_stored, write_computed), decode_sign_codes
+        )
 
     def load_int8_codes(self, object_key: str, stored: StoredChunk) -> Int8Codes:
-        """The chunk's int8 codes: those of the folder, or made from its rows."""
+        """Load the chunk's int8 codes from the cache folder, or else compute them from its rows."""
         from shared.codes.serialization import decode_int8_codes, encode_int8_codes
 
-        def made(target: Path) -> None:
+        def write_computed(target: Path) -> None:
             _write_durably(target, encode_int8_codes(stored.rows, stored.sha256))
 
-        # Twice: what is there may be damaged.
-        return self._load_codes(object_key, stored, "int8", (made, made), decode_int8_codes)
+        # Twice, because an existing file may be damaged.
+        return self._load_codes(
+            object_key, stored, "int8", (write_computed, write_computed), decode_int8_codes
+        )
 
     def _load_codes(
         self,
         object_key: str,
         stored: StoredChunk,
-        ending: str,
-        ways: Sequence[Callable[[Path], None]],
+        suffix: str,
+        writers: Sequence[Callable[[Path], None]],
         decode: Callable[..., Codes],
     ) -> Codes:
-        """Codes of the folder, which the ways to make them are tried for, one after the other."""
-        name = f"{stored.sha256}.{ending}"
+        """Load codes from the cache folder; `writers` are tried in turn to create the file."""
+        name = f"{stored.sha256}.{suffix}"
         rows, dimension = stored.rows.shape
-        for make in ways:
+        for write in writers:
             try:
-                file = self._files.map_or_create(name, make)
+                file = self._files.map_or_create(name, write)
                 return decode(
                     file.memory, rows=rows, dimension=dimension, chunk_sha256=stored.sha256
                 )
             except NotFound:
                 continue
             except ValueError as error:
-                log.warning("the codes of %s are made again: %s", object_key, error)
+                log.warning("the codes of %s are computed again: %s", object_key, error)
                 self._files.evict(name)
-        raise AssertionError("codes that were just made are those of the rows")
+        raise AssertionError("codes that were just computed match the rows")
 
     def evict_except(self, chunks: Collection[LoadedChunk]) -> None:
-        """Remove the files of all other chunks."""
+        """Delete the cached files of all other chunks."""
         hashes = [chunk.stored.sha256 for chunk in chunks if chunk.stored is not None]
-        self._files.evict_except({f"{one}{end}" for one in hashes for end in CACHED_SUFFIXES})
+        self._files.evict_except(
+            {f"{sha256}{suffix}" for sha256 in hashes for suffix in CACHED_SUFFIXES}
+        )
 
 
 def generation_loader(store: ObjectStore, folder: Path, generation_id: UUID) -> ChunkLoader:
-    """The loader of a generation, whose files lie below `folder`."""
+    """Return the loader of a generation, whose files are cached below `folder`."""
     return ChunkLoader(store, folder / str(generation_id))
 
 
 def remove_stale_folders(folder: Path, generation_ids: Collection[UUID]) -> None:
-    """Remove what loaders have kept below `folder` of generations that are gone."""
+    """Delete the cache folders of generations that no longer exist."""
     known = {str(generation_id) for generation_id in generation_ids}
     for path in folder.iterdir() if folder.is_dir() else ():
         if path.name not in known:
-            log.info("removing what was kept of generation %s", path.name)
+            log.info("deleting the cached files of generation %s", path.name)
             shutil.rmtree(path, ignore_errors=True)
 
 
 def hold_in_memory(chunk: LoadedChunk, parts: int) -> LoadedChunk:
-    """The chunk with its first so many parts in memory, the others mapped (`MemoryBudget`)."""
+    """Return the chunk with its first `parts` parts in memory, and the others mapped.
+
+    The order is that of `memory_parts`; `MemoryBudget` determines the number.
+    """
     stored = chunk.stored
     if stored is None:
         return chunk
-    held = 0
+    part = 0
     codes = None
     if stored.codes is not None:
-        held = len(stored.codes.levels)
-        now = (chunk.codes or stored.codes).levels
+        part = len(stored.codes.levels)
+        current = (chunk.codes or stored.codes).levels
         codes = replace(
             stored.codes,
             levels=tuple(
-                _in_memory(level, there, parts > number)
-                for number, (level, there) in enumerate(zip(stored.codes.levels, now, strict=True))
+                _in_memory(level, loaded, parts > number)
+                for number, (level, loaded) in enumerate(
+                    zip(stored.codes.levels, current, strict=True)
+                )
             ),
             norms=np.array(stored.codes.norms),  # 4 bytes a row: always
         )
     int8 = None
     if stored.int8 is not None:
-        there = (chunk.int8 or stored.int8).numbers
-        int8 = replace(stored.int8, numbers=_in_memory(stored.int8.numbers, there, parts > held))
-        held += 1
-    rows = _in_memory(stored.rows, chunk.rows, parts > held)
+        loaded = (chunk.int8 or stored.int8).numbers
+        int8 = replace(stored.int8, numbers=_in_memory(stored.int8.numbers, loaded, parts > part))
+        part += 1
+    rows = _in_memory(stored.rows, chunk.rows, parts > part)
     return replace(chunk, rows=rows, codes=codes, int8=int8)
 
 
 def memory_parts(chunks: Sequence[LoadedChunk]) -> list[tuple[str, int]]:
-    """The parts that these chunks have together, with their sizes in bytes."""
+    """Return the index parts of the chunks, with their total sizes in bytes."""
     sizes: dict[str, int] = {}
     for chunk in chunks:
         levels = chunk.codes.levels if chunk.codes else ()
@@ -342,10 +365,10 @@ def memory_parts(chunks: Sequence[LoadedChunk]) -> list[tuple[str, int]]:
     return [*sizes.items(), ("rows", sum(chunk.rows.nbytes for chunk in chunks))]
 
 
-def _in_memory(stored: NDArray[Number], now: NDArray[Number], wanted: bool) -> NDArray[Number]:
-    if not wanted:
+def _in_memory(stored: NDArray[Number], loaded: NDArray[Number], resident: bool) -> NDArray[Number]:
+    if not resident:
         return stored
-    return np.array(stored) if now is stored else now
+    return np.array(stored) if loaded is stored else loaded
 
 
 def _write_durably(target: Path, data: bytes) -> None:

@@ -1,9 +1,4 @@
-"""The exact end of a search: rows that may matter are compared one by one, the best first.
-
-Where the rows of a snapshot lie in memory, for the compiled loops.
-
-One piece of work over many rows, on several processors.
-"""
+"""Exact reranking of candidates, addresses of rows for compiled loops, and a parallel for loop."""
 
 from __future__ import annotations
 
@@ -29,18 +24,19 @@ Indices = NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RowBlocks:
-    """n rows in c blocks; who makes it keeps them alive."""
+    """Addresses of n rows in c blocks; `keep_alive` keeps their memory alive."""
 
     dimension: int
     first_rows: Indices
-    """(c + 1,): the number of each block's first row; the last is n."""
+    """(c + 1,): number of each block's first row; the last is n."""
     row_addresses: Addresses
-    """(c,): where the block's float32 rows begin."""
+    """(c,): start address of each block's float32 rows."""
     keep_alive: object
-    """What has to live as long."""
+    """Owner of the memory, which must live as long as the addresses are used."""
 
     @classmethod
     def of(cls, chunks: Sequence[LoadedChunk]) -> RowBlocks:
+        """Create them from chunks, one block each."""
         return cls(
             dimension=chunks[0].rows.shape[1],
             first_rows=np.cumsum([0, *(len(chunk.rows) for chunk in chunks)]),
@@ -53,18 +49,21 @@ class RowBlocks:
 
 
 def array_addresses(arrays: Iterable[NDArray[Any]]) -> Addresses:
-    """Where each array begins."""
+    """Return the start address of each array."""
     return np.array([array.ctypes.data for array in arrays], np.uint64)
 
 
-MIN_PART_BYTES = 4_000_000  # less is done before another thread has woken up
+MIN_PART_BYTES = 4_000_000  # smaller parts are not worth waking up another thread
 
 
 def parallel_for(run_range: Callable[[int, int], None], rows: int, bytes_each: int) -> None:
-    """Call `work(begin, end)` for parts that make up 0 to `rows`, of so many bytes each row.
+    """Run a loop over rows in parallel on the available CPUs.
 
-    One part is worked on here. `run_range` has to let go of the interpreter's lock to gain
-    anything.
+    Args:
+        run_range: Called with (begin, end) for parts that cover 0 to `rows`; it must release the
+            GIL for a speedup. One part runs in the calling thread.
+        rows: Number of rows.
+        bytes_each: Bytes of work for each row, which determine the number of parts.
     """
     parts = max(1, min(_cpu_count(), rows * bytes_each // MIN_PART_BYTES))
     ends = [rows * (part + 1) // parts for part in range(parts)]
@@ -76,7 +75,7 @@ def parallel_for(run_range: Callable[[int, int], None], rows: int, bytes_each: i
 
 @cache
 def _cpu_count() -> int:
-    """Those that this process may use."""
+    """Number of CPUs that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
@@ -85,21 +84,22 @@ def _thread_pool() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(max(1, _cpu_count() - 1), "search-part")
 
 
-RERANK_STEP_ROWS = 8  # rows compared exactly between two looks at the floor
+RERANK_STEP_ROWS = 8  # rows compared exactly between two checks of the floor and the budget
 
 Scores = NDArray[np.float64]
 
 
 @dataclass(slots=True)
 class SearchBudget:
-    """When to give up: an answer that was cut short says so."""
+    """Limits of a search; a result that was cut short has certificate `none`."""
 
     max_rows: int | None = None
-    """So many are compared exactly, and no more."""
+    """Maximum number of rows compared exactly."""
     deadline: float | None = None
-    """Of time.monotonic()."""
+    """Deadline on the clock of time.monotonic()."""
 
     def is_exhausted(self, rows: int) -> bool:
+        """Whether `rows` rows compared exactly, or the time, have reached the limit."""
         if self.max_rows is not None and rows >= self.max_rows:
             return True
         return self.deadline is not None and time.monotonic() >= self.deadline
@@ -107,61 +107,64 @@ class SearchBudget:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RerankedRows:
-    """Rows that were compared exactly, and what is known of the others."""
+    """Rows that were compared exactly, and a bound of the others."""
 
     rows: Indices
-    """The first so many of those that were to be compared, in their order."""
+    """The compared rows, by descending upper bound."""
     scores: Scores
     """Cosines, float64."""
     unseen_bound: float
-    """No other row reaches more than this; -inf where none can matter."""
+    """Upper bound of the other rows' scores; -inf if none of them can be in the result."""
 
     @property
     def is_complete(self) -> bool:
-        """Whether it did not end early."""
+        """Whether the comparison did not stop early."""
         return self.unseen_bound == -math.inf
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ExactReranker:
-    """Exact comparison of rows with one query, for its `k` best."""
+    """Compares candidates exactly with one query, to find its `k` best."""
 
     blocks: RowBlocks
     query: NDArray[np.float32]
-    """(dimension,) of any length but 0."""
+    """(dimension,) row of any length but 0."""
     norm: float
-    """Its length."""
+    """Length of the query."""
     k: int
     prefetch: Callable[[Indices], None]
-    """Is told of rows before they are compared."""
+    """Called with rows before they are compared."""
 
     def find_best(
         self, rows: Indices, upper_bounds: Scores, floor: float, budget: SearchBudget
     ) -> RerankedRows:
-        """Compare `rows`, of which none scores more than its `upper_bounds`, highest reach
-        first; until
-        no other reaches `floor`, which rises to the k-th score."""
+        """Compare rows by descending upper bound, until no other row can reach the k-th score.
+
+        Args:
+            rows: Candidates.
+            upper_bounds: Upper bound of each candidate's score.
+            floor: Score that a row must reach; it rises to the k-th exact score.
+            budget: Limits, upon which the comparison stops early.
+        """
         order = np.argsort(-upper_bounds, kind="stable")
         order = order[: np.count_nonzero(upper_bounds >= floor)]
         rows, upper_bounds = rows[order], upper_bounds[order]
         scores = np.empty(len(rows))
-        done, unseen = 0, -math.inf
+        done, unseen_bound = 0, -math.inf
         while done < len(rows) and upper_bounds[done] >= floor:
             if budget.is_exhausted(done):
-                unseen = float(upper_bounds[done])
+                unseen_bound = float(upper_bounds[done])
                 break
-            # The first k are needed in any case.
-            upto = min(
-                len(rows), max(self.k, done + RERANK_STEP_ROWS), budget.max_rows or len(rows)
-            )
-            self.prefetch(rows[done:upto])
-            self._multiply(rows[done:upto], scores[done:upto])
-            scores[done:upto] /= self.norm
-            done = upto
+            # At least k rows are needed before the floor can rise.
+            end = min(len(rows), max(self.k, done + RERANK_STEP_ROWS), budget.max_rows or len(rows))
+            self.prefetch(rows[done:end])
+            self._multiply(rows[done:end], scores[done:end])
+            scores[done:end] /= self.norm
+            done = end
             if done >= self.k:
                 kth = float(np.partition(scores[:done], done - self.k)[done - self.k])
                 floor = max(floor, kth)
-        return RerankedRows(rows[:done], scores[:done], unseen)
+        return RerankedRows(rows[:done], scores[:done], unseen_bound)
 
     def _multiply(self, rows: Indices, out: Scores) -> None:
         blocks = self.blocks

@@ -1,4 +1,8 @@
-"""One query on one snapshot: which way to search, and what can be said of the answer."""
+"""Query executor: runs a query on a snapshot with the cheapest suitable search strategy.
+
+The strategies are the dense scan, sign codes, int8 codes and the GPU. All compare the best
+candidates exactly and rank by float64 cosines; they differ in the certificate of the result.
+"""
 
 from __future__ import annotations
 
@@ -12,25 +16,26 @@ from uuid import UUID
 import numpy as np
 from numpy.typing import NDArray
 
-from services.search import catalog_sync as follow
+from services.search import catalog_sync
 from services.search.dense_scan import QueryRow, exact_scores, scan_min_score, scan_top_k
 from services.search.query_batcher import QueryBatcher
 from services.search.snapshot import Snapshot
 from shared.search_api.protocol import BOUND, EXHAUSTIVE, NONE, STATISTICAL, Mode, SearchHit
 
-if TYPE_CHECKING:  # it leads to numba, which takes a while to load
+if TYPE_CHECKING:  # imports numba, which takes a while to load
     from services.search.exact_rerank import SearchBudget
     from services.search.int8_search import Candidates
 
 log = logging.getLogger(__name__)
 
-# One row in ten million is further off: then the codes are not trusted.
+# Largest plausible error in standard deviations (exceeded by one row in ten million); beyond it
+# the sign codes are not trusted.
 MAX_Z = 5.5
 
-# Equal rows are equal however they were added up, and then the photos' ids decide.
+# Rounding makes equal rows have equal scores whatever the summation order; ties go by photo id.
 SCORE_DECIMALS = 12
 
-INT8_ROW_PARAMS_BYTES = 12  # scale, error and length, beside a code
+INT8_ROW_PARAMS_BYTES = 12  # scale, error and length of a code
 
 RowNumbers = NDArray[np.int64]
 Scores = NDArray[np.float64]
@@ -41,7 +46,15 @@ NO_SCORES = np.empty(0)
 
 @dataclass(frozen=True, slots=True)
 class SearchOptions:
-    """The `k` most similar rows, of those that score at least `min_score`; and when to give up."""
+    """Number of results, minimum score, strategy, and limits of a search.
+
+    Attributes:
+        k: Number of results.
+        min_score: Minimum cosine; None for no minimum.
+        mode: Search strategy.
+        most_rows: Maximum number of rows compared exactly.
+        most_seconds: Time limit in seconds.
+    """
 
     k: int
     min_score: float | None = None
@@ -52,7 +65,7 @@ class SearchOptions:
 
 @dataclass(frozen=True, slots=True)
 class SearchResult:
-    """Hits in order, and how they were found, as `SearchResponse` tells it."""
+    """Hits in order, with the statistics of `SearchResponse`."""
 
     hits: tuple[SearchHit, ...]
     certificate: str
@@ -64,7 +77,7 @@ class SearchResult:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _ScoredRows:
-    """Rows with their exact scores, among them all that the answer needs."""
+    """Rows with their exact scores, among them all that the result needs."""
 
     rows: RowNumbers
     scores: Scores
@@ -72,7 +85,7 @@ class _ScoredRows:
     scanned: int
     max_z: float | None = None
     unseen_bound: float = -math.inf
-    """What no other row exceeds."""
+    """Upper bound of the scores of all other rows."""
 
 
 def execute_query(
@@ -82,16 +95,21 @@ def execute_query(
     options: SearchOptions,
     batcher: QueryBatcher,
 ) -> SearchResult:
-    """Ask with a row, (dimension,) of any length, for the snapshot's rows of `row_mask`, (n,).
+    """Search the rows of a snapshot that are most similar to a query.
 
-    A query of zeros is similar to nothing.
+    Args:
+        snapshot: The snapshot.
+        query: (dimension,) row of any length; a row of zeros has no similar rows.
+        row_mask: (n,) bool, the rows that may be returned.
+        options: Number of results, minimum score, strategy and limits.
+        batcher: Batches the first-level scans of concurrent queries.
     """
     if not row_mask.any() or not query.any():
         return SearchResult((), EXHAUSTIVE, 0, 0, 0)
-    found = _score_rows(snapshot, query, row_mask, options, batcher)
-    hits = _rank_photos(snapshot, found.rows, found.scores, options)
+    scored = _score_rows(snapshot, query, row_mask, options, batcher)
+    hits = _rank_photos(snapshot, scored.rows, scored.scores, options)
     return _to_search_result(
-        [SearchHit(photo_id=photo_id, score=score) for photo_id, _, score in hits], found
+        [SearchHit(photo_id=photo_id, score=score) for photo_id, _, score in hits], scored
     )
 
 
@@ -103,87 +121,99 @@ def execute_weighted_query(
     options: SearchOptions,
     batcher: QueryBatcher,
 ) -> SearchResult:
-    """The same in the order of the scores with the `weighted_query` query, each with its plain
-    cosine
-    beside; `min_score` is of the plain one."""
+    """Rank rows by their similarity to `weighted_query`; hits also carry the plain cosine.
+
+    `options.min_score` applies to the plain cosine, with `query`. See `execute_query`.
+    """
     scanned = int(np.count_nonzero(row_mask))
     if options.min_score is not None and scanned:
         row_mask = _mask_min_score(snapshot, query, row_mask, options, batcher)
     if not row_mask.any():
         return SearchResult((), EXHAUSTIVE, 0, scanned, 0)
-    found = _score_rows(
+    scored = _score_rows(
         snapshot, weighted_query, row_mask, replace(options, min_score=None), batcher
     )
-    ranked = _rank_photos(snapshot, found.rows, found.scores, replace(options, min_score=None))
-    plain = _round_scores(
+    ranked = _rank_photos(snapshot, scored.rows, scored.scores, replace(options, min_score=None))
+    plain_scores = _round_scores(
         exact_scores(snapshot.chunks, query, np.array([row for _, row, _ in ranked]))
     )
     hits = [
         SearchHit(photo_id=photo_id, score=score, weighted_score=weighted_score)
-        for (photo_id, _, weighted_score), score in zip(ranked, plain.tolist(), strict=True)
+        for (photo_id, _, weighted_score), score in zip(ranked, plain_scores.tolist(), strict=True)
     ]
-    return _to_search_result(hits, replace(found, scanned=scanned))
+    return _to_search_result(hits, replace(scored, scanned=scanned))
 
 
 def sign_codes_pay_off(selected: int, k: int) -> bool:
-    """Whether codes spare anything: they leave about twice k rows to compare, and cost as much as
-    some dozens."""
+    """Whether sign codes are faster than a dense scan of the selected rows.
+
+    They leave about 2 k rows to compare exactly, and have a fixed cost of some dozens of rows.
+    """
     return selected > 64 + 4 * k
 
 
 def _score_rows(
     snapshot: Snapshot,
     query: QueryRow,
-    asked: NDArray[np.bool_],
-    question: SearchOptions,
-    glances: QueryBatcher,
+    row_mask: NDArray[np.bool_],
+    options: SearchOptions,
+    batcher: QueryBatcher,
 ) -> _ScoredRows:
-    selected = int(np.count_nonzero(asked))
-    found = None
-    if question.mode != Mode.DENSE and sign_codes_pay_off(selected, question.k):
-        found = _search_on_gpu(snapshot, query, asked, question)
-        if found is None and question.mode == Mode.AUTO and snapshot.has_sign_codes:
-            found = _search_by_sign_codes(snapshot, query, asked, question, glances)
-    if found is None and _uses_int8_codes(snapshot, question.mode, selected, question.k):
-        found = _search_by_int8(snapshot, query, asked, question)
-    if found is None:
-        rows, scores = scan_top_k(snapshot.chunks, query, question.k, asked)
-        found = _ScoredRows(rows, scores, EXHAUSTIVE, selected)
-    return found
+    selected = int(np.count_nonzero(row_mask))
+    scored = None
+    if options.mode != Mode.DENSE and sign_codes_pay_off(selected, options.k):
+        scored = _search_on_gpu(snapshot, query, row_mask, options)
+        if scored is None and options.mode == Mode.AUTO and snapshot.has_sign_codes:
+            scored = _search_by_sign_codes(snapshot, query, row_mask, options, batcher)
+    if scored is None and _uses_int8_codes(snapshot, options.mode, selected, options.k):
+        scored = _search_by_int8(snapshot, query, row_mask, options)
+    if scored is None:
+        rows, scores = scan_top_k(snapshot.chunks, query, options.k, row_mask)
+        scored = _ScoredRows(rows, scores, EXHAUSTIVE, selected)
+    return scored
 
 
 def _uses_int8_codes(snapshot: Snapshot, mode: Mode, selected: int, k: int) -> bool:
-    """Whether int8 codes are there, wanted, and spare anything."""
-    wanted = mode == Mode.DETERMINISTIC or (mode == Mode.AUTO and not snapshot.has_sign_codes)
+    """Whether int8 codes exist, suit the mode, and are faster than a dense scan."""
+    suits_mode = mode == Mode.DETERMINISTIC or (mode == Mode.AUTO and not snapshot.has_sign_codes)
     return (
-        wanted and snapshot.has_int8_codes and int8_codes_pay_off(selected, k, snapshot.dimension)
+        suits_mode
+        and snapshot.has_int8_codes
+        and int8_codes_pay_off(selected, k, snapshot.dimension)
     )
 
 
 def _mask_min_score(
     snapshot: Snapshot,
     query: QueryRow,
-    asked: NDArray[np.bool_],
-    question: SearchOptions,
-    glances: QueryBatcher,
+    row_mask: NDArray[np.bool_],
+    options: SearchOptions,
+    batcher: QueryBatcher,
 ) -> NDArray[np.bool_]:
-    """Of the rows that are asked for, those that score at least `min_score`."""
-    assert question.min_score is not None
-    found = None
-    if question.mode == Mode.AUTO and snapshot.has_sign_codes and sign_codes_pay_off(len(asked), 1):
-        everything = SearchOptions(len(asked), question.min_score)
-        found = _search_by_sign_codes(snapshot, query, asked, everything, glances)
-    if found is not None:
-        rows, scores = found.rows, found.scores
+    """Return the rows of the mask that score at least `options.min_score`."""
+    assert options.min_score is not None
+    scored = None
+    if (
+        options.mode == Mode.AUTO
+        and snapshot.has_sign_codes
+        and sign_codes_pay_off(len(row_mask), 1)
+    ):
+        all_rows = SearchOptions(len(row_mask), options.min_score)
+        scored = _search_by_sign_codes(snapshot, query, row_mask, all_rows, batcher)
+    if scored is not None:
+        rows, scores = scored.rows, scored.scores
     else:
-        rows, scores = scan_min_score(snapshot.chunks, query, question.min_score, asked)
-    passing = np.zeros(len(asked), bool)
-    passing[rows[_round_scores(scores) >= question.min_score]] = True
+        rows, scores = scan_min_score(snapshot.chunks, query, options.min_score, row_mask)
+    passing = np.zeros(len(row_mask), bool)
+    passing[rows[_round_scores(scores) >= options.min_score]] = True
     return passing
 
 
 def int8_codes_pay_off(selected: int, k: int, dimension: int) -> bool:
-    """Whether int8 codes, and about twice k rows to compare, are less to read than all rows."""
+    """Whether a search by int8 codes reads fewer bytes than a dense scan of the selected rows.
+
+    It reads all codes and about 2 k full rows.
+    """
     from shared.codes.rotation import get_rotation
 
     row_bytes = 4 * dimension
@@ -192,11 +222,11 @@ def int8_codes_pay_off(selected: int, k: int, dimension: int) -> bool:
 
 
 def needs_int8_codes(snapshot: Snapshot, row_mask: NDArray[np.bool_], k: int) -> bool:
-    """Whether a search that leaves nothing to chance has to read every row, for want of codes."""
+    """Whether a deterministic search would have to scan all rows because int8 codes are missing."""
     if (
         snapshot.has_int8_codes
         or snapshot.gpu_snapshot
-        or snapshot.row_bytes < follow.MIN_CODED_BYTES
+        or snapshot.row_bytes < catalog_sync.MIN_CODED_BYTES
     ):
         return False
     if not snapshot.chunks:
@@ -205,109 +235,113 @@ def needs_int8_codes(snapshot: Snapshot, row_mask: NDArray[np.bool_], k: int) ->
 
 
 def _search_on_gpu(
-    snapshot: Snapshot, query: QueryRow, asked: NDArray[np.bool_], question: SearchOptions
+    snapshot: Snapshot, query: QueryRow, row_mask: NDArray[np.bool_], options: SearchOptions
 ) -> _ScoredRows | None:
-    """None where the snapshot lies on no GPU, or that fails."""
+    """Search on the GPU; None if the snapshot is not loaded there, or the GPU fails."""
     resident = snapshot.gpu_snapshot
     if resident is None or resident.failure is not None:
         return None
     from services.search.gpu import GpuError, GpuQuery
 
-    budget = _search_budget(question)
+    budget = _search_budget(options)
     try:
-        (near,) = resident.candidates([GpuQuery(query, asked, question.k, _score_floor(question))])
+        (candidates,) = resident.candidates(
+            [GpuQuery(query, row_mask, options.k, _score_floor(options))]
+        )
     except GpuError as error:
         log.error("generation %s is searched by the CPU: %s", snapshot.generation_id, error)
         return None
-    return _rerank_candidates(snapshot, query, near, asked, question, budget)
+    return _rerank_candidates(snapshot, query, candidates, row_mask, options, budget)
 
 
 def _search_by_int8(
-    snapshot: Snapshot, query: QueryRow, asked: NDArray[np.bool_], question: SearchOptions
+    snapshot: Snapshot, query: QueryRow, row_mask: NDArray[np.bool_], options: SearchOptions
 ) -> _ScoredRows:
     from services.search.int8_search import find_candidates
     from shared.codes.int8_codes import Int8Query
 
-    budget = _search_budget(question)
+    budget = _search_budget(options)
     coded = Int8Query.from_row(query)
-    near = find_candidates(
-        snapshot.int8_blocks, coded, asked, question.k, _score_floor(question), budget
+    candidates = find_candidates(
+        snapshot.int8_blocks, coded, row_mask, options.k, _score_floor(options), budget
     )
-    if near is None:
+    if candidates is None:
         return _ScoredRows(
-            NO_ROWS, NO_SCORES, NONE, int(np.count_nonzero(asked)), unseen_bound=math.inf
+            NO_ROWS, NO_SCORES, NONE, int(np.count_nonzero(row_mask)), unseen_bound=math.inf
         )
-    return _rerank_candidates(snapshot, query, near, asked, question, budget)
+    return _rerank_candidates(snapshot, query, candidates, row_mask, options, budget)
 
 
 def _rerank_candidates(
     snapshot: Snapshot,
     query: QueryRow,
-    near: Candidates,
-    asked: NDArray[np.bool_],
-    question: SearchOptions,
+    candidates: Candidates,
+    row_mask: NDArray[np.bool_],
+    options: SearchOptions,
     budget: SearchBudget,
 ) -> _ScoredRows:
-    """Compare what may be among the best exactly."""
+    """Compare the candidates exactly."""
     from services.search.exact_rerank import ExactReranker
 
     norm = float(np.linalg.norm(query.astype(np.float64)))
-    rerank = ExactReranker(snapshot.row_blocks, query, norm, question.k, snapshot.prefetch_rows)
-    found = rerank.find_best(near.rows, near.upper_bounds, near.floor, budget)
-    certificate = BOUND if found.is_complete else NONE
-    scanned = int(np.count_nonzero(asked))
+    reranker = ExactReranker(snapshot.row_blocks, query, norm, options.k, snapshot.prefetch_rows)
+    reranked = reranker.find_best(
+        candidates.rows, candidates.upper_bounds, candidates.floor, budget
+    )
+    certificate = BOUND if reranked.is_complete else NONE
+    scanned = int(np.count_nonzero(row_mask))
     return _ScoredRows(
-        found.rows, found.scores, certificate, scanned, unseen_bound=found.unseen_bound
+        reranked.rows, reranked.scores, certificate, scanned, unseen_bound=reranked.unseen_bound
     )
 
 
-def _score_floor(question: SearchOptions) -> float:
-    return -math.inf if question.min_score is None else question.min_score
+def _score_floor(options: SearchOptions) -> float:
+    return -math.inf if options.min_score is None else options.min_score
 
 
-def _search_budget(question: SearchOptions) -> SearchBudget:
+def _search_budget(options: SearchOptions) -> SearchBudget:
     from services.search.exact_rerank import SearchBudget
 
-    until = question.most_seconds and time.monotonic() + question.most_seconds
-    return SearchBudget(question.most_rows, until)
+    deadline = options.most_seconds and time.monotonic() + options.most_seconds
+    return SearchBudget(options.most_rows, deadline)
 
 
 def _search_by_sign_codes(
     snapshot: Snapshot,
     query: QueryRow,
-    asked: NDArray[np.bool_],
-    question: SearchOptions,
-    glances: QueryBatcher,
+    row_mask: NDArray[np.bool_],
+    options: SearchOptions,
+    batcher: QueryBatcher,
 ) -> _ScoredRows | None:
-    """None when an estimate was further off than chance explains."""
+    """Search by sign codes; None if an error of an estimate is larger than chance explains."""
     from services.search.sign_code_search import SignCodedQuery, SignCodeSearch
     from shared.codes.rotation import get_rotation
 
-    budget = _search_budget(question)
+    budget = _search_budget(options)
     coded = SignCodedQuery.of(query, get_rotation(len(query)))
-    first = glances.scan(snapshot.sign_code_blocks, coded, asked)
-    refinement = SignCodeSearch(
-        snapshot.sign_code_blocks, coded, question.k, question.min_score, snapshot.prefetch_rows
+    first = batcher.scan(snapshot.sign_code_blocks, coded, row_mask)
+    search = SignCodeSearch(
+        snapshot.sign_code_blocks, coded, options.k, options.min_score, snapshot.prefetch_rows
     )
-    found = refinement.search(first, budget)
-    if found.max_z > MAX_Z:
+    result = search.search(first, budget)
+    if result.max_z > MAX_Z:
         return None
-    certificate = STATISTICAL if found.is_complete else NONE
+    certificate = STATISTICAL if result.is_complete else NONE
     return _ScoredRows(
-        found.rows, found.scores, certificate, found.scanned, found.max_z, found.unseen_bound
+        result.rows, result.scores, certificate, result.scanned, result.max_z, result.unseen_bound
     )
 
 
 def _rank_photos(
-    snapshot: Snapshot, rows: RowNumbers, scores: Scores, question: SearchOptions
+    snapshot: Snapshot, rows: RowNumbers, scores: Scores, options: SearchOptions
 ) -> list[tuple[UUID, int, float]]:
-    """(photo, row, score), highest score first, ties by photo id."""
+    """Return (photo, row, score), sorted by descending score, ties by photo id."""
     scores = _round_scores(scores)
-    if question.min_score is not None:
-        enough = scores >= question.min_score
-        rows, scores = rows[enough], scores[enough]
-    if len(rows) > question.k:
-        kth = np.partition(scores, len(scores) - question.k)[len(scores) - question.k]
+    if options.min_score is not None:
+        passing = scores >= options.min_score
+        rows, scores = rows[passing], scores[passing]
+    if len(rows) > options.k:
+        kth = np.partition(scores, len(scores) - options.k)[len(scores) - options.k]
         best = scores >= kth
         rows, scores = rows[best], scores[best]
     ranked: list[tuple[float, UUID, int]] = sorted(
@@ -317,20 +351,20 @@ def _rank_photos(
         )
         if photo_id is not None
     )
-    return [(photo_id, row, -score) for score, photo_id, row in ranked[: question.k]]
+    return [(photo_id, row, -score) for score, photo_id, row in ranked[: options.k]]
 
 
-def _to_search_result(hits: list[SearchHit], found: _ScoredRows) -> SearchResult:
+def _to_search_result(hits: list[SearchHit], scored: _ScoredRows) -> SearchResult:
     return SearchResult(
         hits=tuple(hits),
-        certificate=found.certificate,
-        certified_k=sum(hit.ranked_by > found.unseen_bound for hit in hits),
-        rows_scanned=found.scanned,
-        rows_reranked=len(found.rows),
-        max_z=found.max_z,
+        certificate=scored.certificate,
+        certified_k=sum(hit.ranked_by > scored.unseen_bound for hit in hits),
+        rows_scanned=scored.scanned,
+        rows_reranked=len(scored.rows),
+        max_z=scored.max_z,
     )
 
 
 def _round_scores(scores: Scores) -> Scores:
-    # Rounding may not turn a cosine into 1.0000001, either.
+    # Clipped, because a computed cosine may exceed 1 slightly.
     return np.clip(np.round(scores, SCORE_DECIMALS), -1.0, 1.0)

@@ -1,27 +1,26 @@
-"""Scores of all rows at once by matrix products on a GPU, each within a bound of the exact one.
+"""GPU search: scores of all rows by matrix products, each with a bound of its error.
 
-A generation's rows lie in the device's memory, as float16 where they fit and as int8 codes
+A generation's rows are held in the GPU's memory, as float16 where they fit and as int8 codes
 (`shared.codes.int8_codes`) where only those do. One product gives every row's score to within a
-bound;
-rows that may be among the best are compared exactly on the CPU, from their float32 rows. So the
-answers are those of the CPU.
+bound; rows that may be among the best are compared exactly on the CPU, by their float32 rows. So
+the results are the same as those of the CPU.
 
-The bound of a float16 row: a row x is kept as its nearest float16 numbers h, of 256 x so that none
-is too small for float16; a query u, of length 1, as two float16 vectors whose sum v is u to 22
-bits. Then
+Error bound of a float16 row: a row x is stored as the float16 numbers h nearest to it, scaled by
+256 so that none underflows; a query u of length 1 is stored as two float16 vectors whose sum v
+equals u to 22 bits. Then
 
     |<u, x> - <v, h>| <= |u - v| |h| + |x - h|,
 
-with lengths that are measured, not estimated. What is computed of <v, h> is off by the sums: each
-is cut in pieces of at most PIECE products, added up in float32 on the device, and the pieces'
-sums in float64. Whatever the order, adding n terms in float32 is off by at most n u' times the sum
-of their sizes, which is at most |v| |h|; u' is 2^-24 where each sum is rounded. Tensor cores cut
-off instead of rounding, and line up the terms of one step before they add them: ADDED, 2^-22, is
-twice what that loses at most. A device on which a trial product is off by more is not used
-(`Device.trial`). TF32 and sums in float16 never come in: the inputs are float16 or int8, the
-outputs float32 or int32.
+with lengths that are measured, not estimated. The computed <v, h> has summation errors: each sum is
+split into parts of at most PARTIAL_SUM_TERMS products, which are summed in float32 on the device,
+and the parts in float64. In any order, the error of summing n terms in float32 is at most n u'
+times the sum of their magnitudes, which is at most |v| |h|; u' is 2^-24 if each sum is rounded.
+Tensor cores truncate instead of rounding, and align the terms of one step before they add them:
+ACCUMULATION_ERROR, 2^-22, is twice the most that this loses. A device whose trial product is off by
+more is not used (`GpuDevice.self_test`). TF32 and sums in float16 are never used: the inputs are
+float16 or int8, the outputs float32 or int32.
 
-The products of int8 codes are whole numbers, and exact.
+The products of int8 codes are integers, and exact.
 """
 
 from __future__ import annotations
@@ -41,25 +40,25 @@ from shared.codes.int8_codes import INT8_MAX, Int8Query
 from shared.codes.rotation import get_rotation
 
 FLOAT16, INT8 = "float16", "int8"
-ROW_FORMATS = (FLOAT16, INT8)  # the one that leaves fewer rows to compare first
+ROW_FORMATS = (FLOAT16, INT8)  # in order of preference: float16 leaves fewer rows to compare
 
-PARTIAL_SUM_TERMS = 2048  # products of a row that are added up in float32
-ACCUMULATION_ERROR = 2.0**-22  # lost by each at most, as a share of the sum of all sizes
-FLOAT16_SCALE = 256.0  # float16 numbers stand for so many times less
-RESIDUAL_SCALE = 2.0**11  # the second part of a query stands for so many times less than the first
-MAX_INT8_TERMS = 2**31 // (INT8_MAX * INT8_MAX) - 1  # whose int32 sum can't be too large
-ROUNDING = 1e-9  # of scores and bounds in float64
-ROWS_ALIGNED, COLUMNS_ALIGNED, TERMS_ALIGNED = 32, 8, 8  # what the libraries' fast ways ask for
-COPY_ROWS = 64  # that are copied to the device at once
-HEADROOM_BYTES = 1 << 30  # of the device's memory are left for products
+PARTIAL_SUM_TERMS = 2048  # products of a row that are summed in float32
+ACCUMULATION_ERROR = 2.0**-22  # error of each addition, relative to the sum of all magnitudes
+FLOAT16_SCALE = 256.0  # factor by which stored float16 numbers are larger than the row's
+RESIDUAL_SCALE = 2.0**11  # further factor of the second float16 vector of a query
+MAX_INT8_TERMS = 2**31 // (INT8_MAX * INT8_MAX) - 1  # products whose int32 sum can't overflow
+ROUNDING = 1e-9  # bound of rounding errors of scores and bounds in float64
+ROWS_ALIGNED, COLUMNS_ALIGNED, TERMS_ALIGNED = 32, 8, 8  # alignment for the fast GPU kernels
+COPY_ROWS = 64  # rows copied to the device at once
+HEADROOM_BYTES = 1 << 30  # device memory reserved for products
 
 
 class GpuError(Exception):
-    """The device did not do what it was asked: out of memory, for example."""
+    """A GPU operation failed, for example for lack of memory."""
 
 
 class GpuUnsupported(Exception):
-    """The device computes less exactly than the bounds allow for."""
+    """The GPU lacks an operation, or computes less precisely than the bounds allow for."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,26 +66,26 @@ class GpuQuery:
     """One query of a batch."""
 
     query: NDArray[np.float32]
-    """(dimension,) of any length but 0."""
+    """(dimension,) row of any length but 0."""
     row_mask: NDArray[np.bool_]
-    """(n,): which rows may be answered."""
+    """(n,): rows that may be returned."""
     k: int
     min_score: float
-    """Rows below this score are not wanted."""
+    """Minimum score, or -inf."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GpuChunk:
-    """A chunk's rows on the device."""
+    """A chunk's rows in GPU memory."""
 
     numbers: torch.Tensor
-    """float16 (rows, terms) or int8; filled up with zeros to what the libraries ask for."""
+    """(rows, terms) float16 or int8, padded with zeros to the alignment."""
     scales: torch.Tensor
-    """(n,) float64: what a row's numbers are multiplied by."""
+    """(n,) float64: factor of each row's numbers."""
     errors: torch.Tensor
-    """(n,) float64: how far they are then from the row, at most."""
+    """(n,) float64: upper bound of the distance of the scaled numbers from the row."""
     lengths: torch.Tensor
-    """(n,) float64: their length then, at most."""
+    """(n,) float64: upper bound of the length of the scaled numbers."""
 
     @property
     def nbytes(self) -> int:
@@ -94,28 +93,40 @@ class GpuChunk:
 
 
 class GpuDevice:
-    """One device and its memory."""
+    """A GPU, with its memory."""
 
     def __init__(
-        self, where: torch.device, free_bytes: Callable[[], float], headroom_bytes: int
+        self, torch_device: torch.device, free_bytes: Callable[[], float], headroom_bytes: int
     ) -> None:
-        """`free_bytes` tells how much of its memory can be had now."""
-        self.torch_device = where
+        """Create a device.
+
+        Args:
+            torch_device: The PyTorch device.
+            free_bytes: Returns the bytes of its memory that are free now.
+            headroom_bytes: Bytes to reserve for products.
+        """
+        self.torch_device = torch_device
         self._free_bytes = free_bytes
         self._headroom_bytes = headroom_bytes
 
     @classmethod
     def cuda(cls) -> GpuDevice | None:
-        """The first CUDA device; None where there is none. Unfit when its trial fails."""
+        """Return the first CUDA device, tested; None if there is none.
+
+        Raises:
+            GpuUnsupported: The self-test failed.
+        """
         if not torch.cuda.is_available():
             return None
-        where = torch.device("cuda", 0)
+        torch_device = torch.device("cuda", 0)
 
         def free_bytes() -> int:
-            unused = torch.cuda.memory_reserved(where) - torch.cuda.memory_allocated(where)
-            return torch.cuda.mem_get_info(where)[0] + unused
+            unused = torch.cuda.memory_reserved(torch_device) - torch.cuda.memory_allocated(
+                torch_device
+            )
+            return torch.cuda.mem_get_info(torch_device)[0] + unused
 
-        device = cls(where, free_bytes, HEADROOM_BYTES)
+        device = cls(torch_device, free_bytes, HEADROOM_BYTES)
         device.self_test()
         return device
 
@@ -126,60 +137,78 @@ class GpuDevice:
         return str(self.torch_device)
 
     def self_test(self) -> None:
-        """Multiply rows whose sums are hard to add up; Unfit when that is off by more than the
-        bound."""
-        draw = np.random.default_rng(0)
+        """Multiply rows whose products are hard to sum precisely.
+
+        Raises:
+            GpuUnsupported: float16 products are unsupported, or an error exceeds its bound.
+        """
+        rng = np.random.default_rng(0)
         rows = (
-            np.abs(draw.standard_normal((64, 3 * PARTIAL_SUM_TERMS)))
+            np.abs(rng.standard_normal((64, 3 * PARTIAL_SUM_TERMS)))
             ** np.arange(1, 65)[:, np.newaxis]
         )
         rows = (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32)
         chunk = self._copy_as_float16(rows)
         try:
-            pairs = [
+            results = [
                 _score_all_rows([chunk], FLOAT16, row[np.newaxis], self.torch_device)
                 for row in rows[::9]
             ]
         except (RuntimeError, TypeError) as error:  # TypeError: before PyTorch 2.8
             raise GpuUnsupported(f"{self.name} can't multiply float16 matrices: {error}") from error
-        for row, (scores, bounds) in zip(rows[::9], pairs, strict=True):
+        for row, (scores, bounds) in zip(rows[::9], results, strict=True):
             unit = row.astype(np.float64) / np.linalg.norm(row.astype(np.float64))
             exact = rows.astype(np.float64) @ unit
             if not np.all(np.abs(scores[0].cpu().numpy() - exact) <= bounds[0].cpu().numpy()):
-                raise GpuUnsupported(f"{self.name} adds up products less exactly than float32 does")
+                raise GpuUnsupported(f"{self.name} sums products less precisely than float32 does")
 
     def load(
-        self, chunks: Sequence[LoadedChunk], old: GpuSnapshot | None, most_bytes: float
+        self, chunks: Sequence[LoadedChunk], old: GpuSnapshot | None, max_bytes: float
     ) -> GpuSnapshot | None:
-        """A snapshot's rows on the device, of which those in `old` stay; None when they don't fit,
-        or more than `most_bytes` would have to be copied. DeviceFailed."""
-        kind = next((kind for kind in ROW_FORMATS if self.has_room(chunks, kind, old)), None)
-        if kind is None or (kind == INT8 and any(chunk.int8 is None for chunk in chunks)):
+        """Load a snapshot's rows into GPU memory, reusing those of `old`.
+
+        Args:
+            chunks: The chunks of the snapshot.
+            old: Rows of the previous snapshot, if any.
+            max_bytes: Maximum number of bytes to copy.
+
+        Returns:
+            The rows; None if they don't fit, or more than `max_bytes` would have to be copied.
+
+        Raises:
+            GpuError: The copy failed.
+        """
+        row_format = next(
+            (candidate for candidate in ROW_FORMATS if self.has_room(chunks, candidate, old)), None
+        )
+        if row_format is None or (
+            row_format == INT8 and any(chunk.int8 is None for chunk in chunks)
+        ):
             return None
-        if _copied_bytes(chunks, kind, old) > most_bytes:
+        if _copied_bytes(chunks, row_format, old) > max_bytes:
             return None
-        known = _reusable_chunks(kind, old)
+        reusable = _reusable_chunks(row_format, old)
         try:
-            there = {
-                chunk.chunk_id: known.get(chunk.chunk_id) or self._copy_chunk(chunk, kind)
+            gpu_chunks = {
+                chunk.chunk_id: reusable.get(chunk.chunk_id) or self._copy_chunk(chunk, row_format)
                 for chunk in chunks
             }
-        except RuntimeError as error:  # out of memory is one
+        except RuntimeError as error:  # includes out-of-memory errors
             raise GpuError(str(error)) from error
-        return GpuSnapshot(self.torch_device, kind, there)
+        return GpuSnapshot(self.torch_device, row_format, gpu_chunks)
 
     def has_room(
-        self, chunks: Sequence[LoadedChunk], kind: str, old: GpuSnapshot | None = None
+        self, chunks: Sequence[LoadedChunk], row_format: str, old: GpuSnapshot | None = None
     ) -> bool:
-        """Whether the chunks' rows fit, of this kind, beside what is there."""
+        """Whether the chunks' rows fit into free memory in this format, reusing those of `old`."""
         dimension = chunks[0].rows.shape[1]
-        if kind == INT8 and get_rotation(dimension).padded > MAX_INT8_TERMS:
+        if row_format == INT8 and get_rotation(dimension).padded > MAX_INT8_TERMS:
             return False
-        needed = _copied_bytes(chunks, kind, old) + self._headroom_bytes
+        needed = _copied_bytes(chunks, row_format, old) + self._headroom_bytes
         return needed <= self._free_bytes()
 
-    def _copy_chunk(self, chunk: LoadedChunk, kind: str) -> GpuChunk:
-        if kind == FLOAT16:
+    def _copy_chunk(self, chunk: LoadedChunk, row_format: str) -> GpuChunk:
+        if row_format == FLOAT16:
             return self._copy_as_float16(chunk.rows)
         codes = chunk.int8
         assert codes is not None
@@ -189,165 +218,186 @@ class GpuDevice:
             device=self.torch_device,
         )
         for begin in range(0, len(codes), COPY_ROWS):
-            slab = np.array(codes.numbers[begin : begin + COPY_ROWS])
-            numbers[begin : begin + len(slab)] = torch.from_numpy(slab).to(self.torch_device)
-        figures = (codes.scales, codes.errors, codes.lengths)
+            block = np.array(codes.numbers[begin : begin + COPY_ROWS])
+            numbers[begin : begin + len(block)] = torch.from_numpy(block).to(self.torch_device)
+        params = (codes.scales, codes.errors, codes.lengths)
         return GpuChunk(
             numbers,
-            *(torch.from_numpy(one.astype(np.float64)).to(self.torch_device) for one in figures),
+            *(torch.from_numpy(array.astype(np.float64)).to(self.torch_device) for array in params),
         )
 
     def _copy_as_float16(self, rows: NDArray[np.float32]) -> GpuChunk:
-        pieces, piece = _partial_sum_layout(rows.shape[1])
+        parts, part_terms = _partial_sum_layout(rows.shape[1])
         numbers = torch.zeros(
-            (_round_up(len(rows), ROWS_ALIGNED), pieces * piece),
+            (_round_up(len(rows), ROWS_ALIGNED), parts * part_terms),
             dtype=torch.float16,
             device=self.torch_device,
         )
         errors = torch.empty(len(rows), dtype=torch.float64, device=self.torch_device)
         lengths = torch.empty_like(errors)
         for begin in range(0, len(rows), COPY_ROWS):
-            slab = torch.from_numpy(np.array(rows[begin : begin + COPY_ROWS])).to(self.torch_device)
-            half = (slab * FLOAT16_SCALE).half()
-            end = begin + len(slab)
-            numbers[begin:end, : slab.shape[1]] = half
-            back = half.double() / FLOAT16_SCALE
-            errors[begin:end] = (slab.double() - back).norm(dim=1)
-            lengths[begin:end] = back.norm(dim=1)
+            block = torch.from_numpy(np.array(rows[begin : begin + COPY_ROWS])).to(
+                self.torch_device
+            )
+            scaled = (block * FLOAT16_SCALE).half()
+            end = begin + len(block)
+            numbers[begin:end, : block.shape[1]] = scaled
+            stored = scaled.double() / FLOAT16_SCALE
+            errors[begin:end] = (block.double() - stored).norm(dim=1)
+            lengths[begin:end] = stored.norm(dim=1)
         return GpuChunk(numbers, torch.full_like(errors, 1 / FLOAT16_SCALE), errors, lengths)
 
 
 class GpuSnapshot:
-    """A snapshot's rows on a device; immutable. Its memory is free once nothing refers to it."""
+    """A snapshot's rows in GPU memory; immutable. The memory is freed with its last reference."""
 
-    def __init__(self, where: torch.device, kind: str, chunks: Mapping[UUID, GpuChunk]) -> None:
-        self.row_format = kind
+    def __init__(
+        self, torch_device: torch.device, row_format: str, chunks: Mapping[UUID, GpuChunk]
+    ) -> None:
+        self.row_format = row_format
         self.chunks = chunks
-        """In the snapshot's order."""
+        """Chunks by id, in the snapshot's order."""
         self.failure: str | None = None
-        """Why it is not to be asked again."""
-        self._torch_device = where
+        """Error after which it must not be used any more; None while it works."""
+        self._torch_device = torch_device
 
     @property
     def nbytes(self) -> int:
         return sum(chunk.nbytes for chunk in self.chunks.values())
 
     def candidates(self, batch: Sequence[GpuQuery]) -> list[Candidates]:
-        """For each query of the batch the rows that may be among its best. DeviceFailed."""
+        """Find the rows that may be among the best, for each query of a batch.
+
+        Raises:
+            GpuError: The GPU failed; `failure` is set.
+        """
         try:
-            queries = np.stack([asked.query for asked in batch])
+            queries = np.stack([query.query for query in batch])
             scores, bounds = _score_all_rows(
                 list(self.chunks.values()), self.row_format, queries, self._torch_device
             )
             return [
-                _select_candidates(asked, scores[number], bounds[number])
-                for number, asked in enumerate(batch)
+                _select_candidates(query, scores[index], bounds[index])
+                for index, query in enumerate(batch)
             ]
         except RuntimeError as error:
             self.failure = str(error)
             raise GpuError(self.failure) from error
 
 
-def _select_candidates(asked: GpuQuery, scores: torch.Tensor, bounds: torch.Tensor) -> Candidates:
-    wanted = torch.from_numpy(np.array(asked.row_mask)).to(scores.device)
-    floor = asked.min_score
-    if asked.k <= len(scores):
-        certain = torch.where(wanted, scores - bounds, -math.inf)
-        floor = max(floor, float(torch.topk(certain, asked.k).values[-1]))
-    reach = scores + bounds
-    rows = torch.nonzero(wanted & (reach >= floor))[:, 0]
-    return Candidates(rows.cpu().numpy(), reach[rows].cpu().numpy(), floor)
+def _select_candidates(query: GpuQuery, scores: torch.Tensor, bounds: torch.Tensor) -> Candidates:
+    row_mask = torch.from_numpy(np.array(query.row_mask)).to(scores.device)
+    floor = query.min_score
+    if query.k <= len(scores):
+        lower_bounds = torch.where(row_mask, scores - bounds, -math.inf)
+        floor = max(floor, float(torch.topk(lower_bounds, query.k).values[-1]))
+    upper_bounds = scores + bounds
+    rows = torch.nonzero(row_mask & (upper_bounds >= floor))[:, 0]
+    return Candidates(rows.cpu().numpy(), upper_bounds[rows].cpu().numpy(), floor)
 
 
 def _score_all_rows(
-    chunks: Sequence[GpuChunk], kind: str, queries: NDArray[np.float32], where: torch.device
+    chunks: Sequence[GpuChunk],
+    row_format: str,
+    queries: NDArray[np.float32],
+    torch_device: torch.device,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """The scores of all rows, (b, n) float64, and how far they are off at most."""
+    """Return scores of all rows for b queries, (b, n) float64, and bounds of their errors."""
     count = len(queries)
-    if kind == FLOAT16:
-        columns, errors, added = _float16_query_columns(queries)
+    if row_format == FLOAT16:
+        columns, errors, accumulation_error = _float16_query_columns(queries)
         scales = np.full(count, 1 / FLOAT16_SCALE)
         weights = (1.0, 1 / RESIDUAL_SCALE)
     else:
-        made = [Int8Query.from_row(query) for query in queries]
-        columns = np.concatenate([np.stack([one.parts[part] for one in made]) for part in (0, 1)])
-        errors, added = np.array([one.error for one in made]), 0.0
-        scales = np.array([one.scale for one in made])
+        coded = [Int8Query.from_row(query) for query in queries]
+        columns = np.concatenate(
+            [np.stack([code.parts[part] for code in coded]) for part in (0, 1)]
+        )
+        errors, accumulation_error = np.array([code.error for code in coded]), 0.0
+        scales = np.array([code.scale for code in coded])
         weights = (128.0, 1.0)
-    filled = np.zeros((_round_up(2 * count, COLUMNS_ALIGNED), columns.shape[1]), columns.dtype)
-    filled[: 2 * count] = columns
-    on_device = torch.from_numpy(filled).to(where)
-    parts = []
+    padded = np.zeros((_round_up(2 * count, COLUMNS_ALIGNED), columns.shape[1]), columns.dtype)
+    padded[: 2 * count] = columns
+    on_device = torch.from_numpy(padded).to(torch_device)
+    chunk_scores = []
     for chunk in chunks:
         rows = len(chunk.scales)
-        products = (_float16_products if kind == FLOAT16 else _int8_products)(chunk, on_device)[
-            :rows
-        ]
+        products = (_float16_products if row_format == FLOAT16 else _int8_products)(
+            chunk, on_device
+        )[:rows]
         sums = weights[0] * products[:, :count] + weights[1] * products[:, count : 2 * count]
-        parts.append(sums * chunk.scales[:, None])
-    scores = torch.cat(parts) * torch.from_numpy(scales).to(where)
-    off = torch.cat([chunk.errors for chunk in chunks])[:, None]
+        chunk_scores.append(sums * chunk.scales[:, None])
+    scores = torch.cat(chunk_scores) * torch.from_numpy(scales).to(torch_device)
+    row_errors = torch.cat([chunk.errors for chunk in chunks])[:, None]
     lengths = torch.cat([chunk.lengths for chunk in chunks])[:, None]
-    bounds = off + lengths * (torch.from_numpy(errors).to(where) + added) + ROUNDING
+    bounds = (
+        row_errors
+        + lengths * (torch.from_numpy(errors).to(torch_device) + accumulation_error)
+        + ROUNDING
+    )
     return scores.T, bounds.T
 
 
 def _float16_query_columns(
     queries: NDArray[np.float32],
 ) -> tuple[NDArray[np.float16], NDArray[np.float64], float]:
-    """(2 b, terms): the first parts of b queries, then the second; how far their sums are from the
-    queries of length 1; and what their products lose in being added up."""
+    """Split b queries, scaled to length 1, into two float16 vectors each.
+
+    Returns:
+        (2 b, terms) the first vectors, then the second ones; (b,) distances of their sums from the
+        queries; and the summation error of their products.
+    """
     unit = queries.astype(np.float64)
     unit /= np.linalg.norm(unit, axis=1, keepdims=True)
     first = (unit * FLOAT16_SCALE).astype(np.float16)
     second = ((unit * FLOAT16_SCALE - first) * RESIDUAL_SCALE).astype(np.float16)
-    stands_for = (
+    restored = (
         first.astype(np.float64) + second.astype(np.float64) / RESIDUAL_SCALE
     ) / FLOAT16_SCALE
-    pieces, piece = _partial_sum_layout(queries.shape[1])
-    columns = np.zeros((2 * len(queries), pieces * piece), np.float16)
+    parts, part_terms = _partial_sum_layout(queries.shape[1])
+    columns = np.zeros((2 * len(queries), parts * part_terms), np.float16)
     columns[:, : queries.shape[1]] = np.concatenate([first, second])
-    # The lengths of both parts together are less than 1.001.
-    return columns, np.linalg.norm(unit - stands_for, axis=1), 1.001 * piece * ACCUMULATION_ERROR
+    # The lengths of both vectors sum to less than 1.001.
+    return columns, np.linalg.norm(unit - restored, axis=1), 1.001 * part_terms * ACCUMULATION_ERROR
 
 
 def _float16_products(chunk: GpuChunk, columns: torch.Tensor) -> torch.Tensor:
-    """(rows, columns) float64, of sums of pieces in float32."""
-    pieces = -(-columns.shape[1] // PARTIAL_SUM_TERMS)
-    rows = chunk.numbers.view(len(chunk.numbers), pieces, -1).transpose(0, 1)
-    asked = columns.view(len(columns), pieces, -1).permute(1, 2, 0)
+    """Products (rows, columns) in float64, of partial sums in float32."""
+    parts = -(-columns.shape[1] // PARTIAL_SUM_TERMS)
+    rows = chunk.numbers.view(len(chunk.numbers), parts, -1).transpose(0, 1)
+    queries = columns.view(len(columns), parts, -1).permute(1, 2, 0)
     if rows.is_cuda:
-        products = torch.bmm(rows, asked, out_dtype=torch.float32)
-    else:  # no other device multiplies float16 into float32
-        products = torch.bmm(rows.float(), asked.float())
+        products = torch.bmm(rows, queries, out_dtype=torch.float32)
+    else:  # other devices can't multiply float16 with a float32 result
+        products = torch.bmm(rows.float(), queries.float())
     return products.double().sum(0)
 
 
 def _int8_products(chunk: GpuChunk, columns: torch.Tensor) -> torch.Tensor:
-    """(rows, columns) float64, exact."""
+    """Exact products (rows, columns) in float64."""
     return torch._int_mm(chunk.numbers, columns.t()).double()
 
 
 def _partial_sum_layout(dimension: int) -> tuple[int, int]:
-    """In how many pieces a row is multiplied, and their length."""
-    pieces = -(-dimension // PARTIAL_SUM_TERMS)
-    return pieces, _round_up(-(-dimension // pieces), TERMS_ALIGNED)
+    """Number of partial sums of a row, and the terms of each."""
+    parts = -(-dimension // PARTIAL_SUM_TERMS)
+    return parts, _round_up(-(-dimension // parts), TERMS_ALIGNED)
 
 
-def _gpu_bytes(chunk: LoadedChunk, kind: str) -> int:
+def _gpu_bytes(chunk: LoadedChunk, row_format: str) -> int:
     count, dimension = chunk.rows.shape
-    pieces, piece = _partial_sum_layout(dimension)
-    terms = 2 * pieces * piece if kind == FLOAT16 else get_rotation(dimension).padded
+    parts, part_terms = _partial_sum_layout(dimension)
+    terms = 2 * parts * part_terms if row_format == FLOAT16 else get_rotation(dimension).padded
     return _round_up(count, ROWS_ALIGNED) * (terms + 24)
 
 
-def _copied_bytes(chunks: Sequence[LoadedChunk], kind: str, old: GpuSnapshot | None) -> int:
-    known = _reusable_chunks(kind, old)
-    return sum(_gpu_bytes(c, kind) for c in chunks if c.chunk_id not in known)
+def _copied_bytes(chunks: Sequence[LoadedChunk], row_format: str, old: GpuSnapshot | None) -> int:
+    reusable = _reusable_chunks(row_format, old)
+    return sum(_gpu_bytes(chunk, row_format) for chunk in chunks if chunk.chunk_id not in reusable)
 
 
-def _reusable_chunks(kind: str, old: GpuSnapshot | None) -> Mapping[UUID, GpuChunk]:
-    return old.chunks if old is not None and old.row_format == kind else {}
+def _reusable_chunks(row_format: str, old: GpuSnapshot | None) -> Mapping[UUID, GpuChunk]:
+    return old.chunks if old is not None and old.row_format == row_format else {}
 
 
 def _round_up(number: int, multiple: int) -> int:

@@ -1,7 +1,7 @@
-"""Int8 codes of a whole generation, made in the background once someone asks for them.
+"""Builder of a generation's int8 codes, in a background thread on first use.
 
-At 98,304 dimensions they are 98 KB a row and take a millisecond each to make: most installations
-never need them (`Mode.DETERMINISTIC`), so that they are not made before.
+At 98,304 dimensions a row's code has 98 KB and takes a millisecond to compute. Most installations
+never need it (`Mode.DETERMINISTIC`), so it is not computed in advance.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ MAX_RETRY_SECONDS = 300.0
 
 @dataclass(slots=True)
 class _Int8Build:
-    """The codes of one generation on their way."""
+    """A running build of one generation's codes."""
 
     rows: int
     done: int = 0
@@ -40,14 +40,14 @@ class _Int8Build:
     error: OSError | None = None
 
     def seconds_left(self) -> float:
-        """As the rows that are done tell; a second at least."""
+        """Estimated remaining time: at least 1 and at most MAX_RETRY_SECONDS."""
         elapsed = time.monotonic() - self.started
-        left = elapsed * (self.rows - self.done) / max(1, self.done)
-        return min(max(left, 1.0), MAX_RETRY_SECONDS)
+        remaining = elapsed * (self.rows - self.done) / max(1, self.done)
+        return min(max(remaining, 1.0), MAX_RETRY_SECONDS)
 
 
 class Int8CodeBuilder:
-    """Makes the codes of one generation at a time each, in a thread of its own. Thread-safe."""
+    """Builds int8 codes in background threads, one for each generation; thread-safe."""
 
     def __init__(
         self,
@@ -55,9 +55,13 @@ class Int8CodeBuilder:
         folder: Path,
         on_built: Callable[[UUID, dict[UUID, Int8Codes]], None],
     ) -> None:
-        """Files are kept below `folder`. `on_built` is called with a generation and the codes
-        of its
-        chunks, by chunk id."""
+        """Create a builder.
+
+        Args:
+            store: The object store.
+            folder: Files are cached below this folder.
+            on_built: Called with a generation and its codes by chunk id.
+        """
         self._store = store
         self._folder = folder
         self._on_built = on_built
@@ -65,60 +69,61 @@ class Int8CodeBuilder:
         self._builds: dict[UUID, _Int8Build] = {}
 
     def wait_for_codes(self, snapshot: Snapshot, seconds: float) -> None:
-        """Make the codes of the snapshot's chunks, or wait for whoever does.
+        """Build the codes of the snapshot's chunks, or wait for a running build.
 
-        Unavailable: `codes_being_made` when that takes longer, `codes_not_made` when the disk
-        does not take them.
+        Raises:
+            Unavailable: `codes_being_made` if it takes longer than `seconds`; `codes_not_made` if
+                the codes can't be written to disk.
         """
-        making = self.start_build(snapshot)
-        if not making.ended.wait(seconds):
+        build = self.start_build(snapshot)
+        if not build.ended.wait(seconds):
             raise Unavailable(
                 "codes_being_made",
-                f"The codes for mode=deterministic are being made: {making.done} of "
-                f"{making.rows} rows are done. Ask again later, or with another mode.",
-                done=making.done,
-                rows=making.rows,
-                retry_after_seconds=making.seconds_left(),
+                f"The codes for mode=deterministic are being built: {build.done} of "
+                f"{build.rows} rows are done. Retry later, or use another mode.",
+                done=build.done,
+                rows=build.rows,
+                retry_after_seconds=build.seconds_left(),
             )
-        if making.error is not None:
-            reason = making.error.strerror or str(making.error)
+        if build.error is not None:
+            reason = build.error.strerror or str(build.error)
             raise Unavailable(
                 "codes_not_made",
-                "The codes for mode=deterministic can't be kept in the search worker's folder "
-                f"({reason}). Make room there, or ask with mode=dense.",
+                "The codes for mode=deterministic can't be written to the search worker's folder "
+                f"({reason}). Free some disk space, or use mode=dense.",
             )
 
     def start_build(self, snapshot: Snapshot) -> _Int8Build:
-        """Begin, unless someone has begun for this generation."""
+        """Start a build, or return the generation's running one."""
         with self._lock:
-            making = self._builds.get(snapshot.generation_id)
-            if making is None:
-                making = _Int8Build(sum(len(chunk.rows) for chunk in snapshot.chunks))
-                self._builds[snapshot.generation_id] = making
+            build = self._builds.get(snapshot.generation_id)
+            if build is None:
+                build = _Int8Build(sum(len(chunk.rows) for chunk in snapshot.chunks))
+                self._builds[snapshot.generation_id] = build
                 threading.Thread(
-                    target=self._build, args=(snapshot, making), name="make-int8", daemon=True
+                    target=self._build, args=(snapshot, build), name="build-int8", daemon=True
                 ).start()
-        return making
+        return build
 
-    def _build(self, snapshot: Snapshot, making: _Int8Build) -> None:
+    def _build(self, snapshot: Snapshot, build: _Int8Build) -> None:
         generation_id = snapshot.generation_id
-        log.info("making int8 codes of %d rows of generation %s", making.rows, generation_id)
+        log.info("building int8 codes of %d rows of generation %s", build.rows, generation_id)
         loader = generation_loader(self._store, self._folder, generation_id)
-        said = making.started
-        made: dict[UUID, Int8Codes] = {}
+        logged_at = build.started
+        codes: dict[UUID, Int8Codes] = {}
         try:
             for chunk in snapshot.chunks:
                 if chunk.stored is not None and chunk.int8 is None:
-                    made[chunk.chunk_id] = loader.load_int8_codes(chunk.object_key, chunk.stored)
-                making.done += len(chunk.rows)
-                if time.monotonic() - said > LOG_INTERVAL_SECONDS:
-                    said = time.monotonic()
-                    log.info("int8 codes: %d of %d rows", making.done, making.rows)
-            self._on_built(generation_id, made)
+                    codes[chunk.chunk_id] = loader.load_int8_codes(chunk.object_key, chunk.stored)
+                build.done += len(chunk.rows)
+                if time.monotonic() - logged_at > LOG_INTERVAL_SECONDS:
+                    logged_at = time.monotonic()
+                    log.info("int8 codes: %d of %d rows", build.done, build.rows)
+            self._on_built(generation_id, codes)
         except OSError as error:
-            log.error("int8 codes of generation %s can't be kept: %s", generation_id, error)
-            making.error = error
+            log.error("int8 codes of generation %s can't be stored: %s", generation_id, error)
+            build.error = error
         finally:
             with self._lock:
                 del self._builds[generation_id]
-            making.ended.set()
+            build.ended.set()

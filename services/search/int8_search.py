@@ -1,11 +1,11 @@
-"""Exact top-k by int8 codes: no row is left out that could be in the answer, whatever it holds.
+"""Exact top-k by int8 codes: a proven bound excludes every row that is not compared exactly.
 
-1. The product of each row's code with the query's is its score to within a bound
-   (`shared.codes.int8_codes`). The k-th highest score less its bound is a floor for the answer.
+1. The product of each row's code with the query's code is its score to within a bound
+   (`shared.codes.int8_codes`). The k-th highest score minus bound is a floor of the result.
 2. Rows whose score plus bound reaches the floor are compared exactly, the highest first, until no
-   other can reach the k-th exact score.
+   other row can reach the k-th exact score.
 
-Nothing here is likely: every error is bounded by the lengths of what was rounded away.
+Nothing is probabilistic: every error is bounded by the lengths of the rounding residuals.
 """
 
 from __future__ import annotations
@@ -29,23 +29,21 @@ from services.search.exact_rerank import (
 from services.search.kernels import rows_above_floor
 from shared.codes.int8_codes import Int8Query
 
-BUDGET_CHECK_BYTES = (
-    1 << 28
-)  # of codes between two looks at the clock: about a hundredth of a second
+BUDGET_CHECK_BYTES = 1 << 28  # of codes between two checks of the deadline: about 10 ms
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Int8Blocks(RowBlocks):
-    """Where the int8 codes and the rows of n photos lie, in c blocks."""
+    """Addresses of the int8 codes and rows of n photos in c blocks."""
 
     code_addresses: Addresses
-    """(c,): where the block's bytes begin."""
+    """(c,): start address of each block's codes."""
     row_params: NDArray[np.float32]
     """(3, n): scale, error and length of each row."""
 
     @classmethod
     def of(cls, chunks: Sequence[LoadedChunk]) -> Int8Blocks:
-        """Those of chunks that have int8 codes."""
+        """Create them from chunks that all have int8 codes."""
         codes = [chunk.int8 for chunk in chunks if chunk.int8 is not None]
         if len(codes) < len(chunks):
             raise ValueError("a chunk has no int8 codes")
@@ -64,13 +62,13 @@ class Int8Blocks(RowBlocks):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Candidates:
-    """Every row that may be among the k best."""
+    """All rows that may be among the k best."""
 
     rows: Indices
     upper_bounds: Scores
-    """What each scores at most."""
+    """Upper bound of each row's score."""
     floor: float
-    """What the k-th best scores at least; -inf where there are fewer."""
+    """Lower bound of the k-th best score; -inf if there are fewer than k rows."""
 
 
 def find_candidates(
@@ -81,10 +79,21 @@ def find_candidates(
     min_score: float,
     budget: SearchBudget,
 ) -> Candidates | None:
-    """Of the rows asked for, (n,) bool, those that may be among the `k` best and score at least
-    `min_score`; None when the time is over before all were looked at."""
-    certain = np.full(k, -math.inf)
-    rows, reach = np.empty(len(blocks), np.int64), np.empty(len(blocks))
+    """Find the rows that may be among the `k` best and score at least `min_score`.
+
+    Args:
+        blocks: Codes of n rows.
+        query: The query.
+        row_mask: (n,) bool, the rows that may be returned.
+        k: Number of results.
+        min_score: Minimum score, or -inf.
+        budget: The deadline.
+
+    Returns:
+        The candidates; None if the deadline passed before all rows were scanned.
+    """
+    lower_bounds = np.full(k, -math.inf)
+    rows, upper_bounds = np.empty(len(blocks), np.int64), np.empty(len(blocks))
     step = max(1, BUDGET_CHECK_BYTES // len(query.numbers))
     count = 0
     for begin in range(0, len(blocks), step):
@@ -99,11 +108,11 @@ def find_candidates(
             (query.scale, query.error, min_score),
             begin,
             min(len(blocks), begin + step),
-            certain,
+            lower_bounds,
             rows,
-            reach,
+            upper_bounds,
             count,
         )
-    floor = max(min_score, float(certain[0]))
-    near = reach[:count] >= floor
-    return Candidates(rows[:count][near], reach[:count][near], floor)
+    floor = max(min_score, float(lower_bounds[0]))
+    above_floor = upper_bounds[:count] >= floor
+    return Candidates(rows[:count][above_floor], upper_bounds[:count][above_floor], floor)

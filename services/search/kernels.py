@@ -1,7 +1,12 @@
-"""The compiled loops of a search: over codes, and over rows, wherever in memory they lie.
+"""Compiled kernels of the search: Hamming distances, int8 products and exact products.
 
-Rows lie in many arrays, some of them files mapped into memory; so the loops take addresses. Who
-calls keeps the arrays alive. They hold no lock of the interpreter.
+Rows lie in many arrays, some of them memory-mapped files, so the kernels take addresses; the caller
+keeps the memory alive. The kernels release the GIL.
+
+Parameters that most kernels have:
+
+* `block_addresses` (c,): start address of each block's rows;
+* `first_rows` (c + 1,): number of each block's first row; the last is the number of rows.
 """
 
 from __future__ import annotations
@@ -17,9 +22,9 @@ from numpy.typing import NDArray
 from shared.codes.jit import REORDERED_FASTMATH, numba_jit
 
 EXCLUDED_DISTANCE = 65_535  # more than any distance
-INT32_SAFE_TERMS = 1024  # so many products of a byte and 15 bits add up to less than 2^31
-ROUNDING = 1e-9  # more than what float64 loses of a score anywhere: 2^-53 for each of 100,000 terms
-PLANES = 4  # `weighted_bit_sums` is written for so many
+INT32_SAFE_TERMS = 1024  # this many products of 8-bit and 15-bit integers sum to less than 2^31
+ROUNDING = 1e-9  # bound of float64 rounding errors of a score: 2^-53 for each of 100,000 terms
+PLANES = 4  # `weighted_bit_sums` is written for exactly 4
 LOW_BIT_OF_EACH_BYTE = np.uint64(0x0101010101010101)
 BIT_GATHER_FACTOR = np.uint64(0x0102040810204080)
 
@@ -29,7 +34,7 @@ Addresses = NDArray[np.uint64]
 
 @intrinsic
 def _popcount(_typing: Any, value: types.Type) -> Any:
-    """The number of ones of a uint64."""
+    """Number of set bits of a uint64."""
 
     def generate(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
         return builder.ctpop(arguments[0])
@@ -40,7 +45,7 @@ def _popcount(_typing: Any, value: types.Type) -> Any:
 def _pointer_to(element: types.Type) -> Any:
     @intrinsic
     def pointer(_typing: Any, _address: types.Type) -> Any:
-        """The address as a pointer."""
+        """Convert an address to a pointer."""
 
         def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
             kind = context.get_value_type(signature.return_type)
@@ -58,8 +63,8 @@ _bytes_at = _pointer_to(types.int8)
 
 @numba_jit(REORDERED_FASTMATH)
 def hamming_distances(
-    blocks: Addresses,
-    first: NDArray[np.int64],
+    block_addresses: Addresses,
+    first_rows: NDArray[np.int64],
     row_masks: NDArray[np.bool_],
     queries: Words,
     begin: int,
@@ -67,58 +72,68 @@ def hamming_distances(
     out: NDArray[np.uint16],
     counts: NDArray[np.int64],
 ) -> None:
-    """How many bits of q queries differ from the rows `begin` to `end` of all blocks together.
+    """Hamming distances of q queries to the rows `begin` to `end`, numbered across all blocks.
 
-    blocks (c,): where each block's codes begin, rows of the queries' length one after the other.
-    first (c + 1,): the number of each block's first row. asked (q, rows): the others are passed
-    over, and get NOT_ASKED. queries (q, words). out (q, rows). counts (q, bits + 1): how many rows
-    have each distance, added to what is there.
+    Args:
+        block_addresses: (c,) addresses of the blocks' codes, each row as long as a query.
+        first_rows: (c + 1,) number of each block's first row.
+        row_masks: (q, rows) bool; other rows are skipped and get EXCLUDED_DISTANCE.
+        queries: (q, words) uint64.
+        begin: First row.
+        end: One past the last row.
+        out: (q, rows) uint16, the distances.
+        counts: (q, bits + 1) int64, incremented by the number of rows at each distance.
     """
     words = queries.shape[1]
-    block = np.searchsorted(first, begin, side="right") - 1
+    block = np.searchsorted(first_rows, begin, side="right") - 1
     while begin < end:
-        upto = min(end, first[block + 1])
-        codes = nb.carray(_words_at(blocks[block]), (first[block + 1] - first[block], words))
-        for row in range(begin, upto):
-            code = codes[row - first[block]]
-            for number in range(queries.shape[0]):
-                if not row_masks[number, row]:
-                    out[number, row] = EXCLUDED_DISTANCE
+        block_end = min(end, first_rows[block + 1])
+        codes = nb.carray(
+            _words_at(block_addresses[block]), (first_rows[block + 1] - first_rows[block], words)
+        )
+        for row in range(begin, block_end):
+            code = codes[row - first_rows[block]]
+            for query_index in range(queries.shape[0]):
+                if not row_masks[query_index, row]:
+                    out[query_index, row] = EXCLUDED_DISTANCE
                     continue
-                query = queries[number]
-                differ = np.uint64(0)
+                query = queries[query_index]
+                distance = np.uint64(0)
                 for i in range(words):
-                    differ += _popcount(code[i] ^ query[i])
-                out[number, row] = differ
-                counts[number, differ] += 1
-        begin = upto
+                    distance += _popcount(code[i] ^ query[i])
+                out[query_index, row] = distance
+                counts[query_index, distance] += 1
+        begin = block_end
         block += 1
 
 
 @numba_jit(REORDERED_FASTMATH)
-def _address(begins: Addresses, first: NDArray[np.int64], row: int, row_bytes: int) -> np.uint64:
-    """Where a row lies: blocks begin at `begins` (c,), with the rows from `first` (c + 1,) on."""
-    block = np.searchsorted(first, row, side="right") - 1
-    return begins[block] + np.uint64((row - first[block]) * row_bytes)
+def _address(
+    block_addresses: Addresses, first_rows: NDArray[np.int64], row: int, row_bytes: int
+) -> np.uint64:
+    """Address of a row."""
+    block = np.searchsorted(first_rows, row, side="right") - 1
+    return block_addresses[block] + np.uint64((row - first_rows[block]) * row_bytes)
 
 
 @numba_jit(REORDERED_FASTMATH)
 def int8_product(row: NDArray[np.int8], query: NDArray[np.int16]) -> np.int64:
-    """The product of whole numbers of at most 127 and 127 * 128 + 63: exact."""
+    """Exact dot product of integers up to 127 with integers up to 127 * 128 + 63."""
     total = np.int64(0)
     for begin in range(0, query.shape[0], INT32_SAFE_TERMS):
-        some, asked = row[begin : begin + INT32_SAFE_TERMS], query[begin : begin + INT32_SAFE_TERMS]
-        part = np.int32(0)
-        for j in range(asked.shape[0]):
-            part = np.int32(part + np.int32(some[j]) * np.int32(asked[j]))
-        total += np.int64(part)
+        row_part = row[begin : begin + INT32_SAFE_TERMS]
+        query_part = query[begin : begin + INT32_SAFE_TERMS]
+        partial_sum = np.int32(0)
+        for j in range(query_part.shape[0]):
+            partial_sum = np.int32(partial_sum + np.int32(row_part[j]) * np.int32(query_part[j]))
+        total += np.int64(partial_sum)
     return total
 
 
 @numba_jit(REORDERED_FASTMATH)
 def rows_above_floor(
-    blocks: Addresses,
-    first: NDArray[np.int64],
+    block_addresses: Addresses,
+    first_rows: NDArray[np.int64],
     row_mask: NDArray[np.bool_],
     row_params: NDArray[np.float32],
     query: NDArray[np.int16],
@@ -130,28 +145,41 @@ def rows_above_floor(
     upper_bounds: NDArray[np.float64],
     count: int,
 ) -> int:
-    """Of the rows `begin` to `end` of all blocks together, those that may reach the floor.
+    """Find the rows `begin` to `end`, numbered across all blocks, whose score may reach the floor.
 
-    blocks (c,): where each block's int8 numbers begin, rows of the query's length one after the
-    other. first (c + 1,): the number of each block's first row. asked (rows,): the others are
-    passed over. figures (3, rows): scale, error and length of each row; query_figures: scale and
-    error of the query, and the lowest floor there is. least (k,): a heap, the least first, of the
-    highest scores that rows have for certain; the floor is its least. Who passes is written to
-    `rows`, and to `upper_bounds` what it scores at most, from place `count` on; returns the
-    next place.
+    Args:
+        block_addresses: (c,) addresses of the blocks' int8 codes, each row as long as the query.
+        first_rows: (c + 1,) number of each block's first row.
+        row_mask: (rows,) bool; other rows are skipped.
+        row_params: (3, rows) float32: scale, error and length of each row.
+        query: (padded,) int16.
+        query_params: Scale and error of the query, and the minimum floor.
+        begin: First row.
+        end: One past the last row.
+        best_scores_heap: (k,) min-heap of the highest lower bounds of scores; its minimum is the
+            floor.
+        rows: Rows that may reach the floor, written from index `count` on.
+        upper_bounds: Upper bounds of their scores, written from index `count` on.
+        count: Number of rows found so far.
+
+    Returns:
+        The new number of rows found.
     """
-    words = query.shape[0]
+    padded = query.shape[0]
     scale, error, lowest = query_params
     floor = max(lowest, best_scores_heap[0])
-    block = np.searchsorted(first, begin, side="right") - 1
+    block = np.searchsorted(first_rows, begin, side="right") - 1
     while begin < end:
-        upto = min(end, first[block + 1])
-        numbers = nb.carray(_bytes_at(blocks[block]), (first[block + 1] - first[block], words))
-        for row in range(begin, upto):
+        block_end = min(end, first_rows[block + 1])
+        codes = nb.carray(
+            _bytes_at(block_addresses[block]),
+            (first_rows[block + 1] - first_rows[block], padded),
+        )
+        for row in range(begin, block_end):
             if not row_mask[row]:
                 continue
-            whole = int8_product(numbers[row - first[block]], query)
-            score = np.float64(row_params[0, row]) * scale * np.float64(whole)
+            product = int8_product(codes[row - first_rows[block]], query)
+            score = np.float64(row_params[0, row]) * scale * np.float64(product)
             bound = row_params[1, row] + row_params[2, row] * error + ROUNDING
             if score + bound >= floor:
                 rows[count], upper_bounds[count] = row, score + bound
@@ -159,65 +187,80 @@ def rows_above_floor(
                 if score - bound > best_scores_heap[0]:
                     _replace_heap_minimum(best_scores_heap, score - bound)
                     floor = max(lowest, best_scores_heap[0])
-        begin = upto
+        begin = block_end
         block += 1
     return count
 
 
 @numba_jit(REORDERED_FASTMATH)
 def _replace_heap_minimum(heap: NDArray[np.float64], value: float) -> None:
-    place, end = 0, heap.shape[0]
+    index, end = 0, heap.shape[0]
     while True:
-        child = 2 * place + 1
+        child = 2 * index + 1
         if child + 1 < end and heap[child + 1] < heap[child]:
             child += 1
         if child >= end or heap[child] >= value:
             break
-        heap[place] = heap[child]
-        place = child
-    heap[place] = value
+        heap[index] = heap[child]
+        index = child
+    heap[index] = value
 
 
 @numba_jit(REORDERED_FASTMATH)
 def add_hamming_distances(
-    begins: Addresses,
-    first: NDArray[np.int64],
+    block_addresses: Addresses,
+    first_rows: NDArray[np.int64],
     rows: NDArray[np.int64],
     query: Words,
     out: NDArray[np.int64],
 ) -> None:
-    """Add to `out` how many bits of the query differ from the code of each of these rows; blocks
-    begin at `begins` (c,), with the rows from `first` (c + 1,) on."""
+    """Add the Hamming distance between the query and the code of each row to `out`, (n,).
+
+    Args:
+        block_addresses: (c,) addresses of the blocks' codes, each row as long as the query.
+        first_rows: (c + 1,) number of each block's first row.
+        rows: (n,) row numbers.
+        query: (words,) uint64.
+        out: (n,) int64.
+    """
     words = query.shape[0]
-    for number in range(rows.shape[0]):
-        at = _address(begins, first, rows[number], 8 * words)
-        code = nb.carray(_words_at(at), (words,))
-        differ = np.uint64(0)
+    for index in range(rows.shape[0]):
+        address = _address(block_addresses, first_rows, rows[index], 8 * words)
+        code = nb.carray(_words_at(address), (words,))
+        distance = np.uint64(0)
         for i in range(words):
-            differ += _popcount(code[i] ^ query[i])
-        out[number] += np.int64(differ)
+            distance += _popcount(code[i] ^ query[i])
+        out[index] += np.int64(distance)
 
 
 @numba_jit(REORDERED_FASTMATH)
 def weighted_bit_sums(
-    begins: Addresses,
-    first: NDArray[np.int64],
+    level_addresses: Addresses,
+    first_rows: NDArray[np.int64],
     rows: NDArray[np.int64],
-    ends: NDArray[np.int64],
+    level_ends: NDArray[np.int64],
     planes: Words,
     out: NDArray[np.int64],
 ) -> None:
-    """Of the whole code of each of these rows, to out (n, 2): its ones, and the sum over its ones
-    of the whole numbers of which planes (PLANES, words) hold the bits. Level l of the codes ends
-    at word ends[l]; its blocks begin at begins[l] (c,), with the rows from `first` (c + 1,) on."""
-    for number in range(rows.shape[0]):
+    """Sums over the set bits of each row's code, unweighted and weighted with the query.
+
+    Args:
+        level_addresses: (levels, c) addresses of the blocks' codes of each level.
+        first_rows: (c + 1,) number of each block's first row.
+        rows: (n,) row numbers.
+        level_ends: (levels,) word at which each level ends.
+        planes: (PLANES, words) bits of the query's quantized numbers, least significant plane
+            first.
+        out: (n, 2) int64: number of set bits, and sum of the query's quantized numbers at set bits.
+    """
+    for index in range(rows.shape[0]):
         ones = units = twos = fours = eights = np.uint64(0)
         begin = np.int64(0)
-        for level in range(ends.shape[0]):
-            words = ends[level] - begin
-            at = _address(begins[level], first, rows[number], 8 * words)
-            code = nb.carray(_words_at(at), (words,))
-            weights = planes[:, begin : ends[level]]
+        for level in range(level_ends.shape[0]):
+            words = level_ends[level] - begin
+            address = _address(level_addresses[level], first_rows, rows[index], 8 * words)
+            code = nb.carray(_words_at(address), (words,))
+            weights = planes[:, begin : level_ends[level]]
             one, two, four, eight = weights[0], weights[1], weights[2], weights[3]
             for i in range(words):
                 word = code[i]
@@ -226,33 +269,42 @@ def weighted_bit_sums(
                 twos += _popcount(word & two[i])
                 fours += _popcount(word & four[i])
                 eights += _popcount(word & eight[i])
-            begin = ends[level]
-        out[number, 0] = np.int64(ones)
-        out[number, 1] = np.int64(units + 2 * twos + 4 * fours + 8 * eights)
+            begin = level_ends[level]
+        out[index, 0] = np.int64(ones)
+        out[index, 1] = np.int64(units + 2 * twos + 4 * fours + 8 * eights)
 
 
 @numba_jit(REORDERED_FASTMATH)
 def exact_products(
-    begins: Addresses,
-    first: NDArray[np.int64],
+    block_addresses: Addresses,
+    first_rows: NDArray[np.int64],
     rows: NDArray[np.int64],
     query: NDArray[np.float32],
     out: NDArray[np.float64],
 ) -> None:
-    """The products of these float32 rows with the query, in float64: each term is exact, and the
-    sums of equal rows are equal. Blocks begin at `begins`, with the rows from `first` on."""
-    for number in range(rows.shape[0]):
-        at = _address(begins, first, rows[number], 4 * query.shape[0])
-        row = nb.carray(_floats_at(at), query.shape)
+    """Dot products of float32 rows with the query, summed in float64.
+
+    Each product is exact in float64, and the sums of equal rows are equal.
+
+    Args:
+        block_addresses: (c,) addresses of the blocks' float32 rows.
+        first_rows: (c + 1,) number of each block's first row.
+        rows: (n,) row numbers.
+        query: (dimension,) float32.
+        out: (n,) float64.
+    """
+    for index in range(rows.shape[0]):
+        address = _address(block_addresses, first_rows, rows[index], 4 * query.shape[0])
+        row = nb.carray(_floats_at(address), query.shape)
         total = 0.0
         for i in range(query.shape[0]):
             total += np.float64(row[i]) * np.float64(query[i])
-        out[number] = total
+        out[index] = total
 
 
 @numba_jit(REORDERED_FASTMATH)
 def squared_norm(row: NDArray[np.float32]) -> float:
-    """The sum of a row's squares, in float64."""
+    """Sum of a row's squares, in float64."""
     total = 0.0
     for i in range(row.shape[0]):
         total += np.float64(row[i]) * np.float64(row[i])
@@ -263,41 +315,46 @@ def squared_norm(row: NDArray[np.float32]) -> float:
 def quantize_to_bit_planes(
     numbers: NDArray[np.float32], signs: Words, planes: Words
 ) -> tuple[float, float, float, float, float]:
-    """The signs of (64 n,) float32 numbers, and the numbers rounded to 2^PLANES steps.
+    """Quantize (64 n,) float32 numbers to 2^PLANES steps, as bit planes, and pack their signs.
 
-    signs (n,): bit j of word i is 1 where number 64 i + j is not negative. planes (PLANES, n): the
-    same bits of a whole number w, 0 to 2^PLANES - 1, for which low + step w is nearest.
-    Returns low, step, and of these rounded numbers: the sum, the product with the numbers, the sum
-    of squares.
+    Args:
+        numbers: (64 n,) float32.
+        signs: (n,) uint64; bit j of word i is 1 where number 64 i + j is not negative.
+        planes: (PLANES, n) uint64; the bits, in the same places, of the integer w, 0 to 2^PLANES -
+            1, for which low + step w is nearest to the number.
+
+    Returns:
+        low, step, and of the quantized numbers: their sum, their product with `numbers`, and their
+        sum of squares.
     """
     low, high = numbers[0], numbers[0]
     for i in range(numbers.shape[0]):
         low, high = min(low, numbers[i]), max(high, numbers[i])
     step = (high - low) / np.float32(2**PLANES - 1)
     inverse = np.float32(1.0) / step
-    total = int8_product = square = 0.0
-    whole = np.empty(64, np.uint8)
-    eights = whole.view(np.uint64)
+    total = product = square = 0.0
+    quantized = np.empty(64, np.uint8)
+    packed = quantized.view(np.uint64)
     for i in range(planes.shape[1]):
         part = numbers[64 * i : 64 * i + 64]
         sums = sums_of_products = sums_of_squares = np.float32(0.0)
         for j in range(64):
             nearest = np.int32((part[j] - low) * inverse + np.float32(0.5))
             rounded = np.float32(nearest) * step + low
-            whole[j] = np.uint8(nearest) | (np.uint8(part[j] >= 0) << np.uint8(PLANES))
+            quantized[j] = np.uint8(nearest) | (np.uint8(part[j] >= 0) << np.uint8(PLANES))
             sums += rounded
             sums_of_products += rounded * part[j]
             sums_of_squares += rounded * rounded
         total += sums
-        int8_product += sums_of_products
+        product += sums_of_products
         square += sums_of_squares
         for plane in range(PLANES + 1):
-            word = np.uint64(0)
-            for j in range(8):  # the product gathers one bit of each byte in the highest byte
-                ones = (eights[j] >> np.uint64(plane)) & LOW_BIT_OF_EACH_BYTE
-                word |= ((ones * BIT_GATHER_FACTOR) >> np.uint64(56)) << np.uint64(8 * j)
+            plane_bits = np.uint64(0)
+            for j in range(8):  # the multiplication gathers a bit of each byte in the top byte
+                bits = (packed[j] >> np.uint64(plane)) & LOW_BIT_OF_EACH_BYTE
+                plane_bits |= ((bits * BIT_GATHER_FACTOR) >> np.uint64(56)) << np.uint64(8 * j)
             if plane < PLANES:
-                planes[plane, i] = word
+                planes[plane, i] = plane_bits
             else:
-                signs[i] = word
-    return low, step, total, int8_product, square
+                signs[i] = plane_bits
+    return low, step, total, product, square

@@ -1,4 +1,4 @@
-"""What Prometheus reads of a search worker at `/metrics`."""
+"""Prometheus metrics of a search worker, served at `/metrics`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from shared.errors import PlacewiseError
 from shared.search_api.protocol import SearchRequest, SearchResponse, SearchStatus
 from shared.telemetry.tracing import span
 
-# From a small map in memory to a scan of a full shard, and to the longest wait for a version.
+# From a small map in memory to a dense scan of a full shard, and the longest wait for a version.
 LATENCY_BUCKETS_SECONDS = (
     0.001,
     0.0025,
@@ -32,14 +32,15 @@ LATENCY_BUCKETS_SECONDS = (
     10.0,
 )
 
-# An answer looks at some dozens of rows. From 5.5 on the codes are not trusted (`answer.py`).
+# The maximum over some dozens of rows. From 5.5 on sign codes are not trusted (`executor.py`).
 MAX_Z_BUCKETS = (1.0, 2.0, 3.0, 4.0, 5.0, 5.5)
 
 
 class MeteredSearch:
-    """One worker's figures, and the search port on which they are counted.
+    """`SearchBackend` that counts the searches of a worker.
 
-    Unless `registry` is given, they are in one of their own: tests run several workers at once.
+    The metrics are registered in `registry`, or else in a registry of their own, as tests run
+    several workers in one process.
     """
 
     def __init__(self, worker: SearchWorker, registry: CollectorRegistry | None = None) -> None:
@@ -47,42 +48,42 @@ class MeteredSearch:
         self._registry = registry or CollectorRegistry()
         self._searches = Counter(
             "placewise_search_searches",
-            "Searches by what became of them: answered, or the code of the refusal.",
+            "Searches by outcome: answered, or the error code.",
             ["outcome"],
             registry=self._registry,
         )
         self._seconds = Histogram(
             "placewise_search_seconds",
-            "Seconds that an answered search took.",
+            "Duration of successful searches in seconds.",
             buckets=LATENCY_BUCKETS_SECONDS,
             registry=self._registry,
         )
         self._rows = Counter(
             "placewise_search_rows_scanned",
-            "Descriptor rows that were compared with a query.",
+            "Descriptor rows compared with a query.",
             registry=self._registry,
         )
         self._reranked = Counter(
             "placewise_search_rows_reranked",
-            "Of them, those whose whole rows were read.",
+            "Descriptor rows compared exactly, by their full descriptors.",
             registry=self._registry,
         )
         self._certificates = Counter(
             "placewise_search_answers",
-            "Answers by how they were reached.",
+            "Responses by certificate.",
             ["certificate"],
             registry=self._registry,
         )
         self._deviations = Histogram(
             "placewise_search_max_z",
-            "Largest error of an answer's estimates from codes, in standard deviations.",
+            "Largest error of a response's sign-code estimates, in standard deviations.",
             buckets=MAX_Z_BUCKETS,
             registry=self._registry,
         )
         self._registry.register(_SnapshotCollector(worker))
 
     def search(self, request: SearchRequest) -> SearchResponse:
-        """The worker's answer, counted."""
+        """Search and record the metrics of the response."""
         started = time.perf_counter()
         try:
             with span("search", shard=str(self._worker.shard), k=request.k):
@@ -106,12 +107,12 @@ class MeteredSearch:
             self._deviations.observe(response.max_z)
 
     def render(self) -> bytes:
-        """Prometheus' text format."""
+        """Render the metrics in Prometheus' text format."""
         return generate_latest(self._registry)
 
 
 class _SnapshotCollector(Collector):
-    """Read at each scrape, so that a generation that is gone leaves no figure behind."""
+    """Metrics computed at each scrape, so that a deleted generation leaves no stale series."""
 
     def __init__(self, worker: SearchWorker) -> None:
         self._worker = worker
@@ -132,7 +133,7 @@ class _SnapshotCollector(Collector):
         )
         failed = GaugeMetricFamily(
             f"{prefix}_device_failed",
-            "1 while the CPU searches, because the GPU has failed.",
+            "1 while the CPU searches because the GPU has failed.",
             labels=["device"],
         )
         for device in status.devices:
@@ -142,34 +143,36 @@ class _SnapshotCollector(Collector):
         yield failed
         yield CounterMetricFamily(
             f"{prefix}_code_scans",
-            "Ways through the first codes.",
+            "First-level scans of the sign codes.",
             self._worker.query_batcher.batches_run,
         )
         yield CounterMetricFamily(
             f"{prefix}_code_scan_queries",
-            "Queries that went through the first codes, together or alone.",
+            "Queries in first-level scans of the sign codes.",
             self._worker.query_batcher.queries_run,
         )
-        yield GaugeMetricFamily(f"{prefix}_rows", "Rows that can be answered.", status.rows)
+        yield GaugeMetricFamily(f"{prefix}_rows", "Searchable rows.", status.rows)
         yield GaugeMetricFamily(
-            f"{prefix}_missing_chunks", "Chunks that can't be read.", len(status.missing)
+            f"{prefix}_missing_chunks", "Unreadable chunks.", len(status.missing)
         )
         version = GaugeMetricFamily(
-            f"{prefix}_snapshot_version", "The map's version that is served.", labels=["generation"]
+            f"{prefix}_snapshot_version",
+            "Version of the map in the snapshot.",
+            labels=["generation"],
         )
-        for generation_id, number in status.versions.items():
-            version.add_metric([str(generation_id)], number)
+        for generation_id, version_number in status.versions.items():
+            version.add_metric([str(generation_id)], version_number)
         yield version
-        behind = GaugeMetricFamily(
+        lag_versions = GaugeMetricFamily(
             f"{prefix}_snapshot_lag_versions", "Versions behind the map.", labels=["generation"]
         )
-        seconds = GaugeMetricFamily(
+        lag_seconds = GaugeMetricFamily(
             f"{prefix}_snapshot_lag_seconds",
-            "Seconds since the snapshot was last known to be level with its map.",
+            "Seconds since the snapshot was last known to be current.",
             labels=["generation"],
         )
         for generation_id, lag in status.lags.items():
-            behind.add_metric([str(generation_id)], lag.versions)
-            seconds.add_metric([str(generation_id)], lag.seconds)
-        yield behind
-        yield seconds
+            lag_versions.add_metric([str(generation_id)], lag.versions)
+            lag_seconds.add_metric([str(generation_id)], lag.seconds)
+        yield lag_versions
+        yield lag_seconds

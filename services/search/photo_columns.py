@@ -1,7 +1,4 @@
-"""What search knows of photos, in columns: one entry for each row of a chunk.
-
-Which rows may be answered: the filter of a search as a mask.
-"""
+"""Photo columns: the filterable values of photos, one entry per row, and filters as row masks."""
 
 from __future__ import annotations
 
@@ -26,9 +23,10 @@ LOW_64_BITS = (1 << 64) - 1
 
 @dataclass(frozen=True, eq=False)
 class PhotoColumns:
-    """What is known of the photo of each of a chunk's n rows: arrays of length n.
+    """Values of the photos of a chunk's n rows, as arrays of length n.
 
-    A row without a live photo has `photo_id` None. `findable`: live, and not a labelled query.
+    A row without a live photo has `photo_id` None. `findable` rows have a live photo that is not a
+    labelled query.
     """
 
     photo_id: NDArray[np.object_]
@@ -40,11 +38,11 @@ class PhotoColumns:
     """UTC, microseconds; NaT where unknown."""
     place: NDArray[np.object_]
     tags: NDArray[np.object_]
-    """A frozenset of texts a row."""
+    """A frozenset of str for each row."""
 
     @classmethod
-    def of(cls, rows: int, facts: Iterable[tuple[int, PhotoFilterValues]]) -> PhotoColumns:
-        """(row, photo) pairs as columns of `rows` rows; rows without a photo are dead."""
+    def of(cls, rows: int, photos_by_row: Iterable[tuple[int, PhotoFilterValues]]) -> PhotoColumns:
+        """Build columns of `rows` rows from (row, photo) pairs; rows without a photo are dead."""
         columns = cls(
             photo_id=np.full(rows, None, dtype=object),
             findable=np.zeros(rows, dtype=bool),
@@ -54,7 +52,7 @@ class PhotoColumns:
             place=np.full(rows, None, dtype=object),
             tags=np.full(rows, frozenset(), dtype=object),
         )
-        for row, photo in facts:
+        for row, photo in photos_by_row:
             columns._set_row(row, photo)
         return columns
 
@@ -63,31 +61,33 @@ class PhotoColumns:
 
     @cached_property
     def id_low_bits(self) -> NDArray[np.uint64]:
-        """The low 64 bits of each id, almost all of them drawn at random; 0 for dead rows."""
+        """Low 64 bits of each photo id, almost all of them random; 0 for dead rows."""
         low = (0 if id_ is None else id_.int & LOW_64_BITS for id_ in self.photo_id)
         return np.fromiter(low, np.uint64, len(self.photo_id))
 
     def ids(self, rows: NDArray[np.int64]) -> list[UUID | None]:
-        """The photos of these rows; None for dead ones."""
+        """Return the photo ids of these rows; None for dead rows."""
         return list(self.photo_id[rows])
 
     @cached_property
     def rows_by_tag(self) -> Mapping[str, NDArray[np.int64]]:
+        """Ascending rows of each tag."""
         return _group_rows((tag, row) for row, tags in enumerate(self.tags) for tag in tags)
 
     @cached_property
     def rows_by_place(self) -> Mapping[str, NDArray[np.int64]]:
+        """Ascending rows of each place label."""
         return _group_rows(
             (place, row) for row, place in enumerate(self.place) if place is not None
         )
 
     def with_changes(self, changes: Mapping[UUID, PhotoFilterValues]) -> PhotoColumns:
-        """The columns with what has changed; itself when none of the photos is here."""
-        here = find_rows(self, changes)
-        if not len(here):
+        """Return the columns with changes applied; itself if none of the photos is in the chunk."""
+        rows = find_rows(self, changes)
+        if not len(rows):
             return self
         copy = PhotoColumns(*(getattr(self, column.name).copy() for column in fields(self)))
-        for row in here.tolist():
+        for row in rows.tolist():
             copy._set_row(row, changes[self.photo_id[row]])
         return copy
 
@@ -103,7 +103,7 @@ class PhotoColumns:
 
 @dataclass(frozen=True, eq=False)
 class JoinedColumns:
-    """The columns of several chunks, one after the other; each is joined when it is asked for."""
+    """Concatenated columns of several chunks; each column is joined on first use."""
 
     parts: Sequence[PhotoColumns]
 
@@ -112,7 +112,7 @@ class JoinedColumns:
 
     @cached_property
     def first_rows(self) -> NDArray[np.int64]:
-        """(chunks + 1,): the number of each chunk's first row; the last is the number of rows."""
+        """(chunks + 1,): number of each chunk's first row; the last is the number of rows."""
         return np.cumsum([0, *(len(part) for part in self.parts)])
 
     @cached_property
@@ -144,12 +144,12 @@ class JoinedColumns:
         return _JoinedRowIndex([part.rows_by_place for part in self.parts], self.first_rows)
 
     def ids(self, rows: NDArray[np.int64]) -> list[UUID | None]:
-        """The photos of these rows; None for dead ones."""
+        """Return the photo ids of these rows; None for dead rows."""
         chunks = np.searchsorted(self.first_rows, rows, side="right") - 1
-        inside = rows - self.first_rows[chunks]
+        rows_in_chunk = rows - self.first_rows[chunks]
         return [
             self.parts[chunk].photo_id[row]
-            for chunk, row in zip(chunks.tolist(), inside.tolist(), strict=True)
+            for chunk, row in zip(chunks.tolist(), rows_in_chunk.tolist(), strict=True)
         ]
 
     @staticmethod
@@ -158,23 +158,23 @@ class JoinedColumns:
 
 
 class _JoinedRowIndex(Mapping[str, NDArray[np.int64]]):
-    """Rows by a text, of several chunks: found chunk by chunk, when they are asked for."""
+    """Index from a text to rows, over several chunks; looked up chunk by chunk."""
 
     def __init__(
-        self, parts: list[Mapping[str, NDArray[np.int64]]], first: NDArray[np.int64]
+        self, parts: list[Mapping[str, NDArray[np.int64]]], first_rows: NDArray[np.int64]
     ) -> None:
         self._parts = parts
-        self._first = first
+        self._first_rows = first_rows
 
     def __getitem__(self, text: str) -> NDArray[np.int64]:
-        found = [
-            part[text] + begin
-            for part, begin in zip(self._parts, self._first, strict=False)
+        rows = [
+            part[text] + first_row
+            for part, first_row in zip(self._parts, self._first_rows, strict=False)
             if text in part
         ]
-        if not found:
+        if not rows:
             raise KeyError(text)
-        return np.concatenate(found)
+        return np.concatenate(rows)
 
     def __iter__(self) -> Iterator[str]:
         return iter(set().union(*self._parts))
@@ -187,24 +187,24 @@ AnyPhotoColumns = PhotoColumns | JoinedColumns
 
 
 def find_rows(photos: AnyPhotoColumns, ids: Collection[UUID]) -> NDArray[np.int64]:
-    """The rows of these photos, rising."""
-    ends = np.fromiter((id_.int & LOW_64_BITS for id_ in ids), np.uint64, len(ids))
-    alike = np.flatnonzero(np.isin(photos.id_low_bits, ends))
-    wanted = frozenset(ids)
-    meant = np.fromiter((id_ in wanted for id_ in photos.ids(alike)), bool, len(alike))
-    rows: NDArray[np.int64] = alike[meant]
+    """Return the rows of these photos in ascending order."""
+    low_bits = np.fromiter((id_.int & LOW_64_BITS for id_ in ids), np.uint64, len(ids))
+    matches = np.flatnonzero(np.isin(photos.id_low_bits, low_bits))
+    id_set = frozenset(ids)
+    exact = np.fromiter((id_ in id_set for id_ in photos.ids(matches)), bool, len(matches))
+    rows: NDArray[np.int64] = matches[exact]
     return rows
 
 
 def _group_rows(pairs: Iterable[tuple[str, int]]) -> dict[str, NDArray[np.int64]]:
-    found: dict[str, list[int]] = {}
+    rows_by_text: dict[str, list[int]] = {}
     for text, row in pairs:
-        found.setdefault(text, []).append(row)
-    return {text: np.array(rows, np.int64) for text, rows in found.items()}
+        rows_by_text.setdefault(text, []).append(row)
+    return {text: np.array(rows, np.int64) for text, rows in rows_by_text.items()}
 
 
 def to_datetime64(when: datetime | None) -> np.datetime64:
-    """An aware datetime as NumPy's UTC microseconds."""
+    """Convert an aware datetime to NumPy's UTC microseconds; None becomes NaT."""
     if when is None:
         return UNKNOWN_TIME
     return np.datetime64(when.astimezone(UTC).replace(tzinfo=None), "us")
@@ -217,10 +217,11 @@ NO_ROWS = np.empty(0, np.int64)
 def build_row_mask(
     photos: AnyPhotoColumns, photo_filter: PhotoFilter, exclude: Collection[UUID]
 ) -> RowMask:
-    """(n,) bool: findable photos that pass the filter and are not excluded.
+    """Return the (n,) bool mask of findable photos that pass the filter and are not excluded.
 
-    The same photos that `catalog.metadata_search.filter_conditions` lets pass in SQL. What reads
-    an index goes first; what computes is computed for the rows that are left.
+    It selects the same photos as `catalog.metadata_search.filter_conditions` does in SQL.
+    Conditions that use an index are applied first; distances are computed for the remaining rows
+    only.
     """
     mask = photos.findable.copy()
     if photo_filter.ids is not None:
@@ -238,12 +239,15 @@ def build_row_mask(
     if photo_filter.box is not None:
         mask &= _in_box(photos, photo_filter.box)
     if photo_filter.near is not None:
-        here = photo_filter.near
-        left = np.flatnonzero(mask)
-        away = distances_m(
-            here.latitude, here.longitude, photos.latitude[left], photos.longitude[left]
+        circle = photo_filter.near
+        remaining = np.flatnonzero(mask)
+        distances = distances_m(
+            circle.latitude,
+            circle.longitude,
+            photos.latitude[remaining],
+            photos.longitude[remaining],
         )
-        mask[left] = away <= here.radius_m  # False for NaN: without coordinates
+        mask[remaining] = distances <= circle.radius_m  # False for NaN: without coordinates
     return mask
 
 

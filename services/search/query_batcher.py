@@ -1,7 +1,8 @@
-"""Queries that come at the same time go through the first codes together.
+"""Query batcher: concurrent queries share one first-level scan of the sign codes.
 
-Who comes first goes at once, alone; who comes meanwhile waits, and all who wait go next. So no one
-waits longer than for the round that is on its way, and many cost little more than one.
+The first query is scanned at once, alone; queries that arrive meanwhile are queued and scanned
+together next. So a query waits for the running scan at most, and the scan of many queries costs
+little more than that of one, because it is limited by memory bandwidth.
 """
 
 from __future__ import annotations
@@ -21,66 +22,75 @@ MAX_BATCH_QUERIES = 32
 
 @dataclass(slots=True, eq=False)
 class _QueuedQuery:
+    """A query that waits for its scan."""
+
     blocks: SignCodeBlocks
     query: SignCodedQuery
-    asked: NDArray[np.bool_]
+    row_mask: NDArray[np.bool_]
     ready: threading.Event = field(default_factory=threading.Event)
-    """Set when there is an answer, or when it is this one's turn to go for all."""
-    found: FirstLevelScan | None = None
+    """Set when there is a result, or when this query's thread is to run the next batch."""
+    scan: FirstLevelScan | None = None
     error: BaseException | None = None
 
 
 class QueryBatcher:
-    """`glance` for one query at a time, from many threads."""
+    """Batches first-level scans of concurrent queries; thread-safe."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._queue: list[_QueuedQuery] = []
         self._batch_running = False
-        self.batches_run = 0  # begun so far
-        self.queries_run = 0  # that went with them
+        self.batches_run = 0  # batches started so far
+        self.queries_run = 0  # queries in these batches
 
     @property
     def queue_length(self) -> int:
-        """How many queries wait for the round that is on its way."""
+        """Number of queries that wait for the running batch."""
         return len(self._queue)
 
     def scan(
-        self, blocks: SignCodeBlocks, query: SignCodedQuery, asked: NDArray[np.bool_]
+        self, blocks: SignCodeBlocks, query: SignCodedQuery, row_mask: NDArray[np.bool_]
     ) -> FirstLevelScan:
-        mine = _QueuedQuery(blocks, query, asked)
+        """Scan the first level of the codes for one query, together with concurrent queries."""
+        queued = _QueuedQuery(blocks, query, row_mask)
         with self._lock:
-            self._queue.append(mine)
+            self._queue.append(queued)
             if not self._batch_running:
                 self._batch_running = True
-                mine.ready.set()
-        mine.ready.wait()
-        if mine.found is None and mine.error is None:
-            self._run_batch(mine)
-        if mine.error is not None:
-            raise mine.error
-        assert mine.found is not None
-        return mine.found
+                queued.ready.set()
+        queued.ready.wait()
+        if queued.scan is None and queued.error is None:
+            self._run_batch(queued)
+        if queued.error is not None:
+            raise queued.error
+        assert queued.scan is not None
+        return queued.scan
 
     def _run_batch(self, leader: _QueuedQuery) -> None:
-        """One round for all who wait for the same blocks; then it is the next one's turn."""
+        """Scan for the queued queries with the same blocks, then wake up the next leader."""
         from services.search.sign_code_search import scan_first_level
 
         with self._lock:
-            others = [w for w in self._queue if w.blocks is leader.blocks and w is not leader]
-            together = [leader, *others[: MAX_BATCH_QUERIES - 1]]
-            self._queue = [w for w in self._queue if w not in together]
+            others = [
+                queued
+                for queued in self._queue
+                if queued.blocks is leader.blocks and queued is not leader
+            ]
+            batch = [leader, *others[: MAX_BATCH_QUERIES - 1]]
+            self._queue = [queued for queued in self._queue if queued not in batch]
             self.batches_run += 1
-            self.queries_run += len(together)
+            self.queries_run += len(batch)
         try:
-            found = scan_first_level(
-                leader.blocks, [w.query for w in together], [w.asked for w in together]
+            scans = scan_first_level(
+                leader.blocks,
+                [queued.query for queued in batch],
+                [queued.row_mask for queued in batch],
             )
-            for one, glanced in zip(together, found, strict=True):
-                one.found = glanced
+            for queued, scan in zip(batch, scans, strict=True):
+                queued.scan = scan
         except BaseException as error:
-            for one in together:
-                one.error = error
+            for queued in batch:
+                queued.error = error
             if not isinstance(error, Exception):
                 raise
         finally:
@@ -89,5 +99,5 @@ class QueryBatcher:
                     self._queue[0].ready.set()
                 else:
                     self._batch_running = False
-            for one in together:
-                one.ready.set()
+            for queued in batch:
+                queued.ready.set()

@@ -1,12 +1,9 @@
-"""Which snapshots lie on a GPU: as many as fit, the others are searched by the CPU.
+"""Residency: which index parts are held in memory, and which snapshots are loaded onto the GPU.
 
-Nothing here imports torch before a GPU is to be used.
-
-Which parts of the generations are held in memory: what is read most, as far as the budget goes.
-
-A generation's parts, in the order in which they are wanted: the levels of its sign codes, its int8
-codes, its rows; whichever it has. A part is held whole or not at all; what is not held
-stays a mapped file, of which the operating system keeps what it has room for.
+`MemoryBudget` allocates memory to the parts of all generations, in the order in which they are read
+most: the levels of the sign codes, the int8 codes, the rows. A part is resident completely or stays
+a mapped file in the system's page cache. `GpuResidency` loads as many snapshots as fit onto the
+GPU; the others are searched on the CPU. torch is imported only when a GPU is to be used.
 """
 
 from __future__ import annotations
@@ -33,21 +30,22 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 DRIVER_PATHS = (Path("/dev/nvidiactl"), Path("/dev/dxg"))  # Linux, and Linux on Windows
-MAX_SYNC_COPY_BYTES = 1 << 28  # that a new snapshot may wait for: a tenth of a second
+MAX_SYNC_COPY_BYTES = 1 << 28  # copied before a new snapshot is served: a tenth of a second
 GPU_RETRY_SECONDS = 60.0
 
 
 def open_search_device(setting: str) -> GpuDevice | None:
-    """The GPU for `SEARCH_DEVICE`, or None: search by the CPU.
+    """Open the GPU that SEARCH_DEVICE selects; None for the CPU.
 
-    Misconfigured (`no_gpu`) when one is asked for and there is none that can be used.
+    Raises:
+        Misconfigured: `no_gpu` if `cuda` is selected and no GPU can be used.
     """
-    torch_is_there = importlib.util.find_spec("torch") is not None
+    has_torch = importlib.util.find_spec("torch") is not None
     if setting == "cpu":
         return None
-    if setting == "auto" and not (torch_is_there and any(path.exists() for path in DRIVER_PATHS)):
+    if setting == "auto" and not (has_torch and any(path.exists() for path in DRIVER_PATHS)):
         return None
-    if not torch_is_there:
+    if not has_torch:
         raise _no_gpu_error("PyTorch is not installed: install placewise[search-gpu]")
     from services.search.gpu import GpuDevice, GpuUnsupported
 
@@ -68,7 +66,7 @@ def _no_gpu_error(reason: str) -> Misconfigured:
 
 
 class GpuResidency:
-    """What of a worker's snapshots lies on its device; one thread at a time for each generation."""
+    """Loads snapshots onto the worker's GPU; one thread at a time for each generation."""
 
     def __init__(self, device: GpuDevice | None) -> None:
         self._device = device
@@ -76,14 +74,14 @@ class GpuResidency:
         self._failure: str | None = None
 
     def carry_over(self, new: Snapshot, old: Snapshot | None) -> Snapshot:
-        """The new snapshot with what the old one has on the device, and little more."""
+        """Return the new snapshot with the GPU rows of the old one, if few must be copied."""
         resident = old.gpu_snapshot if old is not None else None
         if resident is not None:
             resident = self._load(new, resident, MAX_SYNC_COPY_BYTES)
         return replace(new, gpu_snapshot=resident)
 
     def needs_update(self, snapshot: Snapshot) -> bool:
-        """Whether there is something to do: rows to put on the device, or to take from it."""
+        """Whether the snapshot is to be loaded onto the GPU, or dropped after a failure."""
         if self._device is None or not snapshot.chunks:
             return False
         if snapshot.gpu_snapshot is not None:
@@ -91,10 +89,10 @@ class GpuResidency:
         return time.monotonic() >= self._retry_at.get(snapshot.generation_id, -math.inf)
 
     def update(self, snapshot: Snapshot) -> Snapshot:
-        """The snapshot with its rows on the device, if they fit; after a failure without them, and
-        not again for a while.
+        """Return the snapshot with its rows on the GPU, or without them after a failure.
 
-        It may take minutes: nothing waits for it.
+        Rows that do not fit, or fail to load, are tried again after GPU_RETRY_SECONDS. Loading may
+        take minutes: call it without holding a lock.
         """
         if snapshot.gpu_snapshot is not None:
             self._failure = snapshot.gpu_snapshot.failure
@@ -106,7 +104,7 @@ class GpuResidency:
         return replace(snapshot, gpu_snapshot=resident)
 
     def needs_int8_codes(self, snapshot: Snapshot) -> bool:
-        """Whether its int8 codes would fit, and are not made."""
+        """Whether the snapshot would fit onto the GPU as int8 codes, which do not exist yet."""
         from services.search.gpu import FLOAT16, INT8
 
         if self._device is None or snapshot.has_int8_codes:
@@ -116,26 +114,37 @@ class GpuResidency:
         )
 
     def status(self, snapshots: Iterable[Snapshot]) -> tuple[DeviceStatus, ...]:
+        """Return the state of the GPU, if there is one."""
         if self._device is None:
             return ()
-        there = {s.generation_id: s.gpu_snapshot for s in snapshots if s.gpu_snapshot is not None}
-        failures = [one.failure for one in there.values() if one.failure is not None]
+        loaded = {s.generation_id: s.gpu_snapshot for s in snapshots if s.gpu_snapshot is not None}
+        failures = [
+            gpu_snapshot.failure
+            for gpu_snapshot in loaded.values()
+            if gpu_snapshot.failure is not None
+        ]
         return (
             DeviceStatus(
                 name=self._device.name,
-                resident_bytes=sum(one.nbytes for one in there.values()),
-                generations={key: one.row_format for key, one in there.items() if not one.failure},
+                resident_bytes=sum(gpu_snapshot.nbytes for gpu_snapshot in loaded.values()),
+                generations={
+                    key: gpu_snapshot.row_format
+                    for key, gpu_snapshot in loaded.items()
+                    if not gpu_snapshot.failure
+                },
                 failure=failures[0] if failures else self._failure,
             ),
         )
 
-    def _load(self, snapshot: Snapshot, old: GpuSnapshot | None, most: float) -> GpuSnapshot | None:
+    def _load(
+        self, snapshot: Snapshot, old: GpuSnapshot | None, max_bytes: float
+    ) -> GpuSnapshot | None:
         from services.search.gpu import GpuError
 
         if self._device is None or (old is not None and old.failure is not None):
             return None
         try:
-            resident = self._device.load(snapshot.chunks, old, most)
+            resident = self._device.load(snapshot.chunks, old, max_bytes)
         except GpuError as error:
             log.error(
                 "generation %s is searched by the CPU for now: %s", snapshot.generation_id, error
@@ -149,7 +158,7 @@ class GpuResidency:
 
 
 class MemoryBudget:
-    """The budget, and who has what of it. Thread-safe."""
+    """Memory budget shared by the generations of a worker; thread-safe."""
 
     def __init__(self, budget_bytes: int) -> None:
         self._budget_bytes = budget_bytes
@@ -157,23 +166,24 @@ class MemoryBudget:
         self._requests: dict[UUID, Sequence[int]] = {}
 
     def allocate(self, generation_id: UUID, part_bytes: Sequence[int]) -> int:
-        """How many of the generation's parts, of these sizes, are to be held: the first so many."""
+        """Return how many of the generation's first parts, of these sizes, are to be resident."""
         with self._lock:
             self._requests[generation_id] = part_bytes
             return allocate_parts(self._requests, self._budget_bytes)[generation_id]
 
     def release_generation(self, generation_id: UUID) -> None:
+        """Release the memory of a generation."""
         with self._lock:
             self._requests.pop(generation_id, None)
 
 
 def allocate_parts(requests: Mapping[UUID, Sequence[int]], budget_bytes: int) -> dict[UUID, int]:
-    """How many parts of each generation fit: everyone's first parts before anyone's second."""
+    """Return how many parts of each generation fit: all first parts before any second part."""
     counts = dict.fromkeys(requests, 0)
-    left = budget_bytes
+    remaining = budget_bytes
     for part in range(max(map(len, requests.values()), default=0)):
         for generation_id, sizes in requests.items():
-            if counts[generation_id] == part < len(sizes) and sizes[part] <= left:
-                left -= sizes[part]
+            if counts[generation_id] == part < len(sizes) and sizes[part] <= remaining:
+                remaining -= sizes[part]
                 counts[generation_id] += 1
     return counts

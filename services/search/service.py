@@ -1,11 +1,8 @@
-"""The search service: one worker that follows the catalog, registers and answers HTTP.
+"""Search service process: syncs with the catalog, sends heartbeats, and serves `POST /search`.
 
-The search port over HTTP: `POST /search` and `GET /status`, probes and metrics.
-
-For the gateway and the steward alone. It asks for no key and tells which photos a map has: listen
-where only they can reach it.
-
-A search worker's entry in the catalog: that it lives, and what it has loaded.
+The HTTP API is for the gateway and the steward only. It requires no API key and exposes which
+photos a map has: listen on an internal network. `WorkerHeartbeat` registers the worker in the
+catalog with the versions that it has loaded.
 """
 
 from __future__ import annotations
@@ -44,13 +41,16 @@ from shared.telemetry.metrics_server import METRICS_CONTENT_TYPE, serve_metrics
 
 log = logging.getLogger(__name__)
 
-# Several looks at the catalog were missed, or loading takes that long.
+# Several syncs were missed, or loading takes too long.
 MAX_READY_LAG_SECONDS = 5.0
 
 
 class Readiness(BaseModel):
-    """`status` is `ready`, `degraded` (ready, without the chunks in `missing`) or `not ready`, for
-    `reasons`."""
+    """Readiness of a search worker.
+
+    `status` is `ready`, `degraded` (ready, but without the chunks in `missing`) or `not ready`, for
+    the given `reasons`.
+    """
 
     status: str
     shard: str
@@ -60,7 +60,7 @@ class Readiness(BaseModel):
 
 
 def create_search_app(worker: SearchWorker, registry: CollectorRegistry | None = None) -> FastAPI:
-    """The HTTP form of one worker, which someone else makes follow the catalog."""
+    """Create the HTTP API of a worker, which the caller keeps in sync with the catalog."""
     app = FastAPI(
         title="Placewise search",
         description=f"Exact cosine top-k on shard {worker.shard} of every map.",
@@ -72,50 +72,53 @@ def create_search_app(worker: SearchWorker, registry: CollectorRegistry | None =
 
     @app.post("/search", operation_id="search", response_model=SearchResponse)
     def search(request: SearchRequest) -> Response:
-        """The rows of this shard that are most similar to the one that is referred to."""
-        # Written here: the framework would check again what was built a moment ago.
+        """Search this shard for the rows that are most similar to the referenced one."""
+        # Serialised here, because FastAPI would validate the response again.
         return Response(metrics.search(request).as_json(), media_type="application/json")
 
-    # On the event loop, as the probes are: it has to answer while every thread is searching.
+    # Async like the probes, so that it answers while all threads of the pool are searching.
     @app.get("/status", operation_id="status", response_model=SearchStatus)
     async def status() -> SearchStatus:
-        """What this worker holds, and how far it has followed."""
+        """Report what this worker has loaded, and its replication lag."""
         return worker.status()
 
     @app.get("/livez", operation_id="livez")
     async def livez() -> dict[str, str]:
-        """The process answers; nothing else is looked at."""
+        """Liveness probe: the process answers; nothing else is checked."""
         return {"status": "alive"}
 
     @app.get("/readyz", operation_id="readyz", response_model=Readiness)
     async def readyz(response: Response) -> Readiness:
-        """503 while what answers is behind the catalog. A chunk that can't be read makes the
-        worker `degraded`, and the rest is answered: no restart would mend it."""
-        found = check_readiness(worker)
-        response.status_code = 503 if found.reasons else 200
-        return found
+        """Readiness probe: 503 while an active generation lags behind the catalog.
+
+        An unreadable chunk makes the worker `degraded`; it still answers with the other chunks,
+        because a restart would not help.
+        """
+        readiness = check_readiness(worker)
+        response.status_code = 503 if readiness.reasons else 200
+        return readiness
 
     @app.get("/metrics", operation_id="metrics", response_class=Response)
     async def read_metrics() -> Response:
-        """Prometheus' text format."""
+        """Prometheus metrics in text format."""
         return Response(metrics.render(), media_type=METRICS_CONTENT_TYPE)
 
     return app
 
 
 def check_readiness(worker: SearchWorker) -> Readiness:
-    """A generation that is only being built may lag: no one asks for it yet."""
+    """Compute the readiness; a generation that is being built may lag, as no query uses it yet."""
     status = worker.status()
     reasons = []
     if not worker.replication_lag.has_read_catalog():
-        reasons.append("the catalog was not read yet")
+        reasons.append("the catalog has not been read yet")
     for generation_id, lag in status.lags.items():
         if not lag.answers:
             continue
         if lag.seconds > MAX_READY_LAG_SECONDS or generation_id not in status.versions:
             reasons.append(
                 f"generation {generation_id} is {lag.versions} versions behind, "
-                f"level {lag.seconds:.1f} s ago"
+                f"last current {lag.seconds:.1f} s ago"
             )
     return Readiness(
         status="not ready" if reasons else "degraded" if status.missing else "ready",
@@ -126,12 +129,15 @@ def check_readiness(worker: SearchWorker) -> Readiness:
     )
 
 
-CHANGE_POLL_SECONDS = 0.5  # between two looks at what is loaded: a switch waits for the news
-HEARTBEAT_SECONDS = 2.0  # between two entries without news; DEAD_SECONDS is five of them
+CHANGE_POLL_SECONDS = 0.5  # polling interval; the activation of a generation waits for the news
+HEARTBEAT_SECONDS = 2.0  # interval without changes; DEAD_SECONDS is five of them
 
 
 class WorkerHeartbeat:
-    """Writes the entry. A thread of its own: loading may take minutes, and who loads lives."""
+    """Registers a search worker in the catalog and keeps its loaded versions up to date.
+
+    It runs in a thread of its own, because loading may take minutes while the worker is alive.
+    """
 
     def __init__(
         self, catalog: Catalog, worker: SearchWorker, name: str, url: str | None = None
@@ -145,8 +151,8 @@ class WorkerHeartbeat:
         self._sent_at = 0.0
 
     def run(self, stop: threading.Event) -> None:
-        """Keep the entry until `stop` is set, and remove it then."""
-        outage = OutageLog("search worker's entry")
+        """Send heartbeats until `stop` is set, then delete the entry."""
+        outage = OutageLog("search worker heartbeat")
         while not stop.is_set():
             try:
                 self.send_if_due()
@@ -158,22 +164,24 @@ class WorkerHeartbeat:
             with self._catalog.write() as session:
                 delete_search_worker(session, self.id)
         except SQLAlchemyError as error:
-            log.warning("search could not sign off, the steward will: %s", error)
+            log.warning("the worker's entry remains until the steward deletes it: %s", error)
 
     def send_if_due(self) -> None:
-        """Write what there is to tell: news at once, else a heartbeat when it is due."""
+        """Write the entry if the loaded versions have changed, or a heartbeat is due."""
         status = self._worker.status()
-        news = status.loaded, status.missing
-        if news == self._sent_versions and time.monotonic() - self._sent_at < HEARTBEAT_SECONDS:
+        versions = status.loaded, status.missing
+        if versions == self._sent_versions and time.monotonic() - self._sent_at < HEARTBEAT_SECONDS:
             return
         with self._catalog.write() as session:
-            upsert_search_worker(session, self.id, self._name, self._url, self._worker.shard, *news)
-        self._sent_versions, self._sent_at = news, time.monotonic()
+            upsert_search_worker(
+                session, self.id, self._name, self._url, self._worker.shard, *versions
+            )
+        self._sent_versions, self._sent_at = versions, time.monotonic()
 
 
 @dataclass(slots=True)
 class SearchService:
-    """A search worker at work; `serve` answers HTTP until the process is asked to stop."""
+    """A running search service; `serve` answers HTTP requests until the process is stopped."""
 
     url: str
     worker: SearchWorker
@@ -182,47 +190,53 @@ class SearchService:
     failed: threading.Event
 
     def stop(self) -> None:
-        """A part has died: stop the others."""
+        """Stop the service because one of its threads has died."""
         self.failed.set()
         self.server.should_exit = True
 
     def serve(self) -> None:
-        """Raises Misconfigured (`part_died`) when one of the parts has ended before its time."""
+        """Serve HTTP requests; Misconfigured (`part_died`) if a thread of the service has died."""
         with stop_on_signals(self.server):
             self.server.run(sockets=[self.listener])
         if self.failed.is_set():
-            raise Misconfigured("part_died", "A part of search died; the log above says why.")
+            raise Misconfigured(
+                "part_died",
+                "A thread of the search service stopped unexpectedly. See the log above.",
+            )
 
 
 @contextlib.contextmanager
 def run_search_service(
     settings: Settings, catalog: Catalog, store: ObjectStore
 ) -> Iterator[SearchService]:
-    """Listen on HOST and PORT, follow the catalog with the shard that SEARCH_SHARD names, and
-    register. Raises Misconfigured (`address_in_use`)."""
+    """Start a search service: listen on HOST and PORT, sync the shard SEARCH_SHARD, and register.
+
+    Raises:
+        Misconfigured: `address_in_use`.
+    """
     with listen(settings.host, settings.port) as listener:
         host, port = listener.getsockname()[:2]
         registry = CollectorRegistry()
         worker = SearchWorker(catalog, store, settings, settings.shard)
         url = reachable_url(host, port)
-        presence = WorkerHeartbeat(catalog, worker, f"{socket.gethostname()}:{port}", url)
-        # Its clients are a few gateways, with a connection for each query under way.
+        heartbeat = WorkerHeartbeat(catalog, worker, f"{socket.gethostname()}:{port}", url)
+        # Its clients are a few gateways, with one connection for each concurrent query.
         limits = replace(ConnectionLimits.of(settings), per_address=0)
         server = http_server(create_search_app(worker, registry), Connections(limits))
-        running = SearchService(url, worker, server, listener, threading.Event())
+        service = SearchService(url, worker, server, listener, threading.Event())
         stop = threading.Event()
-        parts = [
-            start_service_thread(name, part, stop, running.stop)
-            for name, part in (
-                ("search", worker.run),
-                ("search of what is built", worker.run_building),
-                ("search's presence", presence.run),
+        threads = [
+            start_service_thread(name, target, stop, service.stop)
+            for name, target in (
+                ("search sync", worker.run),
+                ("search sync of building generations", worker.run_building),
+                ("search heartbeat", heartbeat.run),
             )
         ]
         try:
             with serve_metrics(settings, registry):
-                yield running
+                yield service
         finally:
             stop.set()
-            for part in parts:
-                part.join()
+            for thread in threads:
+                thread.join()

@@ -1,4 +1,4 @@
-"""What a generation looks like at one version: immutable, so that queries need no lock."""
+"""Immutable snapshot of a generation at one version, so that queries need no lock."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from services.search.chunk_loader import LoadedChunk
 from services.search.photo_columns import JoinedColumns
 from shared.search_api.protocol import IndexPart, LoadedGeneration
 
-if TYPE_CHECKING:  # numba takes a while to load, and small maps need no codes
+if TYPE_CHECKING:  # imports numba, which takes a while to load; small maps need no codes
     from services.search.exact_rerank import RowBlocks
     from services.search.gpu import GpuSnapshot
     from services.search.int8_search import Int8Blocks
@@ -24,7 +24,10 @@ if TYPE_CHECKING:  # numba takes a while to load, and small maps need no codes
 
 @dataclass(frozen=True, eq=False)
 class Snapshot:
-    """A generation's chunks at `version` of its map; `missing` names objects that can't be read."""
+    """The loaded chunks of a generation at `version` of its map.
+
+    `missing` names objects that can't be read.
+    """
 
     generation_id: UUID
     map_id: UUID
@@ -32,35 +35,38 @@ class Snapshot:
     chunks: tuple[LoadedChunk, ...]
     missing: tuple[str, ...] = ()
     parts: tuple[IndexPart, ...] = ()
-    """What lies in memory, and what is mapped from files."""
+    """Parts of the index, and whether they are resident or mapped files."""
     gpu_snapshot: GpuSnapshot | None = None
-    """Its rows in a GPU's memory."""
+    """The rows in a GPU's memory; None if they are not loaded there."""
 
     @cached_property
     def by_key(self) -> Mapping[str, LoadedChunk]:
-        """The loaded chunks by their object's key."""
+        """Loaded chunks by object key."""
         return {chunk.object_key: chunk for chunk in self.chunks}
 
     @cached_property
     def photos(self) -> JoinedColumns:
-        """Of the rows of all chunks, one after the other."""
+        """Photo columns of all chunks, concatenated."""
         return JoinedColumns([chunk.photos for chunk in self.chunks])
 
     @cached_property
     def live_rows(self) -> int:
+        """Number of searchable rows."""
         return int(self.photos.findable.sum())
 
     @property
     def dimension(self) -> int:
-        """0 without any rows."""
+        """Dimension of the rows; 0 without any rows."""
         return self.chunks[0].rows.shape[1] if self.chunks else 0
 
     @property
     def row_bytes(self) -> int:
+        """Size of all rows in bytes."""
         return sum(chunk.rows.nbytes for chunk in self.chunks)
 
     @cached_property
     def held(self) -> LoadedGeneration:
+        """The loaded generation as `SearchStatus` reports it."""
         return LoadedGeneration(rows=len(self.photos), dimension=self.dimension, parts=self.parts)
 
     @cached_property
@@ -74,30 +80,30 @@ class Snapshot:
         return bool(self.chunks) and all(chunk.int8 is not None for chunk in self.chunks)
 
     def prefetch_rows(self, rows: NDArray[np.int64]) -> None:
-        """Say that these rows are read next, where they are mapped from a file."""
-        first = self.photos.first_rows
-        chunks = np.searchsorted(first, rows, side="right") - 1
-        inside = rows - first[chunks]
-        for number, row in zip(chunks.tolist(), inside.tolist(), strict=True):
+        """Advise the system that these rows are read next, where they are mapped files."""
+        first_rows = self.photos.first_rows
+        chunks = np.searchsorted(first_rows, rows, side="right") - 1
+        rows_in_chunk = rows - first_rows[chunks]
+        for number, row in zip(chunks.tolist(), rows_in_chunk.tolist(), strict=True):
             self.chunks[number].prefetch_row(row)
 
     @cached_property
     def sign_code_blocks(self) -> SignCodeBlocks:
-        """Where the sign codes and rows of a coded snapshot lie."""
+        """Addresses of the sign codes and rows; requires `has_sign_codes`."""
         from services.search.sign_code_search import SignCodeBlocks
 
         return SignCodeBlocks.of(self.chunks)
 
     @cached_property
     def int8_blocks(self) -> Int8Blocks:
-        """Where the int8 codes and rows of a bounded snapshot lie."""
+        """Addresses of the int8 codes and rows; requires `has_int8_codes`."""
         from services.search.int8_search import Int8Blocks
 
         return Int8Blocks.of(self.chunks)
 
     @cached_property
     def row_blocks(self) -> RowBlocks:
-        """Where the rows lie."""
+        """Addresses of the rows."""
         from services.search.exact_rerank import RowBlocks
 
         return RowBlocks.of(self.chunks)

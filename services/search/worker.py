@@ -1,10 +1,9 @@
-"""The search port in one process: snapshots swapped atomically, queries on whichever is current.
+"""Search worker: `SearchBackend` in process, on snapshots that are swapped atomically.
 
-The descriptor that a query refers to: in memory, or one row read from the object store.
-
-The row may lie in a chunk of another shard, in a chunk that was merged into another since, or
-under `queries/`. The few rows that were read last are kept: the gateway asks for more hits of one
-query, and evaluations come back to the same photos.
+`SearchWorker` keeps a snapshot of each generation in sync with the catalog and runs queries on the
+current one. `QueryRowReader` reads the row that a query refers to, which may lie in a chunk of
+another shard, in a chunk that has been merged since, or under `queries/`. It caches the rows read
+last: the gateway asks for more hits of the same query, and evaluations use the same photos again.
 """
 
 from __future__ import annotations
@@ -63,7 +62,7 @@ CACHED_ROWS = 64  # 25 MB at 98,304 dimensions
 
 
 class QueryRowReader:
-    """Reads query rows; thread-safe."""
+    """Reads query rows from memory or from the object store; thread-safe."""
 
     def __init__(self, store: ObjectStore) -> None:
         self._store = store
@@ -71,27 +70,31 @@ class QueryRowReader:
         self._cache: OrderedDict[tuple[str, int], Row] = OrderedDict()
 
     def read_query(self, snapshot: Snapshot, request: SearchRequest) -> Row:
-        """The (dimension,) row. Gone (`query_expired_error`) when it is no longer kept, Unavailable
-        (`chunk_unreadable`) when it is damaged."""
-        loaded = snapshot.by_key.get(request.object_key)
+        """Return the (dimension,) row that a request refers to.
+
+        Raises:
+            Gone: `query_expired` if the row no longer exists.
+            Unavailable: `chunk_unreadable` if the row's object is damaged.
+        """
+        chunk = snapshot.by_key.get(request.object_key)
         if request.object_key in snapshot.missing:
             raise _unreadable_error(request.object_key)
-        if loaded is None:
+        if chunk is None:
             return self._read_cached(request.object_key, request.row)
-        if request.row >= len(loaded.rows):
+        if request.row >= len(chunk.rows):
             raise query_expired_error(f"row {request.row} of {request.object_key}")
-        row: Row = loaded.rows[request.row]
+        row: Row = chunk.rows[request.row]
         return row
 
     def _read_cached(self, object_key: str, row: int) -> Row:
-        at = (object_key, row)
+        cache_key = (object_key, row)
         with self._lock:
-            kept = self._cache.get(at)
-            if kept is not None:
-                self._cache.move_to_end(at)
-                return kept
+            cached = self._cache.get(cache_key)
+            if cached is not None:
+                self._cache.move_to_end(cache_key)
+                return cached
         try:
-            found = read_row(self._store, object_key, row)
+            loaded = read_row(self._store, object_key, row)
         except NotFound:
             raise query_expired_error(f"descriptor {object_key}") from None
         except IndexError:
@@ -99,40 +102,40 @@ class QueryRowReader:
         except ValueError as error:
             raise _unreadable_error(object_key) from error
         if object_key.startswith(QUERIES):
-            return found  # not kept: it goes with its object, after QUERY_TTL_SECONDS
-        if not rows_are_valid(found[np.newaxis]).all():
+            return loaded  # not cached: it expires with its object, after QUERY_TTL_SECONDS
+        if not rows_are_valid(loaded[np.newaxis]).all():
             raise _unreadable_error(object_key)
         with self._lock:
-            self._cache[at] = found
+            self._cache[cache_key] = loaded
             while len(self._cache) > CACHED_ROWS:
                 self._cache.popitem(last=False)
-        return found
+        return loaded
 
 
 def query_expired_error(what: str) -> Gone:
-    """What a query needs is no longer kept."""
-    return Gone("query_expired", f"The {what} is no longer kept. Ask with the photo again.")
+    """Error for a query whose row, object or generation no longer exists."""
+    return Gone("query_expired", f"The {what} no longer exists. Query with the photo again.")
 
 
 def _unreadable_error(object_key: str) -> Unavailable:
     return Unavailable(
         "chunk_unreadable",
         f"The descriptor in {object_key} can't be read: the object is missing or damaged. "
-        "Ask with the photo itself, or restore the object from a backup.",
+        "Query with the photo itself, or restore the object from a backup.",
         object_key=object_key,
     )
 
 
 VERSION_POLL_SECONDS = 0.01
-FILE_CHECK_SECONDS = 5.0  # between two looks at whether mapped files were changed
+FILE_CHECK_SECONDS = 5.0  # interval of the checks whether mapped files were changed
 
 
 class SearchWorker:
-    """Holds its shard of every generation, one snapshot each. `search` is thread-safe.
+    """Holds one snapshot of its shard for each generation; `search` is thread-safe.
 
-    A query never waits for a lock that a loading thread holds: it takes the current snapshot, and
-    only when that is older than `min_version` it catches up (or waits for whoever does). Loading
-    one generation never keeps another from being followed or searched.
+    A query never waits for a lock held by a loading thread: it uses the current snapshot, and only
+    if that is older than `min_version` does it sync the generation, or wait for the thread that
+    does. Loading one generation never blocks syncing or searching another.
     """
 
     def __init__(
@@ -143,7 +146,15 @@ class SearchWorker:
         shard: Shard = SINGLE_SHARD,
         device: GpuDevice | None = None,
     ) -> None:
-        """`device`: where rows are compared, instead of what the settings say."""
+        """Create a worker without any snapshot.
+
+        Args:
+            catalog: The catalog.
+            store: The object store.
+            settings: The settings.
+            shard: The shard to hold.
+            device: GPU to search on; by default as SEARCH_DEVICE says.
+        """
         self.shard = shard
         self.replication_lag = ReplicationLagTracker()
         self._catalog = catalog
@@ -154,74 +165,76 @@ class SearchWorker:
         self._memory_budget = MemoryBudget(settings.search_memory_bytes)
         self._query_rows = QueryRowReader(store)
         self._snapshots: dict[UUID, Snapshot] = {}
-        self._snapshots_lock = threading.Lock()  # held for a moment, never while something is read
+        self._snapshots_lock = threading.Lock()  # never held during I/O
         self._load_locks: dict[UUID, threading.Lock] = {}
         self._residency = GpuResidency(device or open_search_device(settings.search_device))
         self._int8 = Int8CodeBuilder(store, self._folder, self._attach_int8)
         self._unreadable = ReadRetries()
-        self._files_due: dict[UUID, float] = {}  # when each generation's files are looked at next
+        self._files_due: dict[UUID, float] = {}  # next check of each generation's files
 
     def run(self, stop: threading.Event) -> None:
-        """Follow what answers until `stop` is set."""
+        """Sync active generations until `stop` is set."""
         self._sync_until_stopped(stop, (GenerationState.ACTIVE,))
 
     def run_building(self, stop: threading.Event) -> None:
-        """Follow what is being built until `stop` is set: it may take minutes to load, and what
-        answers is not to wait for it."""
+        """Sync generations that are being built until `stop` is set.
+
+        A thread of its own, because loading may take minutes and must not delay active generations.
+        """
         self._sync_until_stopped(stop, (GenerationState.BUILDING,))
 
     def _sync_until_stopped(
         self, stop: threading.Event, states: Collection[GenerationState]
     ) -> None:
-        outage = OutageLog(f"search for what is {' or '.join(states)}")
+        outage = OutageLog(f"search sync of {' and '.join(states)} generations")
         while not stop.is_set():
             try:
                 self.sync(states)
                 outage.record_success()
-            except SQLAlchemyError as error:  # what is loaded goes on answering
+            except SQLAlchemyError as error:  # loaded snapshots go on serving queries
                 outage.record_error(error)
             except (OSError, Unavailable) as error:
-                log.error("search can't load what is new; serving what is loaded: %s", error)
+                log.error("sync failed, loaded snapshots go on serving queries: %s", error)
             stop.wait(self._settings.search_follow_seconds)
 
     def sync(self, states: Collection[GenerationState] = SYNCED_STATES) -> None:
-        """Bring every generation of these states to its map's version; forget those that are
-        gone."""
-        looked_at = time.monotonic()
-        wanted = read_generation_versions(self._catalog)
-        self.replication_lag.record_catalog_read(wanted, looked_at)
-        for generation_id, now in wanted.items():
-            if now.state not in states:
+        """Sync every generation of these states to its map's version; drop deleted generations."""
+        read_at = time.monotonic()
+        current = read_generation_versions(self._catalog)
+        self.replication_lag.record_catalog_read(current, read_at)
+        for generation_id, target in current.items():
+            if target.state not in states:
                 continue
             snapshot = self._snapshots.get(generation_id)
-            if snapshot is None or snapshot.version < now.version:
-                self._sync_generation(generation_id, now.version)
-            elif self._can_mend(snapshot):
-                self._sync_generation(generation_id, now.version, damaged=snapshot)
+            if snapshot is None or snapshot.version < target.version:
+                self._sync_generation(generation_id, target.version)
+            elif self._needs_reload(snapshot):
+                self._sync_generation(generation_id, target.version, damaged=snapshot)
             self._update_gpu(generation_id)
-            self.replication_lag.record_synced(generation_id, looked_at)
-        for generation_id in self._snapshots.keys() - wanted.keys():
+            self.replication_lag.record_synced(generation_id, read_at)
+        for generation_id in self._snapshots.keys() - current.keys():
             self._memory_budget.release_generation(generation_id)
-        remove_stale_folders(self._folder, wanted.keys())
+        remove_stale_folders(self._folder, current.keys())
         with self._snapshots_lock:
-            self._snapshots = {k: v for k, v in self._snapshots.items() if k in wanted}
+            self._snapshots = {k: v for k, v in self._snapshots.items() if k in current}
             self._load_locks = {
-                k: v for k, v in self._load_locks.items() if k in wanted or v.locked()
+                k: v for k, v in self._load_locks.items() if k in current or v.locked()
             }
-            self._files_due = {k: v for k, v in self._files_due.items() if k in wanted}
+            self._files_due = {k: v for k, v in self._files_due.items() if k in current}
         self._unreadable.forget_others(
             {key for snapshot in self._snapshots.values() for key in snapshot.missing}
         )
 
     def search(self, request: SearchRequest) -> SearchResponse:
+        """Return the most similar rows of this shard; see `SearchRequest`."""
         snapshot = self.snapshot(request.generation_id, request.min_version)
         query = self._query_rows.read_query(snapshot, request)
-        asked = build_row_mask(snapshot.photos, request.photos, request.exclude)
-        if request.mode == Mode.DETERMINISTIC and needs_int8_codes(snapshot, asked, request.k):
+        row_mask = build_row_mask(snapshot.photos, request.photos, request.exclude)
+        if request.mode == Mode.DETERMINISTIC and needs_int8_codes(snapshot, row_mask, request.k):
             self._int8.wait_for_codes(snapshot, self._settings.search_wait_seconds)
             snapshot = self.snapshot(request.generation_id, snapshot.version)
-            asked = build_row_mask(snapshot.photos, request.photos, request.exclude)
-        question = SearchOptions(
+            row_mask = build_row_mask(snapshot.photos, request.photos, request.exclude)
+        options = SearchOptions(
             k=request.k,
             min_score=request.min_score,
             mode=request.mode,
@@ -230,29 +243,30 @@ class SearchWorker:
         )
         weighted = _weight_query(query, request.word_weights)
         if weighted is None:
-            found = execute_query(snapshot, query, asked, question, self._batcher)
+            result = execute_query(snapshot, query, row_mask, options, self._batcher)
         else:
-            found = execute_weighted_query(
-                snapshot, query, weighted, asked, question, self._batcher
+            result = execute_weighted_query(
+                snapshot, query, weighted, row_mask, options, self._batcher
             )
         return SearchResponse(
-            hits=found.hits,
-            # Better rows may lie in what is missing.
-            certificate=NONE if snapshot.missing else found.certificate,
-            certified_k=0 if snapshot.missing else found.certified_k,
-            rows_scanned=found.rows_scanned,
-            rows_reranked=found.rows_reranked,
-            max_z=found.max_z,
+            hits=result.hits,
+            # Missing chunks may contain better rows.
+            certificate=NONE if snapshot.missing else result.certificate,
+            certified_k=0 if snapshot.missing else result.certified_k,
+            rows_scanned=result.rows_scanned,
+            rows_reranked=result.rows_reranked,
+            max_z=result.max_z,
             snapshot_version=snapshot.version,
             missing=snapshot.missing,
         )
 
     @property
     def query_batcher(self) -> QueryBatcher:
-        """How often queries went through the codes, and how many together."""
+        """The batcher of first-level scans, for its counters."""
         return self._batcher
 
     def status(self) -> SearchStatus:
+        """Return what is loaded, with sizes and lags."""
         snapshots = self._snapshots
         versions = {key: snapshot.version for key, snapshot in snapshots.items()}
         parts = [part for snapshot in snapshots.values() for part in snapshot.parts]
@@ -270,8 +284,12 @@ class SearchWorker:
         )
 
     def snapshot(self, generation_id: UUID, min_version: int) -> Snapshot:
-        """What answers: a snapshot at least as new as `min_version`; Unavailable when that takes
-        too long."""
+        """Return a snapshot at least as new as `min_version`.
+
+        Raises:
+            Gone: `query_expired` if the generation no longer exists.
+            Unavailable: `search_behind` if the version is not reached within SEARCH_WAIT_SECONDS.
+        """
         deadline = time.monotonic() + self._settings.search_wait_seconds
         while True:
             snapshot = self._snapshots.get(generation_id)
@@ -286,17 +304,17 @@ class SearchWorker:
                 raise Unavailable(
                     "search_behind",
                     f"Search has not caught up with version {min_version} of the map. "
-                    "Ask again in a moment.",
+                    "Retry in a moment.",
                 )
             time.sleep(VERSION_POLL_SECONDS)
 
     def _sync_generation(
         self, generation_id: UUID, version: int, damaged: Snapshot | None = None
     ) -> Snapshot | None:
-        """The generation at this version or a later one; another snapshot than `damaged`."""
+        """Return a snapshot of this version or a later one that is not `damaged`."""
         with self._snapshots_lock:
-            loading = self._load_locks.setdefault(generation_id, threading.Lock())
-        with loading:
+            load_lock = self._load_locks.setdefault(generation_id, threading.Lock())
+        with load_lock:
             old = self._snapshots.get(generation_id)
             if old is not None and old.version >= version and old is not damaged:
                 return old  # another thread loaded it while this one waited
@@ -316,8 +334,8 @@ class SearchWorker:
                     self._snapshots = {**self._snapshots, generation_id: new}
             return new
 
-    def _can_mend(self, snapshot: Snapshot) -> bool:
-        """Whether a chunk is to be read again: one that is missing, or whose file was changed."""
+    def _needs_reload(self, snapshot: Snapshot) -> bool:
+        """Whether a missing chunk is due for a retry, or a mapped file was changed."""
         if self._unreadable.any_due(snapshot.missing):
             return True
         now = time.monotonic()
@@ -327,8 +345,7 @@ class SearchWorker:
         return any(chunk.was_changed() for chunk in snapshot.chunks)
 
     def _update_gpu(self, generation_id: UUID) -> None:
-        """Put the generation on the device, if there is one, or take it from there after a failure.
-        Queries go on meanwhile."""
+        """Load the generation onto the GPU, or drop it after a failure; queries continue."""
         snapshot = self._snapshots.get(generation_id)
         if snapshot is None or not self._residency.needs_update(snapshot):
             return
@@ -338,34 +355,34 @@ class SearchWorker:
                 self._int8.start_build(snapshot)
             return
         with self._snapshots_lock:
-            loading = self._load_locks.setdefault(generation_id, threading.Lock())
-        with loading:
-            now = self._snapshots.get(generation_id)
-            if now is not None:
-                new = self._residency.carry_over(now, filled)
+            load_lock = self._load_locks.setdefault(generation_id, threading.Lock())
+        with load_lock:
+            current = self._snapshots.get(generation_id)
+            if current is not None:
+                new = self._residency.carry_over(current, filled)
                 with self._snapshots_lock:
                     self._snapshots = {**self._snapshots, generation_id: new}
 
-    def _attach_int8(self, generation_id: UUID, made: dict[UUID, Int8Codes]) -> None:
-        """Swap in the snapshot that is there now with its int8 codes."""
+    def _attach_int8(self, generation_id: UUID, built: dict[UUID, Int8Codes]) -> None:
+        """Replace the current snapshot by one with its int8 codes."""
         with self._snapshots_lock:
-            loading = self._load_locks.setdefault(generation_id, threading.Lock())
-        with loading:
+            load_lock = self._load_locks.setdefault(generation_id, threading.Lock())
+        with load_lock:
             old = self._snapshots.get(generation_id)
             if old is None:
-                return  # it was forgotten meanwhile
-            new = with_int8_codes(self._store, self._folder, self._memory_budget, old, made)
+                return  # the generation was dropped meanwhile
+            new = with_int8_codes(self._store, self._folder, self._memory_budget, old, built)
             with self._snapshots_lock:
                 self._snapshots = {**self._snapshots, generation_id: new}
 
 
 def _weight_query(row: Row, weights: tuple[float, ...]) -> Row | None:
-    """None without weights, and where no word of the query has any: the plain ranking is left."""
+    """Return the weighted query; None without weights, or if no word of the query has a weight."""
     if not weights:
         return None
     try:
         weighted = apply_word_weights(row, weights)
     except ValueError as error:
         raise InvalidRequest("word_weights_unfit", f"{error}.") from None
-    # As every row and every query is: the same question, whichever way it is searched.
+    # float32 like all rows, so that every search strategy uses the same query.
     return None if weighted is None else weighted.astype(np.float32)

@@ -1,10 +1,10 @@
-"""Codes of descriptor rows, from which search tells most rows apart from the best ones.
+"""Compact codes of descriptor rows, by which search rules out most rows.
 
-    rotation.py   the random rotation before any code (hadamard.py: its core)
-    signs.py      a bit for each rotated number
-    int8.py       a byte for each, and how far off it is at most
-    stored.py     the files of codes
+    rotation.py       random rotation and fast Walsh-Hadamard transform, applied before coding
+    sign_codes.py     one bit for each rotated number
+    int8_codes.py     one byte for each rotated number, with an error bound
+    serialization.py  file format of codes
+    jit.py            compilation of the loops by numba
 
-Loops are compiled (compiled.py), which takes a while the first time: nothing here is imported
-before codes are needed.
+Compilation takes a while the first time, so import these modules only when codes are needed.
 """

@@ -1,7 +1,7 @@
-"""How the loops over codes and rows are compiled: by numba, on their first call.
+"""Just-in-time compilation of loops over codes and rows by numba, on their first call.
 
-What was compiled is kept beside the source, or in NUMBA_CACHE_DIR, for this kind of processor;
-where neither can be written, each process compiles anew (some seconds).
+Compiled code is cached beside the source, or in NUMBA_CACHE_DIR, for the current CPU type. If
+neither is writable, each process compiles again, which takes some seconds.
 """
 
 from __future__ import annotations
@@ -13,21 +13,21 @@ import numba
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
-# What is added in which order stays as it is written.
+# Floating-point additions keep the order in which they are written.
 ORDERED_FASTMATH = frozenset({"contract", "nsz"})
-# Sums may run in vector lanes: for each length in one fixed order all the same.
+# Sums may be vectorized: the order may change, but is the same for each array length.
 REORDERED_FASTMATH = ORDERED_FASTMATH | {"reassoc"}
 
 
 def numba_jit(arithmetic: frozenset[str]) -> Callable[[Function], Function]:
-    """Compile a function of arrays and numbers. It holds no lock of the interpreter."""
+    """Decorator that compiles a function of arrays and numbers; it runs without the GIL."""
 
-    def wrap(function: Function) -> Function:
+    def decorate(function: Function) -> Function:
         options: dict[str, Any] = {"nogil": True, "fastmath": set(arithmetic)}
         try:
-            made: Function = numba.njit(cache=True, **options)(function)
-        except RuntimeError:  # there is no place to keep it
-            made = numba.njit(**options)(function)
-        return made
+            compiled: Function = numba.njit(cache=True, **options)(function)
+        except RuntimeError:  # no writable cache folder
+            compiled = numba.njit(**options)(function)
+        return compiled
 
-    return wrap
+    return decorate

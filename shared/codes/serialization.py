@@ -1,19 +1,17 @@
-"""The files of a chunk's codes.
+"""File format of codes, for memory mapping.
 
-One line of JSON that says what follows and of which rows it is, filled up with blanks to a
-multiple of 64 bytes; then the arrays, little endian, each beginning at a multiple of 64. So they
-can be used where they lie in a mapped file.
+A file begins with one line of JSON that describes the arrays and the rows that they belong to,
+padded with blanks to a multiple of 64 bytes. The arrays follow, little-endian, each aligned to 64
+bytes, so that they can be used in a memory-mapped file.
 
-* Sign codes, `<chunk>.codes`: float32 norms and each level's words. `shared.storage.chunks`
-writes it
-  beside the rows.
-* Int8 codes: float32 scales, errors and lengths, and the bytes. Who searches by them makes them
-  (`services.search.chunk_loader`): they are as large as a quarter of the rows, and made in a
-  fraction of
-  the time that the rows took.
+* Sign codes, `<chunk>.codes`: float32 norms and the words of each level. `shared.storage.chunks`
+  writes them beside the rows.
+* Int8 codes: float32 scales, errors and lengths, and the bytes. Search workers compute them
+  (`services.search.chunk_loader`): they are a quarter of the rows' size, and computed in a fraction
+  of the time that the rows took.
 
-Either can always be made again from the rows: a reader that finds none, or one that is made
-otherwise, does so.
+Codes can always be computed again from the rows, and a reader does so if the file is missing or was
+written with other parameters.
 """
 
 from __future__ import annotations
@@ -36,44 +34,51 @@ ALIGNMENT_BYTES = 64
 MAX_HEADER_BYTES = 4096
 
 Layout = tuple[str, tuple[int, ...]]
-"""The dtype of an array, and the shape of what it has for each row."""
+"""Dtype of an array, and the shape of its entry for one row."""
 
 
 def encode_sign_codes(rows: Floats, chunk_sha256: str) -> bytes:
-    """The file of the sign codes of (n, dimension) rows, whose chunk has this hash."""
+    """Encode the sign codes of (n, dimension) rows of the chunk with this hash."""
     codes = encode_signs(rows)
     return _encode(_sign_codes_spec(rows.shape[1]), [codes.norms, *codes.levels], chunk_sha256)
 
 
 def decode_sign_codes(data: Any, *, rows: int, dimension: int, chunk_sha256: str) -> SignCodes:
-    """The sign codes in a file's bytes, or in any buffer of them, which they go on using.
+    """Decode sign codes from the bytes of a file, or from any buffer, without copying them.
 
-    ValueError says why they are not those of this chunk, as they are made now.
+    Args:
+        data: The buffer, which the codes refer to.
+        rows: Number of rows of the chunk.
+        dimension: Dimension of the rows.
+        chunk_sha256: Hash of the chunk.
+
+    Raises:
+        ValueError: The codes belong to another chunk, have other parameters, or are damaged.
     """
-    made = _sign_codes_spec(dimension)
-    layout: list[Layout] = [("<f4", ()), *(("<u8", (words,)) for words in made["levels"])]
-    norms, *levels = _decode(data, made, layout, rows, chunk_sha256)
+    spec = _sign_codes_spec(dimension)
+    layout: list[Layout] = [("<f4", ()), *(("<u8", (words,)) for words in spec["levels"])]
+    norms, *levels = _decode(data, spec, layout, rows, chunk_sha256)
     return SignCodes(tuple(levels), norms)
 
 
 def encode_int8_codes(rows: Floats, chunk_sha256: str) -> bytes:
-    """The file of the int8 codes of (n, dimension) rows, whose chunk has this hash."""
+    """Encode the int8 codes of (n, dimension) rows of the chunk with this hash."""
     codes = int8_codes(rows)
     arrays: list[NDArray[Any]] = [codes.scales, codes.errors, codes.lengths, codes.numbers]
     return _encode(_int8_codes_spec(rows.shape[1]), arrays, chunk_sha256)
 
 
 def decode_int8_codes(data: Any, *, rows: int, dimension: int, chunk_sha256: str) -> Int8Codes:
-    """The int8 codes in a file's bytes, as `decode_sign_codes` reads sign codes."""
-    single: Layout = ("<f4", ())
-    layout: list[Layout] = [single, single, single, ("|i1", (get_rotation(dimension).padded,))]
+    """Decode int8 codes from a buffer, as `decode_sign_codes` does."""
+    scalar: Layout = ("<f4", ())
+    layout: list[Layout] = [scalar, scalar, scalar, ("|i1", (get_rotation(dimension).padded,))]
     arrays = _decode(data, _int8_codes_spec(dimension), layout, rows, chunk_sha256)
     scales, errors, lengths, numbers = arrays
     return Int8Codes(numbers, scales, errors, lengths)
 
 
 def _sign_codes_spec(dimension: int) -> dict[str, Any]:
-    """How sign codes are made: others are not compared with them."""
+    """Parameters of sign codes; codes with different parameters can't be compared."""
     return {
         "format": SIGN_CODES_FORMAT,
         "dimension": dimension,
@@ -93,51 +98,51 @@ def _int8_codes_spec(dimension: int) -> dict[str, Any]:
     }
 
 
-def _encode(made: dict[str, Any], arrays: list[NDArray[Any]], chunk_sha256: str) -> bytes:
-    pieces = [_padded(np.ascontiguousarray(array).tobytes()) for array in arrays]
+def _encode(spec: dict[str, Any], arrays: list[NDArray[Any]], chunk_sha256: str) -> bytes:
+    blocks = [_padded(np.ascontiguousarray(array).tobytes()) for array in arrays]
     digest = hashlib.sha256()
-    for piece in pieces:
-        digest.update(piece)
+    for block in blocks:
+        digest.update(block)
     header = {
-        **made,
+        **spec,
         "rows": len(arrays[0]),
         "chunk_sha256": chunk_sha256,
         "sha256": digest.hexdigest(),
     }
-    return b"".join([_padded(json.dumps(header).encode(), b" ", end=b"\n"), *pieces])
+    return b"".join([_padded(json.dumps(header).encode(), b" ", end=b"\n"), *blocks])
 
 
 def _decode(
-    data: Any, made: dict[str, Any], layout: list[Layout], rows: int, chunk_sha256: str
+    data: Any, spec: dict[str, Any], layout: list[Layout], rows: int, chunk_sha256: str
 ) -> list[NDArray[Any]]:
-    """The arrays of a file that was made so; ValueError when it is another."""
+    """Return the arrays of a file; ValueError if its parameters, chunk or hash differ."""
     view = memoryview(data)
     line, _, _ = bytes(view[:MAX_HEADER_BYTES]).partition(b"\n")
     header = json.loads(line)  # a JSONDecodeError is a ValueError
     if not isinstance(header, dict):
-        raise ValueError("no codes: the file begins otherwise")
-    expected = {**made, "rows": rows, "chunk_sha256": chunk_sha256}
-    wrong = [name for name, value in expected.items() if header.get(name) != value]
-    if wrong:
-        raise ValueError(f"codes of other rows, or made otherwise: {', '.join(wrong)}")
+        raise ValueError("not a file of codes: its header is not a JSON object")
+    expected = {**spec, "rows": rows, "chunk_sha256": chunk_sha256}
+    mismatched = [name for name, value in expected.items() if header.get(name) != value]
+    if mismatched:
+        raise ValueError(f"codes of other rows or parameters: {', '.join(mismatched)} differ")
     body = view[len(line) + 1 :]
     if hashlib.sha256(body).hexdigest() != header.get("sha256"):
-        raise ValueError("the codes are not what was written: their hash differs")
-    arrays, at = [], 0
+        raise ValueError("the codes are corrupt: their hash differs")
+    arrays, offset = [], 0
     for dtype, shape in layout:
-        array, at = _array(body, at, dtype, (rows, *shape))
+        array, offset = _array(body, offset, dtype, (rows, *shape))
         arrays.append(array)
     return arrays
 
 
 def _array(
-    body: memoryview, at: int, dtype: str, shape: tuple[int, ...]
+    body: memoryview, offset: int, dtype: str, shape: tuple[int, ...]
 ) -> tuple[NDArray[Any], int]:
-    """The array that begins there, and where the next one does."""
-    array = np.frombuffer(body, dtype, math.prod(shape), at).reshape(shape)
-    return array, at + -(-array.nbytes // ALIGNMENT_BYTES) * ALIGNMENT_BYTES
+    """Return the array at the offset, and the offset of the next one."""
+    array = np.frombuffer(body, dtype, math.prod(shape), offset).reshape(shape)
+    return array, offset + -(-array.nbytes // ALIGNMENT_BYTES) * ALIGNMENT_BYTES
 
 
 def _padded(data: bytes, filling: bytes = b"\0", end: bytes = b"") -> bytes:
-    missing = -(len(data) + len(end)) % ALIGNMENT_BYTES
-    return data + filling * missing + end
+    padding = -(len(data) + len(end)) % ALIGNMENT_BYTES
+    return data + filling * padding + end

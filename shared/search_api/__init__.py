@@ -1,0 +1,1 @@
+"""Interface of the search tier: messages, HTTP client, and directory of search workers."""

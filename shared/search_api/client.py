@@ -1,11 +1,8 @@
-"""The search port in front of many workers: one of each shard is asked, all shards at once.
+"""HTTP client of the search tier: fans a query out to all shards and merges their responses.
 
-One answer from the answers of the shards.
-
-The search tier as its clients see it: one port in front of many workers.
-
-`workers` keeps who serves which shard; `port` asks one worker of each shard at once; `merge` makes
-one answer of theirs. One worker that holds everything is the case of a single shard.
+`HttpSearchClient` calls one worker of each shard concurrently, retries other workers of the shard,
+and merges what comes back. `WorkerDirectory` (`shared.search_api.workers`) knows which worker
+serves which shard. A single worker that holds everything is the case of one shard.
 """
 
 from __future__ import annotations
@@ -44,55 +41,63 @@ log = logging.getLogger(__name__)
 
 
 def merge_responses(
-    answers: Sequence[SearchResponse], k: int, unreachable: Iterable[Shard] = ()
+    responses: Sequence[SearchResponse], k: int, unreachable: Iterable[Shard] = ()
 ) -> SearchResponse:
-    """The first `k` hits of all, and what has to be known of the way to them: the sums, the least
-    version, the weakest certificate. `unreachable` are the shards that are missing, and are
-    named: of an
-    answer that lacks anything, nothing is certain."""
-    hits = _top_hits(k, answers)
+    """Merge the responses of the shards into one with the best `k` hits.
+
+    Counts are summed; the version is the lowest, the certificate the weakest. `unreachable` shards
+    are named in `missing`; nothing is certified in a response that lacks anything.
+    """
+    hits = _top_hits(k, responses)
     missing = (
-        *(key for answer in answers for key in answer.missing),
+        *(key for response in responses for key in response.missing),
         *(shard.name for shard in sorted(unreachable)),
     )
-    weakest = max((answer.certificate for answer in answers), key=_certificate_rank)
+    weakest = max((response.certificate for response in responses), key=_certificate_rank)
     return SearchResponse(
         hits=tuple(hits),
-        certified_k=0 if missing else _certified_count(hits, answers),
-        max_z=max((answer.max_z for answer in answers if answer.max_z is not None), default=None),
+        certified_k=0 if missing else _certified_count(hits, responses),
+        max_z=max(
+            (response.max_z for response in responses if response.max_z is not None), default=None
+        ),
         certificate=NONE if missing else weakest,
-        rows_scanned=sum(answer.rows_scanned for answer in answers),
-        rows_reranked=sum(answer.rows_reranked for answer in answers),
-        snapshot_version=min(answer.snapshot_version for answer in answers),
+        rows_scanned=sum(response.rows_scanned for response in responses),
+        rows_reranked=sum(response.rows_reranked for response in responses),
+        snapshot_version=min(response.snapshot_version for response in responses),
         missing=missing,
     )
 
 
-def _top_hits(k: int, answers: Sequence[SearchResponse]) -> list[SearchHit]:
-    """Each answer's hits are sorted already: by what ranks them, best first, ties by photo id."""
-    merged = heapq.merge(*(a.hits for a in answers), key=lambda hit: (-hit.ranked_by, hit.photo_id))
-    found: dict[UUID, SearchHit] = {}
+def _top_hits(k: int, responses: Sequence[SearchResponse]) -> list[SearchHit]:
+    """The best `k` hits of responses that are sorted each: by `ranked_by`, ties by photo id."""
+    merged = heapq.merge(
+        *(response.hits for response in responses), key=lambda hit: (-hit.ranked_by, hit.photo_id)
+    )
+    hits: dict[UUID, SearchHit] = {}
     for hit in merged:
-        if len(found) == k:
+        if len(hits) == k:
             break
-        # Two shards may be at two versions, between which a photo was described anew.
-        found.setdefault(hit.photo_id, hit)
-    return list(found.values())
+        # Shards may be at different versions, between which a photo has moved.
+        hits.setdefault(hit.photo_id, hit)
+    return list(hits.values())
 
 
-def _certified_count(hits: Sequence[SearchHit], answers: Sequence[SearchResponse]) -> int:
-    """How many of the first hits are certain: a shard that ended early vouches for what scores at
-    least as high as the last hit that it is certain of itself."""
-    sure = -1.0
-    for answer in answers:
-        if _certificate_rank(answer.certificate) >= CERTIFICATES.index(NONE):
-            last = answer.certified_k - 1
-            sure = max(sure, answer.hits[last].score if last >= 0 else 2.0)
-    return sum(hit.score >= sure for hit in hits)
+def _certified_count(hits: Sequence[SearchHit], responses: Sequence[SearchResponse]) -> int:
+    """Number of leading hits that are certain.
+
+    A shard that stopped early guarantees only hits that score at least as high as the last hit that
+    it certifies.
+    """
+    certain_from = -1.0
+    for response in responses:
+        if _certificate_rank(response.certificate) >= CERTIFICATES.index(NONE):
+            last = response.certified_k - 1
+            certain_from = max(certain_from, response.hits[last].score if last >= 0 else 2.0)
+    return sum(hit.score >= certain_from for hit in hits)
 
 
 def _certificate_rank(certificate: str) -> int:
-    """A name that this side does not know yet promises the least."""
+    """Rank of a certificate; an unknown one, of a newer worker, counts as the weakest."""
     known = certificate in CERTIFICATES
     return CERTIFICATES.index(certificate) if known else len(CERTIFICATES)
 
@@ -100,46 +105,49 @@ def _certificate_rank(certificate: str) -> int:
 def merge_statuses(
     shards: Mapping[Shard, SearchStatus], unreachable: Iterable[Shard] = ()
 ) -> SearchStatus:
-    """What the shards hold together: a generation is there once every one of them has it."""
-    found = list(shards.values())
-    common = set.intersection(*(set(status.versions) for status in found)) if found else set()
-    lagging = {key for status in found for key in status.lags}
+    """Merge the shards' states; a generation counts as loaded once every shard has loaded it."""
+    statuses = list(shards.values())
+    common = set.intersection(*(set(status.versions) for status in statuses)) if statuses else set()
+    lagging = {key for status in statuses for key in status.lags}
     return SearchStatus(
-        rows=sum(status.rows for status in found),
-        resident_bytes=sum(status.resident_bytes for status in found),
-        mapped_bytes=sum(status.mapped_bytes for status in found),
-        versions={key: min(status.versions[key] for status in found) for key in common},
-        incomplete=tuple(sorted({key for status in found for key in status.incomplete})),
-        missing=tuple(key for status in found for key in status.missing),
+        rows=sum(status.rows for status in statuses),
+        resident_bytes=sum(status.resident_bytes for status in statuses),
+        mapped_bytes=sum(status.mapped_bytes for status in statuses),
+        versions={key: min(status.versions[key] for status in statuses) for key in common},
+        incomplete=tuple(sorted({key for status in statuses for key in status.incomplete})),
+        missing=tuple(key for status in statuses for key in status.missing),
         lags={
             key: max(
-                (status.lags[key] for status in found if key in status.lags),
+                (status.lags[key] for status in statuses if key in status.lags),
                 key=lambda lag: lag.seconds,
             )
             for key in lagging
         },
-        devices=tuple(device for status in found for device in status.devices),
+        devices=tuple(device for status in statuses for device in status.devices),
         away=tuple(shard.name for shard in sorted(unreachable)),
     )
 
 
-MAX_CONCURRENT_CALLS = 64  # to all shards together; more wait for their turn
-RESPONSE_MARGIN_SECONDS = 0.2  # for a call that ends at the deadline to say why
-RETRY_PAUSE_SECONDS = 0.05  # before workers that are behind are asked again
+MAX_CONCURRENT_CALLS = 64  # to all shards together; further calls are queued
+RESPONSE_MARGIN_SECONDS = 0.2  # for a call that times out at the deadline to return its error
+RETRY_PAUSE_SECONDS = 0.05  # before lagging workers are called again
 
 BEHIND, UNREADABLE = "search_behind", "chunk_unreadable"
-RETRYABLE_CODES = (BEHIND, "codes_being_made")  # who refuses so may answer in a moment
+RETRYABLE_CODES = (BEHIND, "codes_being_made")  # the worker may answer in a moment
 PERMANENT_CODES = (UNREADABLE, "codes_not_made")
 
 
 class HttpSearchClient:
-    """Every search worker behind one port; a context manager.
+    """`SearchBackend` over HTTP for all search workers; a context manager, thread-safe.
 
-    Of each shard one worker is asked, and the next one when that fails. A shard of which no worker
-    answers in time is named in the answer's `missing`, and the rest is answered. Raises what the
-    workers refuse with: Gone, NotFound, Unavailable (`chunk_unreadable`, `codes_being_made`,
-    `codes_not_made`); Unavailable (`search_behind`) when no shard reaches `min_version` in time,
-    and (`search_unavailable`) when no shard answers at all.
+    One worker of each shard is called, and the next one when that fails. A shard without a worker
+    that answers in time is named in the response's `missing`; the other shards' hits are returned.
+
+    Raises:
+        Gone, NotFound: As the workers raise them.
+        Unavailable: `chunk_unreadable`, `codes_being_made`, `codes_not_made` as the workers raise
+            them; `search_behind` when no shard reaches `min_version` in time; `search_unavailable`
+            when no shard answers.
     """
 
     def __init__(self, urls: Sequence[str], timeout_seconds: float) -> None:
@@ -148,15 +156,17 @@ class HttpSearchClient:
             limits=httpx2.Limits(max_keepalive_connections=MAX_CONCURRENT_CALLS)
         )
         self._workers = WorkerDirectory(urls, self._http)
-        self._calls = ThreadPoolExecutor(MAX_CONCURRENT_CALLS, thread_name_prefix="search-call")
+        self._call_executor = ThreadPoolExecutor(
+            MAX_CONCURRENT_CALLS, thread_name_prefix="search-call"
+        )
         self._stop = threading.Event()
-        self._following = threading.Thread(
+        self._refresh_thread = threading.Thread(
             target=self._refresh_workers, name="search-workers", daemon=True
         )
 
     def __enter__(self) -> Self:
-        self._workers.look()
-        self._following.start()
+        self._workers.refresh()
+        self._refresh_thread.start()
         return self
 
     def __exit__(
@@ -166,78 +176,85 @@ class HttpSearchClient:
         trace: TracebackType | None,
     ) -> None:
         self._stop.set()
-        self._following.join()
-        self._calls.shutdown(cancel_futures=True)
+        self._refresh_thread.join()
+        self._call_executor.shutdown(cancel_futures=True)
         self._workers.close()
         self._http.close()
 
     def _refresh_workers(self) -> None:
         while not self._stop.wait(REFRESH_SECONDS):
-            self._workers.look()
+            self._workers.refresh()
 
     def search(self, request: SearchRequest) -> SearchResponse:
+        """Search all shards and merge the responses."""
         deadline = time.monotonic() + self._timeout_seconds
         layout = self._workers.layout(request.generation_id, request.min_version)
-        if not layout:  # no worker was ever seen
-            self._workers.look()
+        if not layout:  # no worker has answered yet
+            self._workers.refresh()
             layout = self._workers.layout(request.generation_id, request.min_version)
         calls = {
-            # In the request's context: its id and its trace go along.
-            shard: self._calls.submit(
+            # In the request's context, so that its id and trace are propagated.
+            shard: self._call_executor.submit(
                 copy_context().run, self._search_shard, shard, urls, request, deadline
             )
             for shard, urls in layout.items()
         }
         wait(calls.values(), timeout=deadline + RESPONSE_MARGIN_SECONDS - time.monotonic())
-        answers, away, behind = _collect(calls)
-        if not answers:
+        responses, unreachable, behind = _collect(calls)
+        if not responses:
             raise behind or Unavailable(
-                "search_unavailable", "No search worker answers. Ask again in a moment."
+                "search_unavailable", "No search worker answers. Retry in a moment."
             )
-        return merge_responses(answers, request.k, away)
+        return merge_responses(responses, request.k, unreachable)
 
     def status(self) -> SearchStatus:
-        """Of the workers as they are now; Unavailable (`search_unavailable`) when all are away."""
-        self._workers.look()
-        found, away = self._workers.statuses()
-        if not found:
+        """Poll the workers and merge their states.
+
+        Raises:
+            Unavailable: `search_unavailable` if no worker answers.
+        """
+        self._workers.refresh()
+        statuses, unreachable = self._workers.statuses()
+        if not statuses:
             raise Unavailable("search_unavailable", "No search worker answers.")
-        return merge_statuses(found, away)
+        return merge_statuses(statuses, unreachable)
 
     def _search_shard(
         self, shard: Shard, urls: Sequence[str], request: SearchRequest, deadline: float
     ) -> SearchResponse:
-        """The answer of one of the shard's workers. Workers that are behind are asked again until
-        the deadline; WorkerAway when there is none that answers."""
+        """Return the response of one of the shard's workers; WorkerUnavailable if none answers.
+
+        Lagging workers are called again until the deadline.
+        """
         behind: Unavailable | None = None
         while True:
-            again = False
+            retry = False
             unreadable: Unavailable | None = None
-            # A lone worker has a second chance: the connection that was kept may have been stale.
+            # A lone worker gets a second attempt: the kept-alive connection may have been stale.
             order = list(urls) if len(urls) != 1 else [urls[0], urls[0]]
-            for place, url in enumerate(order):
-                left = deadline - time.monotonic()
-                if left <= 0:
+            for index, url in enumerate(order):
+                remaining = deadline - time.monotonic()
+                if remaining <= 0:
                     break
-                # Who is not the last to be asked may not take all the time that there is.
-                seconds = left if url == order[-1] or place == len(order) - 1 else left / 2
+                # Only the last worker may use up the whole remaining time.
+                seconds = (
+                    remaining if url == order[-1] or index == len(order) - 1 else remaining / 2
+                )
                 try:
                     return call_search(self._http, url, request, seconds)
                 except WorkerUnavailable as error:
-                    log.info(
-                        "a call for %s failed, the next worker is asked: %s", shard.name, error
-                    )
-                    self._workers.failed(url)
+                    log.info("a call for %s failed, trying the next worker: %s", shard.name, error)
+                    self._workers.mark_down(url)
                 except Unavailable as error:
                     log.debug("%s: %s: %s", shard.name, url, error.detail)
                     if error.code in RETRYABLE_CODES:
-                        behind, again = error, True
+                        behind, retry = error, True
                     elif error.code in PERMANENT_CODES:
                         unreadable = error
             if unreadable is not None:
-                raise unreadable  # no other worker could, and this one has the last word
-            if not again or time.monotonic() + RETRY_PAUSE_SECONDS > deadline:
-                # Who was behind and ran out of time at the next try is still behind.
+                raise unreadable  # permanent, and no other worker could answer
+            if not retry or time.monotonic() + RETRY_PAUSE_SECONDS > deadline:
+                # A worker that lagged and then timed out is reported as lagging.
                 raise behind or WorkerUnavailable(shard.name, "no worker answers")
             time.sleep(RETRY_PAUSE_SECONDS)
 
@@ -245,22 +262,22 @@ class HttpSearchClient:
 def _collect(
     calls: dict[Shard, Future[SearchResponse]],
 ) -> tuple[list[SearchResponse], list[Shard], Unavailable | None]:
-    """The answers, the shards without one, and why one of them is behind, if one is.
+    """Return the responses, the shards without one, and the error of a lagging shard, if any.
 
-    What a shard refuses for good is raised: it is about the query, not about the shard.
+    Other errors of a shard are raised: they concern the query, not the shard.
     """
-    answers: list[SearchResponse] = []
-    away: list[Shard] = []
+    responses: list[SearchResponse] = []
+    unreachable: list[Shard] = []
     behind: Unavailable | None = None
     for shard, call in calls.items():
         try:
-            answers.append(call.result(timeout=0))
+            responses.append(call.result(timeout=0))
         except (WorkerUnavailable, TimeoutError):
             call.cancel()
-            away.append(shard)
+            unreachable.append(shard)
         except Unavailable as error:
             if error.code != BEHIND:
                 raise
             behind = error
-            away.append(shard)
-    return answers, away, behind
+            unreachable.append(shard)
+    return responses, unreachable, behind

@@ -1,9 +1,9 @@
-"""Looking closely at what a search has found: reranking it by its patches, and explaining it.
+"""Messages of compare jobs: reranking search results by local features, and explaining them.
 
-A compare job carries a `CompareRequest` in its params (`request`): the gateway asks, and what an
-extractor finds is a `Compared` in the object store (`shared.storage.keys.comparison_key`), for as
-long as the job is kept. Neither holds a vector. Imports no torch: what can be compared, the gateway
-knows before it queues anything.
+The gateway stores a `CompareRequest` in the job's params (`request`). The extractor writes a
+`CompareResult` to the object store (`shared.storage.keys.comparison_key`), where it stays as long
+as the job does. Neither contains a vector. The module imports no torch: the gateway checks whether
+a comparison is possible before it queues the job.
 """
 
 from __future__ import annotations
@@ -17,9 +17,7 @@ from pydantic import BaseModel, ConfigDict
 from shared.errors import Gone, Unprocessable
 from shared.extractor_config.configs import ExtractorConfig
 
-MAX_RERANK_CANDIDATES = (
-    50  # candidates: about three batches of photos, and other queries wait so long
-)
+MAX_RERANK_CANDIDATES = 50  # about three batches of photos, for which other queries have to wait
 
 
 class _Message(BaseModel):
@@ -27,26 +25,26 @@ class _Message(BaseModel):
 
 
 class RerankCandidate(_Message):
-    """A photo that the search has found."""
+    """A search hit that is to be reranked or explained."""
 
     photo_id: UUID
     score: float
     """Cosine similarity in [-1, 1]."""
     weighted_score: float | None = None
-    """That to the query with weighted words; None where the ranking is the plain one."""
+    """Cosine similarity to the query with weighted words; None for a plain ranking."""
 
     @property
     def ranked_by(self) -> float:
-        """The score that the search has ranked by."""
+        """The score that the search ranked by."""
         return self.score if self.weighted_score is None else self.weighted_score
 
 
 class CompareRequest(_Message):
-    """What is to be compared: a query with the photos that a search in one generation found.
+    """Request to compare a query with the hits of a search in one generation.
 
-    The query is a stored photo or the photo of a describe job. Of the `candidates`, most similar
-    first, the first `rerank` are put into the order of their rerank scores, and of what comes out
-    the first `explain` are explained. The generation is the job's `generation_id`.
+    The query is a stored photo or the photo of a describe job. The first `rerank` of the
+    `candidates`, which are sorted by similarity, are sorted by their rerank scores; the first
+    `explain` of the outcome are explained. The generation is the job's `generation_id`.
     """
 
     query_photo_id: UUID | None
@@ -55,73 +53,80 @@ class CompareRequest(_Message):
     rerank: int
     explain: int
     word_weights: tuple[float, ...] = ()
-    """By which the search has ranked; () for none. What is explained is the weighted score then."""
+    """Weights that the search ranked by, or (); with weights, the weighted score is explained."""
 
 
 class ClusterContribution(_Message):
-    """What one cluster of the vocabulary adds to the similarity."""
+    """Contribution of one cluster of the vocabulary to a similarity."""
 
     cluster: int
     share: float
 
 
 class SimilarityExplanation(_Message):
-    """Where a similarity comes from. Both kinds of shares add up to it within float error."""
+    """Decomposition of a similarity into shares, which sum to it within float error."""
 
     clusters: tuple[ClusterContribution, ...] | None
-    """Of the clusters that both photos use, largest share first; None without a vocabulary."""
+    """Clusters that both photos use, largest share first; None without a vocabulary."""
     rows: int
     columns: int
-    """The grid of the query's patches."""
+    """Size of the query's patch grid."""
     overlay: str
     """A PNG of `columns` x `rows` pixels as a data URI, one pixel for each patch."""
     full_share: float
-    """The share of a patch that is drawn without transparency: the strongest, either way."""
+    """Share of a patch drawn fully opaque: the largest absolute share."""
 
 
 class RerankedCandidate(_Message):
+    """A candidate with its rerank score and explanation."""
+
     photo_id: UUID
     rerank_score: float | None
-    """None: not among those to be reranked, or its photo could not be read."""
+    """None if it was not to be reranked, or its photo could not be read."""
     explanation: SimilarityExplanation | None
 
 
 class CompareResult(_Message):
-    """The candidates in the order that they are to be answered in; deleted ones are left out."""
+    """Result of a comparison: the candidates in their final order, without deleted ones."""
 
     candidates: tuple[RerankedCandidate, ...]
 
 
 def check_rerankable(recipe: ExtractorConfig) -> None:
-    """Unprocessable (`not_rerankable`) for an extractor that makes no local features."""
+    """Raise Unprocessable (`not_rerankable`) for an extractor without local features."""
     if not recipe.has_local_features:
         raise Unprocessable(
             "not_rerankable",
-            f"The extractor {recipe.name} makes one feature of a whole photo, and reranking "
-            "compares patches. Leave out `rerank`, or use a map with another extractor.",
+            f"The extractor {recipe.name} computes one feature per photo, but reranking compares "
+            "patches. Leave out `rerank`, or use a map with another extractor.",
         )
 
 
 def check_explainable(recipe: ExtractorConfig, spec: Mapping[str, Any] | None) -> None:
-    """Unprocessable (`not_explainable`) where a similarity is no sum over patches.
+    """Raise Unprocessable (`not_explainable`) if a similarity is not a sum over patches.
 
-    `spec` is that of the generation that answers; None where the map has none yet.
+    Args:
+        recipe: The extractor's configuration.
+        spec: Spec of the active generation; None if the map has none yet.
     """
-    why = None
+    reason = None
     if not recipe.has_local_features:
-        why = "it makes one feature of a whole photo, and no patches"
+        reason = "it computes one feature per photo, and no patches"
     elif recipe.aggregator == "gem":
-        why = "GeM raises the features to a power, so that no patch has a share of its own"
+        reason = "GeM pooling raises features to a power, so a similarity is not a sum over patches"
     elif spec is not None and spec["dimension"] != (recipe.width or 0) * (spec["clusters"] or 1):
-        why = "its descriptors are projected (PCA), which mixes the clusters"
-    if why is not None:
+        reason = "its descriptors are projected (PCA), which mixes the clusters"
+    if reason is not None:
         raise Unprocessable(
             "not_explainable",
-            f"Answers of the extractor {recipe.name} can't be explained: {why}. Leave out "
+            f"Results of the extractor {recipe.name} can't be explained: {reason}. Leave out "
             "`explain`, or use a map with another extractor: VLAD without PCA, or `avg`.",
         )
 
 
 def query_expired_error() -> Gone:
-    """What a query's job or photo left behind is no longer kept."""
-    return Gone("query_expired", "The query is no longer kept (QUERY_TTL_SECONDS). Ask again.")
+    """Error for a query whose photo or descriptor has expired."""
+    return Gone(
+        "query_expired",
+        "The query has expired (QUERY_TTL_SECONDS). Send the query again.",
+    )

@@ -1,6 +1,6 @@
-"""Which photos may be answered: by where, when and what they are.
+"""Photo filter by location, capture time, place, tags and ids.
 
-The same filter narrows a similarity search (inside the scan) and a metadata search (in SQL).
+The same filter restricts a similarity search (inside the scan) and a metadata search (in SQL).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ class _FilterModel(BaseModel):
 
 
 class Circle(_FilterModel):
-    """Everything within `radius_m` metres (inclusive) of a point in degrees."""
+    """All points within `radius_m` metres (inclusive) of a point in degrees."""
 
     latitude: Coordinate
     longitude: Coordinate
@@ -29,9 +29,9 @@ class Circle(_FilterModel):
 
 
 class Box(_FilterModel):
-    """Degrees, bounds inclusive. `west` > `east` crosses the antimeridian.
+    """Bounding box in degrees, bounds inclusive; `west` > `east` crosses the antimeridian.
 
-    A pole has every longitude: a box that reaches latitude 90 holds whatever lies there.
+    A pole has every longitude: a box that reaches latitude 90 contains every photo there.
     """
 
     south: Coordinate
@@ -40,9 +40,9 @@ class Box(_FilterModel):
     east: Coordinate
 
     def longitude_ranges(self) -> list[tuple[float, float]]:
-        """The longitudes as ranges that don't cross the antimeridian, in [-180, 180].
+        """Split the longitudes into ranges in [-180, 180] that don't cross the antimeridian.
 
-        -180 and 180 are one meridian: a range that ends there also holds the other spelling.
+        -180 and 180 are the same meridian: a range that ends there also contains the other value.
         """
         if self.west > self.east:
             return [(self.west, 180.0), (-180.0, self.east)]
@@ -55,7 +55,10 @@ class Box(_FilterModel):
 
 
 class PhotoFilter(_FilterModel):
-    """What is None or empty filters nothing; a photo without a value passes no filter on it."""
+    """Conditions that a photo must meet; None or empty means no condition.
+
+    A photo without a value does not meet a condition on that value.
+    """
 
     near: Circle | None = None
     box: Box | None = None
@@ -63,12 +66,13 @@ class PhotoFilter(_FilterModel):
     captured_before: datetime | None = None
     place: str | None = None
     tags: tuple[str, ...] = ()
-    """A photo must carry all of them."""
+    """The photo must have all of these tags."""
     ids: tuple[UUID, ...] | None = None
-    """Only these; an empty tuple lets nothing pass."""
+    """The photo must be one of these; an empty tuple matches no photo."""
 
     @property
     def is_empty(self) -> bool:
+        """Whether the filter has no condition."""
         return self == NO_FILTER
 
 

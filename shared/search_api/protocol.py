@@ -1,11 +1,12 @@
-"""What is asked of a search worker and what it answers.
+"""Messages and protocol of the search tier: `SearchRequest`, `SearchResponse`, `SearchStatus`.
 
-A query is a reference to one descriptor row in the object store, never the vector itself: the
-gateway stays free of vectors. In one process the port is a call (`services.search.worker`);
-between machines it is HTTP, with a map's slots spread over shards (`shared.search_api.client`).
+A query is a reference to one descriptor row in the object store, never the vector itself, so no
+vector passes through the gateway. `SearchBackend` is implemented in process by
+`services.search.worker.SearchWorker`, and over HTTP by `shared.search_api.client.HttpSearchClient`,
+which spreads a map's slots over shards.
 
-Over HTTP a message leaves out what has its default (`as_json`): whoever is of the release before
-understands everything that it could have been told.
+Messages are serialised without fields that have their default value (`as_json`), so that a worker
+of the previous release accepts every request that uses none of the new fields.
 """
 
 from __future__ import annotations
@@ -20,44 +21,46 @@ from shared.config.shards import SINGLE_SHARD
 from shared.search_api.photo_filter import NO_FILTER, PhotoFilter
 
 EXHAUSTIVE = "exhaustive"  # every row was compared exactly
-BOUND = "bound"  # no row that was left out can reach the answer, whatever it holds
-STATISTICAL = "statistical"  # the same but for a chance of about 1 in 10^8
-NONE = "none"  # the search ended early, or lacks a part of the map: better rows may be missing
+BOUND = "bound"  # a proven bound excludes every row that was not compared exactly
+STATISTICAL = "statistical"  # the same, with a failure probability of about 1 in 10^8
+NONE = "none"  # stopped early, or a part of the map is missing: better rows may exist
 CERTIFICATES = (EXHAUSTIVE, BOUND, STATISTICAL, NONE)
-"""How an answer can have been reached, strongest first."""
+"""Guarantees of a result's completeness, strongest first."""
 
 
 class Mode(StrEnum):
-    """How to search."""
+    """Search strategy."""
 
-    AUTO = "auto"  # whichever reads less
+    AUTO = "auto"  # the strategy that reads the fewest bytes
     DENSE = "dense"  # compare every row exactly
-    DETERMINISTIC = "deterministic"  # leave nothing to chance: `exhaustive` or `bound`
+    DETERMINISTIC = "deterministic"  # only certificates without probability: exhaustive, bound
 
 
 class _Message(BaseModel):
-    # Of an answer, what a newer worker adds is passed over.
+    # Unknown fields of a response are ignored: a newer worker may add some.
     model_config = ConfigDict(frozen=True)
 
     def as_json(self) -> str:
-        """Without defaults: what is not asked for needs no one who understands it."""
+        """Serialise without default values, so that a peer needs to know only the fields in use."""
         return self.model_dump_json(exclude_defaults=True)
 
 
 class SearchRequest(_Message):
-    """The `k` rows of `generation_id` that are most similar to row `row` of object `object_key`,
-    of those whose photos pass the filter `photos`.
+    """Request for the `k` rows of a generation that are most similar to one stored row.
 
-    The worker first catches up with `min_version` of the map, so that whoever just saw a photo
-    indexed or deleted sees it in the answer. `exclude` names photos that must not be answered
-    (the query itself).
+    The query is row `row` of the object `object_key`; only photos that pass the filter `photos` are
+    returned.
 
-    `word_weights`, one for each word of the generation's vocabulary, multiply the query's words,
-    and the rows are ranked by that; `min_score` still means the plain cosine. They come by value,
-    so that all shards of one answer rank by the same ones.
+    The worker first catches up with `min_version` of the map, so that a photo whose indexing or
+    deletion the caller has seen is taken into account. `exclude` names photos to leave out of the
+    result, usually the query itself.
+
+    `word_weights`, one for each word of the generation's vocabulary, multiply the words of the
+    query, and rows are ranked by the similarity to that weighted query; `min_score` still applies
+    to the plain cosine. The weights are sent by value, so that all shards rank by the same ones.
     """
 
-    # What is asked has to be understood: a filter that is passed over would be a wrong answer.
+    # Unknown fields of a request are refused: ignoring a filter would give a wrong result.
     model_config = ConfigDict(extra="forbid")
 
     map_id: UUID
@@ -71,68 +74,70 @@ class SearchRequest(_Message):
     exclude: tuple[UUID, ...] = ()
     mode: Mode = Mode.AUTO
     most_rows: int | None = Field(None, ge=0)
-    """Give up once so many rows were compared exactly, and say so (`none`)."""
+    """Maximum number of rows compared exactly; a search that stops there has certificate `none`."""
     most_seconds: float | None = Field(None, gt=0)
-    """Give up after this time."""
+    """Time limit in seconds."""
     word_weights: tuple[float, ...] = ()
 
 
 class SearchHit(_Message):
+    """One photo of a search result."""
+
     photo_id: UUID
     score: float
     """Cosine similarity in [-1, 1]."""
     weighted_score: float | None = None
-    """Cosine similarity to the weighted query; None where the ranking is the plain one: without
-    weights, or where no word of the query has any."""
+    """Cosine similarity to the weighted query; None for a plain ranking: without weights, or where
+    no word of the query has a weight."""
 
     @property
     def ranked_by(self) -> float:
-        """The score that decides the order."""
+        """The score that determines the order."""
         return self.score if self.weighted_score is None else self.weighted_score
 
 
 class SearchResponse(_Message):
-    """`hits` are sorted by what ranks them (`Hit.ranked_by`), highest first, ties by photo id."""
+    """Result of a search: `hits` sorted by `SearchHit.ranked_by` descending, ties by photo id."""
 
     hits: tuple[SearchHit, ...]
     certificate: str
-    """How the answer was reached, one of CERTIFICATES."""
+    """Guarantee of the result's completeness, one of CERTIFICATES."""
     certified_k: int = 0
-    """So many of the first hits are certain: all of them, unless the search ended early."""
+    """Number of leading hits that are certain: all of them, unless the search stopped early."""
     rows_scanned: int
     rows_reranked: int
-    """Of them, those whose whole rows were read."""
+    """Number of the scanned rows that were compared exactly, by their full descriptors."""
     max_z: float | None = None
-    """The largest error of an estimate from codes, in its standard deviations; None without."""
+    """Largest error of a sign-code estimate, in standard deviations; None if none was made."""
     snapshot_version: int
     missing: tuple[str, ...] = ()
-    """Whose photos can't be in the answer: objects that could not be read, and shards (`shard
-    1/3`) of which no worker answered."""
+    """Objects that could not be read, and shards (`shard 1/3`) without an answering worker; their
+    photos are not in the result."""
 
 
 class ReplicationLag(_Message):
-    """How far a snapshot is behind its map. `seconds` since it was last known to be level."""
+    """Lag of a snapshot behind its map: versions, and seconds since it was last current."""
 
     versions: int
     seconds: float
     answers: bool
-    """Whether the generation is the active one; False for one that is only being built."""
+    """Whether the generation is active, and so serves queries; False while it is being built."""
 
 
 class IndexPart(_Message):
-    """One part of what a generation is searched by: a level of its codes, or its rows."""
+    """One part of a generation's search index: a level of its codes, or its rows."""
 
     name: str
     size_bytes: int
     resident: bool
-    """Held in memory; else mapped from files, of which the system keeps what it has room for."""
+    """Whether it is held in memory; otherwise it is a mapped file in the system's page cache."""
 
 
 class LoadedGeneration(_Message):
-    """What is held of one generation."""
+    """A generation that a worker has loaded."""
 
     rows: int
-    """With those of deleted photos."""
+    """Including the rows of deleted photos."""
     dimension: int
     parts: tuple[IndexPart, ...]
 
@@ -142,47 +147,53 @@ class DeviceStatus(_Message):
 
     name: str
     resident_bytes: int
-    """Of descriptors in its memory."""
+    """Bytes of descriptors in the GPU's memory."""
     generations: dict[UUID, str]
-    """Those that are searched there, as `float16` rows or `int8` codes; others by the CPU."""
+    """Generations searched on the GPU, with their row format, `float16` or `int8`; the others are
+    searched on the CPU."""
     failure: str | None = None
-    """What went wrong last: since then the CPU searches, until the next try."""
+    """Last error, after which the CPU searches until the next attempt; None if there is none."""
 
 
 class SearchStatus(_Message):
-    """How far a worker has followed: rows and bytes in memory, version by generation.
+    """State of a worker: rows and bytes in memory, and the loaded version of each generation.
 
-    Of several workers together: the sums, and the least version that every shard has.
+    For several workers together: the sums, and the lowest version among the shards.
     """
 
     shard: str = str(SINGLE_SHARD)
     rows: int
     resident_bytes: int
     mapped_bytes: int = 0
-    """What is not resident."""
+    """Bytes of mapped files that are not resident."""
     versions: dict[UUID, int]
     held: dict[UUID, LoadedGeneration] = {}
-    """Empty for several workers together."""
+    """Loaded generations; empty for several workers together."""
     incomplete: tuple[UUID, ...] = ()
-    """Generations of which a chunk can't be read."""
+    """Generations with an unreadable chunk."""
     missing: tuple[str, ...]
-    """The chunks that can't be read."""
+    """Object keys of unreadable chunks."""
     lags: dict[UUID, ReplicationLag] = {}
-    """Empty where no one follows the catalog."""
+    """Replication lag by generation; empty for a worker that does not follow the catalog."""
     devices: tuple[DeviceStatus, ...] = ()
-    """Empty where the CPU does all."""
+    """GPUs in use; empty where the CPU searches everything."""
     away: tuple[str, ...] = ()
-    """Shards of which no worker answers, as `missing` of an answer names them."""
+    """Shards without an answering worker, as `SearchResponse.missing` names them."""
 
     @property
     def loaded(self) -> dict[UUID, int]:
-        """The versions of the generations that are there without a gap."""
+        """Versions of the generations that are loaded completely."""
         return {key: value for key, value in self.versions.items() if key not in self.incomplete}
 
 
 class SearchBackend(Protocol):
-    """The gateway's view of the search tier. Raises Unavailable when it can't keep up."""
+    """The search tier as its callers use it.
 
-    def search(self, request: SearchRequest) -> SearchResponse: ...
+    Raises `Unavailable` when it can't reach the requested version in time.
+    """
 
-    def status(self) -> SearchStatus: ...
+    def search(self, request: SearchRequest) -> SearchResponse:
+        """Return the hits of one search."""
+
+    def status(self) -> SearchStatus:
+        """Return the state of the workers."""

@@ -9,8 +9,7 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as some
 from sqlalchemy import delete, select
 
-from services.search.photo_columns import PhotoColumns
-from services.search.photo_columns import build_row_mask as select_rows
+from services.search.photo_columns import PhotoColumns, build_row_mask
 from shared.catalog.photo_search import MetadataFilter, filter_conditions, search_photos
 from shared.catalog.photos import Photo, PhotoFilterValues, PhotoRole
 from shared.catalog.session import Catalog
@@ -57,7 +56,7 @@ def in_sql(catalog: Catalog, wanted: PhotoFilter) -> set[UUID]:
 
 def in_scan(photos: list[PhotoFilterValues], wanted: PhotoFilter) -> set[UUID]:
     columns = PhotoColumns.of(len(photos), enumerate(photos))
-    return set(columns.photo_id[select_rows(columns, wanted, ())])
+    return set(columns.photo_id[build_row_mask(columns, wanted, ())])
 
 
 def test_sql_and_the_scan_let_pass_what_the_filter_means(catalog: Catalog, map_id: UUID) -> None:

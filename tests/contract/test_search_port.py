@@ -30,8 +30,7 @@ from hypothesis.stateful import (
 )
 from numpy.typing import NDArray
 
-from services.search import executor as answer
-from services.search import gpu
+from services.search import executor, gpu
 from services.search import worker as worker_module
 from services.search.chunk_loader import ChunkLoader, StoredChunk
 from services.search.metrics import MeteredSearch
@@ -940,7 +939,7 @@ class TestSearchWorkerOnADevice(TestSearchWorker):
         monkeypatch: pytest.MonkeyPatch,
     ) -> OpenPort:
         always_by_int8(monkeypatch)
-        monkeypatch.setattr(answer, "sign_codes_pay_off", lambda selected, k: selected > 0)
+        monkeypatch.setattr(executor, "sign_codes_pay_off", lambda selected, k: selected > 0)
         monkeypatch.setattr(gpu, "ROW_FORMATS", (request.param,))
 
         def open_port(**changes: object) -> SearchBackend:

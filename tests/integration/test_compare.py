@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from sqlalchemy import select
 
-from services.extractor import prepare as stored_rows
+from services.extractor import prepare
 from services.extractor.comparison import ComparisonRunner, PreparedComparison
 from services.extractor.worker import ExtractorWorker
 from services.steward.tasks.garbage_collection import (
@@ -331,7 +331,7 @@ def test_candidate_whose_descriptor_is_damaged_is_compared_and_not_explained(
         whole = read_row(store, key, row)
         return (whole / 2).astype(np.float32) if (key, row) == (at, number) else whole
 
-    monkeypatch.setattr(stored_rows, "read_row", read)
+    monkeypatch.setattr(prepare, "read_row", read)
     answer = compared(service, query)
     assert set(ids(answer)) == set(ids(before))
     for found_photo in answer["similar_images"]:

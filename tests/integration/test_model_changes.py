@@ -16,7 +16,7 @@ import pytest
 from numpy.typing import NDArray
 from sqlalchemy import select
 
-from services.extractor import checkpointed_steps as slices
+from services.extractor import checkpointed_steps
 from services.extractor.model_changes import ModelChangeRunner, VocabularyFitJob
 from services.extractor.worker import ExtractorWorker
 from services.steward.tasks.garbage_collection import collect_model_change_files
@@ -80,8 +80,8 @@ def photo_ids(workplace: Workplace) -> list[UUID]:
 def do_one_step_a_slice(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each look at the clock is a slice later than the one before."""
     looks = itertools.count()
-    clock = SimpleNamespace(monotonic=lambda: next(looks) * slices.STEP_SECONDS)
-    monkeypatch.setattr(slices, "time", clock)
+    clock = SimpleNamespace(monotonic=lambda: next(looks) * checkpointed_steps.STEP_SECONDS)
+    monkeypatch.setattr(checkpointed_steps, "time", clock)
 
 
 def do_slices(
@@ -135,7 +135,11 @@ def test_a_fit_replaces_the_generation_while_the_old_one_answers(fitted: Workpla
         "photos": PHOTOS,
         "failed": 0,
     }
-    assert job.progress_done == job.progress_total == 2 * PHOTOS + slices.FIT_PROGRESS_UNITS
+    assert (
+        job.progress_done
+        == job.progress_total
+        == 2 * PHOTOS + checkpointed_steps.FIT_PROGRESS_UNITS
+    )
     assert _version(fitted) > version
 
     vocabulary = fitted.vocabulary(new.vocabulary_id)
@@ -229,11 +233,11 @@ def test_a_fit_is_the_same_for_its_seed_and_whoever_does_its_slices(
         assert len(progress) < 120
     assert len(progress) > 20  # plan, two of the sample, 4 seeds, and the passes over one batch
     done, totals = zip(*progress, strict=True)
-    assert set(totals) == {5 + slices.FIT_PROGRESS_UNITS + PHOTOS}, (
+    assert set(totals) == {5 + checkpointed_steps.FIT_PROGRESS_UNITS + PHOTOS}, (
         "what there is to do does not change"
     )
     assert list(done) == sorted(set(done)), "each slice is seen"
-    assert (done[2], done[-1]) == (5, 5 + slices.FIT_PROGRESS_UNITS)
+    assert (done[2], done[-1]) == (5, 5 + checkpointed_steps.FIT_PROGRESS_UNITS)
     again = torn.finish(job_id)
     assert again.progress_done == totals[0]
 

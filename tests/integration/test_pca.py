@@ -13,9 +13,7 @@ import numpy as np
 import pytest
 import torch
 
-from services.extractor import checkpointed_steps as slices
-from services.extractor import fit_pca
-from services.extractor import prepare as stored_rows
+from services.extractor import checkpointed_steps, fit_pca, prepare
 from services.extractor.generation_resolver import reindex_outdated_generations
 from services.extractor.model_changes import ModelChangeRunner
 from services.extractor.model_registry import ModelRegistry
@@ -147,7 +145,11 @@ def test_stored_rows_are_whitened_without_a_photo(
         "rows": PHOTOS,
         "explained": pytest.approx(expected.explained),
     }
-    assert job.progress_done == job.progress_total == 2 * PHOTOS + slices.FIT_PROGRESS_UNITS
+    assert (
+        job.progress_done
+        == job.progress_total
+        == 2 * PHOTOS + checkpointed_steps.FIT_PROGRESS_UNITS
+    )
     (stored,) = whitenings(workplace)
     file = decode_whitening(workplace.store.get(stored.object_key))
     assert file.whitening.sha256 == stored.sha256 == expected.sha256
@@ -189,8 +191,8 @@ def test_a_fit_is_the_same_whoever_does_its_slices(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     looks = itertools.count()
-    clock = SimpleNamespace(monotonic=lambda: next(looks) * slices.STEP_SECONDS)
-    monkeypatch.setattr(slices, "time", clock)
+    clock = SimpleNamespace(monotonic=lambda: next(looks) * checkpointed_steps.STEP_SECONDS)
+    monkeypatch.setattr(checkpointed_steps, "time", clock)
     monkeypatch.setattr(fit_pca, "READ_BATCH_BYTES", 4 * 16 * 5)  # five rows at once
     monkeypatch.setattr(
         fit_pca, "block_width", lambda count, dimension: 6
@@ -240,7 +242,7 @@ def test_a_photo_whose_row_is_damaged_is_described_anew(
         return half
 
     monkeypatch.setattr(fit_pca, "read_stored_rows", lambda *_: before)  # the fit is not meant
-    monkeypatch.setattr(stored_rows, "read_row", read)
+    monkeypatch.setattr(prepare, "read_row", read)
     reduce(described)
     for photo_id, row in described.rows().items():
         assert same(row, projected(expected, before[photo_id]))

@@ -16,7 +16,7 @@ from starlette.testclient import TestClient
 from services.gateway.app import create_app
 from services.gateway.authentication import LocalhostAuthenticator
 from services.gateway.dependencies import GatewayContext
-from services.search import service as search_app
+from services.search import service as search_service
 from services.steward.evaluation_search import GeotaggedPhoto
 from services.steward.map_evaluation import MapEvaluation
 from shared.catalog.chunks import Chunk, Descriptor
@@ -360,7 +360,7 @@ def test_a_worker_is_ready_once_it_has_loaded_what_answers(
         return answer.status_code, answer.json()
 
     status, body = ready()
-    assert (status, body["reasons"]) == (503, ["the catalog was not read yet"])
+    assert (status, body["reasons"]) == (503, ["the catalog has not been read yet"])
     server.worker.sync()
     status, body = ready()
     assert (status, body["status"], body["reasons"]) == (200, "ready", [])
@@ -369,10 +369,10 @@ def test_a_worker_is_ready_once_it_has_loaded_what_answers(
     assert 0 <= lag["seconds"] < 5
 
     with monkeypatch.context() as patched:
-        patched.setattr(search_app, "MAX_READY_LAG_SECONDS", 0.0)
+        patched.setattr(search_service, "MAX_READY_LAG_SECONDS", 0.0)
         status, body = ready()
         assert status == 503
-        assert re.search("is 0 versions behind, level .* s ago", body["reasons"][0])
+        assert re.search("is 0 versions behind, last current .* s ago", body["reasons"][0])
 
     key = places.chunk_keys()[0]
     whole = store.get(key)
@@ -392,7 +392,7 @@ def test_metrics_tell_searches_rows_versions_and_memory(
     tier = tier_of(1)
     ask(tier, places)
     ask(tier, places)
-    with pytest.raises(Exception, match="no longer kept"):
+    with pytest.raises(Exception, match="no longer exists"):
         tier.port.search(places.request(("chunks/no/such.npy", 0)))
     text = httpx2.get(f"{tier.servers[0][0].url}/metrics").text
     figures = dict(re.findall(r"^(\w+(?:\{[^}]*\})?) (\S+)$", text, flags=re.MULTILINE))

@@ -10,7 +10,7 @@ import numpy as np
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from services.search import executor as answer_module
+from services.search import executor
 from services.search.chunk_loader import LoadedChunk
 from services.search.executor import SCORE_DECIMALS, SearchOptions, SearchResult
 from services.search.photo_columns import PhotoColumns
@@ -65,7 +65,7 @@ def answer(
     snapshot: Snapshot, query: Rows, asked: NDArray[np.bool_], question: SearchOptions
 ) -> SearchResult:
     """Of a query that comes alone."""
-    return answer_module.execute_query(snapshot, query, asked, question, QueryBatcher())
+    return executor.execute_query(snapshot, query, asked, question, QueryBatcher())
 
 
 def hits_of(found: SearchResult) -> list[tuple[UUID, float]]:

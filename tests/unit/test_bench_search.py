@@ -40,7 +40,7 @@ from benchmarks.search.synthetic_map import (
     required_memory_bytes,
 )
 from services.cli.bench import app
-from services.search import catalog_sync as follow
+from services.search import catalog_sync
 from shared.search_api.protocol import SearchHit, SearchResponse
 from shared.storage.chunks import Rows
 
@@ -165,7 +165,7 @@ def test_answers_under_load_are_held_against_the_version_that_they_name() -> Non
 def test_a_search_by_codes_touches_all_first_bits_and_the_rows_that_it_compares(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(follow, "MIN_CODED_BYTES", 0)
+    monkeypatch.setattr(catalog_sync, "MIN_CODED_BYTES", 0)
     city = SyntheticCity(7168, 1)
     with world_of(tmp_path, city, 400, 200) as world:
         queries = city.revisits(400, 1)

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from services.search import executor as answer_module
+from services.search import executor
 from services.search.executor import SearchOptions, int8_codes_pay_off, needs_int8_codes
 from shared.ids import new_id
 from shared.search_api.protocol import Mode
@@ -30,7 +30,7 @@ DIMENSION = 512
 
 @pytest.fixture(autouse=True)
 def by_int8(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(answer_module, "int8_codes_pay_off", lambda selected, k, dimension: True)
+    monkeypatch.setattr(executor, "int8_codes_pay_off", lambda selected, k, dimension: True)
 
 
 @settings(max_examples=60, deadline=None)
@@ -83,9 +83,9 @@ def test_query_of_any_length_gives_the_same_answer() -> None:
 
 def test_rows_further_apart_than_a_look_are_all_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
     """Pieces of the scan end anywhere in the chunks."""
-    from services.search import int8_search as bounded
+    from services.search import int8_search
 
-    monkeypatch.setattr(bounded, "BUDGET_CHECK_BYTES", 7 * DIMENSION)
+    monkeypatch.setattr(int8_search, "BUDGET_CHECK_BYTES", 7 * DIMENSION)
     rows = places(4, 100, DIMENSION)
     everything = np.ones(100, bool)
     for number in (0, 6, 7, 50, 99):

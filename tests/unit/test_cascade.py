@@ -10,9 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 
-from services.search import executor as answer_module
-from services.search import kernels
-from services.search import sign_code_search as cascade
+from services.search import executor, kernels, sign_code_search
 from services.search.chunk_loader import LoadedChunk
 from services.search.executor import SearchOptions, SearchResult
 from services.search.query_batcher import QueryBatcher
@@ -38,7 +36,7 @@ DIMENSION = 7168
 
 @pytest.fixture(autouse=True)
 def by_codes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(answer_module, "sign_codes_pay_off", lambda selected, k: True)
+    monkeypatch.setattr(executor, "sign_codes_pay_off", lambda selected, k: True)
 
 
 @settings(max_examples=40, deadline=None)
@@ -170,10 +168,10 @@ def test_queries_that_come_together_get_the_answers_that_they_get_alone(
             wait_until(lambda: glances.queue_length == 23, 30, lambda: None, "23 other queries")
         return scan_first_level(*arguments)
 
-    monkeypatch.setattr(cascade, "scan_first_level", first_waits)
+    monkeypatch.setattr(sign_code_search, "scan_first_level", first_waits)
 
     def ask(number: int) -> SearchResult:
-        return answer_module.execute_query(
+        return executor.execute_query(
             snapshot, queries[number], asked[number], questions[number], glances
         )
 
@@ -185,7 +183,7 @@ def test_queries_that_come_together_get_the_answers_that_they_get_alone(
 
 
 def test_after_warming_up_nothing_is_left_to_compile() -> None:
-    cascade.compile_kernels()
+    sign_code_search.compile_kernels()
     loops = [one for one in vars(kernels).values() if hasattr(one, "signatures")]
     before = {loop.py_func.__name__: len(loop.signatures) for loop in loops}
     assert before["hamming_distances"] == 1

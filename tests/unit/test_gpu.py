@@ -17,9 +17,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from services.search import executor as answer_module
-from services.search import gpu
-from services.search import residency as device_module
+from services.search import executor, gpu
+from services.search import residency as residency_module
 from services.search.executor import SearchOptions
 from services.search.gpu import GpuDevice, GpuError, GpuQuery, GpuUnsupported
 from services.search.residency import GpuResidency, open_search_device
@@ -34,7 +33,7 @@ KINDS = ("float16", "int8")
 
 @pytest.fixture(autouse=True)
 def always_worth_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(answer_module, "sign_codes_pay_off", lambda selected, k: True)
+    monkeypatch.setattr(executor, "sign_codes_pay_off", lambda selected, k: True)
 
 
 def device_with(free_bytes: float = math.inf) -> GpuDevice:
@@ -118,7 +117,7 @@ def test_only_new_chunks_are_copied_to_the_device(monkeypatch: pytest.MonkeyPatc
     assert copied == [30]
     found = answer(new, rows[80], np.ones(90, bool), SearchOptions(5))
     assert hits_of(found) == brute_force(rows, rows[80], 5, np.ones(90, bool))
-    monkeypatch.setattr(device_module, "MAX_SYNC_COPY_BYTES", 0)
+    monkeypatch.setattr(residency_module, "MAX_SYNC_COPY_BYTES", 0)
     assert residency.carry_over(whole, old).gpu_snapshot is None, (
         "many rows are copied while none waits"
     )
@@ -219,7 +218,7 @@ def test_device_that_adds_up_carelessly_is_found_out(monkeypatch: pytest.MonkeyP
         return exact(chunk, columns).half().double()
 
     monkeypatch.setattr(gpu, "_float16_products", in_float16)
-    with pytest.raises(GpuUnsupported, match="less exactly"):
+    with pytest.raises(GpuUnsupported, match="less precisely"):
         device_with().self_test()
 
 
@@ -241,7 +240,7 @@ def test_without_a_gpu_search_uses_the_cpu_or_says_what_is_missing(
     driver = tmp_path / "driver"
     if sees_driver:
         driver.touch()
-    monkeypatch.setattr(device_module, "DRIVER_PATHS", (driver,))
+    monkeypatch.setattr(residency_module, "DRIVER_PATHS", (driver,))
     assert open_search_device("auto") is None
     assert open_search_device("cpu") is None
     with pytest.raises(Misconfigured, match="no CUDA device"):

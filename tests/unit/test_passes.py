@@ -11,7 +11,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from services.extractor import model_registry as loaded_module
+from services.extractor import model_registry
 from services.extractor.model_registry import ModelRegistry
 from shared.config.settings import Settings
 from shared.descriptors.backbones.synthetic import TinyBackbone
@@ -107,7 +107,7 @@ def test_model_that_leaves_no_room_for_one_photo_is_refused_when_it_is_loaded() 
 @pytest.fixture
 def models(settings: Settings, tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> ModelRegistry:
     """With room for one extractor at a time."""
-    monkeypatch.setattr(loaded_module, "MAX_EXTRACTORS", 1)
+    monkeypatch.setattr(model_registry, "MAX_EXTRACTORS", 1)
     return ModelRegistry(
         FolderStore(tmp_path), settings.model_copy(update={"device": "cpu"}), none_added
     )
@@ -136,7 +136,7 @@ def test_models_are_warmed_up_on_a_gpu_when_they_are_loaded(
         def warm_up(self, photos: int) -> None:
             asked.append(photos)
 
-    monkeypatch.setattr(loaded_module, "Extractor", Loaded)
+    monkeypatch.setattr(model_registry, "Extractor", Loaded)
     monkeypatch.setattr(models, "_device", device)
     monkeypatch.setattr(
         models, "_settings", models._settings.model_copy(update={"batch_photos": 7})

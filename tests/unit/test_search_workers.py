@@ -34,7 +34,7 @@ class FakeWorkers:
 
     def seen(self) -> WorkerDirectory:
         workers = WorkerDirectory(list(self.answers), self.http)
-        workers.look()
+        workers.refresh()
         return workers
 
 
@@ -98,14 +98,14 @@ def test_who_refuses_the_connection_is_asked_last_and_who_is_silent_not_at_all(
 ) -> None:
     fake.answers = {name: holding("0/1", version=1) for name in ("http://a", "http://b")}
     workers = fake.seen()
-    workers.failed("http://a")
+    workers.mark_down("http://a")
     assert workers.layout(GENERATION, 0) == {Shard(0, 1): ["http://b", "http://a"]}
     fake.answers["http://a"] = httpx2.ConnectError("refused")
     fake.answers["http://b"] = httpx2.ReadTimeout("silent")
-    workers.look()
+    workers.refresh()
     assert workers.layout(GENERATION, 0) == {Shard(0, 1): ["http://a"]}
     fake.answers["http://b"] = holding("0/1", version=1)
-    workers.look()
+    workers.refresh()
     assert workers.layout(GENERATION, 0) == {Shard(0, 1): ["http://b", "http://a"]}
 
 
