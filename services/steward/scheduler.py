@@ -21,12 +21,7 @@ from services.steward.metrics import StewardMetrics
 from services.steward.tasks.auto_evaluation import evaluate_changed_maps
 from services.steward.tasks.compaction import merge_small_chunks
 from services.steward.tasks.delete_maps import purge_deleted_maps
-from services.steward.tasks.garbage_collection import (
-    CollectionHeld,
-    collect_garbage,
-    collect_orphans,
-    empty_expired_trash,
-)
+from services.steward.tasks.garbage_collection import collect_garbage
 from services.steward.tasks.generation_repair import mend_generations
 from services.steward.tasks.journal import JournalDuty
 from services.steward.tasks.maintenance import (
@@ -43,6 +38,7 @@ from services.steward.tasks.model_changes import (
     auto_fit_vocabularies,
     remove_dead_search_workers,
 )
+from services.steward.tasks.orphans import CollectionHeld, collect_orphans, empty_expired_trash
 from shared.catalog.database_errors import OutageLog
 from shared.catalog.file_checks import sqlite_file
 from shared.catalog.session import Catalog

@@ -13,12 +13,9 @@ from sqlalchemy import delete, func, insert, select
 from services.steward.tasks import journal
 from services.steward.tasks.compaction import merge_small_chunks
 from services.steward.tasks.delete_maps import purge_deleted_maps
-from services.steward.tasks.garbage_collection import (
-    CollectionHeld,
-    collect_deleted_photos,
-    collect_orphans,
-)
+from services.steward.tasks.garbage_collection import collect_deleted_photos
 from services.steward.tasks.model_changes import advance_model_changes
+from services.steward.tasks.orphans import CollectionHeld, collect_orphans
 from shared.catalog.base import Base
 from shared.catalog.chunks import Chunk, Descriptor
 from shared.catalog.generations import Generation
