@@ -341,7 +341,7 @@ def test_bytes_go_once_the_journal_tells_of_the_deletion(
     with monkeypatch.context() as patched:
         patched.setattr(journal, "write_journal", full)
         assert round_() == 2
-        patched.setattr(journal, "PATIENCE_SECONDS", -1.0)
+        patched.setattr(journal, "MAX_JOURNAL_WAIT_SECONDS", -1.0)
         assert round_() == 0, "only deleting makes room in a full store"
         with service.catalog.read() as session:
             assert session.get(Photo, UUID(photos[0])) is not None, "the journal is told later"
