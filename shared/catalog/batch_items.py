@@ -43,7 +43,7 @@ from shared.catalog.jobs import UNFINISHED_STATES, Job, JobKind, JobState, Prior
 from shared.catalog.maps import lock_map
 from shared.ids import new_id
 
-ITEMS_PER_STATEMENT = 1000  # most rows inserted, or jobs selected, by one statement
+ITEMS_PER_STATEMENT = 1000  # rows inserted, or jobs selected, by one statement
 
 
 class BatchSource(StrEnum):

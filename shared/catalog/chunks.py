@@ -33,7 +33,7 @@ from shared.ids import new_id
 # Up to this number, rows are counted per request, which takes about 10 ms.
 MAX_EXACT_COUNT = 10_000
 
-IDS_PER_QUERY = 1000  # most photo ids in one statement
+IDS_PER_QUERY = 1000  # maximum of photo ids in one statement
 
 
 class Chunk(Base):

@@ -37,7 +37,7 @@ from shared.storage.keys import (
 
 log = logging.getLogger(__name__)
 
-ROWS_PER_TRANSACTION = 500  # max. rows deleted in one transaction
+ROWS_PER_TRANSACTION = 500  # rows deleted in one transaction
 SLICE_SECONDS = 2.0  # of one run, so that the steward's other tasks are not delayed
 
 

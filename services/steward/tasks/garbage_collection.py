@@ -42,7 +42,7 @@ from shared.storage.keys import (
     thumbnail_key,
 )
 
-ROWS_PER_TRANSACTION = 500  # max. rows handled in one transaction
+ROWS_PER_TRANSACTION = 500  # rows handled in one transaction
 COMPLETED_UPLOAD_SECONDS = 86_400.0  # retention of a completed presigned upload
 
 

@@ -57,7 +57,7 @@ def resend_hints(catalog: Catalog, hints: Wakeups) -> int:
     return sent
 
 
-RETENTION_ROWS_PER_TRANSACTION = 1000  # max. rows deleted in one transaction
+RETENTION_ROWS_PER_TRANSACTION = 1000  # rows deleted in one transaction
 DAY_SECONDS = 86_400.0
 
 
