@@ -136,7 +136,7 @@ class WordWeightsFit:
         store: The object store with the chunks.
         generation: The generation.
         words: Number of words in its vocabulary.
-        measure: The evaluation of the generation, for its photos and its search client.
+        evaluation: The evaluation of the generation, for its photos and its search client.
     """
 
     def __init__(
@@ -145,13 +145,13 @@ class WordWeightsFit:
         store: ObjectStore,
         generation: Generation,
         words: int,
-        measure: MapEvaluation,
+        evaluation: MapEvaluation,
     ) -> None:
         self._catalog = catalog
         self._store = store
         self._generation = generation
         self._words = words
-        self._evaluation = measure
+        self._evaluation = evaluation
 
     def fit(self, sample: Sequence[GeotaggedPhoto], seed: int, searchable: int) -> WordWeights:
         """Fit the weights and validate them.
