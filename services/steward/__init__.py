@@ -1,5 +1,6 @@
-"""The steward keeps the store healthy. One module per duty; `loop` says how often each is done.
+"""The steward: background maintenance, batch imports, evaluations and webhook deliveries.
 
-Every duty may run twice at once, in two processes: what it changes is locked or checked again
-inside its transaction.
+`scheduler` defines the periodic tasks and their intervals; `tasks` has a module for each group of
+them. Any number of stewards may run: what a task changes is locked, or checked again, inside its
+transaction.
 """

@@ -1,6 +1,6 @@
-"""The photos of a map whose place is known, and which of them show a given place.
+"""Search client of evaluations: ranks a map's own geotagged photos through the search tier.
 
-Asking one generation of a live map with its own photos, through the search tier.
+Also the index of geotagged photos, which tells how many of them show a given place.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from shared.search_api.protocol import SearchBackend, SearchHit, SearchRequest
 
 @dataclass(frozen=True, slots=True)
 class GeotaggedPhoto:
-    """A described photo whose place is known."""
+    """A described photo with coordinates or a place label."""
 
     photo_id: UUID
     spot: PhotoLocation
@@ -37,7 +37,7 @@ class GeotaggedPhoto:
 
 
 class GeotaggedPhotos:
-    """Database photos by place: how many of them show one."""
+    """Index of database photos by place."""
 
     def __init__(self, photos: Sequence[GeotaggedPhoto]) -> None:
         self.photos = photos
@@ -51,31 +51,33 @@ class GeotaggedPhotos:
         ).reshape(-1, 2)
 
     def count_at_place(self, spot: PhotoLocation, radius_m: float) -> int:
-        """How many photos lie within `radius_m` of the spot, or bear its label: the larger count,
-        so that one that does both counts once."""
+        """Count the photos within `radius_m` metres of the spot, or with its place label.
+
+        Returns the larger of the two counts, so that a photo that meets both is counted once.
+        """
         labelled = self._labels[spot.place] if spot.place is not None else 0
         return max(labelled, len(self._within(spot, radius_m)))
 
     def find_within(self, spot: PhotoLocation, radius_m: float) -> list[UUID]:
-        """The photos that lie within `radius_m` of the spot; none where it has no coordinates."""
-        return [self._ids[number] for number in self._within(spot, radius_m).tolist()]
+        """Return the photos within `radius_m` metres; none for a spot without coordinates."""
+        return [self._ids[index] for index in self._within(spot, radius_m).tolist()]
 
     def _within(self, spot: PhotoLocation, radius_m: float) -> NDArray[np.int64]:
         if spot.latitude is None or spot.longitude is None:
             return np.empty(0, np.int64)
         south, north = latitude_bounds(spot.latitude, radius_m)
         first, last = np.searchsorted(self._spots[:, 0], [south, north])
-        near = self._spots[first : last + 1]
-        away = distances_m(spot.latitude, spot.longitude, near[:, 0], near[:, 1])
-        found: NDArray[np.int64] = first + np.flatnonzero(away <= radius_m)
-        return found
+        candidates = self._spots[first : last + 1]
+        distances = distances_m(spot.latitude, spot.longitude, candidates[:, 0], candidates[:, 1])
+        indices: NDArray[np.int64] = first + np.flatnonzero(distances <= radius_m)
+        return indices
 
 
 def read_geotagged_photos(
     session: Session, map_id: UUID, generation_id: UUID, role: PhotoRole
 ) -> list[GeotaggedPhoto]:
-    """The live photos of a role that have a descriptor in the generation and a place, by id."""
-    found = session.execute(
+    """Return the live geotagged photos of a role with a descriptor in the generation, by id."""
+    photos = session.execute(
         select(Photo.id, Photo.latitude, Photo.longitude, Photo.place, Photo.captured_at)
         .join(Descriptor, Descriptor.photo_id == Photo.id)
         .where(
@@ -87,7 +89,7 @@ def read_geotagged_photos(
         )
         .order_by(Photo.id)
     )
-    return [GeotaggedPhoto(row[0], PhotoLocation(*row[1:4]), row[4]) for row in found]
+    return [GeotaggedPhoto(row[0], PhotoLocation(*row[1:4]), row[4]) for row in photos]
 
 
 MAX_READ_ATTEMPTS = 2
@@ -96,11 +98,19 @@ UNKNOWN_LOCATION = PhotoLocation(None, None, None)
 
 LocatedRanking = list[tuple[SearchHit, PhotoLocation]]
 RankPhoto = Callable[[GeotaggedPhoto, int], LocatedRanking | None]
-"""`Asker.ask`, with the weights chosen."""
+"""`EvaluationSearch.rank_similar` with its weights bound."""
 
 
 class EvaluationSearch:
-    """Asks with stored photos; `photos` are those whose spots are known."""
+    """Searches one generation of a map with its stored photos.
+
+    Args:
+        catalog: The catalog.
+        search: The search tier.
+        generation: The generation to search.
+        version: The map version that search workers must have loaded.
+        photos: The geotagged photos by id, for the locations of results.
+    """
 
     def __init__(
         self,
@@ -123,16 +133,27 @@ class EvaluationSearch:
         weights: tuple[float, ...] = (),
         excluded_photos: tuple[UUID, ...] = (),
     ) -> LocatedRanking | None:
-        """The k most similar database photos and their spots, without the query itself and those
-        of `excluded_photos`; None for a query that was deleted since. Conflict (`map_damaged`)
-        when a part
-        can't be searched."""
+        """Return the k most similar database photos with their locations.
+
+        Args:
+            query: The query photo, which is excluded from the results.
+            k: Number of results.
+            weights: Word weights; empty for an unweighted ranking.
+            excluded_photos: More photos to exclude.
+
+        Returns:
+            The ranking, best first; None if the query was deleted since.
+
+        Raises:
+            Conflict: `map_damaged`: a chunk can't be read.
+            Unavailable: `search_incomplete`: a shard did not answer.
+        """
         for attempt in range(1, MAX_READ_ATTEMPTS + 1):
             with self._catalog.read() as session:
-                found = find_descriptor(session, self._generation.id, query.photo_id)
-            if found is None:
+                location = find_descriptor(session, self._generation.id, query.photo_id)
+            if location is None:
                 return None
-            descriptor, chunk = found
+            descriptor, chunk = location
             request = SearchRequest(
                 map_id=self._generation.map_id,
                 generation_id=self._generation.id,
@@ -145,7 +166,7 @@ class EvaluationSearch:
             )
             try:
                 answer = self._search.search(request)
-            except Gone:  # its chunk was merged into another between the two calls
+            except Gone:  # its chunk was merged into another one between the two calls
                 if attempt == MAX_READ_ATTEMPTS:
                     raise
                 continue
@@ -156,23 +177,23 @@ class EvaluationSearch:
             if any(is_shard_name(part) for part in answer.missing):
                 raise Unavailable(
                     "search_incomplete",
-                    f"Without {', '.join(answer.missing)} the figures would be those of a part "
-                    "of the map.",
+                    f"Shards {', '.join(answer.missing)} did not answer: the results would cover "
+                    "only a part of the map.",
                 )
             if answer.missing:
                 raise map_damaged_error(answer.missing)
             return [(hit, self._location(hit)) for hit in answer.hits]
-        raise AssertionError("the last try returns or raises")
+        raise AssertionError("the last attempt returns or raises")
 
     def _location(self, hit: SearchHit) -> PhotoLocation:
-        found = self._photos.get(hit.photo_id)
-        return found.spot if found else UNKNOWN_LOCATION
+        photo = self._photos.get(hit.photo_id)
+        return photo.spot if photo else UNKNOWN_LOCATION
 
 
 def map_damaged_error(missing: Sequence[str]) -> Conflict:
-    """What figures of the rest would hide."""
+    """Return the error for chunks that can't be read: results without them would mislead."""
     return Conflict(
         "map_damaged",
-        f"{', '.join(missing)} can't be read, and figures of a part of the map would mislead. "
-        "Restore it from a backup, or describe its photos again, then evaluate.",
+        f"{', '.join(missing)} can't be read, and results for a part of the map would be "
+        "misleading. Restore it from a backup, or describe its photos again, then evaluate.",
     )

@@ -1,10 +1,8 @@
-"""Evaluation jobs: measure a map's active generation, and keep what its scores mean.
+"""Worker for evaluation and word-weight jobs, which search a live map with its own photos.
 
-Word weights are learnt here, too: both ask a live map with its own photos. They run in a thread of
-their own, beside the steward's duties, and take only the search tier's time: no photo is described
-for them. One that was killed begins anew.
-
-How far a job is that asks many questions, and whether it is to go on.
+An evaluation measures the active generation and stores the calibration of its scores. The jobs run
+in a thread of their own, parallel to the periodic tasks, and load the search tier only: they
+describe no photos. A job whose steward died starts from the beginning.
 """
 
 from __future__ import annotations
@@ -36,11 +34,11 @@ from shared.search_api.protocol import SearchBackend
 from shared.storage import ObjectStore
 from shared.word_weights.record import parse_word_weights
 
-PROGRESS_INTERVAL_SECONDS = 0.5  # between two notes of the progress
+PROGRESS_INTERVAL_SECONDS = 0.5  # between two updates of the job's progress
 
 
 class EvaluationProgress:
-    """Counts the questions of one claimed job."""
+    """Progress and cancellation of one claimed job, counted in searches."""
 
     def __init__(self, catalog: Catalog, job: Job, stop: threading.Event) -> None:
         self._catalog = catalog
@@ -50,11 +48,15 @@ class EvaluationProgress:
         self._reported = time.monotonic()
 
     def set_total(self, total: int) -> None:
-        """So many there will be, about."""
+        """Set the estimated total."""
         self._write_progress(total)
 
     def advance(self) -> None:
-        """One more; Stopped when the job is no longer ours, or its steward is to end."""
+        """Count one search.
+
+        Raises:
+            JobInterrupted: The job lost its lease, or the steward is shutting down.
+        """
         self._count += 1
         if self._stop.is_set():
             raise JobInterrupted
@@ -64,16 +66,16 @@ class EvaluationProgress:
 
     def _write_progress(self, total: int | None = None) -> None:
         with self._catalog.write() as session:
-            mine = lock_leased_jobs(session, get_lease_token(self._job), [self._job])
-            for current in mine:
+            leased = lock_leased_jobs(session, get_lease_token(self._job), [self._job])
+            for current in leased:
                 current.progress_total = max(1, total or current.progress_total)
                 current.progress_done = min(self._count, current.progress_total)
-        if not mine:
+        if not leased:
             raise JobInterrupted
 
 
 class EvaluationWorker:
-    """Does one evaluation, or learning of weights, after the other; `run` until stopped."""
+    """Runs evaluation and word-weight jobs one after the other."""
 
     def __init__(
         self,
@@ -89,32 +91,33 @@ class EvaluationWorker:
         self._search = search
         self._settings = settings
         kinds = (JobKind.EVALUATE, JobKind.WORD_WEIGHTS)
-        counted = metrics or StewardMetrics(CollectorRegistry())
-        self._runner = JobRunner(catalog, settings, name, kinds, counted)
+        metrics = metrics or StewardMetrics(CollectorRegistry())
+        self._runner = JobRunner(catalog, settings, name, kinds, metrics)
 
     def run(self, stop: threading.Event) -> None:
-        """Take jobs until `stop` is set."""
+        """Run jobs until `stop` is set."""
         self._runner.run(stop, lambda job: self._run_job(job, stop))
 
     def run_next(self, stop: threading.Event) -> bool:
-        """Do the next job; False when there is none."""
+        """Run the next job; False when there is none."""
         return self._runner.run_next(lambda job: self._run_job(job, stop))
 
     def _run_job(self, job: Job, stop: threading.Event) -> None:
-        asked = EvaluationProgress(self._catalog, job, stop)
+        progress = EvaluationProgress(self._catalog, job, stop)
         with self._catalog.read() as session:
             generation = active_generation(session, job.map_id)
             if generation is None:
                 raise Conflict("nothing_to_evaluate", "The map has no described photo yet.")
             searchable = count_searchable(session, generation.id)
             words = _count_words(session, generation) if job.kind == JobKind.WORD_WEIGHTS else 0
-        measure = MapEvaluation(
-            self._catalog, self._search, generation, self._settings.estimate_radius_m, asked.advance
+        radius_m = self._settings.estimate_radius_m
+        evaluation = MapEvaluation(
+            self._catalog, self._search, generation, radius_m, progress.advance
         )
         if job.kind == JobKind.WORD_WEIGHTS:
-            self._fit_word_weights(job, generation, words, searchable, measure, asked)
+            self._fit_word_weights(job, generation, words, searchable, evaluation, progress)
         else:
-            self._evaluate(job, generation, searchable, measure, asked)
+            self._evaluate(job, generation, searchable, evaluation, progress)
 
     def _evaluate(
         self,
@@ -128,18 +131,17 @@ class EvaluationWorker:
         weights = record.applied if record else ()
         sample = evaluation.draw_sample(job.params["sample"], job.params["seed"])
         progress.set_total((len(sample) + len(evaluation.queries)) * (2 if weights else 1))
-        measured = evaluation.evaluate(sample)
+        unweighted = evaluation.evaluate(sample)
         weighted = evaluation.evaluate(sample, weights) if weights else None
         figures = {
-            **measured.figures,
+            **unweighted.figures,
             "with_word_weights": weighted.figures if weighted else None,
         }
         evaluation_id = new_id()
         with self._catalog.write() as session:
-            for mine in lock_leased_jobs(session, get_lease_token(job), [job]):
-                session.get_one(
-                    Generation, generation.id
-                ).calibration = measured.calibration.model_dump()
+            for leased in lock_leased_jobs(session, get_lease_token(job), [job]):
+                current = session.get_one(Generation, generation.id)
+                current.calibration = unweighted.calibration.model_dump()
                 if weighted:
                     _store_weighted_calibration(
                         session, generation.id, weights, weighted.calibration
@@ -160,7 +162,7 @@ class EvaluationWorker:
                     "generation_id": str(generation.id),
                     **figures,
                 }
-                succeed_job(mine, result)
+                succeed_job(leased, result)
 
     def _fit_word_weights(
         self,
@@ -174,15 +176,15 @@ class EvaluationWorker:
         if job.params["generation_id"] != str(generation.id):
             raise Conflict(
                 "generation_not_active",
-                f"Another generation answers by now ({generation.id}). Learn its weights.",
+                f"Another generation is active now ({generation.id}). Fit its weights instead.",
                 generation_id=str(generation.id),
             )
         sample = evaluation.draw_sample(job.params["sample"], job.params["seed"])
         progress.set_total(2 * len(sample) + len(evaluation.queries))
-        learn = WordWeightsFit(self._catalog, self._store, generation, words, evaluation)
-        record = learn.fit(sample, job.params["seed"], searchable)
+        weights_fit = WordWeightsFit(self._catalog, self._store, generation, words, evaluation)
+        record = weights_fit.fit(sample, job.params["seed"], searchable)
         with self._catalog.write() as session:
-            for mine in lock_leased_jobs(session, get_lease_token(job), [job]):
+            for leased in lock_leased_jobs(session, get_lease_token(job), [job]):
                 session.get_one(Generation, generation.id).word_weights = record.model_dump(
                     mode="json"
                 )
@@ -190,20 +192,22 @@ class EvaluationWorker:
                     "generation_id": str(generation.id),
                     **record.model_dump(mode="json", exclude={"weights", "calibration"}),
                 }
-                succeed_job(mine, result)
+                succeed_job(leased, result)
 
 
 def _count_words(session: Session, generation: Generation) -> int:
-    """How many words the generation's vocabulary has; Conflict (`no_word_weights`)."""
+    """Return the number of words in the generation's vocabulary; Conflict (`no_word_weights`)."""
     if reason := word_weights_unavailable_reason(session, generation):
-        raise Conflict("no_word_weights", f"This generation gets no word weights: {reason}.")
+        raise Conflict(
+            "no_word_weights", f"This generation does not support word weights: {reason}."
+        )
     return session.get_one(Vocabulary, generation.vocabulary_id).clusters
 
 
 def _store_weighted_calibration(
     session: Session, generation_id: UUID, weights: tuple[float, ...], calibration: Calibration
 ) -> None:
-    """What scores with these weights mean, unless others have been learnt meanwhile."""
+    """Store the calibration of scores with these weights, unless the weights changed meanwhile."""
     generation = session.get_one(Generation, generation_id)
     record = parse_word_weights(generation.word_weights)
     if record and record.applied == weights:

@@ -1,13 +1,12 @@
-"""Asking a live map about photos whose place is known, through the search tier that answers users.
+"""Map evaluation: recall, calibration and false accepts of a live map, through the search tier.
 
-*Leave-one-out*: each of a sample of the map's own photos is asked, itself left out. Photos of one
-session resemble each other, so this flatters; it is for comparing two generations of one map.
-*Labelled queries* (photos of role `query`) were taken at another time: this is what users see.
+*Leave-one-out*: each photo of a sample of the map is searched, itself excluded. Photos of one
+session resemble each other, so the recall is optimistic; use it to compare two generations of a
+map. *Labelled queries* (photos of role `query`) were taken at another time: their recall is what
+users see.
 
-With word weights the ranking is another one, and so is what its scores mean: whoever measures says
-which weights apply, and what is learnt is good for answers with these alone.
-
-Counting what labelled queries come to: recall, accepted strangers, how good a confidence is.
+Word weights change the ranking and the meaning of its scores: a calibration is valid only for
+results with the weights that it was measured with.
 """
 
 from __future__ import annotations
@@ -60,27 +59,28 @@ RECALL_RANKS = (1, 5, 10)
 
 @dataclass(slots=True)
 class RecallCounter:
-    """Counts queries that have a true positive, and whether one came among the first k."""
+    """Recall@k over queries that have a true positive."""
 
     queries: int = 0
-    found: dict[int, int] = field(default_factory=lambda: dict.fromkeys(RECALL_RANKS, 0))
+    hits: dict[int, int] = field(default_factory=lambda: dict.fromkeys(RECALL_RANKS, 0))
+    """k -> queries with a true positive among the first k."""
 
     def add(self, correct: Sequence[bool]) -> None:
-        """One query's ranking, best first: which of them show its place."""
+        """Add a query: for each result, best first, whether it shows the query's place."""
         self.queries += 1
         for rank in RECALL_RANKS:
-            self.found[rank] += any(correct[:rank])
+            self.hits[rank] += any(correct[:rank])
 
     def figures(self) -> dict[str, Any]:
         return {
             "queries": self.queries,
-            **{f"R@{k}": ratio(found, self.queries) for k, found in self.found.items()},
+            **{f"R@{k}": ratio(hits, self.queries) for k, hits in self.hits.items()},
         }
 
 
 @dataclass(frozen=True, slots=True)
 class QueryOutcome:
-    """What came of one labelled query."""
+    """The result of one labelled query."""
 
     in_map: bool
     """Whether the map has a photo of its place."""
@@ -89,19 +89,19 @@ class QueryOutcome:
     """Whether the estimate shows its place."""
     error_m: float | None
     same_session: bool
-    """Taken within hours of the photo that it matched: no witness of another day."""
+    """Taken within SAME_SESSION_PERIOD of the photo that it matched: excluded from calibration."""
     accepted: bool | None
 
 
 @dataclass(slots=True)
 class LabelledQueryMetrics:
-    """All labelled queries of an evaluation."""
+    """Metrics over all labelled queries of an evaluation."""
 
     recall: RecallCounter = field(default_factory=RecallCounter)
     outcomes: list[QueryOutcome] = field(default_factory=list)
 
     def confidence_samples(self) -> list[tuple[PlaceEvidence, bool]]:
-        """(evidence, was it right) of the queries of another session."""
+        """Return (evidence, is correct) of the queries that were taken in another session."""
         return [
             (o.evidence, o.is_correct)
             for o in self.outcomes
@@ -109,17 +109,20 @@ class LabelledQueryMetrics:
         ]
 
     def figures(self) -> dict[str, Any]:
-        """Recall over queries that the map can answer; the rest over all. The confidence's figures
-        are cross-validated: each query is judged by what the others have taught."""
-        here = [o for o in self.outcomes if o.in_map]
+        """Return the metrics as JSON.
+
+        Recall is over queries whose place is in the map, the other metrics are over all. Those of
+        the confidence are cross-validated: the confidence of a query is fitted on the others.
+        """
+        inside = [o for o in self.outcomes if o.in_map]
         outside = [o for o in self.outcomes if not o.in_map]
-        errors = [o.error_m for o in here if o.is_correct and o.error_m is not None]
+        errors = [o.error_m for o in inside if o.is_correct and o.error_m is not None]
         return {
             **self.recall.figures(),
             "out_of_map": len(outside),
             "same_session": sum(o.same_session for o in self.outcomes),
             "median_error_of_right_ones_m": median(errors) if errors else None,
-            "accepted_in_map": ratio(sum(bool(o.accepted) for o in here), len(here)),
+            "accepted_in_map": ratio(sum(bool(o.accepted) for o in inside), len(inside)),
             "right_of_accepted": ratio(
                 sum(o.is_correct for o in self.outcomes if o.accepted),
                 sum(bool(o.accepted) for o in self.outcomes),
@@ -129,38 +132,48 @@ class LabelledQueryMetrics:
         }
 
     def _confidence(self) -> dict[str, Any]:
-        judged = self.confidence_samples()
-        predicted = cross_validate(judged)
+        samples = self.confidence_samples()
+        predicted = cross_validate(samples)
         if predicted is None:
             return {"calibration_error": None, "auroc": None, "recall_at_99_precision": None}
-        right = [ok for _, ok in judged]
+        is_correct = [correct for _, correct in samples]
         findable = sum(o.in_map and not o.same_session for o in self.outcomes)
         return {
-            "calibration_error": expected_calibration_error(predicted, right),
-            "auroc": auroc(predicted, right),
-            "recall_at_99_precision": recall_at_precision(predicted, right, findable),
+            "calibration_error": expected_calibration_error(predicted, is_correct),
+            "auroc": auroc(predicted, is_correct),
+            "recall_at_99_precision": recall_at_precision(predicted, is_correct, findable),
         }
 
 
-def ratio(part: int, whole: int) -> float | None:
-    """None of nothing."""
-    return part / whole if whole else None
+def ratio(part: int, total: int) -> float | None:
+    """Return `part / total`; None if the total is 0."""
+    return part / total if total else None
 
 
-MAX_RANKS = 800  # looked at to find what is elsewhere, where hundreds show the same place
+MAX_RANKS = 800  # depth of the search for other places where hundreds of photos show the same one
 
-# A match taken less than this before or after the query is of the same session.
+# A match taken less than this before or after the query belongs to the same session.
 SAME_SESSION_PERIOD = timedelta(hours=12)
 
 
 @dataclass(frozen=True, slots=True)
 class MapEvaluationResult:
+    """The metrics of an evaluation, as JSON, and the calibration fitted on it."""
+
     figures: dict[str, Any]
     calibration: Calibration
 
 
 class MapEvaluation:
-    """Measures one generation. `on_asked` is called after every query; what it raises ends it."""
+    """Evaluates one generation of a map.
+
+    Args:
+        catalog: The catalog.
+        search: The search tier.
+        generation: The generation to evaluate.
+        radius_m: Photos within this distance, in metres, show the same place.
+        on_query: Called after every search; an exception that it raises ends the evaluation.
+    """
 
     def __init__(
         self,
@@ -173,15 +186,16 @@ class MapEvaluation:
         self.radius_m = radius_m
         self.on_query = on_query
         with catalog.read() as session:
-            of = (session, generation.map_id, generation.id)
-            self.database = GeotaggedPhotos(read_geotagged_photos(*of, PhotoRole.DATABASE))
-            self.queries = read_geotagged_photos(*of, PhotoRole.QUERY)
+            ids = (generation.map_id, generation.id)
+            database = read_geotagged_photos(session, *ids, PhotoRole.DATABASE)
+            self.database = GeotaggedPhotos(database)
+            self.queries = read_geotagged_photos(session, *ids, PhotoRole.QUERY)
             version = session.get_one(Map, generation.map_id).version
         self._by_id = {photo.photo_id: photo for photo in self.database.photos}
         self.search = EvaluationSearch(catalog, search, generation, version, self._by_id)
 
     def draw_sample(self, size: int, seed: int) -> list[GeotaggedPhoto]:
-        """The photos to leave out, one after the other: at most `size`, drawn from the seed."""
+        """Draw at most `size` database photos as leave-one-out queries, reproducible by `seed`."""
         photos = self.database.photos
         chosen = np.random.default_rng(seed).choice(
             len(photos), size=min(size, len(photos)), replace=False
@@ -191,10 +205,14 @@ class MapEvaluation:
     def evaluate(
         self, sample: Sequence[GeotaggedPhoto], weights: tuple[float, ...] = ()
     ) -> MapEvaluationResult:
-        """Ask with every photo of the sample and with every labelled query, ranked by the word
-        weights where there are any."""
-        ask = partial(self.search.rank_similar, weights=weights)
-        recall, impostors, alone = self._leave_one_out(sample, ask)
+        """Search with every photo of the sample and every labelled query, and compute the metrics.
+
+        Args:
+            sample: Database photos for the leave-one-out evaluation.
+            weights: Word weights of the ranking; empty for an unweighted one.
+        """
+        rank_photo = partial(self.search.rank_similar, weights=weights)
+        recall, impostors, alone = self._leave_one_out(sample, rank_photo)
         threshold = fit_threshold(impostors)
         provisional = Calibration(
             radius_m=self.radius_m,
@@ -203,10 +221,10 @@ class MapEvaluation:
             labelled_queries=0,
             confidence=None,
         )
-        labelled = self._evaluate_labelled_queries(provisional, ask)
-        judged = labelled.confidence_samples()
+        labelled = self._evaluate_labelled_queries(provisional, rank_photo)
+        samples = labelled.confidence_samples()
         calibration = provisional.model_copy(
-            update={"labelled_queries": len(judged), "confidence": fit_confidence(judged)}
+            update={"labelled_queries": len(samples), "confidence": fit_confidence(samples)}
         )
         figures = {
             "radius_m": self.radius_m,
@@ -223,14 +241,17 @@ class MapEvaluation:
     def _leave_one_out(
         self, sample: Sequence[GeotaggedPhoto], rank_photo: RankPhoto
     ) -> tuple[RecallCounter, list[PlaceEvidence], int]:
-        """Recall, the evidence of impostors, and how many photos are alone at their place."""
+        """Return recall, the evidence of impostors, and the number of photos alone at their place.
+
+        An impostor is the best match at another place: what a query outside the map would find.
+        """
         recall, impostors, alone = RecallCounter(), [], 0
         for query in sample:
             ranking = rank_photo(query, EVIDENCE_DEPTH)
             self.on_query()
             if ranking is None:
                 continue
-            if self.database.count_at_place(query.spot, self.radius_m) > 1:  # itself is one of them
+            if self.database.count_at_place(query.spot, self.radius_m) > 1:  # includes the query
                 recall.add([is_same_place(query.spot, spot, self.radius_m) for _, spot in ranking])
             else:
                 alone += 1
@@ -242,23 +263,23 @@ class MapEvaluation:
         return recall, impostors, alone
 
     def _other_places(
-        self, query: GeotaggedPhoto, ranking: LocatedRanking, ask: RankPhoto
+        self, query: GeotaggedPhoto, ranking: LocatedRanking, rank_photo: RankPhoto
     ) -> list[RankedPhoto]:
-        """The ranking as it would be if the query's place were not in the map."""
+        """Return the ranking as it would be if the query's place were not in the map."""
         depth = EVIDENCE_DEPTH
         while True:
-            strangers = [r for r in _to_ranked(ranking) if is_different_place(query.spot, r.spot)]
-            if len(strangers) >= EVIDENCE_DEPTH // 2 or len(ranking) < depth or depth >= MAX_RANKS:
-                return strangers[:EVIDENCE_DEPTH]
+            others = [r for r in _to_ranked(ranking) if is_different_place(query.spot, r.spot)]
+            if len(others) >= EVIDENCE_DEPTH // 2 or len(ranking) < depth or depth >= MAX_RANKS:
+                return others[:EVIDENCE_DEPTH]
             depth *= 2
-            ranking = ask(query, depth) or []
+            ranking = rank_photo(query, depth) or []
 
     def _evaluate_labelled_queries(
-        self, calibration: Calibration, ask: RankPhoto
+        self, calibration: Calibration, rank_photo: RankPhoto
     ) -> LabelledQueryMetrics:
         labelled = LabelledQueryMetrics()
         for query in self.queries:
-            ranking = ask(query, EVIDENCE_DEPTH)
+            ranking = rank_photo(query, EVIDENCE_DEPTH)
             self.on_query()
             if ranking is None:
                 continue
@@ -268,7 +289,7 @@ class MapEvaluation:
                     [is_same_place(query.spot, spot, self.radius_m) for _, spot in ranking]
                 )
             evidence = compute_evidence(_to_ranked(ranking), self.radius_m)
-            found = (
+            estimate = (
                 estimate_location(_to_ranked(ranking), self.radius_m)
                 if evidence
                 else UNKNOWN_LOCATION
@@ -277,8 +298,8 @@ class MapEvaluation:
                 QueryOutcome(
                     in_map=in_map,
                     evidence=evidence,
-                    is_correct=is_same_place(query.spot, found, self.radius_m),
-                    error_m=distance_between_m(query.spot, found),
+                    is_correct=is_same_place(query.spot, estimate, self.radius_m),
+                    error_m=distance_between_m(query.spot, estimate),
                     same_session=bool(ranking) and self._same_session(query, ranking[0][0]),
                     accepted=calibration.accepts(evidence) if evidence else None,
                 )

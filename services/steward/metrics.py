@@ -1,4 +1,7 @@
-"""What Prometheus reads of a steward: its rounds, what it mended, what it threw away."""
+"""Prometheus metrics of a steward: runs of periodic tasks, repairs, deletions and jobs.
+
+A periodic task is called `duty` in metric names and labels.
+"""
 
 from __future__ import annotations
 
@@ -11,65 +14,67 @@ from prometheus_client.metrics_core import Metric
 from prometheus_client.registry import Collector
 
 METRIC_PREFIX = "placewise_steward"
-# From a look that finds nothing to a walk over a whole bucket.
+# From one query that finds nothing to a walk over a whole bucket.
 TASK_BUCKETS_SECONDS = (0.005, 0.01, 0.05, 0.1, 0.5, 1.0, 5.0, 10.0, 60.0, 300.0, 900.0)
 
 
 class StewardMetrics:
-    """One steward's figures; several stewards' add up."""
+    """The metrics of one steward process; those of several stewards can be summed."""
 
     def __init__(self, registry: CollectorRegistry) -> None:
-        self._duties = Counter(
+        self._task_runs = Counter(
             f"{METRIC_PREFIX}_duties",
-            "Rounds of each duty by what became of them: done, failed, or catalog_away.",
+            "Runs of each periodic task by outcome: done, failed, or catalog_away.",
             ["duty", "outcome"],
             registry=registry,
         )
-        self._duty_seconds = Histogram(
+        self._task_seconds = Histogram(
             f"{METRIC_PREFIX}_duty_seconds",
-            "Seconds that a round of a duty took.",
+            "Duration of a run of a periodic task, in seconds.",
             ["duty"],
             buckets=TASK_BUCKETS_SECONDS,
             registry=registry,
         )
         self.leases_expired = Counter(
             f"{METRIC_PREFIX}_leases_expired",
-            "Jobs that were taken back from workers that fell silent.",
+            "Jobs whose lease expired because their worker died.",
             registry=registry,
         )
         self.hints_resent = Counter(
             f"{METRIC_PREFIX}_hints_resent",
-            "Hints for work that was found waiting.",
+            "Wake-ups sent again for waiting jobs.",
             registry=registry,
         )
         self.slots_merged = Counter(
-            f"{METRIC_PREFIX}_slots_merged", "Slots whose chunks became one.", registry=registry
+            f"{METRIC_PREFIX}_slots_merged",
+            "Slots whose chunks were merged into one.",
+            registry=registry,
         )
         self.journal_lines = Counter(
             f"{METRIC_PREFIX}_journal_lines",
-            "Rows of the catalog that were written to the journal.",
+            "Catalog rows written to the journal.",
             registry=registry,
         )
         self.catalog_lag_segments = Gauge(
             f"{METRIC_PREFIX}_catalog_lag_segments",
-            "Journal segments of the object store that the catalog does not know: 0, unless an "
+            "Journal segments in the object store that the catalog does not know: 0, unless an "
             "older catalog was restored.",
             registry=registry,
         )
         self.objects_deleted = Counter(
             f"{METRIC_PREFIX}_objects_deleted",
-            "Objects that nothing refers to any more.",
+            "Deleted objects that nothing referred to any more.",
             ["duty"],
             registry=registry,
         )
         self.objects_trashed = Counter(
             f"{METRIC_PREFIX}_objects_trashed",
-            "Orphaned objects that were moved to the trash.",
+            "Orphaned objects moved to the trash.",
             registry=registry,
         )
         self.collection_held = Gauge(
             f"{METRIC_PREFIX}_collection_held",
-            "1 while orphans are not collected before `placewise storage collect --confirm`.",
+            "1 while orphan collection waits for `placewise storage collect --confirm`, else 0.",
             registry=registry,
         )
         self.trash_bytes = Gauge(
@@ -79,8 +84,7 @@ class StewardMetrics:
         )
         self._jobs = Counter(
             f"{METRIC_PREFIX}_jobs",
-            "The steward's own jobs, slice by slice, by what became of each: done, stopped, "
-            "paused, failed, crashed.",
+            "Slices of the steward's own jobs by outcome: done, stopped, paused, failed, crashed.",
             ["kind", "outcome"],
             registry=registry,
         )
@@ -88,29 +92,29 @@ class StewardMetrics:
         registry.register(_TaskLagCollector(self._last_success))
 
     def observe_task(self, name: str, outcome: str, seconds: float) -> None:
-        """A round of the duty has ended."""
+        """Record a run of a periodic task."""
         duty = name.replace(" ", "_")
-        self._duties.labels(duty, outcome).inc()
-        self._duty_seconds.labels(duty).observe(seconds)
+        self._task_runs.labels(duty, outcome).inc()
+        self._task_seconds.labels(duty).observe(seconds)
         if outcome == "done":
             self._last_success[duty] = time.monotonic()
 
     def count_job(self, kind: str, outcome: str) -> None:
-        """A slice of one of its jobs has ended."""
+        """Record a slice of one of the steward's own jobs."""
         self._jobs.labels(kind, outcome).inc()
 
 
 class _TaskLagCollector(Collector):
-    def __init__(self, done_at: Mapping[str, float]) -> None:
-        self._done_at = done_at
+    def __init__(self, last_success: Mapping[str, float]) -> None:
+        self._last_success = last_success
 
     def collect(self) -> Iterable[Metric]:
         lag = GaugeMetricFamily(
             f"{METRIC_PREFIX}_duty_lag_seconds",
-            "Seconds since a round of the duty was last done.",
+            "Seconds since the last successful run of the periodic task.",
             labels=["duty"],
         )
         now = time.monotonic()
-        for duty, done_at in dict(self._done_at).items():
-            lag.add_metric([duty], now - done_at)
+        for duty, succeeded_at in dict(self._last_success).items():
+            lag.add_metric([duty], now - succeeded_at)
         yield lag

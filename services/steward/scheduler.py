@@ -1,7 +1,4 @@
-"""The steward's one loop: which duty, how often.
-
-The object store of a duty that throws things away, with its deletions counted.
-"""
+"""The steward's scheduler: runs each periodic maintenance task at its interval, in one thread."""
 
 from __future__ import annotations
 
@@ -21,14 +18,9 @@ from services.steward.metrics import StewardMetrics
 from services.steward.tasks.auto_evaluation import evaluate_changed_maps
 from services.steward.tasks.compaction import merge_small_chunks
 from services.steward.tasks.delete_maps import purge_deleted_maps
-from services.steward.tasks.garbage_collection import (
-    CollectionHeld,
-    collect_garbage,
-    collect_orphans,
-    empty_expired_trash,
-)
-from services.steward.tasks.generation_repair import mend_generations
-from services.steward.tasks.journal import JournalDuty
+from services.steward.tasks.garbage_collection import collect_garbage
+from services.steward.tasks.generation_repair import repair_generations
+from services.steward.tasks.journal import JournalTask
 from services.steward.tasks.maintenance import (
     delete_expired_idempotency_keys,
     delete_old_deliveries,
@@ -43,6 +35,7 @@ from services.steward.tasks.model_changes import (
     auto_fit_vocabularies,
     remove_dead_search_workers,
 )
+from services.steward.tasks.orphans import CollectionHeld, collect_orphans, empty_expired_trash
 from shared.catalog.database_errors import OutageLog
 from shared.catalog.file_checks import sqlite_file
 from shared.catalog.session import Catalog
@@ -58,7 +51,7 @@ log = logging.getLogger(__name__)
 
 
 class DeletionCountingStore:
-    """`store`, and `on_delete` after each deletion."""
+    """Wraps an object store and calls `on_delete` after each deletion."""
 
     def __init__(self, store: ObjectStore, on_delete: Callable[[], object]) -> None:
         self._store = store
@@ -97,20 +90,28 @@ class DeletionCountingStore:
 
 
 SCHEDULER_TICK_SECONDS = 0.25
-# The trash is emptied before the gateway refuses uploads (MIN_FREE_BYTES).
+# Objects in the trash are deleted before the gateway rejects uploads (MIN_FREE_BYTES).
 FREE_TRASH_FACTOR = 2
 
 
 @dataclass(slots=True)
 class PeriodicTask:
+    """A maintenance task of the scheduler."""
+
     name: str
+    """What it does, as a verb phrase: also the metrics' label, with underscores."""
     interval_seconds: float
+    """Pause between the end of a run and the next one."""
     run: Callable[[], object]
     next_run: float = field(default=0.0)
+    """By `time.monotonic`."""
 
 
 class Scheduler:
-    """Does each duty when it is due. A duty that fails is logged and tried again next time."""
+    """Runs the periodic tasks when they are due.
+
+    A failed task is logged and runs again after its interval.
+    """
 
     def __init__(
         self,
@@ -125,13 +126,13 @@ class Scheduler:
         self._heartbeat = Heartbeat(settings.heartbeat_file)
         merge_retries = ReadRetries()
 
-        def counted(duty: str) -> DeletionCountingStore:
-            return DeletionCountingStore(store, metrics.objects_deleted.labels(duty).inc)
+        def counted(task: str) -> DeletionCountingStore:
+            return DeletionCountingStore(store, metrics.objects_deleted.labels(task).inc)
 
-        # Of the catalog's own disk, where it is a file.
+        # On the disk of the SQLite file; PostgreSQL reserves its own space.
         catalog_file = sqlite_file(catalog)
         reserve = catalog_file and DiskReserve(catalog_file.parent, settings.min_free_bytes)
-        self._journal = PeriodicTask("write journal", 2.0, JournalDuty(catalog, store, metrics))
+        self._journal = PeriodicTask("write journal", 2.0, JournalTask(catalog, store, metrics))
         self.tasks = [
             *([PeriodicTask("keep disk reserve", 5.0, reserve.keep)] if reserve else []),
             PeriodicTask(
@@ -149,7 +150,7 @@ class Scheduler:
                 0.5,
                 lambda: advance_model_changes(catalog, hints),
             ),
-            PeriodicTask("mend generations", 5.0, lambda: mend_generations(catalog, store)),
+            PeriodicTask("mend generations", 5.0, lambda: repair_generations(catalog, store)),
             PeriodicTask("resume batches", 5.0, lambda: resume_batches(catalog, settings)),
             PeriodicTask(
                 "remove dead search workers", 2.0, lambda: remove_dead_search_workers(catalog)
@@ -212,52 +213,52 @@ class Scheduler:
         ]
 
     def run(self, stop: threading.Event) -> None:
-        """Do what is due until `stop` is set; then write what the journal does not have yet."""
+        """Run due tasks until `stop` is set; then write the pending rows to the journal."""
         while not stop.is_set():
-            for duty in self.tasks:
-                if time.monotonic() >= duty.next_run and not stop.is_set():
-                    self._run_task(duty)
+            for task in self.tasks:
+                if time.monotonic() >= task.next_run and not stop.is_set():
+                    self._run_task(task)
                     self._heartbeat.beat()
             stop.wait(SCHEDULER_TICK_SECONDS)
         self._run_task(self._journal)
 
-    def _run_task(self, duty: PeriodicTask) -> None:
+    def _run_task(self, task: PeriodicTask) -> None:
         started, outcome = time.monotonic(), "done"
         try:
-            duty.run()
+            task.run()
             self._outage.record_success()
         except SQLAlchemyError as error:
             outcome = "catalog_away"
             self._outage.record_error(error)
-        except Exception:  # one duty's trouble must not end the others
+        except Exception:  # a failed task must not stop the others
             outcome = "failed"
             log.exception(
-                "the steward could not %s; next try in %g s",
-                duty.name,
-                duty.interval_seconds,
+                "the periodic task %r failed; next run in %g s",
+                task.name,
+                task.interval_seconds,
             )
-        self._metrics.observe_task(duty.name, outcome, time.monotonic() - started)
-        duty.next_run = time.monotonic() + duty.interval_seconds
+        self._metrics.observe_task(task.name, outcome, time.monotonic() - started)
+        task.next_run = time.monotonic() + task.interval_seconds
 
 
 def _collect_orphans(
     catalog: Catalog, store: OwnedStore, settings: Settings, metrics: StewardMetrics
 ) -> None:
-    """Move orphans to the trash and delete what has been there long enough, or hold both back."""
+    """Move orphans to the trash and delete expired trash, unless collection is held."""
     try:
         moved = collect_orphans(
             catalog, store, settings.orphan_age_seconds, max_share=settings.collect_max_share
         )
-    except CollectionHeld as held:
+    except CollectionHeld as error:
         metrics.collection_held.set(1)
-        log.error("collection is held: %s", held.detail)
+        log.error("orphan collection is held: %s", error.detail)
         return
     metrics.collection_held.set(0)
     metrics.objects_trashed.inc(moved)
-    deleted, left = empty_expired_trash(catalog, store, settings.trash_days)
+    deleted, remaining = empty_expired_trash(catalog, store, settings.trash_days)
     metrics.objects_deleted.labels("collect_orphans").inc(deleted)
-    metrics.trash_bytes.set(left.size_bytes)
+    metrics.trash_bytes.set(remaining.size_bytes)
 
 
-def _free_trash(store: OwnedStore, least_free_bytes: int, metrics: StewardMetrics) -> None:
-    metrics.objects_deleted.labels("free_trash").inc(store.free_trash(least_free_bytes))
+def _free_trash(store: OwnedStore, min_free_bytes: int, metrics: StewardMetrics) -> None:
+    metrics.objects_deleted.labels("free_trash").inc(store.free_trash(min_free_bytes))

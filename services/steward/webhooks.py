@@ -1,14 +1,11 @@
-"""Webhooks: what happened is told to who wants to know, signed, until it was heard.
+"""Delivers signed webhook events from the outbox (`shared.catalog.webhooks`), with retries.
 
-The signature of a webhook, as the Standard Webhooks specification 1.0 has it.
+Events are signed by the Standard Webhooks specification 1.0. A request goes only to the IP address
+that was checked, without redirects, and has a deadline.
 
-One POST to a webhook: to the address that was checked, no further, and not for long.
-
-The outbox's other end: what is due is sent, tried again later, or given up.
-
-A try is claimed in one transaction and its end is written in another. Whoever dies between them
-leaves a delivery that comes due again: each is sent at least once, and its id tells the receiver
-which he has had already.
+Delivery is at least once: an attempt is claimed in one transaction and its result is written in
+another, so a delivery whose steward died in between becomes due again. The receiver recognises a
+duplicate by the event's id.
 """
 
 from __future__ import annotations
@@ -45,10 +42,13 @@ log = logging.getLogger(__name__)
 
 
 def sign_webhook(secret: str, message_id: str, timestamp_seconds: int, body: str) -> str:
-    """`v1,` and the base64 of HMAC-SHA256 over `id.timestamp.body`.
+    """Return the signature: `v1,` and the base64 of HMAC-SHA256 over `id.timestamp.body`.
 
-    `secret` is `whsec_` and the key in base64; the time is Unix', so that a receiver can refuse
-    what is old, and a copy of it sent again.
+    Args:
+        secret: `whsec_` and the key in base64.
+        message_id: Id of the event.
+        timestamp_seconds: Unix time, so that a receiver can reject old and replayed messages.
+        body: The request body.
     """
     key = base64.b64decode(secret.removeprefix(SECRET_PREFIX))
     signed = f"{message_id}.{timestamp_seconds}.{body}".encode()
@@ -58,7 +58,7 @@ def sign_webhook(secret: str, message_id: str, timestamp_seconds: int, body: str
 def signature_headers(
     secret: str, message_id: str, timestamp_seconds: int, body: str
 ) -> dict[str, str]:
-    """What a receiver needs to believe the body. The id is the same in every try."""
+    """Return the headers that authenticate the body. The id is the same in every attempt."""
     return {
         "webhook-id": message_id,
         "webhook-timestamp": str(timestamp_seconds),
@@ -76,18 +76,18 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True)
 class DeliveryAttempt:
-    """What came of a try."""
+    """The result of an attempt."""
 
     status: int | None
-    """HTTP status; None where there was no answer."""
+    """HTTP status; None without a response."""
     error: str | None
-    """Why it was no success; None for 2xx."""
+    """Why it failed; None for a 2xx response."""
     is_permanent: bool = False
-    """The address may not be called: another try would find the same."""
+    """The address is not allowed: a retry would fail, too."""
 
 
 class PinnedBackend(httpcore2.AnyIOBackend):
-    """Connects to one address, whichever host is named; TLS still verifies the host name."""
+    """Connects to one IP address, whatever the host name; TLS still verifies the host name."""
 
     def __init__(self, address: str) -> None:
         super().__init__()
@@ -109,10 +109,16 @@ class PinnedBackend(httpcore2.AnyIOBackend):
 async def send_webhook(
     webhook: Webhook, delivery: Delivery, tls: ssl.SSLContext, *, allow_private: bool
 ) -> DeliveryAttempt:
-    """Attempt the delivery once, for ATTEMPT_SECONDS at most.
+    """Send the delivery once, within ATTEMPT_SECONDS.
 
-    Never raises for what the network or the receiver does. `tls` verifies the receiver's
-    certificate. Redirects are not followed, and proxies of the environment are not used.
+    Redirects are not followed, and the proxies of the environment are not used. Network errors and
+    error responses are returned, not raised.
+
+    Args:
+        webhook: The webhook.
+        delivery: The delivery.
+        tls: Verifies the receiver's certificate.
+        allow_private: Whether private IP addresses may be called.
     """
     try:
         async with asyncio.timeout(ATTEMPT_SECONDS):
@@ -135,7 +141,7 @@ async def send_webhook(
 async def _post(
     webhook: Webhook, delivery: Delivery, tls: ssl.SSLContext, allow_private: bool
 ) -> int:
-    """The response's status. Its body is not read: nothing in it is of use."""
+    """Send the request and return the response's status; its body is not read."""
     target = parse_webhook_url(webhook.url, allow_private=allow_private)
     address = await in_daemon_thread(
         lambda: resolve_webhook_target(target, allow_private=allow_private)
@@ -165,9 +171,8 @@ async def _post(
 def in_daemon_thread(call: Callable[[], T]) -> asyncio.Future[T]:
     """Run a blocking call that cannot be interrupted, such as a name lookup.
 
-    Returns:
-        Its result. Whoever gives up waiting for it leaves it behind: no event loop and no exiting
-        process waits for a daemon thread, as they do for the threads of an executor.
+    Unlike the threads of an executor, a daemon thread delays neither the end of the event loop nor
+    the exit of the process when its result is no longer awaited.
     """
     result: Future[T] = Future()
     result.set_running_or_notify_cancel()
@@ -184,17 +189,16 @@ def in_daemon_thread(call: Callable[[], T]) -> asyncio.Future[T]:
 
 DELIVERY_POLL_SECONDS = 1.0
 MAX_WEBHOOKS = 32  # served at the same time
-MAX_IN_FLIGHT = 4  # attempts for one webhook
-CLAIM_SECONDS = 4 * ATTEMPT_SECONDS  # after which a try whose steward died is due again
-# Between tries, as the Standard Webhooks specification recommends: 10 tries within some three days.
+MAX_IN_FLIGHT = 4  # attempts at the same time for one webhook
+CLAIM_SECONDS = 4 * ATTEMPT_SECONDS  # after which an attempt whose steward died is due again
+# Delays between attempts, as the Standard Webhooks specification recommends: 10 attempts in about
+# three days.
 RETRY_DELAYS_SECONDS = (5, 300, 1800, 7200, 18_000, 36_000, 50_400, 72_000, 86_400)
-RETRY_JITTER = (
-    0.2  # of a pause, at random: receivers that come back are not met by everyone at once
-)
+RETRY_JITTER = 0.2  # largest random share added to a delay, to spread the retries
 
 
 class WebhookDispatcher:
-    """Sends what is due; `run` until stopped. Any number of stewards may have one.
+    """Sends due deliveries. Any number of stewards may run one.
 
     Each webhook with due deliveries has a task of its own, so a receiver that hangs delays only
     its own deliveries, and at most MAX_IN_FLIGHT of them are in flight.
@@ -204,12 +208,14 @@ class WebhookDispatcher:
         self._catalog = catalog
         self._allow_private = settings.webhook_private_addresses
         self._tls = ssl.create_default_context()
-        self._outage = OutageLog("sender of webhooks")
+        self._outage = OutageLog("webhook dispatcher")
 
     def run(self, stop: threading.Event) -> None:
-        """Send until `stop` is set. Attempts in flight are then cut off, not waited for: they
-        come due again after CLAIM_SECONDS."""
-        asyncio.run(self._run(stop))  # which cancels the tasks that are left
+        """Send deliveries until `stop` is set.
+
+        Attempts in flight are then cancelled; they become due again after CLAIM_SECONDS.
+        """
+        asyncio.run(self._run(stop))  # cancels the remaining tasks
 
     async def _run(self, stop: threading.Event) -> None:
         stopped = in_daemon_thread(stop.wait)
@@ -222,15 +228,15 @@ class WebhookDispatcher:
             except SQLAlchemyError as error:
                 due = []
                 self._outage.record_error(error)
-            # At random: webhooks with a backlog must not keep the others from the last places.
+            # At random, so that webhooks with a backlog don't starve the others.
             for webhook_id in random.sample(due, min(len(due), MAX_WEBHOOKS - len(tasks))):
                 tasks[webhook_id] = asyncio.create_task(self._serve(webhook_id))
             awaited: set[asyncio.Future[Any]] = {stopped, *tasks.values()}
             await asyncio.wait(
                 awaited, timeout=DELIVERY_POLL_SECONDS, return_when=asyncio.FIRST_COMPLETED
             )
-            for webhook_id in [one for one, task in tasks.items() if task.done()]:
-                tasks.pop(webhook_id).result()  # raises what nobody has foreseen
+            for webhook_id in [id_ for id_, task in tasks.items() if task.done()]:
+                tasks.pop(webhook_id).result()  # raises unexpected errors
 
     async def _serve(self, webhook_id: UUID) -> None:
         try:
@@ -240,19 +246,19 @@ class WebhookDispatcher:
             self._outage.record_error(error)
             await asyncio.sleep(DELIVERY_POLL_SECONDS)
 
-    def due_webhooks(self, besides: Collection[UUID] = ()) -> list[UUID]:
-        """Ids of webhooks with due deliveries, but for those in `besides`."""
-        due = select(Delivery.webhook_id).where(*_is_due(), Delivery.webhook_id.not_in(besides))
+    def due_webhooks(self, excluded: Collection[UUID] = ()) -> list[UUID]:
+        """Return the ids of webhooks with due deliveries, except those in `excluded`."""
+        due = select(Delivery.webhook_id).where(*_is_due(), Delivery.webhook_id.not_in(excluded))
         with self._catalog.read() as session:
             return list(session.scalars(due.distinct()))
 
     async def deliver_due(self, webhook_id: UUID) -> int:
-        """Attempt what is due for one webhook, MAX_IN_FLIGHT at most; how many that were."""
+        """Attempt the due deliveries of one webhook, up to MAX_IN_FLIGHT; return their number."""
         webhook, claimed = await asyncio.to_thread(self._claim_due, webhook_id)
-        ends = await asyncio.gather(
+        results = await asyncio.gather(
             *(self._attempt(webhook, delivery) for delivery in claimed), return_exceptions=True
         )
-        for error in ends:  # only now: one that can't be noted must not cut off the others
+        for error in results:  # after all have ended: an error must not cancel the others
             if error is not None:
                 raise error
         return len(claimed)
@@ -286,18 +292,18 @@ class WebhookDispatcher:
 
     def _record_attempt(self, delivery_id: UUID, attempts: int, outcome: DeliveryAttempt) -> None:
         values: dict[str, Any] = {"last_status": outcome.status, "last_error": outcome.error}
-        pause = retry_delay_seconds(attempts)
+        delay = retry_delay_seconds(attempts)
         if outcome.error is None:
             values |= {"state": DeliveryState.DELIVERED, "ended_at": db_now()}
-        elif outcome.is_permanent or pause is None:
+        elif outcome.is_permanent or delay is None:
             values |= {"state": DeliveryState.FAILED, "ended_at": db_now()}
-            log.warning("webhook delivery %s is given up: %s", delivery_id, outcome.error)
+            log.warning("webhook delivery %s failed permanently: %s", delivery_id, outcome.error)
         else:
-            values |= {"next_attempt_at": db_now_plus(pause)}
+            values |= {"next_attempt_at": db_now_plus(delay)}
         with self._catalog.write() as session:
             session.execute(
                 update(Delivery)
-                # Not where another steward has taken it over since.
+                # Unless another steward has taken it over since.
                 .where(Delivery.id == delivery_id, Delivery.attempts == attempts)
                 .values(**values)
                 .execution_options(synchronize_session=False)
@@ -309,7 +315,7 @@ def _is_due() -> tuple[ColumnElement[bool], ...]:
 
 
 def retry_delay_seconds(attempts: int) -> float | None:
-    """Until the next try, after so many; None when it is given up."""
+    """Return the delay before the next attempt, after `attempts` failures; None to give up."""
     if attempts > len(RETRY_DELAYS_SECONDS):
         return None
     return RETRY_DELAYS_SECONDS[attempts - 1] * random.uniform(1, 1 + RETRY_JITTER)  # noqa: S311

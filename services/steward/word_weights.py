@@ -1,13 +1,12 @@
-"""Learning a map's word weights, and trying them on photos that have not taught them.
+"""Fits a map's word weights and validates them on held-out photos.
 
-The map is dealt out in two halves, place by place (`shared.word_weights.training_pairs`).
-Photos of one half
-are asked with what the other half has taught, in the whole map through the search tier that answers
-users. Each is left out with whatever lies within 5 m of it: its own burst would come first with and
-without weights, and hide what they do. Only where more photos find their place first than without
-weights, and more than by chance, the weights are kept: those that both halves teach together.
+The map is split into two halves by place (`shared.word_weights.training_pairs`). Photos of one half
+are searched, in the whole map and through the search tier, with the weights fitted on the other
+half. Each query is excluded from the results together with all photos within 5 m: its own burst
+would rank first with and without weights, and hide their effect. The weights, fitted on both
+halves, are kept only if significantly more photos find their place at rank 1 than without weights.
 
-What the rows of a map's photos teach of its words, read a lesson at a time.
+Descriptor rows are read in batches, to bound the memory.
 """
 
 from __future__ import annotations
@@ -43,12 +42,12 @@ from shared.word_weights.weights import (
     sign_test_p_value,
 )
 
-ROW_BATCH_BYTES = 64_000_000  # of rows in memory: 160 photos at 98,304 dimensions
-MIN_BATCH_ROWS = 8  # however long they are: the far pairs come from the same photos
+ROW_BATCH_BYTES = 64_000_000  # rows in memory: 160 photos at 98,304 dimensions
+MIN_BATCH_ROWS = 8  # at any dimension: the far pairs come from the same photos
 
 
-def photos_per_lesson(dimension: int) -> int:
-    """How many photos a lesson may have."""
+def photos_per_batch(dimension: int) -> int:
+    """Return the largest number of photos in a batch of pairs."""
     return max(MIN_BATCH_ROWS, ROW_BATCH_BYTES // (dimension * np.dtype(np.float32).itemsize))
 
 
@@ -57,69 +56,88 @@ def accumulate_pair_statistics(
     store: ObjectStore,
     generation_id: UUID,
     photo_ids: Sequence[UUID],
-    lessons: Sequence[PairBatch],
+    batches: Sequence[PairBatch],
     words: int,
-    on_lesson: Callable[[], None],
+    on_batch: Callable[[], None],
 ) -> PairStatistics:
-    """What the lessons about `photo_ids` come to; pairs of photos deleted since are left out.
+    """Accumulate the statistics of photo pairs, reading the rows of one batch at a time.
 
-    Holds the rows of one lesson at a time. Conflict (`map_damaged`) for rows that can't be read.
+    Args:
+        catalog: The catalog.
+        store: The object store with the chunks.
+        generation_id: The generation whose rows are read.
+        photo_ids: The photos that the batches index. Pairs with a photo that was deleted since are
+            left out.
+        batches: Pairs of photos.
+        words: Number of words in the vocabulary.
+        on_batch: Called before each batch; an exception that it raises ends the loop.
+
+    Raises:
+        Conflict: `map_damaged`: rows can't be read.
     """
-    taught = empty_pair_statistics(words)
-    for lesson in lessons:
-        on_lesson()
-        rows, there = _read_photo_rows(
-            catalog, store, generation_id, [photo_ids[i] for i in lesson.photos]
+    statistics = empty_pair_statistics(words)
+    for batch in batches:
+        on_batch()
+        rows, exists = _read_photo_rows(
+            catalog, store, generation_id, [photo_ids[i] for i in batch.photos]
         )
-        near, far = (pairs[there[pairs].all(axis=1)] for pairs in (lesson.near, lesson.far))
-        taught += PairStatistics.from_rows(rows, near, far, words)
-    return taught
+        near, far = (pairs[exists[pairs].all(axis=1)] for pairs in (batch.near, batch.far))
+        statistics += PairStatistics.from_rows(rows, near, far, words)
+    return statistics
 
 
 def _read_photo_rows(
     catalog: Catalog, store: ObjectStore, generation_id: UUID, photo_ids: Sequence[UUID]
 ) -> tuple[Rows, NDArray[np.bool_]]:
-    """(n, dimension) rows in the photos' order, and which of them there are."""
-    place_of = {photo_id: place for place, photo_id in enumerate(photo_ids)}
+    """Return (n, dimension) rows in the photos' order, and an (n,) mask of the existing ones."""
+    index_of = {photo_id: index for index, photo_id in enumerate(photo_ids)}
     for attempt in range(1, MAX_READ_ATTEMPTS + 1):
         with catalog.read() as session:
             located = find_descriptor_rows(session, generation_id, photo_ids)
-        found: Rows | None = None
-        there = np.zeros(len(photo_ids), dtype=bool)
+        matrix: Rows | None = None
+        exists = np.zeros(len(photo_ids), dtype=bool)
         try:
             for object_key, rows in located.items():
-                read = _read_rows_checked(store, object_key, [row for row, _ in rows])
-                if found is None:
-                    found = np.zeros((len(photo_ids), read.shape[1]), dtype=np.float32)
-                places = [place_of[photo_id] for _, photo_id in rows]
-                found[places], there[places] = read, True
-        except NotFound as error:  # the chunk was merged into another between the two reads
+                chunk_rows = _read_rows_checked(store, object_key, [row for row, _ in rows])
+                if matrix is None:
+                    matrix = np.zeros((len(photo_ids), chunk_rows.shape[1]), dtype=np.float32)
+                indices = [index_of[photo_id] for _, photo_id in rows]
+                matrix[indices], exists[indices] = chunk_rows, True
+        except NotFound as error:  # the chunk was merged into another one between the two reads
             if attempt == MAX_READ_ATTEMPTS:
                 raise map_damaged_error(sorted(located)) from error
             continue
-        return found if found is not None else np.zeros((len(photo_ids), 0), np.float32), there
-    raise AssertionError("the last try returns or raises")
+        return matrix if matrix is not None else np.zeros((len(photo_ids), 0), np.float32), exists
+    raise AssertionError("the last attempt returns or raises")
 
 
-def _read_rows_checked(store: ObjectStore, object_key: str, rows: Sequence[int]) -> Rows:
+def _read_rows_checked(store: ObjectStore, object_key: str, row_numbers: Sequence[int]) -> Rows:
     try:
-        read = read_rows(store, object_key, rows)
+        rows = read_rows(store, object_key, row_numbers)
     except (IndexError, ValueError) as error:
         raise map_damaged_error([object_key]) from error
-    if not rows_are_valid(read).all():
+    if not rows_are_valid(rows).all():
         raise map_damaged_error([object_key])
-    return read
+    return rows
 
 
-WEIGHT_DECIMALS = 6  # of a weight, as it is stored
-TRIAL_RANKS = 10  # looked at for R@10
-MAX_BURST_PHOTOS = (
-    200  # photos that are left out with one: more are a fixed camera's, and not asked with
-)
+WEIGHT_DECIMALS = 6  # precision of stored weights
+VALIDATION_RANKS = 10  # results per query, for R@10
+# Largest number of photos excluded with a query. A larger burst is a fixed camera's, which is not
+# used as a query.
+MAX_BURST_PHOTOS = 200
 
 
 class WordWeightsFit:
-    """Learns the weights of one generation with `words` words in its vocabulary."""
+    """Fits and validates the word weights of one generation.
+
+    Args:
+        catalog: The catalog.
+        store: The object store with the chunks.
+        generation: The generation.
+        words: Number of words in its vocabulary.
+        evaluation: The evaluation of the generation, for its photos and its search client.
+    """
 
     def __init__(
         self,
@@ -127,28 +145,38 @@ class WordWeightsFit:
         store: ObjectStore,
         generation: Generation,
         words: int,
-        measure: MapEvaluation,
+        evaluation: MapEvaluation,
     ) -> None:
         self._catalog = catalog
         self._store = store
         self._generation = generation
         self._words = words
-        self._evaluation = measure
+        self._evaluation = evaluation
 
     def fit(self, sample: Sequence[GeotaggedPhoto], seed: int, searchable: int) -> WordWeights:
-        """What there is to keep, whatever came of it. `sample` are the photos to try weights on.
+        """Fit the weights and validate them.
 
-        Raises what `MapEvaluation` and `teach` raise.
+        Args:
+            sample: The photos to validate with.
+            seed: Seed of the split and of the sampled pairs.
+            searchable: Number of searchable photos, stored with the record.
+
+        Returns:
+            The record to store, also where the weights were not kept.
+
+        Raises:
+            Conflict, Unavailable: As `EvaluationSearch.rank_similar` and
+                `accumulate_pair_statistics`.
         """
         photos = self._evaluation.database.photos
-        chosen = sample_pairs(
-            [photo.spot for photo in photos], seed, photos_per_lesson(self._generation.dimension)
+        split = sample_pairs(
+            [photo.spot for photo in photos], seed, photos_per_batch(self._generation.dimension)
         )
-        halves = self._fit_halves(chosen)
+        halves = self._fit_halves(split)
         record = WordWeights(
             outcome=Outcome.NOT_ENOUGH_PAIRS,
-            reason=_not_enough_pairs_reason(chosen.by, halves),
-            taught_by=chosen.by,
+            reason=_not_enough_pairs_reason(split.by, halves),
+            taught_by=split.by,
             near_pairs=sum(half.near.pairs for half in halves),
             far_pairs=sum(half.far.pairs for half in halves),
             seed=seed,
@@ -156,61 +184,59 @@ class WordWeightsFit:
         )
         if min(min(half.near.pairs, half.far.pairs) for half in halves) < MIN_PAIRS:
             return record
-        together = _rounded_weights(halves[0] + halves[1])
-        of_other_half = (_rounded_weights(halves[1]), _rounded_weights(halves[0]))
-        half_of = {photo.photo_id: half for photo, half in zip(photos, chosen.halves, strict=True)}
-        tried = [(query, of_other_half[half_of[query.photo_id]]) for query in sample]
-        held_out = self._cross_validate(tried, chosen.by)
-        kept = is_significant_improvement(held_out.better, held_out.worse)
+        weights = _rounded_weights(halves[0] + halves[1])
+        weights_of_other_half = (_rounded_weights(halves[1]), _rounded_weights(halves[0]))
+        half_of = {photo.photo_id: half for photo, half in zip(photos, split.halves, strict=True)}
+        queries = [(query, weights_of_other_half[half_of[query.photo_id]]) for query in sample]
+        held_out = self._cross_validate(queries, split.by)
+        is_better = is_significant_improvement(held_out.better, held_out.worse)
         record = record.model_copy(
             update={
-                "outcome": Outcome.KEPT if kept else Outcome.NOT_KEPT,
+                "outcome": Outcome.KEPT if is_better else Outcome.NOT_KEPT,
                 "reason": _held_out_reason(held_out),
-                "weights": together,
+                "weights": weights,
                 "held_out": held_out,
             }
         )
-        if kept:
-            measured = self._evaluation.evaluate(sample, together)
-            record = record.model_copy(update={"calibration": measured.calibration})
+        if is_better:
+            result = self._evaluation.evaluate(sample, weights)
+            record = record.model_copy(update={"calibration": result.calibration})
         return record
 
-    def _fit_halves(self, chosen: PairSplit) -> tuple[PairStatistics, PairStatistics]:
+    def _fit_halves(self, split: PairSplit) -> tuple[PairStatistics, PairStatistics]:
         ids = [photo.photo_id for photo in self._evaluation.database.photos]
 
-        def half(lessons: int) -> PairStatistics:
+        def fit_half(half: int) -> PairStatistics:
             return accumulate_pair_statistics(
                 self._catalog,
                 self._store,
                 self._generation.id,
                 ids,
-                chosen.batches[lessons],
+                split.batches[half],
                 self._words,
                 self._evaluation.on_query,
             )
 
-        return half(0), half(1)
+        return fit_half(0), fit_half(1)
 
     def _cross_validate(
-        self, sample: Sequence[tuple[GeotaggedPhoto, tuple[float, ...]]], by: PairSource
+        self, queries: Sequence[tuple[GeotaggedPhoto, tuple[float, ...]]], by: PairSource
     ) -> HeldOut:
-        """Each photo that is not alone at its place, asked without weights and with these."""
+        """Search with each photo that is not alone at its place, without and with its weights."""
         without, weighted, better, worse = RecallCounter(), RecallCounter(), 0, 0
-        for query, weights in sample:
+        for query, weights in queries:
             self._evaluation.on_query()
             burst = self._photos_to_exclude(query, by)
             if burst is None:
                 continue
-            plain, found = (
-                self._correct_ranks(query, (), burst),
-                self._correct_ranks(query, weights, burst),
-            )
-            if plain is None or found is None:
+            correct_without = self._correct_ranks(query, (), burst)
+            correct_weighted = self._correct_ranks(query, weights, burst)
+            if correct_without is None or correct_weighted is None:
                 continue
-            without.add(plain)
-            weighted.add(found)
-            better += any(found[:1]) and not any(plain[:1])
-            worse += any(plain[:1]) and not any(found[:1])
+            without.add(correct_without)
+            weighted.add(correct_weighted)
+            better += any(correct_weighted[:1]) and not any(correct_without[:1])
+            worse += any(correct_without[:1]) and not any(correct_weighted[:1])
         return HeldOut(
             without=without.figures(),
             weighted=weighted.figures(),
@@ -220,43 +246,43 @@ class WordWeightsFit:
         )
 
     def _photos_to_exclude(self, query: GeotaggedPhoto, by: PairSource) -> tuple[UUID, ...] | None:
-        """What is left out with the photo; None where nothing of its place would be left."""
+        """Return the photos to exclude with the query; None if no photo of its place would remain
+        or the burst is too large."""
         database, radius_m = self._evaluation.database, self._evaluation.radius_m
         if by == PairSource.PLACES:
-            return (
-                () if database.count_at_place(query.spot, radius_m) > 1 else None
-            )  # itself is one
-        burst = database.find_within(query.spot, NEAREST_M)  # itself among them
+            # The count includes the query itself.
+            return () if database.count_at_place(query.spot, radius_m) > 1 else None
+        burst = database.find_within(query.spot, NEAREST_M)  # includes the query itself
         alone = len(database.find_within(query.spot, radius_m)) == len(burst)
         return None if alone or len(burst) > MAX_BURST_PHOTOS else tuple(burst)
 
     def _correct_ranks(
-        self, query: GeotaggedPhoto, weights: tuple[float, ...], without: tuple[UUID, ...]
+        self, query: GeotaggedPhoto, weights: tuple[float, ...], excluded: tuple[UUID, ...]
     ) -> list[bool] | None:
-        """Which photos of the ranking show the query's place; None for a deleted query."""
-        ranking = self._evaluation.search.rank_similar(query, TRIAL_RANKS, weights, without)
+        """Return for each rank whether it shows the query's place; None for a deleted query."""
+        ranking = self._evaluation.search.rank_similar(query, VALIDATION_RANKS, weights, excluded)
         if ranking is None:
             return None
         return [is_same_place(query.spot, spot, self._evaluation.radius_m) for _, spot in ranking]
 
 
-def _rounded_weights(taught: PairStatistics) -> tuple[float, ...]:
-    return tuple(round(weight, WEIGHT_DECIMALS) for weight in taught.weights().tolist())
+def _rounded_weights(statistics: PairStatistics) -> tuple[float, ...]:
+    return tuple(round(weight, WEIGHT_DECIMALS) for weight in statistics.weights().tolist())
 
 
 def _not_enough_pairs_reason(by: PairSource, halves: tuple[PairStatistics, PairStatistics]) -> str:
     near, far = ([half.near.pairs for half in halves], [half.far.pairs for half in halves])
-    what = "5 to 25 m apart" if by == PairSource.COORDINATES else "under one label"
+    criterion = "5 to 25 m apart" if by == PairSource.COORDINATES else "with the same label"
     return (
-        f"By {by} the two halves of the map have {near[0]} and {near[1]} pairs of photos of one "
-        f"place ({what}) and {far[0]} and {far[1]} of two places; {MIN_PAIRS} of either kind are "
-        "needed in each half."
+        f"By {by}, the two halves of the map have {near[0]} and {near[1]} pairs of photos of one "
+        f"place ({criterion}) and {far[0]} and {far[1]} pairs of two places; each half needs "
+        f"{MIN_PAIRS} pairs of each kind."
     )
 
 
 def _held_out_reason(held_out: HeldOut) -> str:
     return (
-        f"Of {held_out.without['queries']} photos, each asked with what the other half of the map "
-        f"has taught, {held_out.better} find their place first with weights alone and "
-        f"{held_out.worse} without them alone (by chance: p = {held_out.chance:.2g})."
+        f"Of {held_out.without['queries']} photos, each searched with the weights fitted on the "
+        f"other half of the map, {held_out.better} find their place at rank 1 only with weights "
+        f"and {held_out.worse} only without (sign test: p = {held_out.chance:.2g})."
     )

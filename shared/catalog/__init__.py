@@ -1,5 +1,5 @@
-"""The catalog: what exists, in PostgreSQL (or SQLite when embedded).
+"""The catalog: SQLAlchemy tables and queries on PostgreSQL, or SQLite in the embedded mode.
 
-One module per table, with the table's queries beside it. `session.Catalog` is the only place that
-opens a session and the only place that commits.
+Each module has the tables of one subject and their queries. Only `session.Catalog` opens sessions
+and commits.
 """

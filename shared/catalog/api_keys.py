@@ -1,6 +1,6 @@
-"""Keys: who may call, what they may do, and how much of it. Only hashes of keys are kept.
+"""API keys: authentication, scopes and limits. Only the hashes of keys are stored.
 
-A revoked or expired key stays as a row, so that lists and logs can still say whose it was.
+The row of a revoked or expired key stays, so that lists and logs can still name it.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from shared.errors import NotFound, Unauthorized
 from shared.ids import new_id
 from shared.security.api_keys import Scope, api_key_prefix, generate_api_key, hash_api_key
 
-LAST_USED_RESOLUTION_SECONDS = 60.0  # `last_used_at` is no finer
+LAST_USED_RESOLUTION_SECONDS = 60.0  # of `last_used_at`
 
 
 class ApiKey(Base):
-    """One key. A limit that is null is the one of the settings."""
+    """An API key. A limit that is null defaults to the one of the settings."""
 
     __tablename__ = "api_keys"
 
@@ -43,7 +43,7 @@ class ApiKey(Base):
 
 @dataclass(frozen=True, slots=True)
 class KeyLimits:
-    """How much a key may do; None is the limit of the settings."""
+    """Rate limit and quotas of a key; None defaults to the limit of the settings."""
 
     requests_per_minute: int | None = None
     upload_bytes_per_day: int | None = None
@@ -58,7 +58,7 @@ def create_api_key(
     life_seconds: float | None = None,
     limits: KeyLimits = KeyLimits(),
 ) -> tuple[ApiKey, str]:
-    """A new key's row, and the key itself: to be shown now or never."""
+    """Create a key. Returns its row and the key itself, which is not stored and only shown once."""
     key = generate_api_key()
     row = ApiKey(
         name=name,
@@ -77,45 +77,49 @@ def create_api_key(
 
 
 def authenticate_api_key(session: Session, sha256: str) -> ApiKey:
-    """The key that may be used now. Unauthorized (`key_unknown`, `key_revoked`, `key_expired`)."""
-    found = session.execute(
+    """Return the valid key with this hash.
+
+    Raises:
+        Unauthorized: `key_unknown`, `key_revoked` or `key_expired`.
+    """
+    result = session.execute(
         select(ApiKey, (ApiKey.expires_at <= db_now()).label("expired")).where(
             ApiKey.sha256 == sha256
         )
     ).one_or_none()
-    if found is None:
-        raise Unauthorized("key_unknown", "This is not a key of this server.")
-    key: ApiKey = found[0]
+    if result is None:
+        raise Unauthorized("key_unknown", "The API key is unknown to this server.")
+    key: ApiKey = result[0]
     if key.revoked_at is not None:
         raise Unauthorized("key_revoked", f"The key {key.prefix}... ({key.name}) was revoked.")
-    if found.expired:
+    if result.expired:
         raise Unauthorized(
             "key_expired",
-            f"The key {key.prefix}... ({key.name}) expired at {key.expires_at}. An admin makes "
-            "another one: placewise keys create.",
+            f"The key {key.prefix}... ({key.name}) expired at {key.expires_at}. An admin can "
+            "create another one: placewise keys create.",
         )
     return key
 
 
 def list_api_keys(session: Session) -> list[ApiKey]:
-    """Every key that was ever made, newest first."""
+    """List all keys, also revoked and expired ones, newest first."""
     return list(session.scalars(select(ApiKey).order_by(ApiKey.id.desc())))
 
 
 def revoke_api_key(session: Session, key_id: UUID) -> ApiKey:
-    """From this commit on the key opens nothing. NotFound (`key_not_found`)."""
-    found = session.get(ApiKey, key_id, with_for_update=True)
-    if found is None:
+    """Revoke the key: it is rejected from this commit on. NotFound (`key_not_found`)."""
+    key = session.get(ApiKey, key_id, with_for_update=True)
+    if key is None:
         raise NotFound("key_not_found", f"There is no key {key_id}. GET /api/v1/keys lists all.")
-    if found.revoked_at is None:
-        found.revoked_at = db_now()
+    if key.revoked_at is None:
+        key.revoked_at = db_now()
         session.flush()
-        session.refresh(found)
-    return found
+        session.refresh(key)
+    return key
 
 
 def has_admin_key(session: Session) -> bool:
-    """Is there a key that may make others, and can be used now?"""
+    """Return whether a valid key with the admin scope exists."""
     usable = select(ApiKey.scopes).where(
         ApiKey.revoked_at.is_(None),
         or_(ApiKey.expires_at.is_(None), ApiKey.expires_at > db_now()),
@@ -124,7 +128,7 @@ def has_admin_key(session: Session) -> bool:
 
 
 def record_key_use(session: Session, key_id: UUID) -> None:
-    """The key was used now; written only where that was not noted within the last minute."""
+    """Set `last_used_at`, at most once per LAST_USED_RESOLUTION_SECONDS."""
     session.execute(
         update(ApiKey)
         .where(
@@ -140,6 +144,6 @@ def record_key_use(session: Session, key_id: UUID) -> None:
 
 
 def count_photos_of_key(session: Session, key_id: UUID, limit: int) -> int:
-    """Live photos that came in with the key, counted up to `limit`."""
-    some = select(Photo.id).where(Photo.key_id == key_id, Photo.deleted_at.is_(None)).limit(limit)
-    return session.scalar(select(func.count()).select_from(some.subquery())) or 0
+    """Count the live photos uploaded with the key, up to `limit`."""
+    photos = select(Photo.id).where(Photo.key_id == key_id, Photo.deleted_at.is_(None)).limit(limit)
+    return session.scalar(select(func.count()).select_from(photos.subquery())) or 0

@@ -1,11 +1,9 @@
-"""What every table of the catalog shares: the declarative base, UTC times, the database's clock.
+"""Declarative base, column types and SQL functions shared by the catalog's tables.
 
-Leases and ages are decided by the database's clock alone, so that a worker whose clock is wrong
-can neither steal a lease nor keep one: `db_now()` and `db_now_plus(seconds)` are SQL, not Python.
-
-Marks rows that the journal in the object store has to be told of (`shared.journal`).
-
-Rows of the catalog as JSON values, the same from SQLite and PostgreSQL.
+Leases and ages use the database's clock only, so that a worker with a wrong clock can neither steal
+nor keep a lease: `db_now()` and `db_now_plus(seconds)` are SQL expressions. `Journaled` marks rows
+that are not yet in the journal of the object store (`shared.journal`); `to_json` and `from_json`
+convert column values, with the same result from SQLite and PostgreSQL.
 """
 
 from __future__ import annotations
@@ -50,7 +48,7 @@ class UtcDateTime(TypeDecorator[datetime]):
 
 
 class CoordinateColumn(TypeDecorator[float]):
-    """A latitude or longitude, without what is too small to compute with."""
+    """A latitude or longitude; denormally small values are stored as 0."""
 
     impl = Float
     cache_ok = True
@@ -63,7 +61,7 @@ JsonValue = JSON(none_as_null=True).with_variant(JSONB(none_as_null=True), "post
 
 
 class Base(DeclarativeBase):
-    """The tables' common ancestor. Constraint names are fixed so that migrations can name them."""
+    """Declarative base of all tables; constraints get fixed names, which migrations refer to."""
 
     metadata = MetaData(
         naming_convention={
@@ -77,35 +75,36 @@ class Base(DeclarativeBase):
 
 
 def partial_index(name: str, *columns: Any, only: Condition) -> Index:
-    """An index of the rows that meet `only`."""
+    """Return a partial index of the rows that match `only`."""
     return Index(name, *columns, postgresql_where=only, sqlite_where=only)
 
 
 class db_now(FunctionElement[datetime]):
-    """The database's clock at the statement's start (not the transaction's)."""
+    """The database's time at the start of the statement (not of the transaction)."""
 
     type = UtcDateTime()
     inherit_cache = True
 
 
 class db_now_plus(FunctionElement[datetime]):
-    """The database's clock plus a number of seconds (which may be negative)."""
+    """The database's time plus a number of seconds, which may be negative."""
 
     type = UtcDateTime()
     inherit_cache = True
 
 
 class json_array_has(FunctionElement[bool]):
-    """True where a JSON array column holds a string: `json_array_has(Photo.tags, "night")`."""
+    """True where a JSON array column contains a string: `json_array_has(Photo.tags, "night")`."""
 
     type = Boolean()
     inherit_cache = True
 
 
 class filename_trigrams(FunctionElement[Any]):
-    """Every three characters in a row of a text, case ignored: what an index of substrings holds.
+    """The case-folded trigrams of a text, for an index that serves substring searches.
 
-    PostgreSQL only, by a function that a migration has made: no extension has to be installed.
+    PostgreSQL only. A migration creates the SQL function, so that the extension pg_trgm is not
+    required.
     """
 
     type = ARRAY(Text())
@@ -121,13 +120,14 @@ class db_distance_m(FunctionElement[float]):
 
 @compiles(db_now, "postgresql")
 def _now_postgresql(element: db_now, compiler: Any, **kw: Any) -> str:
-    # Not clock_timestamp(): what may change within a statement can't be looked up in an index.
+    # Not clock_timestamp(): an index can't be used for a value that changes within a statement.
     return "statement_timestamp()"
 
 
 @compiles(db_now, "sqlite")
 def _now_sqlite(element: db_now, compiler: Any, **kw: Any) -> str:
-    # SQLite gives milliseconds; SQLAlchemy stores microseconds: pad, so that text sorts as time.
+    # SQLite returns milliseconds and SQLAlchemy stores microseconds: padded, so that text sorts
+    # by time.
     return "(strftime('%Y-%m-%d %H:%M:%f', 'now') || '000')"
 
 
@@ -178,20 +178,21 @@ def _distance_postgresql(element: db_distance_m, compiler: Any, **kw: Any) -> st
 
 @compiles(db_distance_m, "sqlite")
 def _distance_sqlite(element: db_distance_m, compiler: Any, **kw: Any) -> str:
-    # SQLite may be built without trigonometry: `session` brings the function to each connection.
+    # SQLite may be built without trigonometry: `session` registers this function with each
+    # connection.
     return f"{SQLITE_DISTANCE_FUNCTION}({compiler.process(element.clauses, **kw)})"
 
 
 def affected_rows(result: Any) -> int:
-    """How many rows an UPDATE or DELETE touched."""
+    """Return the number of rows that an UPDATE or DELETE affected."""
     return int(result.rowcount)
 
 
 class Journaled:
     """Mixin of tables whose rows are written to the journal.
 
-    Every INSERT and UPDATE that goes through SQLAlchemy raises `revision`, in the same transaction.
-    A row whose `revision` differs from `journaled_revision` is pending.
+    Every INSERT and UPDATE through SQLAlchemy increments `revision` in the same transaction. A row
+    whose `revision` differs from `journaled_revision` is pending.
     """
 
     revision: Mapped[int] = mapped_column(
@@ -201,12 +202,12 @@ class Journaled:
 
 
 def is_journaled(table: type[Journaled]) -> Condition:
-    """True for rows whose present state is in the journal."""
+    """Condition for rows whose current state is in the journal."""
     return table.revision == table.journaled_revision
 
 
 def to_json(value: Any) -> Any:
-    """A column's value as JSON can hold it: UUIDs and times become text."""
+    """Convert a column's value to JSON: UUIDs and times become text."""
     if isinstance(value, UUID):
         return str(value)
     if isinstance(value, datetime):
@@ -215,7 +216,7 @@ def to_json(value: Any) -> Any:
 
 
 def from_json(column: Column[Any], value: Any) -> Any:
-    """The value of `column` that `to_json` was given."""
+    """Convert a JSON value of `to_json` back to the value of `column`."""
     if value is None:
         return None
     if isinstance(column.type, Uuid):

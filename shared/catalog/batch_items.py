@@ -1,15 +1,15 @@
-"""Batches: one job that brings in many photos, and what has become of each of them.
+"""Batches: one job that imports many photos, and the state of each of its items.
 
 ```
-            the steward brings it in              its photo's own job ends
+            the steward imports it                its photo's own job ends
   QUEUED ─────────────────────────────> RUNNING ───────────────────────────> SUCCEEDED: searchable
-     │  its bytes or fields are refused     │ ────────────────────────────> FAILED
+     │  its bytes or fields are invalid     │ ────────────────────────────> FAILED
      └──────────> FAILED                    │ the photo was deleted, or its job cancelled
                                             └────────────────────────────> CANCELLED
 ```
-An item moves to RUNNING in the transaction that makes its photo and that photo's job, under the
-batch's lease: so each is brought in once, whoever is killed. The batch succeeds when every item
-has ended, also when some have failed.
+An item becomes RUNNING in the transaction that creates its photo and the photo's job, under the
+batch's lease: so each is imported exactly once, whichever process dies. The batch succeeds when
+every item has ended, also when some have failed.
 """
 
 from __future__ import annotations
@@ -43,20 +43,20 @@ from shared.catalog.jobs import UNFINISHED_STATES, Job, JobKind, JobState, Prior
 from shared.catalog.maps import lock_map
 from shared.ids import new_id
 
-ITEMS_PER_STATEMENT = 1000  # rows written by one statement, jobs looked up by one
+ITEMS_PER_STATEMENT = 1000  # rows inserted, or jobs selected, by one statement
 
 
 class BatchSource(StrEnum):
-    """Where a batch's photos come from."""
+    """Source of a batch's photos."""
 
-    FILES = "files"  # uploaded one by one: they lie in the object store already
+    FILES = "files"  # uploaded files, already in the object store
     ARCHIVE = "archive"  # members of an uploaded archive
-    KEYS = "keys"  # objects that others have put into the store
-    PREFIX = "prefix"  # all such objects below a prefix, which the steward lists
+    KEYS = "keys"  # objects that the user has put into the store
+    PREFIX = "prefix"  # all such objects under a prefix, which the steward lists
 
 
 class BatchItem(Base):
-    """One photo of a batch, by its number from 1. `state` is that of jobs."""
+    """A photo of a batch, numbered from 1. Its states are those of jobs."""
 
     __tablename__ = "batch_items"
 
@@ -66,14 +66,14 @@ class BatchItem(Base):
     number: Mapped[int] = mapped_column(Integer, primary_key=True, autoincrement=False)
     name: Mapped[str] = mapped_column(Text)
     state: Mapped[JobState] = mapped_column(String(20), default=JobState.QUEUED)
-    # The object that its bytes lie in; null for a member of an archive.
+    # The object with its bytes; null for a member of an archive.
     object_key: Mapped[str | None] = mapped_column(Text)
-    # Where in the archive it lies, or what is known of the uploaded file.
+    # Its location in the archive, or the size and hash of the uploaded file.
     source: Mapped[dict[str, Any]] = mapped_column(JsonValue, default=dict)
     fields: Mapped[dict[str, str]] = mapped_column(JsonValue, default=dict)
-    # The line of the manifest that says these fields.
+    # The line of the manifest with these fields.
     line: Mapped[int | None] = mapped_column(Integer)
-    # Either may be gone by now.
+    # Either may have been deleted since.
     photo_id: Mapped[UUID | None] = mapped_column(Uuid)
     photo_job_id: Mapped[UUID | None] = mapped_column(Uuid)
     already_there: Mapped[bool] = mapped_column(Boolean, default=False)
@@ -93,7 +93,7 @@ class BatchItem(Base):
 def create_batch(
     session: Session, map_id: UUID, source: BatchSource, params: dict[str, Any] | None = None
 ) -> Job:
-    """A queued batch without items."""
+    """Queue a batch without items."""
     job = Job(
         id=new_id(),
         map_id=map_id,
@@ -108,7 +108,7 @@ def create_batch(
 
 
 def add_batch_items(session: Session, job: Job, items: Iterable[dict[str, Any]]) -> None:
-    """All the batch's items at once: columns of BatchItem without `job_id` and `number`."""
+    """Add all items of the batch: columns of BatchItem without `job_id` and `number`."""
     rows = (
         {
             "job_id": job.id,
@@ -125,9 +125,9 @@ def add_batch_items(session: Session, job: Job, items: Iterable[dict[str, Any]])
         for number, item in enumerate(items, start=1)
     )
     total = 0
-    while some := list(islice(rows, ITEMS_PER_STATEMENT)):
-        session.execute(insert(BatchItem), some)
-        total += len(some)
+    while chunk := list(islice(rows, ITEMS_PER_STATEMENT)):
+        session.execute(insert(BatchItem), chunk)
+        total += len(chunk)
     job.params = {**job.params, "listed": True}
     job.progress_total = total
     job.stage = "store"
@@ -135,12 +135,12 @@ def add_batch_items(session: Session, job: Job, items: Iterable[dict[str, Any]])
 
 
 def has_batch_items(job: Job) -> bool:
-    """Is it a batch that has its items?"""
+    """Return whether the job is a batch whose items were listed."""
     return job.kind == JobKind.BATCH and bool(job.params["listed"])
 
 
 def next_queued_items(session: Session, job_id: UUID, limit: int) -> list[BatchItem]:
-    """The next items to bring in."""
+    """Return the next items to import."""
     return list(
         session.scalars(
             select(BatchItem)
@@ -154,17 +154,17 @@ def next_queued_items(session: Session, job_id: UUID, limit: int) -> list[BatchI
 def list_batch_items(
     session: Session, job_id: UUID, states: list[JobState], limit: int, after: int
 ) -> list[BatchItem]:
-    """In their order, up to `limit`, behind the number `after`; no states mean "any"."""
-    wanted = select(BatchItem).where(BatchItem.job_id == job_id, BatchItem.number > after)
+    """List items in their order, up to `limit`, with numbers above `after`; empty `states`: all."""
+    statement = select(BatchItem).where(BatchItem.job_id == job_id, BatchItem.number > after)
     if states:
-        wanted = wanted.where(BatchItem.state.in_(states))
-    return list(session.scalars(wanted.order_by(BatchItem.number).limit(limit)))
+        statement = statement.where(BatchItem.state.in_(states))
+    return list(session.scalars(statement.order_by(BatchItem.number).limit(limit)))
 
 
 def count_queued_photos(session: Session, limit: int) -> int:
-    """How many photos the extractors have before them, counted up to `limit`.
+    """Count the photos that are queued for the extractors, up to `limit`.
 
-    Those that wait for a vocabulary are not: more of them may be what makes one.
+    Photos that wait for a vocabulary don't count: a fit may need more of them.
     """
     waiting = (
         select(Job.id)
@@ -181,7 +181,7 @@ def count_queued_photos(session: Session, limit: int) -> int:
 
 
 def sync_item_states(session: Session, job: Job) -> Counter[JobState]:
-    """Let items end as their photos' jobs have ended, and note the progress; counts by state."""
+    """End items whose photos' jobs have ended, update the progress; return the counts by state."""
     ended = session.execute(
         select(BatchItem.number, Job.state, Job.error)
         .outerjoin(Job, Job.id == BatchItem.photo_job_id)
@@ -198,32 +198,32 @@ def sync_item_states(session: Session, job: Job) -> Counter[JobState]:
                 {
                     "job_id": job.id,
                     "number": number,
-                    # A job goes when its photo was deleted.
+                    # A job is deleted with its photo.
                     "state": state or JobState.CANCELLED,
                     "error": error if state == JobState.FAILED else None,
                 }
                 for number, state, error in ended
             ],
         )
-    counted = session.execute(
+    rows = session.execute(
         select(BatchItem.state, func.count())
         .where(BatchItem.job_id == job.id)
         .group_by(BatchItem.state)
     )
-    counts = Counter({JobState(state): count for state, count in counted})
+    counts = Counter({JobState(state): count for state, count in rows})
     update_batch_progress(job, counts)
     return counts
 
 
 def update_batch_progress(job: Job, counts: Counter[JobState]) -> None:
-    """What `progress` says: searchable photos, failed ones, all."""
+    """Set the job's progress: searchable, failed and all photos."""
     job.progress_done = counts[JobState.SUCCEEDED]
     job.progress_failed = counts[JobState.FAILED]
     job.progress_total = counts.total()
 
 
 def summarise_batch(session: Session, job: Job, counts: Counter[JobState]) -> dict[str, Any]:
-    """What an ended batch has come to, in photos; `ignored` counts an archive's other members."""
+    """Return the result of an ended batch, as photo counts; `ignored` counts other members."""
     already_there = session.scalar(
         select(func.count())
         .select_from(BatchItem)
@@ -244,8 +244,10 @@ def summarise_batch(session: Session, job: Job, counts: Counter[JobState]) -> di
 
 
 def is_waiting_for_vocabulary(session: Session, job: Job) -> bool:
-    """Do all running items wait for a vocabulary that the map still lacks? Call it under the map's
-    lock: whoever brings one wakes what waits by then."""
+    """Return whether all running items wait for a vocabulary that the map does not have.
+
+    The caller holds the map's lock, so that a vocabulary added later wakes the batch.
+    """
     if active_generation(session, job.map_id) is not None:
         return False
     other = (
@@ -262,7 +264,7 @@ def is_waiting_for_vocabulary(session: Session, job: Job) -> bool:
 
 
 def lock_batch(session: Session, job: Job, token: UUID) -> Job | None:
-    """The batch if it still carries the token, both rows locked in the order of everyone."""
+    """Lock the map, then the batch; return the batch if it is still under the token."""
     lock_map(session, job.map_id)
     return session.scalar(
         select(Job)

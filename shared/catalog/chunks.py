@@ -1,7 +1,7 @@
-"""Chunks and descriptor rows: which photo's descriptor is which row of which file.
+"""Chunks and descriptors: which row of which chunk file is the descriptor of a photo.
 
-A chunk object is never rewritten. Merging writes a new one in the same slot and supersedes the
-old; a row that no descriptor points at is dead and is dropped at the next merging.
+A chunk object is immutable. Compaction writes a new chunk in the same slot and supersedes the old
+ones. A row that no descriptor refers to is dead; the next compaction drops it.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ from shared.catalog.generations import Generation
 from shared.catalog.photos import Photo, PhotoFilterValues, PhotoRole, is_geotagged
 from shared.ids import new_id
 
-# Rows that are counted whenever someone asks: some 10 ms.
+# Up to this number, rows are counted per request, which takes about 10 ms.
 MAX_EXACT_COUNT = 10_000
 
-IDS_PER_QUERY = 1000  # photos named in one statement
+IDS_PER_QUERY = 1000  # maximum of photo ids in one statement
 
 
 class Chunk(Base):
-    """One immutable `.npy` file of `rows` descriptors, float32, with its hash."""
+    """An immutable `.npy` file of `rows` float32 descriptors, with its SHA-256."""
 
     __tablename__ = "chunks"
 
@@ -70,7 +70,7 @@ class Chunk(Base):
 
 
 class Descriptor(Base):
-    """Where the one descriptor of a photo in a generation lies: chunk and row (from 0)."""
+    """The location of a photo's descriptor in a generation: chunk and row (from 0)."""
 
     __tablename__ = "descriptors"
 
@@ -90,21 +90,24 @@ class Descriptor(Base):
 def find_descriptor(
     session: Session, generation_id: UUID, photo_id: UUID
 ) -> tuple[Descriptor, Chunk] | None:
-    """The photo's descriptor in the generation and the chunk that holds it."""
-    found = session.execute(
+    """Return the photo's descriptor in the generation and its chunk; None if there is none."""
+    row = session.execute(
         select(Descriptor, Chunk)
         .join(Chunk, Chunk.id == Descriptor.chunk_id)
         .where(Descriptor.generation_id == generation_id, Descriptor.photo_id == photo_id)
     ).one_or_none()
-    return None if found is None else (found[0], found[1])
+    return None if row is None else (row[0], row[1])
 
 
 def find_descriptor_rows(
     session: Session, generation_id: UUID, photo_ids: Sequence[UUID]
 ) -> dict[str, list[tuple[int, UUID]]]:
-    """Where the photos' descriptors in the generation lie: (row, photo) by row, of each chunk's
-    object; photos without one are left out."""
-    found: dict[str, list[tuple[int, UUID]]] = {}
+    """Locate the descriptors of photos in the generation; photos without one are left out.
+
+    Returns:
+        Object key of a chunk -> (row, photo id) of its descriptors, sorted by row.
+    """
+    rows_by_key: dict[str, list[tuple[int, UUID]]] = {}
     for begin in range(0, len(photo_ids), IDS_PER_QUERY):
         located = session.execute(
             select(Chunk.object_key, Descriptor.row, Descriptor.photo_id)
@@ -115,14 +118,14 @@ def find_descriptor_rows(
             )
         )
         for object_key, row, photo_id in located:
-            found.setdefault(object_key, []).append((row, photo_id))
-    for rows in found.values():
+            rows_by_key.setdefault(object_key, []).append((row, photo_id))
+    for rows in rows_by_key.values():
         rows.sort()
-    return found
+    return rows_by_key
 
 
 def list_live_chunks(session: Session, generation_id: UUID) -> list[Chunk]:
-    """The chunks that make up the generation now, in slot order."""
+    """List the chunks of the generation that are not superseded, by slot."""
     return list(
         session.scalars(
             select(Chunk)
@@ -133,39 +136,42 @@ def list_live_chunks(session: Session, generation_id: UUID) -> list[Chunk]:
 
 
 def list_live_rows(session: Session, chunk_id: UUID) -> list[tuple[int, UUID]]:
-    """(row, photo) of the chunk's rows that belong to live photos, by row."""
-    return [(row, facts.photo_id) for row, facts in list_live_filter_values(session, chunk_id)]
+    """List (row, photo id) of the chunk's rows that belong to live photos, by row."""
+    return [(row, values.photo_id) for row, values in list_live_filter_values(session, chunk_id)]
 
 
 def list_live_filter_values(
     session: Session, chunk_id: UUID
 ) -> list[tuple[int, PhotoFilterValues]]:
-    """(row, what search knows of its photo) of the chunk's live rows, by row."""
-    found = session.execute(
+    """List (row, filter values of its photo) of the chunk's live rows, by row."""
+    rows = session.execute(
         select(Descriptor.row, *PhotoFilterValues.COLUMNS)
         .join(Photo, Photo.id == Descriptor.photo_id)
         .where(Descriptor.chunk_id == chunk_id, Photo.deleted_at.is_(None))
         .order_by(Descriptor.row)
     )
-    return [(row[0], PhotoFilterValues(*row[1:])) for row in found]
+    return [(row[0], PhotoFilterValues(*row[1:])) for row in rows]
 
 
 def count_described(session: Session, generation_id: UUID, role: PhotoRole | None = None) -> int:
-    """How many live photos, of one role or of any, have a descriptor in the generation."""
-    counted = (
+    """Count the live photos, of one role or of all, with a descriptor in the generation."""
+    statement = (
         select(func.count())
         .select_from(Descriptor)
         .join(Photo, Photo.id == Descriptor.photo_id)
         .where(Descriptor.generation_id == generation_id, Photo.deleted_at.is_(None))
     )
     if role is not None:
-        counted = counted.where(Photo.role == role)
-    return session.scalar(counted) or 0
+        statement = statement.where(Photo.role == role)
+    return session.scalar(statement) or 0
 
 
 def estimate_described(session: Session, generation_id: UUID) -> int:
-    """As `count_described`, for progress: beyond COUNTED_NOW the chunks' rows are added up, which
-    may hold some of photos that were deleted since they were merged last."""
+    """Count as `count_described`, or estimate, for progress.
+
+    Above MAX_EXACT_COUNT it is the sum of the chunks' rows, which may include rows of photos that
+    were deleted since the last compaction.
+    """
     rows = session.scalar(
         select(func.sum(Chunk.rows)).where(
             Chunk.generation_id == generation_id, Chunk.superseded_at.is_(None)
@@ -175,18 +181,18 @@ def estimate_described(session: Session, generation_id: UUID) -> int:
 
 
 def count_searchable(session: Session, generation_id: UUID) -> int:
-    """How many photos can be found in the generation."""
+    """Count the photos that searches of the generation can return."""
     return count_described(session, generation_id, PhotoRole.DATABASE)
 
 
 def count_geotagged(session: Session, generation_id: UUID, role: PhotoRole) -> int:
-    """How many live photos of a role have a descriptor in the generation and a known place."""
-    located = _select_geotagged(generation_id, role).subquery()
-    return session.scalar(select(func.count()).select_from(located)) or 0
+    """Count the live geotagged photos of a role with a descriptor in the generation."""
+    geotagged = _select_geotagged(generation_id, role).subquery()
+    return session.scalar(select(func.count()).select_from(geotagged)) or 0
 
 
 def has_geotagged(session: Session, generation_id: UUID, role: PhotoRole) -> bool:
-    """Whether there is one of those that `count_geotagged` counts."""
+    """Return whether `count_geotagged` is not 0."""
     return session.scalar(_select_geotagged(generation_id, role).limit(1)) is not None
 
 
@@ -204,9 +210,10 @@ def _select_geotagged(generation_id: UUID, role: PhotoRole) -> Select[UUID]:
 
 
 def allocate_slot(generation: Generation, rows: int, slot_rows: int) -> int:
-    """The slot that a new chunk of `rows` goes into, holding at most `slot_rows` in the end.
+    """Return the slot for a new chunk of `rows` rows, and open a new slot when it is full.
 
-    The caller holds the generation's lock.
+    A slot has at most `slot_rows` rows, unless a single chunk has more. The caller holds the
+    generation's lock.
     """
     if generation.open_slot_rows and generation.open_slot_rows + rows > slot_rows:
         generation.open_slot += 1

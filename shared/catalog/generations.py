@@ -1,9 +1,7 @@
-r"""Generations: one complete set of descriptors of a map, made by one extractor spec.
+r"""Generations (complete sets of a map's descriptors, by one extractor spec) and their evaluations.
 
-BUILDING --complete, loaded by search--> ACTIVE --another is switched in--> RETIRED --grace--> gone
-   \--its job is cancelled or fails--> ABANDONED --grace--> gone
-
-Evaluations: how often the right place came first, measured on a generation of a live map.
+BUILDING --complete, loaded by search--> ACTIVE --another is activated--> RETIRED --grace--> deleted
+   \--its job is cancelled or fails--> ABANDONED --grace--> deleted
 """
 
 from __future__ import annotations
@@ -23,17 +21,17 @@ from shared.ids import new_id
 
 class GenerationState(StrEnum):
     BUILDING = "building"  # photos are being described into it; not searched yet
-    ACTIVE = "active"  # the one that answers
-    RETIRED = "retired"  # answered until another was switched in; removed after a grace period
-    ABANDONED = "abandoned"  # never became complete; removed after a grace period
+    ACTIVE = "active"  # serves the map's searches
+    RETIRED = "retired"  # was active until another was activated; deleted after a grace period
+    ABANDONED = "abandoned"  # never became complete; deleted after a grace period
 
 
 class Generation(Journaled, Base):
-    """`spec` is everything that decides a descriptor's value; rows of two specs never mix.
+    """A generation. `spec` has everything that determines a descriptor's value.
 
-    `calibration` is what its evaluations have learnt of its scores (`shared.evaluation`),
-    `word_weights` what the map's places have taught of its words (`shared.word_weights.record`).
-    New chunks go into `open_slot`, which holds `open_slot_rows` rows so far.
+    `calibration` is that of its scores, fitted by evaluations (`shared.evaluation`); `word_weights`
+    is a record of `shared.word_weights.record`. New chunks go into `open_slot`, which has
+    `open_slot_rows` rows so far.
     """
 
     __tablename__ = "generations"
@@ -57,21 +55,22 @@ class Generation(Journaled, Base):
     created_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())
     activated_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
     ended_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
-    # The map's version, and the time, at which every photo was in it for the first time: search
-    # workers have to have loaded that before it is switched in.
+    # The map's version and the time at which it first had every photo: search workers must have
+    # loaded that version before it is activated.
     complete_version: Mapped[int | None] = mapped_column(BigInteger)
     complete_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
 
     @property
     def pca_from(self) -> int | None:
-        """The dimension of its descriptors before PCA; None without. Known of a generation whose
-        whitening is gone, too.
+        """Dimension of its descriptors before PCA; None without PCA.
+
+        Taken from the spec, so also known after the whitening was deleted.
         """
         whitening = self.spec.get("whitening")
         return int(whitening["from_dimension"]) if whitening else None
 
     __table_args__ = (
-        # One model change at a time: two would describe every photo three times over.
+        # One model change at a time: with two, each photo would be described three times.
         Index(
             "uq_generations_one_building",
             "map_id",
@@ -90,7 +89,7 @@ class Generation(Journaled, Base):
 
 
 def active_generation(session: Session, map_id: UUID) -> Generation | None:
-    """The generation that answers, if the map has one."""
+    """Return the map's active generation, if any."""
     return session.scalar(
         select(Generation).where(
             Generation.map_id == map_id, Generation.state == GenerationState.ACTIVE
@@ -99,7 +98,7 @@ def active_generation(session: Session, map_id: UUID) -> Generation | None:
 
 
 def building_generation(session: Session, map_id: UUID) -> Generation | None:
-    """The generation being made, if there is one."""
+    """Return the map's generation that is being built, if any."""
     return session.scalar(
         select(Generation).where(
             Generation.map_id == map_id, Generation.state == GenerationState.BUILDING
@@ -108,21 +107,21 @@ def building_generation(session: Session, map_id: UUID) -> Generation | None:
 
 
 def get_generation(session: Session, map_id: UUID, generation_id: UUID) -> Generation:
-    """A generation of the map; 404 when there is none."""
-    found = session.scalar(
+    """Return a generation of the map; NotFound (`generation_not_found`)."""
+    generation = session.scalar(
         select(Generation).where(Generation.id == generation_id, Generation.map_id == map_id)
     )
-    if found is None:
+    if generation is None:
         raise NotFound(
             "generation_not_found",
             f"There is no generation {generation_id} in this map.",
             generation_id=str(generation_id),
         )
-    return found
+    return generation
 
 
 def lock_generation(session: Session, generation_id: UUID) -> Generation:
-    """The generation's row as it is now, locked until the transaction ends."""
+    """Lock the generation's row until the end of the transaction, and return it refreshed."""
     return session.scalars(
         select(Generation)
         .where(Generation.id == generation_id)
@@ -132,7 +131,7 @@ def lock_generation(session: Session, generation_id: UUID) -> Generation:
 
 
 def list_generations(session: Session, map_id: UUID) -> list[Generation]:
-    """The map's generations, newest first."""
+    """List the map's generations, newest first."""
     return list(
         session.scalars(
             select(Generation).where(Generation.map_id == map_id).order_by(Generation.id.desc())
@@ -141,7 +140,7 @@ def list_generations(session: Session, map_id: UUID) -> list[Generation]:
 
 
 class Evaluation(Base):
-    """The figures of one evaluation. `searchable` is how many photos could be found then."""
+    """The metrics of an evaluation; `searchable` is the number of searchable photos back then."""
 
     __tablename__ = "evaluations"
 
@@ -163,15 +162,15 @@ class Evaluation(Base):
 def list_evaluations(
     session: Session, map_id: UUID, limit: int, before: UUID | None = None
 ) -> list[Evaluation]:
-    """Newest first, up to `limit`, older than `before`."""
-    wanted = select(Evaluation).where(Evaluation.map_id == map_id)
+    """List the map's evaluations, newest first, up to `limit`; `before` is the page's cursor."""
+    statement = select(Evaluation).where(Evaluation.map_id == map_id)
     if before is not None:
-        wanted = wanted.where(Evaluation.id < before)
-    return list(session.scalars(wanted.order_by(Evaluation.id.desc()).limit(limit)))
+        statement = statement.where(Evaluation.id < before)
+    return list(session.scalars(statement.order_by(Evaluation.id.desc()).limit(limit)))
 
 
 def latest_evaluation(session: Session, generation_id: UUID) -> Evaluation | None:
-    """The generation's newest one."""
+    """Return the generation's newest evaluation, if any."""
     return session.scalar(
         select(Evaluation)
         .where(Evaluation.generation_id == generation_id)

@@ -1,15 +1,15 @@
-"""Idempotency keys: which call was made under a key, and what it was answered.
+"""Idempotency keys: the request made with a key, and its stored response.
 
 ```
-            claim_key: lease + token              keep_answer, the token still its own
+            claim: lease + token                  store_response, with a valid token
   (no row) ───────────────────────────> IN FLIGHT ─────────────────────────────────────> ANSWERED
      ^                                   │  │  ^                                            │
-     │  release_key: no effect was made  │  │  │ claim_key: the lease has expired,          │
-     ├───────────────────────────────────┘  └──┘ its process died; a fresh token            │
+     │  release: it had no effect        │  │  │ claim: the lease has expired, because      │
+     ├───────────────────────────────────┘  └──┘ its process died; a new token              │
      └──────────────────────────────────────────────────────────────── expires_at ──────────┘
 ```
-The answer is kept in the transaction that makes the effect, and only under the token: of two that
-hold a key after each other, one at most commits.
+The response is stored in the transaction of the request's effects, and only with a valid token: of
+two processes that claim a key one after the other, at most one commits.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ IN_USE_RETRY_SECONDS = 1
 
 
 class IdempotencyRecord(Base):
-    """One call under a key. `scope` is whose key it is: two callers may choose the same one."""
+    """A request with a key. `scope` is the caller: two callers may use the same key."""
 
     __tablename__ = "idempotency_keys"
 
@@ -41,7 +41,7 @@ class IdempotencyRecord(Base):
     fingerprint: Mapped[str] = mapped_column(String(64))
     token: Mapped[UUID] = mapped_column(Uuid, index=True)
     lease_until: Mapped[datetime] = mapped_column(UtcDateTime)
-    status: Mapped[int | None] = mapped_column(Integer)  # of the answer; null while in flight
+    status: Mapped[int | None] = mapped_column(Integer)  # of the response; null while in flight
     headers: Mapped[dict[str, str] | None] = mapped_column(JsonValue)
     body: Mapped[str | None] = mapped_column(Text)
     created_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())
@@ -55,17 +55,19 @@ class IdempotencyRecord(Base):
 
 @dataclass(frozen=True, slots=True)
 class RequestIdentity:
-    """What tells a repeated call from another one under the same key."""
+    """Identifies a request, to tell a repetition from another request with the same key."""
 
     scope: str
     key: str
     call: str
     fingerprint: str
-    """SHA-256 of everything that the call says, in hexadecimal."""
+    """SHA-256 of the whole request, in hexadecimal."""
 
 
 @dataclass(frozen=True, slots=True)
 class StoredResponse:
+    """The response of a request, to be repeated."""
+
     status: int
     headers: dict[str, str]
     body: str
@@ -75,38 +77,48 @@ class StoredResponse:
 def claim_idempotency_key(
     session: Session, request: RequestIdentity, *, lease_seconds: float, life_seconds: float
 ) -> UUID | StoredResponse:
-    """A token under which the call may be done, or the answer that it was given already.
+    """Claim the key for a request.
 
-    Raises Unprocessable (`idempotency_key_reused`) when another call was made under the key, and
-    Conflict (`idempotency_key_in_use`) while the same call is under way.
+    Args:
+        session: The session of a write transaction.
+        request: The request.
+        lease_seconds: Time after which another process may take the request over.
+        life_seconds: Time for which the key and its response are stored.
+
+    Returns:
+        A token with which the request may be executed, or its stored response.
+
+    Raises:
+        Unprocessable: `idempotency_key_reused`: another request was made with the key.
+        Conflict: `idempotency_key_in_use`: the same request is being executed.
     """
     while True:
         token = _insert(session, request, lease_seconds, life_seconds)
         if token is not None:
             return token
-        found = session.execute(
+        result = session.execute(
             select(
                 IdempotencyRecord,
                 (IdempotencyRecord.expires_at <= db_now()).label("expired"),
-                (IdempotencyRecord.lease_until > db_now()).label("held"),
+                (IdempotencyRecord.lease_until > db_now()).label("is_leased"),
             )
             .where(IdempotencyRecord.scope == request.scope, IdempotencyRecord.key == request.key)
             .with_for_update()
             .execution_options(populate_existing=True)
         ).one_or_none()
-        if found is None:
-            continue  # given back since the insert met it
-        row, expired, held = found
+        if result is None:
+            continue  # released since the insert failed
+        row, expired, is_leased = result
         if not expired:
             if (row.call, row.fingerprint) != (request.call, request.fingerprint):
                 raise Unprocessable(
                     "idempotency_key_reused",
-                    "Another call was made with this Idempotency-Key. Take a new key for each "
-                    "call, and the same one only to repeat it.",
+                    "This Idempotency-Key was used for another request. Use a new key for each "
+                    "request, and the same key only to repeat one.",
                 )
             if row.status is not None:
                 return StoredResponse(row.status, row.headers or {}, row.body or "")
-            if held:
+            if is_leased:
                 raise key_in_use_error()
         row.call, row.fingerprint = request.call, request.fingerprint
         row.token = new_id()
@@ -118,20 +130,24 @@ def claim_idempotency_key(
 
 
 def store_response(session: Session, token: UUID, response: StoredResponse) -> None:
-    """The call's answer from now on. Conflict (`idempotency_key_in_use`), which must undo the
-    caller's transaction, when the lease has expired and someone else does the call."""
-    kept = session.execute(
+    """Store the response of the request.
+
+    Raises:
+        Conflict: `idempotency_key_in_use`: the lease expired and another process executes the
+            request. The caller's transaction must be rolled back.
+    """
+    updated = session.execute(
         update(IdempotencyRecord)
         .where(IdempotencyRecord.token == token)
         .values(status=response.status, headers=response.headers, body=response.body)
         .execution_options(synchronize_session=False)
     )
-    if not affected_rows(kept):
+    if not affected_rows(updated):
         raise key_in_use_error()
 
 
 def release_idempotency_key(session: Session, token: UUID) -> None:
-    """The call has had no effect: it may be made again at once."""
+    """Release the key of a request that had no effect, so that it may be repeated at once."""
     session.execute(
         delete(IdempotencyRecord).where(
             IdempotencyRecord.token == token, IdempotencyRecord.status.is_(None)
@@ -142,24 +158,24 @@ def release_idempotency_key(session: Session, token: UUID) -> None:
 def key_in_use_error() -> Conflict:
     return Conflict(
         "idempotency_key_in_use",
-        "The same call is under way with this Idempotency-Key. Repeat it a little later.",
+        "A request with this Idempotency-Key is still being processed. Repeat it a little later.",
         retry_after_seconds=IN_USE_RETRY_SECONDS,
     )
 
 
 def _insert(
-    session: Session, made: RequestIdentity, lease_seconds: float, life_seconds: float
+    session: Session, request: RequestIdentity, lease_seconds: float, life_seconds: float
 ) -> UUID | None:
-    """The new row's token; None when the key has a row."""
+    """Insert a row and return its token; None if the key already has a row."""
     token = new_id()
     try:
         with session.begin_nested():
             session.add(
                 IdempotencyRecord(
-                    scope=made.scope,
-                    key=made.key,
-                    call=made.call,
-                    fingerprint=made.fingerprint,
+                    scope=request.scope,
+                    key=request.key,
+                    call=request.call,
+                    fingerprint=request.fingerprint,
                     token=token,
                     lease_until=db_now_plus(lease_seconds),
                     expires_at=db_now_plus(life_seconds),

@@ -1,8 +1,9 @@
-"""The installation: which Placewise this catalog is, and where its objects lie.
+"""The installation: the catalog's id, and the object store that belongs to it.
 
-Every object belongs to one catalog: what it does not know is collected as an orphan. So the store
-carries the catalog's id (`shared.storage.ownership`), and the catalog remembers its bucket. A
-restored backup of the catalog has the id in it, and so finds the store to be its own.
+Objects that a catalog does not refer to are collected as orphans, so a store must belong to exactly
+one catalog. The store has a mark with the catalog's id (`shared.storage.ownership`), and the
+catalog stores its bucket. A restored backup of the catalog has the same id and still owns the
+store.
 """
 
 from __future__ import annotations
@@ -28,21 +29,21 @@ from shared.storage.folder import OWNER_MARK
 from shared.storage.open_store import open_store
 from shared.storage.ownership import Place, check_free, claim_store, place_of
 
-SAMPLE_KEYS = 20  # of each table
-REBUILDING = -1  # of `Installation.journal_sequence`
+SAMPLE_KEYS = 20  # per table
+REBUILDING = -1  # special value of `Installation.journal_sequence`
 
 
 class Installation(Base):
-    """The one row: `id` is made at the first start and never changes."""
+    """The table's single row; `id` is generated at the first start and never changes."""
 
     __tablename__ = "installation"
 
     number: Mapped[int] = mapped_column(Integer, primary_key=True, autoincrement=False, default=1)
     id: Mapped[UUID] = mapped_column(Uuid, default=new_id)
-    # The endpoint and the name of the bucket that holds the objects; null: they lie in a folder.
+    # Endpoint and name of the bucket with the objects; null if they are in a folder.
     bucket: Mapped[Place | None] = mapped_column(JsonValue)
-    # The number of the last journal segment that this catalog has written (`shared.journal`), or
-    # REBUILDING while `placewise rebuild-catalog` has not finished.
+    # Number of the last journal segment that this catalog has written (`shared.journal`), or
+    # REBUILDING until `placewise rebuild-catalog` has finished.
     journal_sequence: Mapped[int] = mapped_column(BigInteger, default=0, server_default="0")
     created_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())
 
@@ -50,25 +51,26 @@ class Installation(Base):
 
 
 def get_or_create_installation(session: Session) -> Installation:
-    """The catalog's row, made on first use."""
-    found: Installation | None = session.scalar(select(Installation))
-    if found is not None:
-        return found
+    """Return the installation's row, created on first use."""
+    existing: Installation | None = session.scalar(select(Installation))
+    if existing is not None:
+        return existing
     try:
         with session.begin_nested():
-            made = Installation()
-            session.add(made)
+            created = Installation()
+            session.add(created)
             session.flush()
-    except IntegrityError:  # another process made it between the two statements
+    except IntegrityError:  # another process created it between the two statements
         return session.scalars(select(Installation)).one()
-    return made
+    return created
 
 
 def open_installation_store(catalog: Catalog, settings: Settings, *, exclusive: bool) -> OwnedStore:
-    """The object store of the settings, once it is sure to be this catalog's own.
+    """Open the object store of the settings after checking that it belongs to this catalog.
 
-    Raises Misconfigured as `open_store` and `claim_store` do, and Unavailable for a bucket that
-    can't be used now.
+    Raises:
+        Misconfigured: As `open_store` and `claim_store` raise.
+        Unavailable: The bucket can't be used right now.
     """
     store = open_store(settings, exclusive=exclusive)
     with catalog.write() as session:
@@ -78,7 +80,7 @@ def open_installation_store(catalog: Catalog, settings: Settings, *, exclusive: 
         installation.id,
         installation.bucket,
         settings.placewise_home / "objects",
-        lambda: _some_named_keys(catalog),
+        lambda: _sample_referenced_keys(catalog),
         settings.import_prefix,
     )
     if place != installation.bucket:
@@ -88,29 +90,34 @@ def open_installation_store(catalog: Catalog, settings: Settings, *, exclusive: 
 
 
 def check_before_new_catalog(catalog: Catalog, settings: Settings) -> None:
-    """Refuse to create an SQLite catalog beside objects of another one, before its file exists: a
-    restored file would otherwise meet the new one. Misconfigured as `open_installation_store`."""
+    """Refuse to create an SQLite catalog for a store that has objects of another catalog.
+
+    Checked before the file exists, because it would be in the way of a restored one.
+
+    Raises:
+        Misconfigured: As `open_installation_store` raises.
+    """
     file = Path(catalog.url.database or "") if catalog.is_sqlite else None
     if file is not None and (not file.exists() or file.stat().st_size == 0):
         check_free(open_store(settings, exclusive=False), settings.import_prefix)
 
 
 def adopt_store(catalog: Catalog, store: OwnedStore) -> None:
-    """Make this catalog the owner of the store, whoever owned it."""
+    """Make this catalog the owner of the store, also if another catalog owns it."""
     with catalog.write() as session:
         installation = get_or_create_installation(session)
         store.write_note(OWNER_MARK, str(installation.id).encode())
         installation.bucket = place_of(store)
 
 
-def _some_named_keys(catalog: Catalog) -> list[str]:
-    """A sample of the keys that the catalog's rows name; [] for a catalog that names none."""
-    found: list[str] = []
+def _sample_referenced_keys(catalog: Catalog) -> list[str]:
+    """Return a sample of the object keys that the catalog's rows refer to."""
+    sample: list[str] = []
     with catalog.read() as session:
         for table in (Photo, Chunk, Vocabulary, StoredWhitening, Model):
-            named = table.object_key.is_not(None) & (table.object_key != "")
-            keys = select(table.object_key).where(named)
+            has_object = table.object_key.is_not(None) & (table.object_key != "")
+            keys = select(table.object_key).where(has_object)
             if table is Photo:
                 keys = keys.where(Photo.deleted_at.is_(None))
-            found += filter(None, session.scalars(keys.limit(SAMPLE_KEYS)))
-    return found
+            sample += filter(None, session.scalars(keys.limit(SAMPLE_KEYS)))
+    return sample

@@ -1,24 +1,24 @@
-"""The jobs table and its state machine.
+"""The jobs table: kinds, priorities, state machine and queries.
 
 ```
-            claim (lease + token)                finish, the token still its own
+            claim (lease + token)                succeed, with a valid token
   QUEUED ───────────────────────────> RUNNING ───────────────────────────────────> SUCCEEDED
-   ^  ^ │                              │ │ │ └──── the photo or the request is at fault ──> FAILED
-   │  │ │                              │ │ └── release: a slice is done, or what it needs is away
-   │  │ │ cancel                       │ │     (no attempt is counted) ──> QUEUED, or RUNNING
-   │  │ └─────────> CANCELLED <────────┘ │     without a lease for a sliced job
+   ^  ^ │                              │ │ │ └──── the photo or the request is invalid ───> FAILED
+   │  │ │                              │ │ └── release: a slice ended, or a dependency is
+   │  │ │ cancel                       │ │     unavailable (no attempt counted) ──> QUEUED, or
+   │  │ └─────────> CANCELLED <────────┘ │     RUNNING without a lease for a checkpointed job
    │  │                 │    cancel      │
    │  └──── retry ──────┴──── FAILED     │ the lease expires: the worker died
    │                                     v
-   ├──── nothing that could harm the worker had begun: as it was
-   └──── in a batch: marked `alone`, tried again one by one, no attempt counted
+   ├──── not started (no step that could crash the worker): unchanged
+   └──── in a batch: marked `alone`, retried one by one, no attempt counted
          alone: attempts + 1; at `max_attempts` ──────────────────────────────────> FAILED
 ```
 
-A job is claimable when it is unfinished, no one holds its lease, it waits for nothing
-(`waiting_for`) and its time has come (`run_after`). Every claim writes a fresh `lease_token`; a
-worker may only finish what still carries its token, so one that was taken over can compute but
-never commit. A batch's jobs share one token.
+A job is claimable when it is unfinished, has no lease, waits for nothing (`waiting_for`) and
+`run_after` has passed. Every claim writes a new `lease_token` (a fencing token). A worker may only
+finish jobs that still have its token: after another worker took them over, it can't commit. The
+jobs of a batch share one token.
 """
 
 from __future__ import annotations
@@ -43,9 +43,9 @@ from shared.telemetry.tracing import (
 
 
 class JobState(StrEnum):
-    QUEUED = "queued"  # waiting for a worker, or for what `waiting_for` names
-    RUNNING = "running"  # a worker holds its lease, or it rests between two slices
-    SUCCEEDED = "succeeded"  # done: what it promised can be seen
+    QUEUED = "queued"  # waits for a worker, or for what `waiting_for` names
+    RUNNING = "running"  # a worker has its lease, or it pauses between two slices
+    SUCCEEDED = "succeeded"  # completed: its effect is visible
     FAILED = "failed"  # ended with `error`; may be retried
     CANCELLED = "cancelled"  # ended on request; may be retried
 
@@ -57,25 +57,23 @@ class JobKind(StrEnum):
     INDEX = "index"  # describe a stored photo into the active generation
     REINDEX = "reindex"  # describe a stored photo into one generation that is being built
     DESCRIBE = "describe"  # describe a query photo that is not stored
-    COMPARE = "compare"  # look closely at what a search has found (`shared.search_api.comparison`)
-    FIT = "fit"  # learn a vocabulary from the map's photos and switch to it
+    COMPARE = "compare"  # compare a query with its search results (`shared.search_api.comparison`)
+    FIT = "fit"  # fit a vocabulary on the map's photos and switch to it
     IMPORT = "import_vocabulary"  # check a vocabulary file and switch to it
     SWITCH = "switch"  # switch to a vocabulary that the map already has
     PCA = "pca"  # fit PCA whitening on the map's descriptors and switch to shorter ones
-    ADD_MODEL = "add_model"  # check a checkpoint and keep it as a model, for any map
-    EVALUATE = "evaluate"  # ask the map about photos whose place is known, and count
-    WORD_WEIGHTS = "word_weights"  # learn which words of its vocabulary tell its places apart
-    BATCH = (
-        "batch"  # bring in many photos; each has a job of its own (`shared.catalog.batch_items`)
-    )
+    ADD_MODEL = "add_model"  # check a checkpoint and register it as a model, for any map
+    EVALUATE = "evaluate"  # search the map with photos whose place is known; compute recall
+    WORD_WEIGHTS = "word_weights"  # fit weights of the words of the map's vocabulary
+    BATCH = "batch"  # import many photos, each with its own job (`shared.catalog.batch_items`)
 
 
 MODEL_CHANGE_JOBS = (JobKind.FIT, JobKind.IMPORT, JobKind.SWITCH, JobKind.PCA)
 
-# Someone waits for their result, which is kept for QUERY_TTL_SECONDS.
+# A client waits for their result, which is stored for QUERY_TTL_SECONDS.
 QUERY_JOBS = (JobKind.DESCRIBE, JobKind.COMPARE)
 
-# Who takes what: extractors need photos and a backbone, the steward only the search tier.
+# Extractors run the jobs that need photos and a backbone, the steward those that need only search.
 EXTRACTOR_JOBS = (
     JobKind.INDEX,
     JobKind.REINDEX,
@@ -85,38 +83,38 @@ EXTRACTOR_JOBS = (
 )
 STEWARD_JOBS = (JobKind.EVALUATE, JobKind.WORD_WEIGHTS, JobKind.BATCH)
 
-# Done in slices: between two of them they are running, and no one holds their lease.
+# Run in slices: between two slices they are `running` without a lease.
 CHECKPOINTED_JOBS = (*MODEL_CHANGE_JOBS, JobKind.BATCH)
 
-# Claimed one at a time: each is as much work as a batch, or changes what the next one finds.
+# Claimed one at a time: each is as much work as a batch, or changes the input of the next one.
 SINGLE_CLAIM_JOBS = (*MODEL_CHANGE_JOBS, JobKind.ADD_MODEL, JobKind.COMPARE)
 
 
 class Priority(IntEnum):
-    """Higher goes first; within one priority, older goes first."""
+    """Higher is claimed first; within one priority, older is claimed first."""
 
-    QUERY = 100  # someone waits for the answer
+    QUERY = 100  # a client waits for the result
     UPLOAD = 50
-    BATCH = 40  # its photos, too: one upload does not wait for thousands
+    BATCH = 40  # also of its photos, so that a single upload does not wait for thousands
     MODEL_CHANGE = 20
     REINDEX = 10
     EVALUATION = 5
 
 
 class WaitingFor(StrEnum):
-    VOCABULARY = "vocabulary"  # the map's extractor needs one and the map has none yet
+    VOCABULARY = "vocabulary"  # the map's extractor needs one, and the map has none yet
     DESCRIPTORS = "descriptors"  # every photo has to be described into the new generation
     SEARCH = "search"  # every live search worker has to load the new generation
-    DISK_SPACE = "disk_space"  # a batch: the disk or the bucket has no room for its photos
+    DISK_SPACE = "disk_space"  # a batch: the disk or the bucket is full
 
 
 def _ready_condition(state: Any, lease_token: Any, waiting_for: Any) -> Condition:
-    """What `claimable` asks of every row: indexes of such rows serve claims."""
+    """The time-independent part of `claimable_condition`, for partial indexes."""
     return and_(state.in_(UNFINISHED_STATES), lease_token.is_(None), waiting_for.is_(None))
 
 
 class Job(Base):
-    """One thing to do. See the module's docstring for `state`, `attempts` and the lease."""
+    """A job. See the module's docstring for `state`, `attempts` and the lease."""
 
     __tablename__ = "jobs"
 
@@ -130,7 +128,7 @@ class Job(Base):
     params: Mapped[dict[str, Any]] = mapped_column(JsonValue, default=dict)
     stage: Mapped[str | None] = mapped_column(String(30))
     waiting_for: Mapped[str | None] = mapped_column(String(30))
-    # The names of those that `waiting_for` waits for, once that takes long.
+    # Names of the search workers that a job waits for, once that takes long.
     awaited: Mapped[list[str] | None] = mapped_column(JsonValue)
     progress_done: Mapped[int] = mapped_column(Integer, default=0)
     progress_total: Mapped[int] = mapped_column(Integer, default=1)
@@ -148,14 +146,14 @@ class Job(Base):
     created_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())
     started_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
     finished_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
-    # Of the request that made it, or of the job that did: logs and traces follow them.
+    # Of the request, or of the job, that created it: links logs and traces.
     request_id: Mapped[str | None] = mapped_column(
         String(MAX_REQUEST_ID_CHARACTERS), default=current_request_id
     )
     traceparent: Mapped[str | None] = mapped_column(String(55), default=current_traceparent)
 
     __table_args__ = (
-        # Claiming: whatever goes first, then the rest of its batch.
+        # Claiming: first the job with the highest priority, then the rest of its batch.
         partial_index(
             "ix_jobs_ready",
             priority.desc(),
@@ -174,7 +172,7 @@ class Job(Base):
         partial_index(
             "ix_jobs_waiting", "map_id", "waiting_for", "id", only=waiting_for.is_not(None)
         ),
-        # What is listed when no kind is asked for; a model change has very many others.
+        # Lists without a kind exclude reindex jobs, of which a model change has very many.
         partial_index("ix_jobs_map_listed", "map_id", "id", only=kind != JobKind.REINDEX),
         partial_index("ix_jobs_finished", "finished_at", only=finished_at.is_not(None)),
         partial_index("ix_jobs_asked", "created_at", only=kind.in_(QUERY_JOBS)),
@@ -186,7 +184,7 @@ class Job(Base):
 
 
 def claimable_condition(kinds: Sequence[JobKind] = EXTRACTOR_JOBS) -> Condition:
-    """True for jobs of these kinds that a worker may take now."""
+    """Condition for jobs of these kinds that a worker may claim now."""
     return and_(
         Job.state.in_(UNFINISHED_STATES),
         Job.kind.in_(kinds),
@@ -197,18 +195,18 @@ def claimable_condition(kinds: Sequence[JobKind] = EXTRACTOR_JOBS) -> Condition:
 
 
 def select_locked_job_ids(token: UUID) -> Select[UUID]:
-    """The ids of the jobs under the token, locked in the order in which everyone locks jobs.
+    """Select the ids of the jobs under the token and lock them, ordered by id.
 
-    The lease's thread and the transaction that finishes run at once: in two orders they would
-    wait for each other.
+    Every statement locks jobs in this order: the thread that extends the lease and the transaction
+    that finishes the jobs would deadlock otherwise.
     """
     return select(Job.id).where(Job.lease_token == token).order_by(Job.id).with_for_update()
 
 
 def get_job(session: Session, map_id: UUID, job_id: UUID, *, lock: bool = False) -> Job:
-    """A job of the map; 404 when there is none."""
-    wanted = select(Job).where(Job.id == job_id, Job.map_id == map_id)
-    job = session.scalar(wanted.with_for_update() if lock else wanted)
+    """Return a job of the map; NotFound (`job_not_found`)."""
+    statement = select(Job).where(Job.id == job_id, Job.map_id == map_id)
+    job = session.scalar(statement.with_for_update() if lock else statement)
     if job is None:
         raise NotFound(
             "job_not_found",
@@ -226,13 +224,24 @@ def list_jobs(
     limit: int,
     before: UUID | None,
 ) -> list[Job]:
-    """Newest first, up to `limit`, older than `before`; empty lists mean "any"."""
-    wanted = select(Job).where(Job.map_id == map_id)
+    """List jobs of the map, newest first.
+
+    Args:
+        session: The session.
+        map_id: The map.
+        states: States to list; empty for all.
+        kinds: Kinds to list; empty for all but reindex jobs.
+        limit: Page size.
+        before: Cursor: only jobs with a smaller id, which are older.
+    """
+    statement = select(Job).where(Job.map_id == map_id)
     if states:
-        wanted = wanted.where(Job.state.in_(states))
-    wanted = (
-        wanted.where(Job.kind.in_(kinds)) if kinds else wanted.where(Job.kind != JobKind.REINDEX)
+        statement = statement.where(Job.state.in_(states))
+    statement = (
+        statement.where(Job.kind.in_(kinds))
+        if kinds
+        else statement.where(Job.kind != JobKind.REINDEX)
     )
     if before is not None:
-        wanted = wanted.where(Job.id < before)
-    return list(session.scalars(wanted.order_by(Job.id.desc()).limit(limit)))
+        statement = statement.where(Job.id < before)
+    return list(session.scalars(statement.order_by(Job.id.desc()).limit(limit)))

@@ -1,15 +1,11 @@
-"""Maps: named databases of photos, each with its own extractor, active generation and version.
+"""Maps (named databases of photos), their search history and their statistics.
 
-A deleted map keeps its row, under a name that no one can ask for, until the steward has removed
-everything that belongs to it.
+A deleted map keeps its row, under a name that requests can't use, until the steward has purged
+everything that belongs to it. Searches are stored for SEARCH_HISTORY_DAYS.
 
-Searches: what was asked, for the history and the figures; kept for SEARCH_HISTORY_DAYS.
-
-How much a map holds, and how much was asked of it.
-
-A map of up to COUNTED_NOW photos, jobs and searches is counted whenever someone asks. Counting
-more would cost every caller seconds: the steward counts larger ones from time to time, and the
-answer says when it did.
+The statistics of a map with up to MAX_EXACT_COUNT photos, jobs and searches are counted for each
+request. Those of larger maps would take seconds: the steward caches them from time to time, and
+the response has the time of the count.
 """
 
 from __future__ import annotations
@@ -49,11 +45,11 @@ from shared.ids import new_id
 
 DEFAULT_MAP = "default"
 MAP_NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$"
-DELETED_NAME_PREFIX = "deleted/"  # no name that people can give holds a slash
+DELETED_NAME_PREFIX = "deleted/"  # valid names of maps have no slash
 
 
 class Map(Journaled, Base):
-    """`version` grows with every transaction that changes what can be found in the map."""
+    """A map. Every transaction that changes its search results increments `version`."""
 
     __tablename__ = "maps"
 
@@ -66,26 +62,26 @@ class Map(Journaled, Base):
 
 
 def create_map(session: Session, name: str, extractor: str) -> Map:
-    """A new, empty map; 409 (`map_exists`) when the name is taken."""
-    made = Map(id=new_id(), name=name, extractor=extractor)
+    """Create an empty map; Conflict (`map_exists`) when the name is taken."""
+    map_ = Map(id=new_id(), name=name, extractor=extractor)
     try:
         with session.begin_nested():
-            session.add(made)
+            session.add(map_)
             session.flush()
     except IntegrityError:
-        raise Conflict("map_exists", f"There is a map named {name!r} already.", map=name) from None
-    return made
+        raise Conflict("map_exists", f"A map named {name!r} already exists.", map=name) from None
+    return map_
 
 
 def list_maps(session: Session) -> list[Map]:
-    """Every live map, by name."""
+    """List the live maps by name."""
     return list(session.scalars(select(Map).where(Map.deleted_at.is_(None)).order_by(Map.name)))
 
 
 def mark_map_deleted(session: Session, map_: Map) -> None:
-    """The map is gone from every answer from this commit on, and its name is free.
+    """Hide the map from all responses from this commit on, and free its name.
 
-    What belongs to it goes later: `services.steward.tasks.delete_maps`.
+    `services.steward.tasks.delete_maps` deletes its data later.
     """
     map_.name = f"{DELETED_NAME_PREFIX}{map_.id}"
     map_.deleted_at = db_now()
@@ -93,34 +89,34 @@ def mark_map_deleted(session: Session, map_: Map) -> None:
 
 
 def get_or_create_default_map(session: Session, extractor: str) -> Map:
-    """The map named `default`, made on first use."""
-    found = session.scalar(select(Map).where(Map.name == DEFAULT_MAP))
-    if found is not None:
-        return found
+    """Return the map named `default`, created on first use."""
+    existing = session.scalar(select(Map).where(Map.name == DEFAULT_MAP))
+    if existing is not None:
+        return existing
     try:
         return create_map(session, DEFAULT_MAP, extractor)
-    except Conflict:  # another process made it between the two statements
+    except Conflict:  # another process created it between the two statements
         return get_map(session, DEFAULT_MAP)
 
 
 def get_map(session: Session, name: str) -> Map:
-    """The map called `name`; 404 when there is none."""
-    found = session.scalar(select(Map).where(Map.name == name, Map.deleted_at.is_(None)))
-    if found is None:
+    """Return the live map of this name; NotFound (`map_not_found`)."""
+    map_ = session.scalar(select(Map).where(Map.name == name, Map.deleted_at.is_(None)))
+    if map_ is None:
         raise NotFound(
             "map_not_found",
-            f"There is no map named {name!r}. Make it: POST /api/v1/maps, or "
+            f"There is no map named {name!r}. Create it: POST /api/v1/maps, or "
             f"`placewise maps create {name}`.",
             map=name,
         )
-    return found
+    return map_
 
 
 def lock_map(session: Session, map_id: UUID) -> Map:
-    """The map's row as it is now, locked until the transaction ends.
+    """Lock the map's row until the end of the transaction, and return it refreshed.
 
-    Publishing, activation and deletion take this lock, so what they read of the map stays true
-    until they commit. SQLite has one writer and needs no row lock.
+    Publishing, activation and deletion take this lock, so the state of the map that they read stays
+    valid until they commit. SQLite has one writer and needs no row lock.
     """
     return session.scalars(
         select(Map)
@@ -131,9 +127,9 @@ def lock_map(session: Session, map_id: UUID) -> Map:
 
 
 def increment_map_version(session: Session, map_id: UUID) -> int:
-    """One more: search workers following the map will look again. Returns the new version.
+    """Increment the map's version, so that search workers reload changes; return the new one.
 
-    The row stays locked until commit, so versions become visible in the order of their numbers.
+    The row stays locked until the commit, so versions become visible in the order of their numbers.
     """
     return session.execute(
         update(Map).where(Map.id == map_id).values(version=Map.version + 1).returning(Map.version)
@@ -141,7 +137,7 @@ def increment_map_version(session: Session, map_id: UUID) -> int:
 
 
 class Search(Base):
-    """One answered similarity search."""
+    """A completed similarity search, for the history and the statistics."""
 
     __tablename__ = "searches"
 
@@ -167,21 +163,21 @@ class Search(Base):
 def list_searches(
     session: Session, map_id: UUID, limit: int, before: UUID | None = None
 ) -> list[Search]:
-    """Newest first, up to `limit`, older than `before`."""
-    wanted = select(Search).where(Search.map_id == map_id)
+    """List the map's searches, newest first, up to `limit`; `before` is the page's cursor."""
+    statement = select(Search).where(Search.map_id == map_id)
     if before is not None:
-        wanted = wanted.where(Search.id < before)
-    return list(session.scalars(wanted.order_by(Search.id.desc()).limit(limit)))
+        statement = statement.where(Search.id < before)
+    return list(session.scalars(statement.order_by(Search.id.desc()).limit(limit)))
 
 
 MIN_STATISTICS_AGE_SECONDS = 30.0
-# A large map's figures are counted in 1/50 of the time at most.
+# Counting a large map takes at most 1/50 of the time: the pause is at least 50 times the duration.
 RECOUNT_REST_FACTOR = 50.0
 DAY_SECONDS = 86_400.0
 
 
 class CachedMapStatistics(Base):
-    """The last count of a large map: `MapStatistics` as JSON, and how long it took."""
+    """The last count of a large map: `MapStatistics` as JSON, and the duration of the count."""
 
     __tablename__ = "map_figures"
 
@@ -193,7 +189,7 @@ class CachedMapStatistics(Base):
 
 @dataclass(frozen=True, slots=True)
 class MapStatistics:
-    """Counts of live rows; those of descriptors are of the generation that answers."""
+    """Statistics of a map: counts of live rows; descriptors are those of the active generation."""
 
     photos: int
     labelled_queries: int
@@ -201,54 +197,56 @@ class MapStatistics:
     uploads_24h: int
     searchable: int
     located: int
-    """Searchable ones whose place is known."""
+    """Searchable photos with coordinates or a place label."""
     located_queries: int
+    """Labelled queries with coordinates or a place label."""
     searches: int
     searches_24h: int
     average_ms: float | None
-    """Of the searches of the last seven days, as is `longest_ms`."""
+    """Mean duration of the searches of the last seven days, in milliseconds."""
     longest_ms: float | None
+    """Longest duration of the searches of the last seven days, in milliseconds."""
     jobs: dict[str, int]
-    """By state."""
+    """State -> number of jobs."""
 
 
 def get_map_statistics(session: Session, map_id: UUID) -> tuple[MapStatistics, datetime]:
-    """The map's figures, and the time for which they hold."""
+    """Return the map's statistics and the time of the count; those of a large map are cached."""
     if is_large_map(session, map_id):
-        kept = session.get(CachedMapStatistics, map_id)
-        if kept is not None:
-            return MapStatistics(**kept.figures), kept.counted_at
+        cached = session.get(CachedMapStatistics, map_id)
+        if cached is not None:
+            return MapStatistics(**cached.figures), cached.counted_at
     return compute_map_statistics(session, map_id), session.execute(select(db_now())).scalar_one()
 
 
 def is_large_map(session: Session, map_id: UUID) -> bool:
-    """Whether the map has too much to be counted for every caller."""
-    of_map: tuple[Select[Any], ...] = (
+    """Return whether the map has more than MAX_EXACT_COUNT photos, jobs or searches."""
+    row_selects: tuple[Select[Any], ...] = (
         select(literal(1)).select_from(Photo).where(Photo.map_id == map_id),
         select(literal(1)).select_from(Job).where(Job.map_id == map_id),
         select(literal(1)).select_from(Search).where(Search.map_id == map_id),
     )
-    most = MAX_EXACT_COUNT + 1
+    limit = MAX_EXACT_COUNT + 1
     return any(
-        session.scalar(select(func.count()).select_from(rows.limit(most).subquery())) == most
-        for rows in of_map
+        session.scalar(select(func.count()).select_from(rows.limit(limit).subquery())) == limit
+        for rows in row_selects
     )
 
 
 def compute_map_statistics(session: Session, map_id: UUID) -> MapStatistics:
-    """Count everything; on a map with a million photos this takes seconds."""
+    """Count the map's rows; this takes seconds on a map with a million photos."""
     generation = active_generation(session, map_id)
     live = (Photo.map_id == map_id) & Photo.deleted_at.is_(None)
-    day = db_now_plus(-DAY_SECONDS)
-    asked = select(func.count()).select_from(Search).where(Search.map_id == map_id)
+    day_ago = db_now_plus(-DAY_SECONDS)
+    searches = select(func.count()).select_from(Search).where(Search.map_id == map_id)
     average, longest = session.execute(
         select(func.avg(Search.processing_ms), func.max(Search.processing_ms)).where(
             Search.map_id == map_id, Search.searched_at > db_now_plus(-7 * DAY_SECONDS)
         )
     ).one()
     jobs = select(Job.state, func.count()).where(Job.map_id == map_id).group_by(Job.state)
-    recent = select(func.count()).select_from(Photo).where(live, Photo.uploaded_at > day)
-    located = (
+    recent = select(func.count()).select_from(Photo).where(live, Photo.uploaded_at > day_ago)
+    geotagged = (
         [count_geotagged(session, generation.id, role) for role in PhotoRole]
         if generation
         else [0, 0]
@@ -259,10 +257,10 @@ def compute_map_statistics(session: Session, map_id: UUID) -> MapStatistics:
         photo_bytes=int(session.scalar(select(func.sum(Photo.size_bytes)).where(live)) or 0),
         uploads_24h=session.scalar(recent) or 0,
         searchable=count_searchable(session, generation.id) if generation else 0,
-        located=located[0],
-        located_queries=located[1],
-        searches=session.scalar(asked) or 0,
-        searches_24h=session.scalar(asked.where(Search.searched_at > day)) or 0,
+        located=geotagged[0],
+        located_queries=geotagged[1],
+        searches=session.scalar(searches) or 0,
+        searches_24h=session.scalar(searches.where(Search.searched_at > day_ago)) or 0,
         average_ms=average,
         longest_ms=longest,
         jobs={str(state): count for state, count in session.execute(jobs)},
@@ -270,16 +268,17 @@ def compute_map_statistics(session: Session, map_id: UUID) -> MapStatistics:
 
 
 def are_statistics_stale(session: Session, map_id: UUID) -> bool:
-    """Whether a large map's figures have become old."""
-    kept = session.get(CachedMapStatistics, map_id)
-    if kept is None:
+    """Return whether the cached statistics of a large map are due to be counted again."""
+    cached = session.get(CachedMapStatistics, map_id)
+    if cached is None:
         return True
-    age = max(MIN_STATISTICS_AGE_SECONDS, RECOUNT_REST_FACTOR * kept.took_seconds)
-    return bool(session.scalar(select(literal(kept.counted_at, UtcDateTime()) < db_now_plus(-age))))
+    max_age = max(MIN_STATISTICS_AGE_SECONDS, RECOUNT_REST_FACTOR * cached.took_seconds)
+    is_stale = literal(cached.counted_at, UtcDateTime()) < db_now_plus(-max_age)
+    return bool(session.scalar(select(is_stale)))
 
 
 def cache_map_statistics(session: Session, map_id: UUID) -> None:
-    """Count, and keep the figures."""
+    """Count the map's rows and cache the statistics."""
     started = time.perf_counter()
     now = session.execute(select(db_now())).scalar_one()
     figures = asdict(compute_map_statistics(session, map_id))

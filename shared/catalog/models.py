@@ -1,10 +1,7 @@
-"""Models: the backbones that have described photos here, with their weights' fingerprint; and those
-that were added (`shared.catalog.models`), whether or not they have described one.
+"""Model registry: the models that have described photos, and trained models that users added.
 
-Models that were added: trained elsewhere, named once, fetched by whoever describes with them.
-
-A name is given once and for all. Rows of descriptors, manifests and caches say `gsv:N`, so `N`
-never comes to mean other weights, not even after the model was removed.
+The name of an added model is permanent: descriptors, manifests and caches refer to it as
+`gsv:NAME`, so NAME is never given to other weights, not even after the model was removed.
 """
 
 from __future__ import annotations
@@ -28,11 +25,11 @@ from shared.ids import new_id
 
 
 class Model(Journaled, Base):
-    """One set of weights. `card` says where they come from and under which licence.
+    """A set of weights. `card` has their source and licence.
 
-    The columns from `added_name` on are those of a model that was added: its weights are a file of
-    `shared.descriptors.vpr_models.checkpoint` under `object_key`, whose hash is `sha256`. A removed
-    one keeps its row, without `object_key`: its name never comes to mean other weights.
+    The columns from `added_name` on are those of an added model: its weights are a file of
+    `shared.descriptors.vpr_models.checkpoint` under `object_key`, with the hash `sha256`. A removed
+    model keeps its row, without `object_key`, to reserve its name.
     """
 
     __tablename__ = "models"
@@ -61,31 +58,31 @@ class Model(Journaled, Base):
 def get_or_create_model(
     session: Session, name: str, fingerprint: str, licence: str, card: dict[str, Any]
 ) -> Model:
-    """The row of these weights, made on first use."""
-    known = select(Model).where(Model.name == name, Model.fingerprint == fingerprint)
-    found = session.scalar(known)
-    if found is not None:
-        return found
+    """Return the row of these weights, created on first use."""
+    statement = select(Model).where(Model.name == name, Model.fingerprint == fingerprint)
+    existing = session.scalar(statement)
+    if existing is not None:
+        return existing
     try:
         with session.begin_nested():
-            made = Model(name=name, fingerprint=fingerprint, licence=licence, card=card)
-            session.add(made)
+            created = Model(name=name, fingerprint=fingerprint, licence=licence, card=card)
+            session.add(created)
             session.flush()
     except IntegrityError:  # another worker loaded the same weights
-        return session.scalars(known).one()
-    return made
+        return session.scalars(statement).one()
+    return created
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ModelRegistration:
-    """What is known of a checkpoint that was checked and stored."""
+    """A checkpoint that was checked and stored, to be registered."""
 
     name: str
     fingerprint: str
-    """sha256 of its configuration and weights, whatever file they came in."""
+    """SHA-256 of its configuration and weights, independent of the file format."""
     object_key: str
     sha256: str
-    """Of the stored object."""
+    """SHA-256 of the stored object."""
     size_bytes: int
     dimension: int
     config: dict[str, Any]
@@ -95,14 +92,18 @@ class ModelRegistration:
 
 
 def register_model(session: Session, registration: ModelRegistration) -> tuple[Model, bool]:
-    """The model's row, and whether it was not there before.
+    """Register a model, or replace the file of a registered or removed model with these weights.
 
-    The same weights under the same name replace the file that is there, or come back after they
-    were removed; with them come the licence and the note, where they are given. Conflict
-    (`model_name_taken`) where the name means, or has meant, other weights.
+    The licence and the note are updated if they are given.
+
+    Returns:
+        The model's row, and whether the model is new or was removed before.
+
+    Raises:
+        Conflict: `model_name_taken`: the name belongs, or belonged, to other weights.
     """
-    found = _find_model(session, registration.name, lock=True)
-    if found is None:
+    existing = _find_model(session, registration.name, lock=True)
+    if existing is None:
         row = Model(
             id=new_id(),
             name=f"{TRAINED_MODEL_PREFIX}{registration.name}",
@@ -122,39 +123,34 @@ def register_model(session: Session, registration: ModelRegistration) -> tuple[M
             with session.begin_nested():
                 session.add(row)
                 session.flush()
-        except IntegrityError:  # another worker was first
-            found = _find_model(session, registration.name, lock=True)
-            assert found is not None
+        except IntegrityError:  # another worker registered it first
+            existing = _find_model(session, registration.name, lock=True)
+            assert existing is not None
         else:
             return row, True
-    if found.fingerprint != registration.fingerprint:
-        gone = "" if found.object_key else ", which were removed, and names are not used again"
+    if existing.fingerprint != registration.fingerprint:
+        removed = "" if existing.object_key else "; they were removed, but names are not reused"
         raise Conflict(
             "model_name_taken",
             f"The name {registration.name!r} belongs to other weights (fingerprint "
-            f"{found.fingerprint[:12]}, these have {registration.fingerprint[:12]}){gone}. "
-            "Take another "
-            "name.",
+            f"{existing.fingerprint[:12]}, these have {registration.fingerprint[:12]}){removed}. "
+            "Choose another name.",
             model=registration.name,
         )
-    came_back = found.object_key is None
-    found.object_key, found.sha256, found.size_bytes = (
-        registration.object_key,
-        registration.sha256,
-        registration.size_bytes,
-    )
-    found.licence, found.note = (
-        registration.licence or found.licence,
-        registration.note or found.note,
-    )
-    if came_back:
-        found.added_at = db_now()
+    was_removed = existing.object_key is None
+    existing.object_key = registration.object_key
+    existing.sha256 = registration.sha256
+    existing.size_bytes = registration.size_bytes
+    existing.licence = registration.licence or existing.licence
+    existing.note = registration.note or existing.note
+    if was_removed:
+        existing.added_at = db_now()
     session.flush()
-    return found, came_back
+    return existing, was_removed
 
 
 def list_registered_models(session: Session) -> list[Model]:
-    """Every model that was added and not removed, by name."""
+    """List the added models that were not removed, by name."""
     return list(
         session.scalars(
             select(Model)
@@ -165,36 +161,43 @@ def list_registered_models(session: Session) -> list[Model]:
 
 
 def get_registered_model(session: Session, name: str) -> Model:
-    """The added model of that name; NotFound (`model_missing`)."""
-    found = _find_model(session, name)
-    if found is None or found.object_key is None:
+    """Return the added model of this name; NotFound (`model_missing`)."""
+    model = _find_model(session, name)
+    if model is None or model.object_key is None:
         raise NotFound("model_missing", _model_missing_detail(name), model=name)
-    return found
+    return model
 
 
 def check_model_registered(session: Session, recipe: ExtractorConfig) -> None:
-    """NotFound (`model_missing`) where the recipe names a model that was not added."""
+    """Raise NotFound (`model_missing`) if the extractor uses a model that was not added."""
     if recipe.trained is not None and recipe.trained.registered is not None:
         get_registered_model(session, recipe.trained.registered)
 
 
 def get_model_for_loading(session: Session, name: str, *, lock: bool = False) -> Model:
-    """`get_registered_model` for who describes photos: Misconfigured, as weights that are
-    missing are.
+    """Return the added model of this name, for extractors.
 
-    With `lock` it can't be removed before the transaction ends.
+    Args:
+        session: The session.
+        name: Name of the model.
+        lock: Lock the row, so that the model can't be removed before the transaction ends.
+
+    Raises:
+        Misconfigured: `model_missing`, as for other missing weights.
     """
-    found = _find_model(session, name, lock=lock)
-    if found is None or found.object_key is None:
+    model = _find_model(session, name, lock=lock)
+    if model is None or model.object_key is None:
         raise Misconfigured("model_missing", _model_missing_detail(name), model=name)
-    return found
+    return model
 
 
 def remove_model(session: Session, name: str, new_map_extractor: str) -> Model:
-    """The model is gone from every list; its bytes go when the steward looks for orphans.
+    """Remove an added model; the steward collects its object as an orphan.
 
-    NotFound (`model_missing`); Conflict (`model_in_use`) while a map is described with it, is
-    about to be, or new maps are (`new_map_extractor`).
+    Raises:
+        NotFound: `model_missing`.
+        Conflict: `model_in_use`: a map or a running model change uses it, or `new_map_extractor`,
+            the extractor of new maps, does.
     """
     row = _find_model(session, name, lock=True)
     if row is None or row.object_key is None:
@@ -204,15 +207,14 @@ def remove_model(session: Session, name: str, new_map_extractor: str) -> Model:
         raise Conflict(
             "model_in_use",
             f"The model {name!r} describes the photos of {_join_names(maps)}. Switch them to "
-            "another "
-            "extractor first (POST /api/v1/generations), or delete them.",
+            "another extractor first (POST /api/v1/generations), or delete them.",
             model=name,
             maps=maps,
         )
     if new_map_extractor == row.name:
         raise Conflict(
             "model_in_use",
-            f"New maps are described with the model {name!r} (EXTRACTOR). Set another one first.",
+            f"The model {name!r} is the extractor of new maps (EXTRACTOR). Set another one first.",
             model=name,
             maps=[],
         )
@@ -222,9 +224,11 @@ def remove_model(session: Session, name: str, new_map_extractor: str) -> Model:
 
 
 def list_maps_using_model(session: Session, model: Model) -> list[str]:
-    """Names of the live maps whose photos it describes, or will: by a generation that answers or
-    is being built, or by the extractor of a map that has none yet."""
-    of_generations = (
+    """Return the names of the live maps that use the model, sorted.
+
+    A map uses it with its active generation, a generation that is being built, or its extractor.
+    """
+    by_generation = (
         select(Map.name)
         .join(Generation, Generation.map_id == Map.id)
         .where(
@@ -233,21 +237,21 @@ def list_maps_using_model(session: Session, model: Model) -> list[str]:
             Generation.state.in_((GenerationState.ACTIVE, GenerationState.BUILDING)),
         )
     )
-    of_maps = select(Map.name).where(Map.deleted_at.is_(None), Map.extractor == model.name)
-    return sorted({*session.scalars(of_generations), *session.scalars(of_maps)})
+    by_extractor = select(Map.name).where(Map.deleted_at.is_(None), Map.extractor == model.name)
+    return sorted({*session.scalars(by_generation), *session.scalars(by_extractor)})
 
 
 def _find_model(session: Session, name: str, *, lock: bool = False) -> Model | None:
-    wanted = select(Model).where(Model.added_name == name)
+    statement = select(Model).where(Model.added_name == name)
     if lock:
-        wanted = wanted.with_for_update().execution_options(populate_existing=True)
-    return session.scalar(wanted)
+        statement = statement.with_for_update().execution_options(populate_existing=True)
+    return session.scalar(statement)
 
 
 def _model_missing_detail(name: str) -> str:
     return (
-        f"There is no model named {name!r} here. Add it: `placewise models add CHECKPOINT --name "
-        f"{name}`, or POST /api/v1/models. GET /api/v1/models lists those that are there."
+        f"There is no model named {name!r}. Add it: `placewise models add CHECKPOINT --name "
+        f"{name}`, or POST /api/v1/models. GET /api/v1/models lists the added models."
     )
 
 

@@ -1,9 +1,8 @@
-"""Photos: what was uploaded into a map, where it was taken, and where its bytes lie.
+"""Photos of maps, and presigned uploads.
 
-Direct uploads: photos that callers send straight to the object store, and then complete.
-
-The bytes arrive under a key of their own (`shared.storage.keys.incoming_key`). Completing copies
-them, and keeps its answer here in the transaction that stores the photo.
+A presigned upload is a photo that a client sends directly to the object store, under a key of its
+own (`shared.storage.keys.incoming_key`), and then completes. Completing copies the object and
+stores its response in the transaction that stores the photo.
 """
 
 from __future__ import annotations
@@ -50,15 +49,15 @@ from shared.ids import new_id
 
 
 class PhotoRole(StrEnum):
-    DATABASE = "database"  # indexed: it can be found
-    QUERY = "query"  # a labelled query: described, never found; evaluations ask with it
+    DATABASE = "database"  # indexed and searchable
+    QUERY = "query"  # a labelled query for evaluations: described, but never a search result
 
 
 class Photo(Journaled, Base):
-    """One live or deleted photo. `sha256` is unique among a map's live photos.
+    """A live or deleted photo. `sha256` is unique among the live photos of a map.
 
-    `job_id` is the job that describes the photo; whether it is searchable is told by its row in
-    `descriptors`. `changed_version` is the map's version at the last change that search must see.
+    `job_id` is the job that describes the photo; the photo is searchable if it has a row in
+    `descriptors`. `changed_version` is the map's version at the last change that affects searches.
     """
 
     __tablename__ = "photos"
@@ -86,7 +85,7 @@ class Photo(Journaled, Base):
     uploaded_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())
     deleted_at: Mapped[datetime | None] = mapped_column(UtcDateTime)
     changed_version: Mapped[int] = mapped_column(BigInteger, default=0)
-    key_id: Mapped[UUID | None] = mapped_column(Uuid)  # that it came in with, if there was one
+    key_id: Mapped[UUID | None] = mapped_column(Uuid)  # the API key of the upload, if any
 
     __table_args__ = (
         CheckConstraint(
@@ -129,7 +128,7 @@ class Photo(Journaled, Base):
             "id",
             only=and_(deleted_at.is_(None), role == PhotoRole.QUERY),
         ),
-        # Of all maps: an array has no order that a map could come first in.
+        # Over all maps: a GIN index on an array can't have the map as its first column.
         Index(
             "ix_photos_tags",
             "tags",
@@ -154,7 +153,7 @@ class Photo(Journaled, Base):
 
 @dataclass(frozen=True, slots=True)
 class PhotoFilterValues:
-    """What search keeps of a photo, to filter by."""
+    """The columns of a photo that search workers hold in memory for filters."""
 
     COLUMNS: ClassVar = (
         Photo.id,
@@ -178,12 +177,12 @@ class PhotoFilterValues:
 
     @property
     def findable(self) -> bool:
-        """Live, and not a labelled query."""
+        """Whether the photo is live and not a labelled query."""
         return self.deleted_at is None and self.role == PhotoRole.DATABASE
 
 
 def get_photo(session: Session, map_id: UUID, photo_id: UUID) -> Photo:
-    """A live photo of the map; 404 when there is none."""
+    """Return a live photo of the map; NotFound (`photo_not_found`)."""
     photo = session.scalar(
         select(Photo).where(
             Photo.id == photo_id, Photo.map_id == map_id, Photo.deleted_at.is_(None)
@@ -199,7 +198,7 @@ def get_photo(session: Session, map_id: UUID, photo_id: UUID) -> Photo:
 
 
 def find_photo_by_sha256(session: Session, map_id: UUID, sha256: str) -> Photo | None:
-    """The live photo with these bytes, if the map has it."""
+    """Return the map's live photo with this hash, if any."""
     return session.scalar(
         select(Photo).where(
             Photo.map_id == map_id, Photo.sha256 == sha256, Photo.deleted_at.is_(None)
@@ -208,52 +207,52 @@ def find_photo_by_sha256(session: Session, map_id: UUID, sha256: str) -> Photo |
 
 
 def get_live_photos(session: Session, photo_ids: Iterable[UUID]) -> dict[UUID, Photo]:
-    """Those of the photos that are live, by id."""
-    found = session.scalars(
+    """Return the live photos among the ids, by id."""
+    photos = session.scalars(
         select(Photo).where(Photo.id.in_(list(photo_ids)), Photo.deleted_at.is_(None))
     )
-    return {photo.id: photo for photo in found}
+    return {photo.id: photo for photo in photos}
 
 
 def list_photos_changed_since(
     session: Session, map_id: UUID, version: int
 ) -> list[PhotoFilterValues]:
-    """Photos of the map that were changed or deleted after `version`, as they are now."""
-    found = session.execute(
+    """Return the current values of the photos that were changed or deleted after `version`."""
+    rows = session.execute(
         select(*PhotoFilterValues.COLUMNS).where(
             Photo.map_id == map_id, Photo.changed_version > version
         )
     )
-    return [PhotoFilterValues(*facts) for facts in found]
+    return [PhotoFilterValues(*row) for row in rows]
 
 
 def count_live_photos(session: Session, map_id: UUID, role: PhotoRole | None = None) -> int:
-    """How many live photos the map has, of one role or of any."""
-    counted = (
+    """Count the live photos of the map, of one role or of all."""
+    statement = (
         select(func.count())
         .select_from(Photo)
         .where(Photo.map_id == map_id, Photo.deleted_at.is_(None))
     )
     if role is not None:
-        counted = counted.where(Photo.role == role)
-    return session.scalar(counted) or 0
+        statement = statement.where(Photo.role == role)
+    return session.scalar(statement) or 0
 
 
 def has_live_photo(session: Session, map_id: UUID, role: PhotoRole) -> bool:
-    """Whether the map has a live photo of the role."""
-    wanted = select(Photo.id).where(
+    """Return whether the map has a live photo of the role."""
+    statement = select(Photo.id).where(
         Photo.map_id == map_id, Photo.deleted_at.is_(None), Photo.role == role
     )
-    return session.scalar(wanted.limit(1)) is not None
+    return session.scalar(statement.limit(1)) is not None
 
 
 def is_geotagged() -> Condition:
-    """True for photos with coordinates or a place label."""
+    """Condition for photos with coordinates or a place label."""
     return or_(Photo.latitude.is_not(None), Photo.place.is_not(None))
 
 
 def mark_photo_deleted(session: Session, photo: Photo, version: int) -> None:
-    """The photo is gone from every answer from this commit on; its bytes go later."""
+    """Hide the photo from all responses from this commit on; its objects are deleted later."""
     session.execute(
         update(Photo)
         .where(Photo.id == photo.id)
@@ -262,7 +261,7 @@ def mark_photo_deleted(session: Session, photo: Photo, version: int) -> None:
 
 
 class PresignedUpload(Base):
-    """A photo that was announced. `status` and `answer` are what completing it was answered."""
+    """A presigned upload. `status` and `answer` are the response of its completion."""
 
     __tablename__ = "direct_uploads"
 
@@ -286,26 +285,28 @@ class PresignedUpload(Base):
 def get_presigned_upload(
     session: Session, map_id: UUID, upload_id: UUID, *, lock: bool = False
 ) -> PresignedUpload:
-    """An upload of the map that is completed, or can be still.
+    """Return a presigned upload of the map that is completed or has not expired.
 
-    Raises NotFound (`upload_not_found`) and Gone (`upload_expired`).
+    Raises:
+        NotFound: `upload_not_found`.
+        Gone: `upload_expired`.
     """
-    wanted = (
+    statement = (
         select(PresignedUpload, (PresignedUpload.expires_at <= db_now()).label("expired"))
         .where(PresignedUpload.id == upload_id, PresignedUpload.map_id == map_id)
         .execution_options(populate_existing=True)
     )
-    found = session.execute(wanted.with_for_update() if lock else wanted).one_or_none()
-    if found is None:
+    row = session.execute(statement.with_for_update() if lock else statement).one_or_none()
+    if row is None:
         raise NotFound(
             "upload_not_found",
-            f"There is no upload {upload_id} in this map. Begin one: POST /api/v1/uploads/presign.",
+            f"There is no upload {upload_id} in this map. Start one: POST /api/v1/uploads/presign.",
         )
-    upload: PresignedUpload = found[0]
-    if found.expired and upload.answer is None:
+    upload: PresignedUpload = row[0]
+    if row.expired and upload.answer is None:
         raise Gone(
             "upload_expired",
-            f"The upload {upload_id} was not completed in time. Begin another one: POST "
+            f"The upload {upload_id} expired before it was completed. Start another one: POST "
             "/api/v1/uploads/presign.",
         )
     return upload

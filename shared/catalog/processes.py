@@ -1,12 +1,11 @@
-"""Which processes of a deployment live: gateways, extractors, stewards. (Search workers have a
-register of their own, which says what they have loaded.)
+"""Registry and heartbeats of running processes and of search workers.
 
-Nothing is decided by it, leases decide: it is for `placewise doctor` and for people.
+The registry of gateways, extractors and stewards is informational, for `placewise doctor` and
+operators; leases decide which worker owns a job.
 
-Search workers: who lives, which shard it holds, which versions it has loaded.
-
-Written by the workers about every second or two. What a worker says here is a promise about its
-memory: it is why a generation is switched in only once it can be answered from.
+Search workers have a registry of their own with their shard and the versions that they have
+loaded, updated about every second or two. A generation is activated only once every live worker has
+registered it as loaded.
 """
 
 from __future__ import annotations
@@ -37,12 +36,12 @@ from shared.ids import new_id
 log = logging.getLogger(__name__)
 
 PROCESS_HEARTBEAT_SECONDS = 10.0
-PROCESS_TIMEOUT_SECONDS = 35.0  # three of them, and a little
+PROCESS_TIMEOUT_SECONDS = 35.0  # three missed heartbeats
 PROCESS_RETENTION_SECONDS = 86_400.0
 
 
 class RegisteredProcess(Base):
-    """One process; `role` is the name of its command."""
+    """A running process; `role` is the name of its command."""
 
     __tablename__ = "live_processes"
 
@@ -56,6 +55,8 @@ class RegisteredProcess(Base):
 
 @dataclass(frozen=True, slots=True)
 class ProcessStatus:
+    """A registered process and the age of its last heartbeat."""
+
     role: str
     name: str
     release: str
@@ -64,13 +65,16 @@ class ProcessStatus:
 
 @contextlib.contextmanager
 def process_heartbeat(catalog: Catalog, role: str) -> Iterator[None]:
-    """While the block runs, a thread says every EVERY_SECONDS that this process lives. While the
-    catalog is away it says nothing, and is the first to notice that nobody listens."""
+    """Register this process while the block runs.
+
+    A thread writes a heartbeat every PROCESS_HEARTBEAT_SECONDS; heartbeats are skipped while the
+    catalog is unreachable.
+    """
     process_id, stop = new_id(), threading.Event()
     name = f"{socket.gethostname()}-{os.getpid()}"
-    outage = OutageLog(f"{role}'s sign of life")
+    outage = OutageLog(f"{role}'s heartbeat")
 
-    def tell() -> None:
+    def send_heartbeats() -> None:
         while True:
             try:
                 with catalog.write() as session:
@@ -81,28 +85,28 @@ def process_heartbeat(catalog: Catalog, role: str) -> Iterator[None]:
             if stop.wait(PROCESS_HEARTBEAT_SECONDS):
                 return
 
-    teller = threading.Thread(target=tell, name="signs-of-life", daemon=True)
-    teller.start()
+    thread = threading.Thread(target=send_heartbeats, name="heartbeat", daemon=True)
+    thread.start()
     try:
         yield
     finally:
         stop.set()
-        teller.join()
+        thread.join()
         try:
             with catalog.write() as session:
                 session.execute(delete(RegisteredProcess).where(RegisteredProcess.id == process_id))
         except SQLAlchemyError as error:
-            log.info("this process could not sign off: %s", error)
+            log.info("this process could not be unregistered: %s", error)
 
 
 def _upsert_process(session: Session, process_id: UUID, role: str, name: str) -> None:
-    touched = session.execute(
+    updated = session.execute(
         update(RegisteredProcess)
         .where(RegisteredProcess.id == process_id)
         .values(seen_at=db_now())
         .returning(RegisteredProcess.id)
     )
-    if touched.first() is None:
+    if updated.first() is None:
         session.execute(
             delete(RegisteredProcess).where(
                 RegisteredProcess.seen_at < db_now_plus(-PROCESS_RETENTION_SECONDS)
@@ -114,27 +118,34 @@ def _upsert_process(session: Session, process_id: UUID, role: str, name: str) ->
 
 
 def list_processes(session: Session) -> list[ProcessStatus]:
-    """Every process that was heard of in the last day; who is silent for DEAD_SECONDS is dead, or
-    was killed."""
-    found = session.execute(
+    """List the processes with a heartbeat in the last day.
+
+    A process without a heartbeat for PROCESS_TIMEOUT_SECONDS is dead.
+    """
+    rows = session.execute(
         select(RegisteredProcess, db_now()).order_by(RegisteredProcess.role, RegisteredProcess.name)
     )
     return [
-        ProcessStatus(one.role, one.name, one.release, (now - one.seen_at).total_seconds())
-        for one, now in found
+        ProcessStatus(
+            process.role, process.name, process.release, (now - process.seen_at).total_seconds()
+        )
+        for process, now in rows
     ]
 
 
 UNREADABLE = "unreadable"
-"""In `loaded`, beside the generations: the keys of the chunks that the worker can't read."""
+"""Key in `loaded`, next to the generations: the keys of the chunks that the worker can't read."""
 
-# Several heartbeats: a worker that was silent for longer holds up nothing any more.
+# Several heartbeats: a worker without one for longer is dead and does not block activations.
 SEARCH_WORKER_TIMEOUT_SECONDS = 10.0
 
 
 class RegisteredSearchWorker(Base):
-    """One process that answers searches. `loaded`: generation id -> version without a gap, and
-    `UNREADABLE`."""
+    """A search worker process.
+
+    `loaded` maps generation ids to the map version up to which all chunks are loaded; it also has
+    the key `UNREADABLE`.
+    """
 
     __tablename__ = "search_workers"
 
@@ -148,7 +159,7 @@ class RegisteredSearchWorker(Base):
     seen_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())
 
     def has(self, generation_id: UUID, version: int) -> bool:
-        """Whether it has loaded the generation at this version or a later one."""
+        """Return whether it has loaded the generation at this version or a later one."""
         return int(self.loaded.get(str(generation_id), -1)) >= version
 
 
@@ -161,17 +172,17 @@ def upsert_search_worker(
     loaded: Mapping[UUID, int],
     unreadable: Sequence[str] = (),
 ) -> None:
-    """The worker lives, has loaded these versions, and can't read these chunks."""
+    """Write a heartbeat of the worker with its loaded versions and its unreadable chunks."""
     versions: dict[str, Any] = {str(id_): version for id_, version in loaded.items()}
     if unreadable:
         versions[UNREADABLE] = list(unreadable)
-    known = session.execute(
+    updated = session.execute(
         update(RegisteredSearchWorker)
         .where(RegisteredSearchWorker.id == worker_id)
         .values(loaded=versions, seen_at=db_now())
         .execution_options(synchronize_session=False)
     )
-    if not affected_rows(known):  # new, or removed while it could not reach the catalog
+    if not affected_rows(updated):  # new, or removed while it could not reach the catalog
         session.add(
             RegisteredSearchWorker(
                 id=worker_id,
@@ -185,12 +196,12 @@ def upsert_search_worker(
 
 
 def delete_search_worker(session: Session, worker_id: UUID) -> None:
-    """The worker has ended."""
+    """Unregister a worker that shuts down."""
     session.execute(delete(RegisteredSearchWorker).where(RegisteredSearchWorker.id == worker_id))
 
 
 def delete_dead_search_workers(session: Session, *, all_workers: bool = False) -> int:
-    """Remove the workers that are dead; `all_workers`, where none can live."""
+    """Unregister dead workers, or all of them where none can be running; return their number."""
     dead = delete(RegisteredSearchWorker)
     if not all_workers:
         dead = dead.where(
@@ -200,7 +211,7 @@ def delete_dead_search_workers(session: Session, *, all_workers: bool = False) -
 
 
 def unreadable_keys(session: Session) -> set[str]:
-    """The chunks that a live worker reports as unreadable."""
+    """Return the keys of the chunks that a live worker reports as unreadable."""
     live = session.scalars(
         select(RegisteredSearchWorker.loaded).where(
             RegisteredSearchWorker.seen_at >= db_now_plus(-SEARCH_WORKER_TIMEOUT_SECONDS)
@@ -212,8 +223,10 @@ def unreadable_keys(session: Session) -> set[str]:
 def list_lagging_workers(
     session: Session, generation_id: UUID, version: int
 ) -> list[RegisteredSearchWorker]:
-    """The live workers that hold a part of the generation and have not loaded it at `version`
-    yet, by name. A worker whose shard has no row of it has nothing to load."""
+    """List the live workers that have not loaded the generation at `version` yet, by name.
+
+    Workers whose shards have no chunk of the generation are left out.
+    """
     slots = session.scalars(
         select(Chunk.slot)
         .where(Chunk.generation_id == generation_id, Chunk.superseded_at.is_(None))

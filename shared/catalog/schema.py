@@ -1,7 +1,8 @@
-"""The catalog's schema: bringing it up to date beside a running fleet, and knowing one's own.
+"""Schema migrations while services run, and the check that a release fits the schema.
 
-`placewise migrate` runs once per release, before its services start; the embedded Placewise does it
-itself. Services only look (`wait_for_schema`). docs/how-to/migrations.md has the rules.
+`placewise migrate` runs once per release, before its services start; the embedded Placewise
+migrates at startup. Services only check the schema (`wait_for_schema`). The rules for migrations
+are in docs/how-to/migrations.md.
 """
 
 from __future__ import annotations
@@ -30,8 +31,9 @@ log = logging.getLogger(__name__)
 MIGRATIONS = Path(__file__).parent / "migrations"
 ADVISORY_LOCK_ID = 1886151011  # "plac" in ASCII
 
-# Whoever asks for a table's strongest lock makes everyone behind him wait as long as he does: less
-# than a request waits for a lock. A statement that has its lock may take any time.
+# While a migration waits for a table's exclusive lock, all later statements on the table wait, too:
+# its lock timeout has to be shorter than that of requests. A statement that has its lock may take
+# any time.
 MIGRATION_TIMEOUTS = TransactionTimeouts(statement_seconds=0, lock_seconds=1.0)
 LOCK_NOT_AVAILABLE = "55P03"
 DEADLOCK = "40P01"
@@ -41,12 +43,18 @@ SCHEMA_POLL_SECONDS = 0.5
 
 
 def migrate(catalog: Catalog, timeout_seconds: float = MIGRATION_TIMEOUT_SECONDS) -> None:
-    """Bring the schema to this release's; safe from several processes at once, beside a fleet.
+    """Migrate the schema to this release's; safe to run from several processes, while others serve.
 
-    On PostgreSQL each migration is a transaction of its own, which gives up after a second when it
-    can't have a lock and is tried again: traffic goes on meanwhile. Raises Unavailable
-    (`catalog_unavailable`; `catalog_busy` when a lock was not to be had for `timeout_seconds`)
-    and Misconfigured (`schema_too_new`, and for a file that can't be used as `opening` does).
+    On PostgreSQL each migration is a transaction of its own, with a lock timeout of one second
+    after which it is retried, so that traffic continues.
+
+    Args:
+        catalog: The catalog.
+        timeout_seconds: Time after which a migration that can't get a lock is not retried.
+
+    Raises:
+        Unavailable: `catalog_unavailable`, or `catalog_busy` after `timeout_seconds`.
+        Misconfigured: As `opening` raises, for an SQLite file that can't be used.
     """
     try:
         if catalog.is_sqlite:
@@ -63,10 +71,11 @@ def migrate(catalog: Catalog, timeout_seconds: float = MIGRATION_TIMEOUT_SECONDS
 
 
 def check_schema(catalog: Catalog) -> None:
-    """Raise Misconfigured unless this release can work with the schema that is there.
+    """Check that this release can work with the catalog's schema.
 
-    `schema_outdated`: older than this release needs. `schema_too_new`: a later release has changed
-    it in a way that this one does not understand; what was only added does no harm.
+    Raises:
+        Misconfigured: `schema_outdated`: the schema is older than this release needs.
+            `schema_too_new`: a later release has changed it incompatibly; additions are compatible.
     """
     scripts = ScriptDirectory.from_config(_config())
     known = {script.revision for script in scripts.walk_revisions()}
@@ -77,7 +86,7 @@ def check_schema(catalog: Catalog) -> None:
     if present is None or present in known:
         raise Misconfigured(
             "schema_outdated",
-            f"The catalog's schema is {present or 'not there'}, and this release needs {head}. "
+            f"The catalog's schema is {present or 'missing'}, but this release needs {head}. "
             "Run `placewise migrate` once.",
             present=present,
             needed=head,
@@ -85,8 +94,8 @@ def check_schema(catalog: Catalog) -> None:
     if understood_from not in known:
         raise Misconfigured(
             "schema_too_new",
-            f"The catalog's schema is {present}, which releases before {understood_from} don't "
-            f"understand; this one ends at {head}. Start the newer release.",
+            f"The catalog's schema is {present}, which requires a release with schema "
+            f"{understood_from} or later; this one has {head}. Start the newer release.",
             present=present,
             needed=head,
         )
@@ -94,35 +103,37 @@ def check_schema(catalog: Catalog) -> None:
 
 
 def wait_for_schema(catalog: Catalog, seconds: float) -> None:
-    """Until the catalog answers with a schema that this release can work with. SQLite, which only
-    processes of one machine share, is brought up to date instead.
+    """Wait until the catalog is reachable and has a schema that this release can work with.
 
-    After `seconds` raises what is still in the way: Unavailable, or Misconfigured as `check_schema`
-    does. `schema_too_new` is raised at once: waiting does not help.
+    An SQLite catalog, which only processes of one machine share, is migrated instead.
+
+    Raises:
+        Unavailable: The catalog is not reachable after `seconds`.
+        Misconfigured: As `check_schema` raises, after `seconds`; `schema_too_new` at once.
     """
     if catalog.is_sqlite:
         migrate(catalog)
         return
-    deadline, told = time.monotonic() + seconds, False
+    deadline, has_warned = time.monotonic() + seconds, False
     while True:
         try:
             check_schema(catalog)
             return
         except (Misconfigured, SQLAlchemyError) as error:
             reason = to_unavailable(error) or error
-            hopeless = isinstance(reason, Misconfigured) and reason.code == "schema_too_new"
+            is_permanent = isinstance(reason, Misconfigured) and reason.code == "schema_too_new"
             if not isinstance(reason, PlacewiseError):
                 raise
-            if hopeless or time.monotonic() > deadline:
+            if is_permanent or time.monotonic() > deadline:
                 raise reason from error
-            if not told:
-                told = True
+            if not has_warned:
+                has_warned = True
                 log.warning("waiting up to %g s: %s", seconds, reason.detail)
         time.sleep(SCHEMA_POLL_SECONDS)
 
 
 def _read_schema_revision(catalog: Catalog) -> tuple[str | None, str | None]:
-    """The schema's revision, and the oldest one whose release understands it."""
+    """Return the schema's revision, and the oldest revision whose release works with it."""
     with catalog.read() as session:
         tables = set(inspect(session.connection()).get_table_names())
         if "alembic_version" not in tables:
@@ -134,7 +145,7 @@ def _read_schema_revision(catalog: Catalog) -> tuple[str | None, str | None]:
 
 
 def _migrate_sqlite(catalog: Catalog) -> None:
-    """In one transaction, which keeps every other process out."""
+    """Run all migrations in one transaction, which excludes every other process."""
     if catalog.url.database:
         file = Path(catalog.url.database)
         make_private_folder(file.parent)
@@ -156,24 +167,28 @@ def _migrate_postgres(catalog: Catalog, deadline: float) -> None:
                     command.upgrade(config, "head")
                 return
             except DBAPIError as error:
-                in_the_way = get_sqlstate(error) in (LOCK_NOT_AVAILABLE, DEADLOCK)
-                if not in_the_way or time.monotonic() > deadline:
+                is_retryable = get_sqlstate(error) in (LOCK_NOT_AVAILABLE, DEADLOCK)
+                if not is_retryable or time.monotonic() > deadline:
                     raise
-                log.info("traffic holds a lock that a migration needs: trying again")
+                log.info("a migration could not get a lock because of traffic: retrying")
             time.sleep(LOCK_RETRY_SECONDS * random.uniform(0.5, 1.5))  # noqa: S311
 
 
 @contextlib.contextmanager
 def _migration_lock(catalog: Catalog, deadline: float) -> Iterator[None]:
-    """One migration at a time. The lock is tried, not waited for: a waiting statement holds a
-    snapshot, and `CREATE INDEX CONCURRENTLY` waits for every snapshot to end."""
+    """Hold the advisory lock that allows one migration at a time.
+
+    The lock is polled: a waiting statement would hold a snapshot, and `CREATE INDEX CONCURRENTLY`
+    waits for every snapshot to end.
+    """
     while True:
         with catalog.engine.connect() as connection:
-            # Without a parameter: a portal with one keeps its snapshot until the next statement.
-            tried = connection.exec_driver_sql(
+            # Without a bound parameter, with which the portal keeps its snapshot until the next
+            # statement.
+            acquired = connection.exec_driver_sql(
                 f"SELECT pg_try_advisory_xact_lock({ADVISORY_LOCK_ID})"
             )
-            if tried.scalar():
+            if acquired.scalar():
                 yield
                 return
         if time.monotonic() > deadline:

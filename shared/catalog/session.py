@@ -1,11 +1,8 @@
-"""How a process talks to PostgreSQL: its pool, its patience, and when a statement is given up.
+"""Database sessions: engine, connection pool, timeouts, transactions and their retries.
 
-Every limit of the server is set inside the transaction (`SET LOCAL`), and nothing is prepared on
-it: so a PgBouncer in transaction mode, which lends a server connection for one transaction, may
-stand between. Not preparing also lets the planner see the values: a plan that is good for a map
-with a million photos is bad for one with ten.
-
-The one session factory and the one place that commits.
+Timeouts are set inside the transaction (`SET LOCAL`) and no statements are prepared on the server,
+so that PgBouncer in transaction mode works. Without prepared statements the planner also sees the
+values: a plan that is good for a map with a million photos is bad for one with ten.
 """
 
 from __future__ import annotations
@@ -34,14 +31,14 @@ from shared.geodesy import distance_m
 
 log = logging.getLogger(__name__)
 
-# A transaction waits for its own process only between two statements: that takes no time, unless
-# the process hangs. Its locks are then taken from it.
+# idle_in_transaction_session_timeout: a transaction is idle only between two statements, which
+# takes no time unless the process hangs. PostgreSQL then ends it and releases its locks.
 PING_AFTER_IDLE_SECONDS = 60.0
-# What the server's own limit may take to reach us; after that the server itself is silent.
+# Grace for the server's own timeout error to arrive; after it the server counts as unresponsive.
 ANSWER_MARGIN_SECONDS = 2.0
 PING_TIMEOUT_SECONDS = 2.0
 
-# A peer that vanished without a word (a cut network, a lost machine) is found out by these.
+# Detects a peer that disappeared without closing the connection (lost network or machine).
 TCP_KEEPALIVE_OPTIONS = {
     "keepalives": 1,
     "keepalives_idle": 10,  # seconds
@@ -53,21 +50,21 @@ TCP_KEEPALIVE_OPTIONS = {
 
 @dataclass(frozen=True, slots=True)
 class TransactionTimeouts:
-    """How long PostgreSQL may take inside a transaction; SQLite knows no such limits."""
+    """Timeouts inside a PostgreSQL transaction; SQLite has none."""
 
     statement_seconds: float = 60.0
-    """For one statement, then it is ended (SQLSTATE 57014); 0: for as long as it takes."""
+    """Statement timeout (SQLSTATE 57014); 0 for none."""
     lock_seconds: float = 60.0
-    """Waiting for one lock, then the statement is ended (SQLSTATE 55P03)."""
+    """Lock timeout (SQLSTATE 55P03)."""
 
     @classmethod
     def for_requests(cls, settings: Settings) -> Self:
-        """Someone waits for the answer."""
+        """Return the timeouts for requests, where a client waits for the response."""
         return cls(settings.database_statement_seconds, settings.database_lock_seconds)
 
     @classmethod
     def for_background(cls, settings: Settings) -> Self:
-        """In the background, where giving up costs more than waiting."""
+        """Return the timeouts for background work, where an abort costs more than waiting."""
         return cls(settings.database_work_seconds, settings.database_work_seconds)
 
     def sql(self) -> str:
@@ -78,21 +75,21 @@ class TransactionTimeouts:
         )
 
 
-# Of a walk over everything.
+# For statements that read whole tables.
 NO_TIMEOUTS = TransactionTimeouts(statement_seconds=0)
 
 
 @dataclass(frozen=True, slots=True)
 class PoolConfig:
-    """A process's connections to PostgreSQL. Durations in seconds."""
+    """Connection pool of a process. Durations in seconds."""
 
     name: str = "placewise"
-    """`application_name`: who it is, in `pg_stat_activity`."""
+    """`application_name`, shown in `pg_stat_activity`."""
     size: int = 10
     overflow: int = 20
-    """Connections beyond `size` while they are needed."""
+    """Temporary connections beyond `size`."""
     wait_seconds: float = 3.0
-    """For a free connection, then sqlalchemy.exc.TimeoutError."""
+    """Wait for a free connection, then sqlalchemy.exc.TimeoutError."""
     connect_seconds: float = 3.0
 
     @classmethod
@@ -107,27 +104,29 @@ class PoolConfig:
 
 
 class TimeoutConnection(psycopg.Connection[Any]):
-    """Gives the server up when it is silent for `answer_seconds`.
+    """A connection with a client-side timeout for responses.
 
-    The server's own limits need a server that works: a frozen one, or one whose disk hangs, keeps
-    its connections open and says nothing.
+    The server's own timeouts need a working server: one that is frozen, or whose disk hangs, keeps
+    its connections open and does not respond.
     """
 
     answer_seconds: float | None = PING_TIMEOUT_SECONDS
-    """None: for as long as it takes."""
+    """Response timeout; None for no timeout."""
 
     def wait(self, gen: PQGen[RV], interval: float = 0.1, timeout: float | None = None) -> RV:
         try:
             return super().wait(gen, interval, self.answer_seconds if timeout is None else timeout)
         except psycopg.OperationalError:
             if self.pgconn.transaction_status == psycopg.pq.TransactionStatus.ACTIVE:
-                self.pgconn.finish()  # an answer may still come: no one may take it for theirs
+                self.pgconn.finish()  # a late response must not be read as that of another query
             raise
 
 
 def make_postgres_engine(url: URL, pool: PoolConfig) -> Engine:
-    """The engine; transactions run under `Limits` when the execution option `placewise_limits`
-    says so."""
+    """Create the engine.
+
+    The execution option `placewise_limits` sets the TransactionTimeouts of its transactions.
+    """
     engine = create_engine(
         url,
         pool_size=pool.size,
@@ -144,11 +143,11 @@ def make_postgres_engine(url: URL, pool: PoolConfig) -> Engine:
 def _connector(url: URL, pool: PoolConfig) -> Callable[[], TimeoutConnection]:
     arguments: dict[str, Any] = {
         "application_name": pool.name,
-        # psycopg takes whole seconds, and no less than 2.
+        # psycopg accepts whole seconds from 2 on.
         "connect_timeout": max(2, round(pool.connect_seconds)),
         **TCP_KEEPALIVE_OPTIONS,
         **url.translate_connect_args(username="user", database="dbname"),
-        **url.query,  # what the operator says comes last
+        **url.query,  # the operator's options override the others
     }
 
     def connect() -> TimeoutConnection:
@@ -166,20 +165,20 @@ def _set_timeouts(connection: Connection) -> None:
         return
     if limits.statement_seconds:
         driver.answer_seconds = limits.statement_seconds + ANSWER_MARGIN_SECONDS
-    if not driver.autocommit:  # where there is no transaction to be limited
+    if not driver.autocommit:  # SET LOCAL needs a transaction
         connection.exec_driver_sql(limits.sql())
 
 
 def _limit_ping(connection: TimeoutConnection | None, _record: object) -> None:
-    if connection is not None:  # None: it was found broken
+    if connection is not None:  # None: the connection was invalidated
         connection.answer_seconds = PING_TIMEOUT_SECONDS
 
 
-# A writer that waits this long for SQLite's single write lock has met a bug, not a queue.
+# A longer wait for SQLite's single write lock is caused by a bug, not by load.
 SQLITE_BUSY_SECONDS = 60
 
-MAX_TRANSACTION_ATTEMPTS = 5  # of a unit that PostgreSQL sacrifices to others
-RETRY_BASE_SECONDS = 0.05  # doubled each time
+MAX_TRANSACTION_ATTEMPTS = 5  # of a transaction that PostgreSQL rolls back (deadlock, conflict)
+RETRY_BASE_SECONDS = 0.05  # doubled after each attempt
 
 T = TypeVar("T")
 
@@ -187,10 +186,10 @@ T = TypeVar("T")
 class Catalog:
     """Opens sessions on one database.
 
-    `read()` gives a consistent snapshot and never writes; `write()` commits when its block ends
-    and rolls back when it raises; `run(unit)` is a `write()` that begins anew after a deadlock.
-    Objects stay readable after the block. Whatever the database refuses raises SQLAlchemyError;
-    `shared.catalog.database_errors` says what of it is an outage.
+    `read()` opens a read-only session on a consistent snapshot; `write()` commits at the end of its
+    block and rolls back when it raises; `run(unit)` is a `write()` that is retried after a
+    deadlock. Objects stay readable after the block. Database errors raise SQLAlchemyError;
+    `shared.catalog.database_errors` tells which of them are outages.
     """
 
     def __init__(
@@ -215,18 +214,18 @@ class Catalog:
         else:
             self.engine = make_postgres_engine(self.url, pool)
         self._sessions = sessionmaker(expire_on_commit=False)
-        # SQLite has one writer: queueing here is fair and does not spin as its busy handler does.
+        # SQLite has one writer: a lock is fair and does not poll, unlike SQLite's busy handler.
         self._sqlite_writer = threading.Lock()
 
     def with_timeouts(self, limits: TransactionTimeouts) -> Catalog:
-        """The same connections, for transactions with other limits."""
-        other = copy.copy(self)
-        other.limits = limits
-        return other
+        """Return a catalog on the same connection pool with other timeouts."""
+        catalog = copy.copy(self)
+        catalog.limits = limits
+        return catalog
 
     @contextlib.contextmanager
     def read(self) -> Iterator[Session]:
-        """A session on one consistent snapshot; what it changes is thrown away."""
+        """Open a read-only session on one consistent snapshot."""
         isolation: dict[str, Any] = (
             {}
             if self.is_sqlite
@@ -237,19 +236,19 @@ class Catalog:
 
     @contextlib.contextmanager
     def write(self) -> Iterator[Session]:
-        """A session that commits when the block ends. PostgreSQL: READ COMMITTED."""
-        turn = self._sqlite_writer if self.is_sqlite else contextlib.nullcontext()
-        with turn, self._session(placewise_write=True) as session:
+        """Open a session that commits at the end of the block. PostgreSQL: READ COMMITTED."""
+        writer_lock = self._sqlite_writer if self.is_sqlite else contextlib.nullcontext()
+        with writer_lock, self._session(placewise_write=True) as session:
             yield session
             session.commit()
 
     def run(self, unit: Callable[[Session], T]) -> T:
-        """What `unit` returns, after its transaction is committed.
+        """Run `unit` in a write transaction, commit, and return its result.
 
-        For units that lock rows of several tables: where PostgreSQL ends one for another's sake
-        (a deadlock, a serialization failure), the whole unit is run again, up to TRIES times. It
-        begins from nothing each time: `unit` may change nothing but the session. Every other
-        error is raised at once.
+        For units that lock rows of several tables: when PostgreSQL rolls one back because of a
+        deadlock or a serialization failure, the whole unit is retried, up to
+        MAX_TRANSACTION_ATTEMPTS times. `unit` must therefore have no effects outside the session.
+        Other errors are raised at once.
         """
         for attempt in range(MAX_TRANSACTION_ATTEMPTS - 1):
             try:
@@ -259,8 +258,8 @@ class Catalog:
                 reason = ROLLBACK_SQLSTATES.get(get_sqlstate(error) or "")
                 if reason is None:
                     raise
-                log.info("%s: %s is run again", reason, unit.__qualname__)
-            # Apart, or they meet again.
+                log.info("%s: retrying %s", reason, unit.__qualname__)
+            # Jitter, or the two transactions would conflict again.
             time.sleep(random.uniform(0.5, 1.0) * RETRY_BASE_SECONDS * 2**attempt)  # noqa: S311
         with self.write() as session:
             return unit(session)
@@ -276,12 +275,10 @@ class Catalog:
 
 
 def _prepare_sqlite(connection: Any, _record: Any) -> None:
-    connection.isolation_level = (
-        None  # transactions are begun by `_begin_sqlite`, not by the driver
-    )
+    connection.isolation_level = None  # `_begin_sqlite` begins transactions, not the driver
     cursor = connection.cursor()
     cursor.execute("PRAGMA journal_mode = WAL")
-    # FULL: a committed upload survives a power cut, not only a killed process.
+    # FULL: a committed upload survives a power failure, not only a killed process.
     cursor.execute("PRAGMA synchronous = FULL")
     cursor.execute("PRAGMA foreign_keys = ON")
     cursor.close()
@@ -294,8 +291,8 @@ def _distance_or_null(*degrees: float | None) -> float | None:
 
 
 def _begin_sqlite(connection: Any) -> None:
-    # IMMEDIATE takes the write lock at once: a transaction that reads before it writes can then
-    # never fail half way because another one wrote in between.
+    # IMMEDIATE acquires the write lock at once: otherwise a transaction that reads before it writes
+    # fails when another one writes in between.
     writes = connection.get_execution_options().get("placewise_write", True)
     connection.exec_driver_sql(f"PRAGMA query_only = {'OFF' if writes else 'ON'}")
     connection.exec_driver_sql("BEGIN IMMEDIATE" if writes else "BEGIN")

@@ -1,8 +1,6 @@
-"""Every table, imported: what Alembic compares the database with.
+"""Imports every table, for Alembic and for foreign keys, and opens the configured catalog.
 
-Which releases understand the schema that is there; one row, written by migrations.
-
-The catalog that the settings name, with every table known.
+Also the table of the schema's compatibility with older releases, written by migrations.
 """
 
 from __future__ import annotations
@@ -10,7 +8,7 @@ from __future__ import annotations
 from sqlalchemy import String
 from sqlalchemy.orm import Mapped, mapped_column
 
-# A foreign key may lead to a table whose module the service itself never needs.
+# A foreign key may refer to a table whose module a service does not import itself.
 import shared.catalog.tables  # noqa: F401
 from shared.catalog.api_keys import ApiKey
 from shared.catalog.base import Base
@@ -31,7 +29,7 @@ from shared.config.settings import Settings
 
 
 class SchemaCompatibility(Base):
-    """`understood_from`: the oldest revision whose release works with the schema as it is now."""
+    """The single row has the oldest revision whose release works with the current schema."""
 
     __tablename__ = "schema_compatibility"
 
@@ -41,8 +39,13 @@ class SchemaCompatibility(Base):
 def open_catalog(
     settings: Settings, service: str, limits: TransactionTimeouts | None = None
 ) -> Catalog:
-    """The catalog that the settings name, for a service of this name; `limits` are those of
-    background work unless given."""
+    """Open the catalog of the settings.
+
+    Args:
+        settings: The settings.
+        service: Name of the service, for `pg_stat_activity`.
+        limits: Timeouts; by default those of background work.
+    """
     return Catalog(
         settings.catalog_url(),
         PoolConfig.from_settings(settings, service),

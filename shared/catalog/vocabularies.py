@@ -1,7 +1,4 @@
-"""Vocabularies: VLAD's cluster centres, where they were learnt, and where they lie.
-
-PCA whitenings that a map's generations are made with, and where they lie.
-"""
+"""Vocabularies (VLAD cluster centres) and PCA whitenings of maps, stored as objects."""
 
 from __future__ import annotations
 
@@ -21,15 +18,15 @@ from shared.ids import new_id
 
 
 class VocabularyOrigin(StrEnum):
-    SHIPPED = "shipped"  # came with the extractor: learnt on photographs of elsewhere
-    FITTED = "fitted"  # learnt on the map's own photos
-    IMPORTED = "imported"  # brought by the user
+    SHIPPED = "shipped"  # shipped with the extractor: fitted on photos of other places
+    FITTED = "fitted"  # fitted on the map's own photos
+    IMPORTED = "imported"  # uploaded by the user
 
 
 class Vocabulary(Journaled, Base):
-    """(clusters, dimension) float32 centres under `object_key`, as a `.npy` file.
+    """A vocabulary: (clusters, dimension) float32 centres in a `.npy` file under `object_key`.
 
-    `provenance` is what `shared.descriptors.vocabulary_file` says of them.
+    `provenance` is that of `shared.descriptors.vocabulary_file`.
     """
 
     __tablename__ = "vocabularies"
@@ -46,33 +43,33 @@ class Vocabulary(Journaled, Base):
 
     @property
     def standing(self) -> str:
-        """What an answer says of it: `own` when learnt on this map's photos, else `foreign`."""
+        """`own` if fitted on this map's photos, else `foreign`; part of API responses."""
         return "own" if self.origin == VocabularyOrigin.FITTED else "foreign"
 
 
 def vocabulary_standing(session: Session, generation: Generation) -> str:
-    """The standing of the generation's vocabulary; `none` for an extractor without one."""
+    """Return the standing of the generation's vocabulary; `none` for an extractor without one."""
     if generation.vocabulary_id is None:
         return "none"
     return session.get_one(Vocabulary, generation.vocabulary_id).standing
 
 
 def word_weights_unavailable_reason(session: Session, generation: Generation) -> str | None:
-    """Why its words can't be weighed, as a clause; None where they can.
+    """Return why the generation does not support word weights, as a clause; None if it does.
 
-    A weight belongs to one block of the descriptor, as long as a local feature. PCA mixes the
-    blocks, which its shorter descriptors show.
+    A weight applies to the block of the descriptor that belongs to a word, which is as long as a
+    local feature. PCA mixes the blocks; it is recognised by the shorter descriptors.
     """
     if generation.vocabulary_id is None:
         return "its extractor uses no vocabulary"
     preprocessing = generation.spec["preprocessing"]["name"]
     if preprocessing in ANYLOC_PREPROCESSING_NAMES:
-        return f"with {preprocessing} it is to rank as its authors' code does"
+        return f"with {preprocessing} its ranking has to be that of its authors' code"
     vocabulary = session.get_one(Vocabulary, generation.vocabulary_id)
     if "pca" in generation.spec or (
         vocabulary.clusters * vocabulary.dimension != generation.dimension
     ):
-        return "its descriptors are projected, and no longer made of words"
+        return "its descriptors are projected and no longer consist of a block per word"
     return None
 
 
@@ -86,7 +83,7 @@ def add_vocabulary(
     sha256: str,
     provenance: dict[str, Any],
 ) -> Vocabulary:
-    """Make centres that lie under `object_key` known; `shape` is (clusters, dimension)."""
+    """Register the centres stored under `object_key`; `shape` is (clusters, dimension)."""
     vocabulary = Vocabulary(
         id=new_id(),
         map_id=map_id,
@@ -103,21 +100,21 @@ def add_vocabulary(
 
 
 def get_vocabulary(session: Session, map_id: UUID, vocabulary_id: UUID) -> Vocabulary:
-    """A vocabulary of the map; 404 when there is none."""
-    found = session.scalar(
+    """Return a vocabulary of the map; NotFound (`vocabulary_not_found`)."""
+    vocabulary = session.scalar(
         select(Vocabulary).where(Vocabulary.id == vocabulary_id, Vocabulary.map_id == map_id)
     )
-    if found is None:
+    if vocabulary is None:
         raise NotFound(
             "vocabulary_not_found",
             f"There is no vocabulary {vocabulary_id} in this map.",
             vocabulary_id=str(vocabulary_id),
         )
-    return found
+    return vocabulary
 
 
 def list_vocabularies(session: Session, map_id: UUID) -> list[Vocabulary]:
-    """The map's vocabularies, newest first."""
+    """List the map's vocabularies, newest first."""
     return list(
         session.scalars(
             select(Vocabulary).where(Vocabulary.map_id == map_id).order_by(Vocabulary.id.desc())
@@ -126,10 +123,10 @@ def list_vocabularies(session: Session, map_id: UUID) -> list[Vocabulary]:
 
 
 class StoredWhitening(Journaled, Base):
-    """From `dimension` numbers to `kept`: a file of `shared.descriptors.pca_whitening` under
-    `object_key`.
+    """A PCA whitening from `dimension` to `kept` components, stored under `object_key`.
 
-    It goes when none of its generations answers or is built any more, some time after.
+    The file is one of `shared.descriptors.pca_whitening`. It is deleted after a grace period when
+    none of its generations is active or being built any more.
     """
 
     __tablename__ = "whitenings"
@@ -138,7 +135,7 @@ class StoredWhitening(Journaled, Base):
     map_id: Mapped[UUID] = mapped_column(Uuid, ForeignKey("maps.id"), index=True)
     dimension: Mapped[int] = mapped_column(Integer)
     kept: Mapped[int] = mapped_column(Integer)
-    # Those that it was fitted on, and the share of their variance that is left, 0 to 1.
+    # The number of rows that it was fitted on, and the explained share of their variance, 0 to 1.
     rows: Mapped[int] = mapped_column(Integer)
     explained: Mapped[float] = mapped_column(Float)
     object_key: Mapped[str] = mapped_column(Text)
@@ -146,7 +143,7 @@ class StoredWhitening(Journaled, Base):
     created_at: Mapped[datetime] = mapped_column(UtcDateTime, default=db_now())
 
     def summary(self) -> dict[str, Any]:
-        """What an answer says of it."""
+        """Return its description in API responses."""
         return {
             "from_dimension": self.dimension,
             "dimension": self.kept,
@@ -156,30 +153,31 @@ class StoredWhitening(Journaled, Base):
 
 
 def get_pca_source_generation(session: Session, map_id: UUID) -> Generation:
-    """The active generation, whose rows a PCA can be fitted on.
+    """Return the active generation, whose descriptors a PCA is fitted on.
 
-    Conflict: `nothing_described` in a map without one; `already_reduced` where PCA has shortened
-    its descriptors: what it has left out can't be had back from them.
+    Raises:
+        Conflict: `nothing_described`: the map has no active generation. `already_reduced`: its
+            descriptors are already reduced by PCA, and what that discarded can't be restored.
     """
     active = active_generation(session, map_id)
     if active is None:
         raise Conflict(
             "nothing_described",
-            "PCA is fitted on the map's descriptors, and it has none yet. Upload photos first.",
+            "PCA is fitted on the map's descriptors, but it has none yet. Upload photos first.",
         )
     if active.pca_from is not None:
         raise Conflict(
             "already_reduced",
-            f"PCA has brought the map's descriptors to {active.dimension} dimensions already. Go "
-            "back to whole ones first: `placewise pca undo`, or POST /api/v1/generations with the "
-            "vocabulary alone.",
+            f"The map's descriptors are already reduced to {active.dimension} dimensions by PCA. "
+            "Go back to full descriptors first: `placewise pca undo`, or POST /api/v1/generations "
+            "with only the vocabulary.",
             dimension=active.dimension,
         )
     return active
 
 
 def add_whitening(session: Session, map_id: UUID, **columns: Any) -> StoredWhitening:
-    """Make a whitening that lies under `object_key` known."""
+    """Register a whitening that is stored under `object_key`."""
     whitening = StoredWhitening(id=new_id(), map_id=map_id, **columns)
     session.add(whitening)
     session.flush()

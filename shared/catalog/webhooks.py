@@ -1,8 +1,8 @@
-"""Webhooks, and the outbox of what is to be told to them.
+"""Webhooks and the transactional outbox of their events.
 
-An event is written in the transaction that makes it true (`announce`), as one delivery for each
-webhook that wants it. So none is lost, and nothing is told that did not happen; the steward sends
-it afterwards, until it was taken or has failed for good.
+An event is written in the transaction that causes it (`enqueue_event`), as one delivery per
+subscribed webhook: no event is lost, and none is sent for a transaction that was rolled back. The
+steward sends the deliveries (`services.steward.webhooks`).
 """
 
 from __future__ import annotations
@@ -29,18 +29,18 @@ SECRET_BYTES = 32
 class EventKind(StrEnum):
     JOB_SUCCEEDED = "job.succeeded"
     JOB_FAILED = "job.failed"
-    BATCH_FINISHED = "batch.finished"  # beside the batch's own job.succeeded or job.failed
+    BATCH_FINISHED = "batch.finished"  # in addition to the batch's job.succeeded or job.failed
     GENERATION_SWITCHED = "generation.switched"
 
 
 class DeliveryState(StrEnum):
-    PENDING = "pending"  # to be tried, or tried again, at `next_attempt_at`
-    DELIVERED = "delivered"  # answered with 2xx
-    FAILED = "failed"  # given up
+    PENDING = "pending"  # next attempt at `next_attempt_at`
+    DELIVERED = "delivered"  # got a 2xx response
+    FAILED = "failed"  # no more attempts
 
 
 class Webhook(Base):
-    """Where events are sent. The secret signs them: it has to be kept as it is."""
+    """A webhook. Its secret signs the events, so it is stored in plain text."""
 
     __tablename__ = "webhooks"
 
@@ -54,15 +54,15 @@ class Webhook(Base):
 class Delivery(Base):
     """One event for one webhook.
 
-    No foreign key: an event is written beside the work of extractors, whom a webhook that is being
-    deleted must not stop. What is left of it is never sent.
+    It has no foreign key to the webhook, because the deletion of a webhook must not block the
+    extractors' transactions, which write events. Deliveries of a deleted webhook are never sent.
     """
 
     __tablename__ = "webhook_deliveries"
 
     id: Mapped[UUID] = mapped_column(Uuid, primary_key=True, default=new_id)
     webhook_id: Mapped[UUID] = mapped_column(Uuid)
-    event_id: Mapped[UUID] = mapped_column(Uuid)  # the same in every try, and for every webhook
+    event_id: Mapped[UUID] = mapped_column(Uuid)  # the same for all attempts and webhooks
     event: Mapped[EventKind] = mapped_column(String(50))
     body: Mapped[str] = mapped_column(Text)  # JSON, exactly as it is signed
     state: Mapped[DeliveryState] = mapped_column(String(20), default=DeliveryState.PENDING)
@@ -83,52 +83,54 @@ class Delivery(Base):
 
 
 def create_webhook(session: Session, url: str, events: list[EventKind]) -> Webhook:
-    """A webhook with a new secret; `shared.security.webhook_targets` says which `url` may be
-    one."""
+    """Create a webhook with a new secret.
+
+    The caller has checked the `url` with `shared.security.webhook_targets`.
+    """
     secret = SECRET_PREFIX + base64.b64encode(secrets.token_bytes(SECRET_BYTES)).decode()
-    made = Webhook(url=url, events=sorted(set(events)), secret=secret)
-    session.add(made)
+    webhook = Webhook(url=url, events=sorted(set(events)), secret=secret)
+    session.add(webhook)
     session.flush()
-    session.refresh(made)
-    return made
+    session.refresh(webhook)
+    return webhook
 
 
 def get_webhook(session: Session, webhook_id: UUID) -> Webhook:
-    """NotFound (`webhook_not_found`) when there is none."""
-    found = session.get(Webhook, webhook_id)
-    if found is None:
+    """Return a webhook; NotFound (`webhook_not_found`)."""
+    webhook = session.get(Webhook, webhook_id)
+    if webhook is None:
         raise NotFound("webhook_not_found", f"There is no webhook {webhook_id}.")
-    return found
+    return webhook
 
 
 def list_webhooks(session: Session) -> list[Webhook]:
-    """Newest first."""
+    """List all webhooks, newest first."""
     return list(session.scalars(select(Webhook).order_by(Webhook.id.desc())))
 
 
 def delete_webhook(session: Session, webhook_id: UUID) -> Webhook:
-    """With all of its deliveries, also those that wait."""
-    found = get_webhook(session, webhook_id)
+    """Delete a webhook with all its deliveries, also pending ones; NotFound."""
+    webhook = get_webhook(session, webhook_id)
     session.execute(delete(Delivery).where(Delivery.webhook_id == webhook_id))
-    session.delete(found)
-    return found
+    session.delete(webhook)
+    return webhook
 
 
 def list_deliveries(
     session: Session, webhook_id: UUID, limit: int, before: UUID | None
 ) -> list[Delivery]:
-    """What was and will be sent, newest first, up to `limit`, older than `before`."""
-    subscribed_webhook_ids = select(Delivery).where(Delivery.webhook_id == webhook_id)
+    """List the webhook's deliveries, newest first, up to `limit`; `before` is the page's cursor."""
+    statement = select(Delivery).where(Delivery.webhook_id == webhook_id)
     if before is not None:
-        subscribed_webhook_ids = subscribed_webhook_ids.where(Delivery.id < before)
-    return list(session.scalars(subscribed_webhook_ids.order_by(Delivery.id.desc()).limit(limit)))
+        statement = statement.where(Delivery.id < before)
+    return list(session.scalars(statement.order_by(Delivery.id.desc()).limit(limit)))
 
 
 def subscribed_webhook_ids(session: Session, event: EventKind) -> list[UUID]:
-    """The webhooks that want the event; they are looked up once in a transaction."""
+    """Return the ids of the webhooks subscribed to the event, read once per transaction."""
     webhooks = session.info.get("webhooks")
     if webhooks is None:
-        # In the midst of others' changes, which are not to be written before they are whole.
+        # The caller's changes may be incomplete, so they must not be flushed here.
         with session.no_autoflush:
             webhooks = session.execute(select(Webhook.id, Webhook.events)).all()
         session.info["webhooks"] = webhooks
@@ -136,14 +138,14 @@ def subscribed_webhook_ids(session: Session, event: EventKind) -> list[UUID]:
 
 
 def enqueue_event(session: Session, event: EventKind, data: dict[str, Any]) -> None:
-    """Let every webhook that wants it hear of the event once this transaction is committed."""
-    webhooks = subscribed_webhook_ids(session, event)
-    if not webhooks:
+    """Write a delivery of the event for each subscribed webhook, to be sent after the commit."""
+    webhook_ids = subscribed_webhook_ids(session, event)
+    if not webhook_ids:
         return
     event_id = new_id()
-    said = {"type": event, "timestamp": datetime.now(UTC).isoformat(), "data": data}
-    body = json.dumps(said, separators=(",", ":"))
+    payload = {"type": event, "timestamp": datetime.now(UTC).isoformat(), "data": data}
+    body = json.dumps(payload, separators=(",", ":"))
     session.add_all(
         Delivery(webhook_id=webhook_id, event_id=event_id, event=event, body=body)
-        for webhook_id in webhooks
+        for webhook_id in webhook_ids
     )

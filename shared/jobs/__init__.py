@@ -1,6 +1,7 @@
-"""Jobs: what has to be done, who is doing it, and until when that is believed.
+"""The job queue: claims, leases, state transitions and wake-ups.
 
-The `jobs` table is the queue. A hint (`shared.jobs.wakeups`) only wakes a worker sooner.
+The `jobs` table is the queue and the only source of truth. A wake-up (`shared.jobs.wakeups`), also
+called a hint, only makes a worker look at the table sooner.
 """
 
 from shared.catalog.jobs import Job, JobKind, JobState, Priority

@@ -1,11 +1,11 @@
-"""The Celery application that carries hints, and nothing else: the truth is in the job table.
+"""Wake-ups as Celery messages: the Celery application and a non-blocking sender.
 
-A message names no job. The task drains the table for a few seconds; its result is what Flower
-shows. Whatever Redis does to messages (loses them, doubles them, delivers them again while they are
-worked on) costs a look at the table at most: claims skip what others hold, and a worker that was
-taken over can't commit.
+Celery carries wake-ups only; the job table is the source of truth. A message names no job. Its task
+drains the table for a few seconds, and Flower shows the task's result. When Redis loses, duplicates
+or redelivers a message, the cost is at most one query of the table: claims skip the jobs of other
+workers, and a worker that lost its lease can't commit.
 
-Hints as Celery messages, sent from a thread so that no request waits for Redis.
+Messages are sent from a thread, so that no request waits for Redis.
 """
 
 from __future__ import annotations
@@ -28,16 +28,21 @@ log = logging.getLogger(__name__)
 
 DRAIN_TASK = "placewise.drain"
 
-# A look at Redis for messages whose worker fell silent; kombu's own 10 s x 10 would make it 100 s.
+# Interval of the search for unacknowledged messages of dead workers; kombu's defaults (10 s, every
+# tenth time) would make it 100 s.
 UNACKED_RESTORE_SECONDS = 5
 BROKER_TIMEOUT_SECONDS = 5
 
 
 def create_celery_app(settings: Settings) -> Celery:
-    """The application, for sending and for working; Misconfigured without REDIS_URL.
+    """Create the Celery application for senders and workers.
 
-    JSON only, no result backend. A message is acknowledged when its drain has ended, so a killed
-    worker's comes back after `visibility_seconds`, which outlasts any drain.
+    It uses JSON only and no result backend. A message is acknowledged after its drain, so the
+    message of a killed worker is delivered again after `visibility_seconds`, which is longer than
+    any drain.
+
+    Raises:
+        Misconfigured: REDIS_URL is not set.
     """
     if settings.redis_url is None:
         raise Misconfigured(
@@ -55,7 +60,7 @@ def create_celery_app(settings: Settings) -> Celery:
         task_acks_late=True,
         task_reject_on_worker_lost=True,
         worker_prefetch_multiplier=1,
-        task_queues=[_queue(lane) for lane in WakeupQueue],
+        task_queues=[_queue(queue) for queue in WakeupQueue],
         task_default_queue=WakeupQueue.BULK,
         task_create_missing_queues=False,
         task_track_started=False,
@@ -85,68 +90,71 @@ def create_celery_app(settings: Settings) -> Celery:
     return app
 
 
-def _queue(lane: WakeupQueue) -> Queue:
-    # With an exchange of its own: on the default one every hint would reach both lanes.
-    return Queue(lane, Exchange(lane), routing_key=lane)  # type: ignore[no-untyped-call]
+def _queue(queue: WakeupQueue) -> Queue:
+    # An exchange of its own: through the default one every message would reach both queues.
+    return Queue(queue, Exchange(queue), routing_key=queue)  # type: ignore[no-untyped-call]
 
 
-# Waiting messages that are worth having: one wakes one free worker, and a worker that finds more
-# than it can do sends the next.
+# More pending messages would be of no use: one message wakes one free worker, and a worker that
+# finds more jobs than it can run sends the next.
 MAX_PENDING_WAKEUPS = 16
-# A burst of uploads is one hint.
+# A burst of uploads sends one message.
 DEBOUNCE_SECONDS = 0.01
-WARNING_INTERVAL_SECONDS = 60.0  # between two lines of the log about Redis being away
+WARNING_INTERVAL_SECONDS = 60.0  # between two log lines about an unreachable Redis
 BROKER_ERRORS = (OperationalError, KombuError, RedisError, OSError, TimeoutError)
 
 
 class CeleryWakeups:
-    """Sends hints; `close` ends its thread. While Redis is away, hints are dropped."""
+    """Sends wake-ups from a thread, which `close` ends.
+
+    Wake-ups are dropped while Redis is unreachable.
+    """
 
     def __init__(self, app: Celery, settings: Settings) -> None:
-        assert settings.redis_url is not None, "make_celery has checked it"
+        assert settings.redis_url is not None, "create_celery_app has checked it"
         self._app = app
         self._redis = Redis.from_url(
             settings.redis_url.get_secret_value(),
             socket_timeout=BROKER_TIMEOUT_SECONDS,
             socket_connect_timeout=BROKER_TIMEOUT_SECONDS,
         )
-        self._wanted: dict[WakeupQueue, threading.Event] = {
-            lane: threading.Event() for lane in WakeupQueue
+        self._pending: dict[WakeupQueue, threading.Event] = {
+            queue: threading.Event() for queue in WakeupQueue
         }
-        self._any = threading.Event()
+        self._any_pending = threading.Event()
         self._stop = threading.Event()
-        self._silent_until = 0.0
+        self._next_warning = 0.0
         self._sender = threading.Thread(target=self._run, name="hints", daemon=True)
         self._sender.start()
 
-    def send(self, lane: WakeupQueue = WakeupQueue.BULK) -> None:
-        self._wanted[lane].set()
-        self._any.set()
+    def send(self, queue: WakeupQueue = WakeupQueue.BULK) -> None:
+        self._pending[queue].set()
+        self._any_pending.set()
 
     def close(self) -> None:
         self._stop.set()
-        self._any.set()
+        self._any_pending.set()
         self._sender.join(timeout=2 * BROKER_TIMEOUT_SECONDS)
         self._redis.close()
 
     def _run(self) -> None:
         while True:
-            self._any.wait()
+            self._any_pending.wait()
             if self._stop.is_set():
                 return
             self._stop.wait(DEBOUNCE_SECONDS)
-            self._any.clear()
-            for lane in WakeupQueue:
-                if self._wanted[lane].is_set():
-                    self._wanted[lane].clear()
-                    self._publish(lane)
+            self._any_pending.clear()
+            for queue in WakeupQueue:
+                if self._pending[queue].is_set():
+                    self._pending[queue].clear()
+                    self._publish(queue)
 
-    def _publish(self, lane: WakeupQueue) -> None:
+    def _publish(self, queue: WakeupQueue) -> None:
         try:
-            if int(self._redis.llen(lane)) >= MAX_PENDING_WAKEUPS:
+            if int(self._redis.llen(queue)) >= MAX_PENDING_WAKEUPS:
                 return
-            self._app.send_task(DRAIN_TASK, queue=lane, ignore_result=True, retry=False)
+            self._app.send_task(DRAIN_TASK, queue=queue, ignore_result=True, retry=False)
         except BROKER_ERRORS as error:
-            if time.monotonic() > self._silent_until:
-                self._silent_until = time.monotonic() + WARNING_INTERVAL_SECONDS
-                log.warning("Redis can't be reached, hints are dropped for now: %s", error)
+            if time.monotonic() > self._next_warning:
+                self._next_warning = time.monotonic() + WARNING_INTERVAL_SECONDS
+                log.warning("Redis is unreachable, wake-ups are dropped: %s", error)

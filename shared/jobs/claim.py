@@ -1,4 +1,4 @@
-"""Taking work: a batch of jobs that one forward pass can serve."""
+"""Claiming jobs: leases a batch of queued jobs that one forward pass can serve."""
 
 from __future__ import annotations
 
@@ -32,18 +32,30 @@ def claim_jobs(
     alone: bool = True,
     started: bool = True,
 ) -> list[Job]:
-    """Up to `limit` claimable jobs of one kind, map and generation, leased under one fresh token.
+    """Claim claimable jobs of one kind, map and generation, under one new lease token.
 
-    The first by (priority, age) decides which; jobs that other workers hold are passed over
-    (`FOR UPDATE SKIP LOCKED`; SQLite has one writer). A job marked `alone` and one of LONE_JOBS
-    come as a batch of one. Jobs below `min_priority` are left, and without `alone` those that
-    have to be tried alone. A worker that will first do what can't harm it (read, decode) says so
-    with `begun=False`, and calls `begin` after that.
+    The first job by (priority, age) decides the kind, map and generation. Jobs locked by other
+    workers are skipped (`FOR UPDATE SKIP LOCKED`; SQLite has a single writer). A job that is marked
+    `alone` or is one of SINGLE_CLAIM_JOBS is claimed as a batch of one.
+
+    Args:
+        session: The session of a write transaction.
+        worker: Name of the worker, stored with the jobs.
+        limit: Largest number of jobs.
+        lease_seconds: Duration of the lease.
+        kinds: Kinds of jobs that the worker runs.
+        min_priority: Jobs of a lower priority are not claimed.
+        alone: Whether to claim jobs that have to be retried alone.
+        started: False for a worker that begins with steps that can't crash it (reading, decoding):
+            if it dies before it calls `mark_started`, the jobs are not blamed.
+
+    Returns:
+        The claimed jobs; empty when there are none.
     """
     order = (Job.priority.desc(), Job.id)
-    wanted = _claim_conditions(kinds, min_priority, alone)
+    conditions = _claim_conditions(kinds, min_priority, alone)
     head = session.scalar(
-        select(Job).where(*wanted).order_by(*order).limit(1).with_for_update(skip_locked=True)
+        select(Job).where(*conditions).order_by(*order).limit(1).with_for_update(skip_locked=True)
     )
     if head is None:
         return []
@@ -52,7 +64,7 @@ def claim_jobs(
         batch += session.scalars(
             select(Job)
             .where(
-                *wanted,
+                *conditions,
                 Job.id != head.id,
                 Job.alone.is_(False),
                 Job.kind == head.kind,
@@ -77,7 +89,7 @@ def claim_jobs(
         )
         .execution_options(synchronize_session=False)
     )
-    # One statement for all of them: the claim's times and token are the database's.
+    # Refreshes all of them with one statement: the database has set the times and the token.
     session.scalars(
         select(Job)
         .where(Job.id.in_([job.id for job in batch]))
@@ -89,15 +101,15 @@ def claim_jobs(
 def has_claimable_jobs(
     session: Session, kinds: Sequence[JobKind], min_priority: int | None = None, *, alone: bool
 ) -> bool:
-    """Is there something for `claim` with the same arguments?"""
-    found = session.scalar(
+    """Return whether `claim_jobs` with the same arguments would find a job."""
+    job_id = session.scalar(
         select(Job.id).where(*_claim_conditions(kinds, min_priority, alone)).limit(1)
     )
-    return found is not None
+    return job_id is not None
 
 
 def mark_started(session: Session, token: UUID, job_count: int) -> None:
-    """From here on the `job_count` jobs under the token may be to blame if the worker falls."""
+    """Record that the `job_count` jobs under the token run: they may be the cause of a crash."""
     session.execute(
         update(Job)
         .where(Job.id.in_(session.scalars(select_locked_job_ids(token)).all()))
@@ -107,11 +119,11 @@ def mark_started(session: Session, token: UUID, job_count: int) -> None:
 
 
 def _claim_conditions(
-    kinds: Sequence[JobKind], least_priority: int | None, alone: bool
+    kinds: Sequence[JobKind], min_priority: int | None, alone: bool
 ) -> list[Condition]:
-    wanted = [claimable_condition(kinds)]
-    if least_priority is not None:
-        wanted.append(Job.priority >= least_priority)
+    conditions = [claimable_condition(kinds)]
+    if min_priority is not None:
+        conditions.append(Job.priority >= min_priority)
     if not alone:
-        wanted.append(Job.alone.is_(False))
-    return wanted
+        conditions.append(Job.alone.is_(False))
+    return conditions

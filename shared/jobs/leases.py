@@ -1,4 +1,8 @@
-"""Leases: how long a worker is believed to be alive, by the database's clock alone."""
+"""Leases of claimed jobs: extending, checking and reclaiming them.
+
+A claim has a lease and a fencing token. A worker that does not extend its lease counts as dead; its
+jobs go back to the queue, and its token can no longer commit. Leases use the database's clock only.
+"""
 
 from __future__ import annotations
 
@@ -25,49 +29,52 @@ log = logging.getLogger(__name__)
 
 
 def get_lease_token(job: Job) -> UUID:
-    """The token that a claimed job carries."""
-    assert job.lease_token is not None, "a claimed job carries a token"
+    """Return the fencing token of a claimed job."""
+    assert job.lease_token is not None, "a claimed job has a token"
     return job.lease_token
 
 
 def extend_lease(session: Session, token: UUID, lease_seconds: float) -> bool:
-    """Keep what was claimed under `token`; False when all of it has been taken over or ended."""
-    touched = session.execute(
+    """Extend the lease of the jobs claimed under `token`; False when none of them is left.
+
+    A job is no longer under the token once another worker took it over, or once it ended.
+    """
+    updated = session.execute(
         update(Job)
         .where(Job.id.in_(session.scalars(select_locked_job_ids(token)).all()))
         .values(lease_until=db_now_plus(lease_seconds))
         .execution_options(synchronize_session=False)
     )
-    return affected_rows(touched) > 0
+    return affected_rows(updated) > 0
 
 
 @contextlib.contextmanager
 def maintain_lease(catalog: Catalog, token: UUID, lease_seconds: float) -> Iterator[None]:
-    """Extends the lease from a thread while the block runs, three times per lease."""
+    """Extend the lease from a thread while the block runs, three times per lease period."""
     done = threading.Event()
     outage = OutageLog(f"lease {token}")
 
-    def keep() -> None:
+    def renew() -> None:
         while not done.wait(lease_seconds / 3):
             try:
                 with catalog.write() as session:
                     if not extend_lease(session, token, lease_seconds):
                         return
             except SQLAlchemyError as error:
-                # The lease may run out, and then the token fences the commit.
+                # If the lease expires meanwhile, the token prevents the commit.
                 outage.record_error(error)
 
-    keeper = threading.Thread(target=keep, name=f"lease-{token}", daemon=True)
-    keeper.start()
+    renewer = threading.Thread(target=renew, name=f"lease-{token}", daemon=True)
+    renewer.start()
     try:
         yield
     finally:
         done.set()
-        keeper.join()
+        renewer.join()
 
 
 def lock_leased_jobs(session: Session, token: UUID, jobs: Sequence[Job]) -> list[Job]:
-    """Those of the jobs that still carry the token, locked: only these may be finished."""
+    """Lock and return the jobs that are still under the token: only these may be finished."""
     return list(
         session.scalars(
             select(Job)
@@ -80,11 +87,17 @@ def lock_leased_jobs(session: Session, token: UUID, jobs: Sequence[Job]) -> list
 
 
 def reclaim_expired_leases(session: Session, max_attempts: int, *, all_leases: bool = False) -> int:
-    """Give back what dead workers held; returns how many jobs that were.
+    """Return the jobs of dead workers to the queue, or fail them after `max_attempts`.
 
-    A job that fell with others is marked `alone`: it may be innocent. One that fell alone has
-    used an attempt, and after `max_attempts` it is failed. `all_leases` frees all leases, for a
-    process that knows that no other worker lives.
+    Args:
+        session: The session of a write transaction.
+        max_attempts: Number of crashes after which a job that ran alone fails. A job that was in a
+            batch of several is marked `alone` instead, because another one may be the cause.
+        all_leases: Reclaim also leases that have not expired, for a process that knows that no
+            other worker runs.
+
+    Returns:
+        The number of jobs reclaimed.
     """
     expired = select(Job).where(Job.lease_token.is_not(None))
     if not all_leases:
@@ -98,34 +111,35 @@ def reclaim_expired_leases(session: Session, max_attempts: int, *, all_leases: b
 def handle_worker_crash(
     session: Session, job: Job, max_attempts: int, *, cause: str | None
 ) -> None:
-    """The worker that had the job died, or crashed (`cause`): who is to blame is not known yet.
+    """Retry or fail a job whose worker died (`cause` is None) or raised an exception (its name).
 
-    What fell in a batch is tried again alone, and no attempt is counted.
+    A job that was in a batch of several is retried alone without counting an attempt, to isolate
+    the job that crashed the worker. A job that ran alone fails after `max_attempts`.
     """
-    if job.claimed_together == 0:  # nothing had begun that the job could be blamed for
+    if job.claimed_together == 0:  # not started: the job can't be the cause
         release_job(job)
         return
-    fell_alone = job.claimed_together == 1
-    job.attempts += fell_alone
-    # A batch goes on without the one photo that may be to blame; its worker sees to that.
+    ran_alone = job.claimed_together == 1
+    job.attempts += ran_alone
+    # An upload batch continues without the photo that may be the cause: see BatchWorker.
     if job.attempts >= max_attempts and not has_batch_items(job):
         fail_job(job, _worker_crash_problem(job, cause))
         abandon_generation(session, job)
         cancel_batch_items(session, job)
         return
-    job.alone = job.alone or not fell_alone
+    job.alone = job.alone or not ran_alone
     release_job(job)
 
 
 def _worker_crash_problem(job: Job, cause: str | None) -> dict[str, Any]:
-    what = f"crashed ({cause})" if cause else "died"
+    event = f"crashed ({cause})" if cause else "died"
     return {
         "type": "urn:placewise:problem:worker_fell",
-        "title": "The worker fell",
+        "title": "The worker crashed",
         "status": 500,
         "code": "worker_fell",
         "detail": (
-            f"The worker {job.worker} {what} {job.attempts} times while it had only this job. "
-            "If the photo is fine, look at the worker's log and memory, then retry the job."
+            f"The worker {job.worker} {event} {job.attempts} times while it ran only this job. "
+            "If the photo is valid, check the worker's log and memory, then retry the job."
         ),
     }

@@ -1,14 +1,14 @@
-"""Model changes: a new vocabulary or PCA for a map, and the generation made with it.
+"""Model changes: jobs that give a map a new vocabulary, PCA or extractor, and a new generation.
 
 ```
 POST /vocabularies ─> FIT     ─ sample ─ cluster ─┐
-     .../import    ─> IMPORT  ─ check ────────────┼─> begin_generation ─> waits for descriptors
+     .../import    ─> IMPORT  ─ check ────────────┼─> create_generation ─> waits for descriptors
 POST /generations  ─> SWITCH  ────────────────────┤        │
                    ─> PCA     ─ gather ─ reduce ──┘        │
                                                            v
-       every live photo is in it, or its failure is recorded: the steward switches and succeeds
+       each live photo has a descriptor or a recorded failure: the steward activates the generation
 ```
-At most one is under way in a map.
+A map has at most one unfinished model change.
 """
 
 from __future__ import annotations
@@ -43,13 +43,17 @@ from shared.jobs.transitions import cancel_job, cancel_jobs, release_job, wake_w
 def start_model_change(
     session: Session, map_id: UUID, kind: JobKind, params: dict[str, Any]
 ) -> Job:
-    """Queue a model change; 409 (`model_change_running`) names the one under way."""
+    """Queue a model change for the map.
+
+    Raises:
+        Conflict: `model_change_running`, naming the unfinished one.
+    """
     lock_map(session, map_id)
     running = get_unfinished_model_change(session, map_id)
     if running is not None:
         raise Conflict(
             "model_change_running",
-            f"The map is already changing its model (job {running.id}, {running.kind}). "
+            f"The map already has a running model change (job {running.id}, {running.kind}). "
             f"Wait for it, or cancel it: POST /api/v1/jobs/{running.id}/cancel.",
             job_id=str(running.id),
         )
@@ -66,7 +70,7 @@ def start_model_change(
 
 
 def get_unfinished_model_change(session: Session, map_id: UUID) -> Job | None:
-    """The model change that is under way in the map, if any."""
+    """Return the unfinished model change of the map, if any."""
     return session.scalar(
         select(Job).where(
             Job.map_id == map_id, Job.kind.in_(MODEL_CHANGE_JOBS), Job.state.in_(UNFINISHED_STATES)
@@ -75,10 +79,10 @@ def get_unfinished_model_change(session: Session, map_id: UUID) -> Job | None:
 
 
 def create_generation(session: Session, job: Job, **columns: Any) -> Generation:
-    """The generation that the model change `job` leads to; the job now waits for descriptors.
+    """Create the generation of the model change `job`, which then waits for its descriptors.
 
-    In a map without an active generation it answers at once, and photos that waited for a
-    vocabulary are described into it. Otherwise it is built beside the active one.
+    In a map without an active generation, the new one is active at once, and photos that waited for
+    a vocabulary are described into it. Otherwise it is built while the active one serves queries.
     """
     map_ = lock_map(session, job.map_id)
     first = active_generation(session, job.map_id) is None
@@ -102,20 +106,20 @@ def create_generation(session: Session, job: Job, **columns: Any) -> Generation:
 
 
 def wake_vocabulary_waiters(session: Session, map_id: UUID) -> None:
-    """The map has a vocabulary: photos and queries that waited for one may go on."""
+    """Wake the jobs of the map that waited for a vocabulary."""
     wake_waiting_jobs(session, (Job.map_id == map_id) & (Job.waiting_for == WaitingFor.VOCABULARY))
 
 
 def cancel_model_change(session: Session, job: Job) -> None:
-    """Cancel the job, and give up the generation that it was building."""
+    """Cancel the job and abandon the generation that it was building."""
     cancel_job(job)
     abandon_generation(session, job)
 
 
 def abandon_generation(session: Session, job: Job) -> None:
-    """Give up the generation that an ended model change was building, with its queued photos.
+    """Abandon the generation that an ended model change was building, and cancel its photo jobs.
 
-    Any other job, one of those photos' too, ends without touching its generation.
+    Does nothing for any other job: the end of one photo's job does not affect its generation.
     """
     if job.kind not in MODEL_CHANGE_JOBS or job.generation_id is None:
         return

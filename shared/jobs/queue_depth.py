@@ -1,4 +1,4 @@
-"""How much work waits, and how fast it gets done: counted within bounds, never in full."""
+"""Queue depth and throughput, measured with bounded counts."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from shared.catalog.jobs import QUERY_JOBS, UNFINISHED_STATES, Job, JobKind, Pri
 from shared.catalog.maps import Map
 
 THROUGHPUT_WINDOW_SECONDS = 60.0
-MAX_COUNTED_FINISHED = 100_000  # counted in RATE_SECONDS at most: nobody is faster
+MAX_COUNTED_FINISHED = 100_000  # in THROUGHPUT_WINDOW_SECONDS: above any real throughput
 
-# All but `reindex`: a model change queues every photo of its map, behind everything that is asked.
+# All but `reindex`: a model change queues every photo of its map, with the lowest priority.
 BACKLOG_PRIORITIES = (Priority.UPLOAD, Priority.BATCH, Priority.MODEL_CHANGE, Priority.EVALUATION)
 
 
 @dataclass(frozen=True, slots=True)
 class QueueDepth:
-    """Jobs that a worker could take and none has; those that wait for a vocabulary are no queue."""
+    """Jobs that a worker could claim and none has; jobs that wait for a vocabulary don't count."""
 
     jobs_by_map: Mapping[str, int]
-    """Name of a map -> its jobs, without queries."""
+    """Map name -> number of its jobs, without queries."""
     queries: int
-    """Query photos and comparisons, of all maps."""
+    """Number of query photos and comparisons of all maps."""
     finished_per_second: float
-    """Uploads and queries that ended of late, well or not."""
+    """Uploads and queries that succeeded or failed in the last THROUGHPUT_WINDOW_SECONDS."""
 
     @property
     def jobs(self) -> int:
@@ -36,9 +36,9 @@ class QueueDepth:
 
 
 def measure_queue_depth(session: Session, limit: int) -> QueueDepth:
-    """Counts `limit` jobs and as many queries at most, by the index that workers claim by."""
-    of_maps = _count(session, BACKLOG_PRIORITIES, limit)
-    queries = sum(_count(session, (Priority.QUERY,), limit).values())
+    """Count up to `limit` jobs and up to `limit` queries, with the index that claims use."""
+    jobs_by_map = _count_by_map(session, BACKLOG_PRIORITIES, limit)
+    queries = sum(_count_by_map(session, (Priority.QUERY,), limit).values())
     finished = (
         select(Job.id)
         .where(
@@ -48,13 +48,13 @@ def measure_queue_depth(session: Session, limit: int) -> QueueDepth:
         .limit(MAX_COUNTED_FINISHED)
         .subquery()
     )
-    done = session.scalar(select(func.count()).select_from(finished)) or 0
-    return QueueDepth(of_maps, queries, done / THROUGHPUT_WINDOW_SECONDS)
+    finished_count = session.scalar(select(func.count()).select_from(finished)) or 0
+    return QueueDepth(jobs_by_map, queries, finished_count / THROUGHPUT_WINDOW_SECONDS)
 
 
-def _count(session: Session, priorities: Sequence[Priority], most: int) -> dict[str, int]:
-    """Jobs of these priorities by their map's name, `most` in all."""
-    some = (
+def _count_by_map(session: Session, priorities: Sequence[Priority], limit: int) -> dict[str, int]:
+    """Map name -> claimable jobs of these priorities; counts at most `limit` jobs in total."""
+    claimable = (
         select(Job.map_id)
         .where(
             Job.state.in_(UNFINISHED_STATES),
@@ -62,12 +62,12 @@ def _count(session: Session, priorities: Sequence[Priority], most: int) -> dict[
             Job.waiting_for.is_(None),
             Job.priority.in_(priorities),
         )
-        .limit(most)
+        .limit(limit)
         .subquery()
     )
-    counted = session.execute(
+    counts = session.execute(
         select(Map.name, func.count())
-        .join_from(some, Map, Map.id == some.c.map_id)
+        .join_from(claimable, Map, Map.id == claimable.c.map_id)
         .group_by(Map.name)
     )
-    return {name: count for name, count in counted}  # noqa: C416  (rows, not pairs, to mypy)
+    return {name: count for name, count in counts}  # noqa: C416  (rows, not pairs, to mypy)

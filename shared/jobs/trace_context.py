@@ -1,4 +1,4 @@
-"""Doing a step of jobs as what it is: work that someone's request has asked for."""
+"""Trace and log context of job steps: links the work of a job to the request that queued it."""
 
 from __future__ import annotations
 
@@ -11,8 +11,11 @@ from shared.telemetry.tracing import request_id_context, span
 
 @contextlib.contextmanager
 def job_trace_context(jobs: Sequence[Job], step: str) -> Iterator[None]:
-    """The block as a span that leads back to the requests of the jobs; where all of them are of one
-    request, log lines carry its id, and jobs that are made belong to it."""
+    """Run the block in a span that links to the traces of the jobs' requests.
+
+    When all jobs come from one request, log lines carry its id, and jobs that the block creates
+    belong to it.
+    """
     ids = distinct_request_ids(jobs)
     with (
         request_id_context(ids[0] if len(ids) == 1 else None),
@@ -29,5 +32,5 @@ def job_trace_context(jobs: Sequence[Job], step: str) -> Iterator[None]:
 
 
 def distinct_request_ids(jobs: Sequence[Job]) -> list[str]:
-    """Each once, in the jobs' order; jobs that nobody's request has made add none."""
+    """Return each request id once, in the jobs' order; a job without a request adds none."""
     return list(dict.fromkeys(job.request_id for job in jobs if job.request_id is not None))

@@ -1,8 +1,6 @@
-"""Ending a job, or giving it back. Callers hold the job's row and have checked its token.
+"""State transitions of jobs and batches: succeed, fail, release, cancel, retry.
 
-Ending a batch early, with what of it has not ended.
-
-Trying again what a batch has not brought in.
+Callers hold the lock of the job's row; a worker has also checked its lease token.
 """
 
 from __future__ import annotations
@@ -41,7 +39,7 @@ def _clear_waiting(job: Job) -> None:
 
 
 def succeed_job(job: Job, result: dict[str, Any] | None = None) -> None:
-    """The job has done what it promised."""
+    """Mark the job as succeeded with its result."""
     job.state = JobState.SUCCEEDED
     job.result = result
     job.error = None
@@ -53,7 +51,7 @@ def succeed_job(job: Job, result: dict[str, Any] | None = None) -> None:
 
 
 def fail_job(job: Job, problem: dict[str, Any]) -> None:
-    """The job ends with a stored reason: an RFC 9457 problem."""
+    """Mark the job as failed and store the reason, an RFC 9457 problem."""
     job.state = JobState.FAILED
     job.error = problem
     _clear_waiting(job)
@@ -65,15 +63,15 @@ def fail_job(job: Job, problem: dict[str, Any]) -> None:
 
 
 def _enqueue_job_event(job: Job, event: EventKind) -> None:
-    """Tell the webhooks of it; not of each photo of a model change, which is told of as a whole."""
+    """Queue the job's event for webhooks; a model change sends one event, not one per photo."""
     session = object_session(job)
     assert session is not None, "a job ends in a transaction"
     events = [event] if job.kind != JobKind.REINDEX else []
     if job.kind == JobKind.BATCH:
         events.append(EventKind.BATCH_FINISHED)
-    for one in events:
-        if subscribed_webhook_ids(session, one):
-            enqueue_event(session, one, _event_data(session, job))
+    for kind in events:
+        if subscribed_webhook_ids(session, kind):
+            enqueue_event(session, kind, _event_data(session, job))
 
 
 def _event_data(session: Session, job: Job) -> dict[str, Any]:
@@ -92,9 +90,14 @@ def _event_data(session: Session, job: Job) -> dict[str, Any]:
 def release_job(
     job: Job, *, after_seconds: float = 0.0, waiting_for: WaitingFor | None = None
 ) -> None:
-    """Give the job back without counting an attempt: to go on later, or once something is there.
+    """End the job's lease without counting an attempt, so that it is claimed again later.
 
-    A sliced job stays `running` between its slices; everything else is `queued` again.
+    A checkpointed job stays `running` between its slices; any other job is `queued` again.
+
+    Args:
+        job: The claimed job.
+        after_seconds: Delay before it may be claimed.
+        waiting_for: What it waits for; it can't be claimed until `wake_waiting_jobs`.
     """
     job.state = JobState.RUNNING if job.kind in CHECKPOINTED_JOBS else JobState.QUEUED
     job.waiting_for = waiting_for
@@ -103,7 +106,7 @@ def release_job(
 
 
 def wake_waiting_jobs(session: Session, condition: Condition) -> None:
-    """What the jobs waited for is there: they may be claimed."""
+    """Make the waiting jobs that match the condition claimable: what they waited for exists."""
     session.execute(
         update(Job)
         .where(Job.waiting_for.is_not(None), condition)
@@ -113,7 +116,11 @@ def wake_waiting_jobs(session: Session, condition: Condition) -> None:
 
 
 def cancel_job(job: Job) -> None:
-    """End the job at once; a worker that has it computes in vain, its token is gone."""
+    """Cancel the job at once; a worker that runs it can't commit, because its token is removed.
+
+    Raises:
+        Conflict: `job_finished`.
+    """
     if job.state not in UNFINISHED_STATES:
         raise Conflict(
             "job_finished",
@@ -128,11 +135,11 @@ def cancel_job(job: Job) -> None:
 
 
 def cancel_jobs(session: Session, condition: Condition) -> None:
-    """Cancel every unfinished job that the condition names, as `cancel` does one."""
+    """Cancel every unfinished job that matches the condition."""
     unfinished = (
         select(Job.id)
         .where(condition, Job.state.in_(UNFINISHED_STATES))
-        .order_by(Job.id)  # as `held` locks them
+        .order_by(Job.id)  # the lock order of `lock_leased_jobs`
         .with_for_update()
     )
     session.execute(
@@ -151,7 +158,11 @@ def cancel_jobs(session: Session, condition: Condition) -> None:
 
 
 def retry_job(session: Session, job: Job) -> None:
-    """Queue a failed or cancelled job again, with all its attempts."""
+    """Queue a failed or cancelled job again, with its attempts reset.
+
+    Raises:
+        Conflict: `job_not_retryable` or `photo_deleted`.
+    """
     if job.state not in (JobState.FAILED, JobState.CANCELLED):
         raise Conflict(
             "job_not_retryable",
@@ -160,19 +171,21 @@ def retry_job(session: Session, job: Job) -> None:
             state=job.state,
         )
     photo = session.get_one(Photo, job.photo_id) if job.photo_id is not None else None
-    # A failed reindex job becomes its photo's own job at the switch: from then on it may.
-    part_of_a_change = job.kind == JobKind.REINDEX and (photo is None or photo.job_id != job.id)
-    if job.kind in MODEL_CHANGE_JOBS or part_of_a_change:
+    # A failed reindex job becomes its photo's own job when the generation is activated, and can be
+    # retried from then on.
+    in_model_change = job.kind == JobKind.REINDEX and (photo is None or photo.job_id != job.id)
+    if job.kind in MODEL_CHANGE_JOBS or in_model_change:
         raise Conflict(
             "job_not_retryable",
-            "A model change is started anew, not retried: POST /api/v1/vocabularies or "
+            "A model change can't be retried. Start a new one: POST /api/v1/vocabularies or "
             "/api/v1/generations.",
             job_id=str(job.id),
         )
     if job.kind == JobKind.ADD_MODEL:
         raise Conflict(
             "job_not_retryable",
-            "The checkpoint is not kept once it was looked at: send it again, POST /api/v1/models.",
+            "The uploaded checkpoint is deleted after it was checked. Upload it again: POST "
+            "/api/v1/models.",
             job_id=str(job.id),
         )
     if photo is not None:
@@ -183,9 +196,9 @@ def retry_job(session: Session, job: Job) -> None:
 
 
 def requeue_job(job: Job) -> None:
-    """Back to the start, as if it were new."""
+    """Reset the job to `queued`, as if it were new."""
     if job.kind == JobKind.REINDEX:
-        # The generation that it failed in may be gone: the photo goes to the one that answers.
+        # Its generation may be gone: the photo is indexed into the active one.
         job.kind, job.priority, job.generation_id = JobKind.INDEX, Priority.UPLOAD, None
     job.state = JobState.QUEUED
     job.attempts = 0
@@ -202,19 +215,23 @@ def requeue_job(job: Job) -> None:
 
 
 def cancel_batch(session: Session, job: Job) -> None:
-    """Cancel the batch and what of it has not ended; photos that are searchable stay."""
+    """Cancel the batch and its unfinished items; photos that are searchable stay.
+
+    Raises:
+        Conflict: `job_finished`.
+    """
     cancel_job(job)
     cancel_batch_items(session, job)
 
 
 def cancel_batch_items(session: Session, job: Job) -> None:
-    """The batch has ended: so does what of it has not. Of any other job there is nothing."""
+    """Cancel the unfinished items of an ended batch; does nothing for any other job."""
     if job.kind != JobKind.BATCH:
         return
     own = select(BatchItem.photo_job_id).where(
         BatchItem.job_id == job.id,
         BatchItem.state == JobState.RUNNING,
-        BatchItem.already_there.is_(False),  # those are other uploads' photos
+        BatchItem.already_there.is_(False),  # other uploads created those photos
     )
     cancel_jobs(session, Job.id.in_(own))
     sync_item_states(session, job)
@@ -227,10 +244,13 @@ def cancel_batch_items(session: Session, job: Job) -> None:
 
 
 def retry_batch(session: Session, job: Job) -> None:
-    """Queue the failed and the cancelled items again, whose bytes are still there.
+    """Queue the failed and cancelled items of the batch again whose bytes are still stored.
 
-    Those are in the store with the photo, or under the key that the manifest named; archives and
-    refused files are not kept. Conflict (`job_not_retryable`) when nothing can be tried again.
+    The bytes are stored with the photo, or under the object key that the manifest named. Archives
+    and rejected files are not stored.
+
+    Raises:
+        Conflict: `job_not_retryable`: the batch is unfinished, or no item can be retried.
     """
     if job.state in UNFINISHED_STATES:
         raise _batch_not_retryable_error(job, f"is {job.state}: wait for it, or cancel it first")
@@ -243,12 +263,12 @@ def retry_batch(session: Session, job: Job) -> None:
         .order_by(BatchItem.number)
     ).all()
     from_keys = job.params["source"] in (BatchSource.KEYS, BatchSource.PREFIX)
-    again = 0
+    retried_count = 0
     for begin in range(0, len(items), ITEMS_PER_STATEMENT):
-        some = items[begin : begin + ITEMS_PER_STATEMENT]
-        live = get_live_photos(session, [item.photo_id for item in some if item.photo_id])
-        for item in some:
-            photo = live.get(item.photo_id) if item.photo_id else None
+        chunk = items[begin : begin + ITEMS_PER_STATEMENT]
+        live_photos = get_live_photos(session, [item.photo_id for item in chunk if item.photo_id])
+        for item in chunk:
+            photo = live_photos.get(item.photo_id) if item.photo_id else None
             if photo is not None:
                 _retry_item_photo(session, photo, item)
             elif from_keys:
@@ -256,12 +276,12 @@ def retry_batch(session: Session, job: Job) -> None:
             else:
                 continue
             item.error = None
-            again += 1
-    if not again:
+            retried_count += 1
+    if not retried_count:
         raise _batch_not_retryable_error(
             job,
-            "has no item that can be tried again: their bytes were refused and not kept. Upload "
-            "them again; what is in the map already is not described twice",
+            "has no item that can be retried, because rejected files are not stored. Upload them "
+            "again; photos that are already in the map are not described twice",
         )
     session.flush()
     requeue_job(job)
@@ -276,7 +296,7 @@ def _retry_item_photo(session: Session, photo: Photo, item: BatchItem) -> None:
     item.state, item.photo_job_id = JobState.RUNNING, photo.job_id
 
 
-def _batch_not_retryable_error(job: Job, why: str) -> Conflict:
+def _batch_not_retryable_error(job: Job, reason: str) -> Conflict:
     return Conflict(
-        "job_not_retryable", f"The batch {job.id} {why}.", job_id=str(job.id), state=job.state
+        "job_not_retryable", f"The batch {job.id} {reason}.", job_id=str(job.id), state=job.state
     )

@@ -1,7 +1,8 @@
-"""Hints: "there may be work". Losing one costs seconds, never a job; two of one are harmless.
+"""Wake-ups (hints): messages that tell workers that the job table may have work for them.
 
-There are two lanes, so that whoever serves queries first sees them first. What a woken worker does
-is decided by the job table alone.
+A lost wake-up delays a job by seconds and never loses it; a duplicate is harmless. Queries have a
+queue of their own, so that a worker can receive their wake-ups first. Which jobs a worker runs is
+decided by the job table alone.
 """
 
 from __future__ import annotations
@@ -14,34 +15,34 @@ from shared.catalog.jobs import Priority
 
 
 class WakeupQueue(StrEnum):
-    QUERY = "placewise.query"  # someone waits for the answer
+    QUERY = "placewise.query"  # a client waits for the result
     BULK = "placewise.bulk"
 
 
 def queue_for_priority(priority: int) -> WakeupQueue:
-    """The lane that a job of this priority is hinted on."""
+    """Return the queue for wake-ups of jobs with this priority."""
     return WakeupQueue.QUERY if priority >= Priority.QUERY else WakeupQueue.BULK
 
 
 class Wakeups(Protocol):
-    """The port over which whoever queued a job wakes a worker."""
+    """Interface for waking a worker after a job was queued."""
 
-    def send(self, lane: WakeupQueue = WakeupQueue.BULK) -> None:
-        """Wake a worker. Never raises and never waits: the job is already committed and will be
-        found anyway."""
+    def send(self, queue: WakeupQueue = WakeupQueue.BULK) -> None:
+        """Wake a worker. Never raises and never blocks: the job is already committed, and workers
+        find it without a wake-up, too."""
 
 
 class InProcessWakeups:
-    """Hints inside one process, for the embedded mode: at most one is outstanding."""
+    """Wake-ups inside one process, for the embedded mode: at most one is outstanding."""
 
     def __init__(self) -> None:
         self._event = threading.Event()
 
-    def send(self, lane: WakeupQueue = WakeupQueue.BULK) -> None:
+    def send(self, queue: WakeupQueue = WakeupQueue.BULK) -> None:
         self._event.set()
 
     def wait(self, seconds: float) -> bool:
-        """Sleep until a hint comes or the time is up; True when a hint came."""
-        came = self._event.wait(seconds)
+        """Block until a wake-up arrives or the timeout expires; True when one arrived."""
+        arrived = self._event.wait(seconds)
         self._event.clear()
-        return came
+        return arrived

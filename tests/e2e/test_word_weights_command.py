@@ -33,7 +33,7 @@ def test_a_small_map_is_told_in_numbers_why_it_gets_no_weights(
     shown = command(server, "evaluate", "--word-weights")
     assert shown.returncode == 0, shown.stderr
     assert "Word weights: not enough pairs." in shown.stdout
-    assert "50 of either kind are needed" in " ".join(shown.stdout.split())
+    assert "each half needs 50 pairs of each kind" in " ".join(shown.stdout.split())
     said = json.loads(command(server, "evaluate", "--word-weights", "--json").stdout)
     assert said["word_weights"]["outcome"] == "not enough pairs"
     assert said["word_weights"]["near_pairs"] == 0

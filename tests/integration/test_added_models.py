@@ -14,8 +14,9 @@ import torch
 from sqlalchemy import select, update
 
 from services.extractor import checkpointed_steps as new_generation_module
-from services.steward.tasks.garbage_collection import collect_job_files, collect_orphans
+from services.steward.tasks.garbage_collection import collect_job_files
 from services.steward.tasks.model_changes import advance_model_changes
+from services.steward.tasks.orphans import collect_orphans
 from shared.catalog.generations import Generation, active_generation
 from shared.catalog.maps import get_map
 from shared.catalog.models import Model, remove_model

@@ -19,7 +19,8 @@ from services.steward.batches import worker as bring_in_module
 from services.steward.batches import worker as worker_module
 from services.steward.batches.worker import BatchWorker, resume_batches
 from services.steward.tasks.delete_maps import purge_deleted_maps
-from services.steward.tasks.garbage_collection import collect_job_files, collect_orphans
+from services.steward.tasks.garbage_collection import collect_job_files
+from services.steward.tasks.orphans import collect_orphans
 from shared.catalog.batch_items import BatchItem
 from shared.catalog.maps import get_or_create_default_map
 from shared.catalog.photos import Photo

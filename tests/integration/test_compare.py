@@ -13,11 +13,8 @@ from sqlalchemy import select
 from services.extractor import prepare
 from services.extractor.comparison import ComparisonRunner, PreparedComparison
 from services.extractor.worker import ExtractorWorker
-from services.steward.tasks.garbage_collection import (
-    collect_ended_generations,
-    collect_orphans,
-    collect_queries,
-)
+from services.steward.tasks.garbage_collection import collect_ended_generations, collect_queries
+from services.steward.tasks.orphans import collect_orphans
 from shared.catalog.chunks import find_descriptor_rows
 from shared.catalog.maps import get_or_create_default_map
 from shared.catalog.session import Catalog

@@ -16,7 +16,8 @@ from sqlalchemy import func, select, update
 
 from services.extractor.worker import ExtractorWorker
 from services.steward.tasks.delete_maps import purge_deleted_maps
-from services.steward.tasks.garbage_collection import collect_direct_uploads, collect_orphans
+from services.steward.tasks.garbage_collection import collect_direct_uploads
+from services.steward.tasks.orphans import collect_orphans
 from shared.catalog.base import db_now_plus
 from shared.catalog.photos import Photo, PresignedUpload
 from shared.catalog.session import Catalog

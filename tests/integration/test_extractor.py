@@ -23,9 +23,9 @@ from services.extractor import worker as worker_module
 from services.extractor.generation_resolver import resolve_generation
 from services.extractor.model_changes import ModelChangeRunner
 from services.extractor.worker import ExtractorWorker
-from services.steward.tasks.garbage_collection import collect_orphans
 from services.steward.tasks.maintenance import release_expired_leases
 from services.steward.tasks.model_changes import auto_fit_vocabularies
+from services.steward.tasks.orphans import collect_orphans
 from shared.catalog.chunks import Chunk, Descriptor, list_live_chunks
 from shared.catalog.generations import Generation, GenerationState
 from shared.catalog.jobs import WaitingFor

@@ -10,8 +10,8 @@ from services.steward.tasks.delete_maps import purge_deleted_maps
 from services.steward.tasks.garbage_collection import (
     collect_deleted_photos,
     collect_ended_generations,
-    collect_orphans,
 )
+from services.steward.tasks.orphans import collect_orphans
 from shared.catalog.generations import active_generation
 from shared.catalog.maps import get_map
 from shared.config.settings import Settings

@@ -22,8 +22,8 @@ from services.steward.evaluation_worker import EvaluationWorker
 from services.steward.tasks import delete_maps as delete_maps_module
 from services.steward.tasks.compaction import merge_small_chunks
 from services.steward.tasks.delete_maps import purge_deleted_maps
-from services.steward.tasks.garbage_collection import collect_orphans
 from services.steward.tasks.model_changes import advance_model_changes
+from services.steward.tasks.orphans import collect_orphans
 from shared.catalog.base import Base, db_now_plus
 from shared.catalog.batch_items import BatchItem
 from shared.catalog.chunks import Chunk, Descriptor

@@ -19,7 +19,8 @@ from services.extractor.model_changes import ModelChangeRunner
 from services.extractor.model_registry import ModelRegistry
 from services.extractor.worker import ExtractorWorker
 from services.steward.tasks.delete_maps import purge_deleted_maps
-from services.steward.tasks.garbage_collection import collect_orphans, collect_whitenings
+from services.steward.tasks.garbage_collection import collect_whitenings
+from services.steward.tasks.orphans import collect_orphans
 from shared.catalog.generations import Generation
 from shared.catalog.jobs import WaitingFor
 from shared.catalog.maps import Map, mark_map_deleted

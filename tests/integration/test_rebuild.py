@@ -13,12 +13,9 @@ from sqlalchemy import delete, func, insert, select
 from services.steward.tasks import journal
 from services.steward.tasks.compaction import merge_small_chunks
 from services.steward.tasks.delete_maps import purge_deleted_maps
-from services.steward.tasks.garbage_collection import (
-    CollectionHeld,
-    collect_deleted_photos,
-    collect_orphans,
-)
+from services.steward.tasks.garbage_collection import collect_deleted_photos
 from services.steward.tasks.model_changes import advance_model_changes
+from services.steward.tasks.orphans import CollectionHeld, collect_orphans
 from shared.catalog.base import Base
 from shared.catalog.chunks import Chunk, Descriptor
 from shared.catalog.generations import Generation
@@ -344,7 +341,7 @@ def test_bytes_go_once_the_journal_tells_of_the_deletion(
     with monkeypatch.context() as patched:
         patched.setattr(journal, "write_journal", full)
         assert round_() == 2
-        patched.setattr(journal, "PATIENCE_SECONDS", -1.0)
+        patched.setattr(journal, "MAX_JOURNAL_WAIT_SECONDS", -1.0)
         assert round_() == 0, "only deleting makes room in a full store"
         with service.catalog.read() as session:
             assert session.get(Photo, UUID(photos[0])) is not None, "the journal is told later"

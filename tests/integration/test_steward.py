@@ -17,20 +17,22 @@ from sqlalchemy import func, select, update
 from services.steward.metrics import StewardMetrics
 from services.steward.scheduler import PeriodicTask, Scheduler
 from services.steward.tasks import compaction as compact_module
-from services.steward.tasks import garbage_collection as collect_module
+from services.steward.tasks import orphans as orphans_module
 from services.steward.tasks.compaction import merge_slot, merge_small_chunks
 from services.steward.tasks.garbage_collection import (
-    CollectionHeld,
     collect_deleted_photos,
     collect_ended_generations,
     collect_garbage,
     collect_model_change_files,
-    collect_orphans,
     collect_queries,
     collect_superseded_chunks,
-    empty_expired_trash,
 )
 from services.steward.tasks.maintenance import resend_hints
+from services.steward.tasks.orphans import (
+    CollectionHeld,
+    collect_orphans,
+    empty_expired_trash,
+)
 from shared.catalog.base import db_now_plus
 from shared.catalog.chunks import Chunk, Descriptor, count_searchable, list_live_chunks
 from shared.catalog.generations import Generation, GenerationState
@@ -564,8 +566,8 @@ def test_what_is_restored_from_the_trash_is_kept_as_long_as_a_new_orphan(house: 
 def test_collection_of_more_than_a_share_is_held_before_anything_is_moved(
     house: House, settings: Settings, monkeypatch: pytest.MonkeyPatch, caplog: Any
 ) -> None:
-    monkeypatch.setattr(collect_module, "ALWAYS_COLLECTED", 3)
-    monkeypatch.setattr(collect_module, "REMEMBERED", 2)
+    monkeypatch.setattr(orphans_module, "HOLD_MIN_ORPHANS", 3)
+    monkeypatch.setattr(orphans_module, "MAX_REMEMBERED_ORPHANS", 2)
     live = _live_objects(house)
     orphans = {new_original_key() for _ in range(4)}
     for key in orphans:
@@ -601,7 +603,7 @@ def test_collection_of_more_than_a_share_is_held_before_anything_is_moved(
 def test_hold_ends_by_itself_once_the_catalog_knows_the_objects_again(
     house: House, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(collect_module, "ALWAYS_COLLECTED", 0)
+    monkeypatch.setattr(orphans_module, "HOLD_MIN_ORPHANS", 0)
     photo_id, _ = upload(house.catalog, house.store, house.map_id, b"photo")
     with house.catalog.read() as session:
         key = session.get_one(Photo, photo_id).object_key
@@ -682,7 +684,7 @@ def test_stray_files_stop_no_collection_and_go_with_the_orphans(house: House) ->
 def test_more_orphans_than_one_look_takes_all_go(
     house: House, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(collect_module, "ROWS_PER_TRANSACTION", 3)
+    monkeypatch.setattr(orphans_module, "OBJECTS_PER_LOOKUP", 3)
     live = _live_objects(house)
     for _ in range(8):
         house.store.put(new_original_key(), b"orphan")

@@ -181,7 +181,7 @@ def test_too_few_pairs_are_no_error_and_are_told_in_numbers(city: City) -> None:
     assert (record.outcome, record.weights) == (Outcome.NOT_ENOUGH_PAIRS, ())
     assert record.near_pairs == 24
     assert "12 and 12 pairs" in record.reason
-    assert "50 of either kind" in record.reason
+    assert "each half needs 50 pairs" in record.reason
 
 
 def test_a_burst_is_left_out_with_the_photo_that_is_tried(city: City) -> None:

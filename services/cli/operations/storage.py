@@ -42,7 +42,7 @@ from shared.storage.trash import (
 )
 
 if TYPE_CHECKING:
-    from services.steward.tasks.garbage_collection import StoreCount
+    from services.steward.tasks.orphans import StoreCount
     from shared.rebuild.take_in import TakenIn
 
 
@@ -74,7 +74,7 @@ def verify(
     --repair takes in what is missing."""
     with report_errors(as_json), progress_reporter() as progress:
         # Imported only here: it is the steward's.
-        from services.steward.tasks.garbage_collection import find_orphans
+        from services.steward.tasks.orphans import find_orphans
 
         settings = read_settings()
         with open_storage(settings, "verify") as (catalog, store):
@@ -205,7 +205,7 @@ def adopt(confirm: ConfirmOption = False, as_json: JsonOption = False) -> None:
     does not know are kept until `placewise storage collect --confirm`.
     """
     with report_errors(as_json), contextlib.ExitStack() as held:
-        from services.steward.tasks.garbage_collection import count_store
+        from services.steward.tasks.orphans import count_store
 
         settings = read_settings()
         if settings.database_url is None:
@@ -251,11 +251,7 @@ def collect(confirm: ConfirmOption = False, as_json: JsonOption = False) -> None
     Only those older than ORPHAN_AGE_SECONDS. Runs while the service runs.
     """
     with report_errors(as_json):
-        from services.steward.tasks.garbage_collection import (
-            StoreCount,
-            collect_orphans,
-            find_orphans,
-        )
+        from services.steward.tasks.orphans import StoreCount, collect_orphans, find_orphans
 
         settings = read_settings()
         with open_storage(settings, "storage") as (catalog, store):

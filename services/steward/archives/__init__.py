@@ -1,10 +1,9 @@
-"""Archives of strangers, read from the object store: what is in them, and one member at a time.
+"""Readers for uploaded zip and tar archives in the object store.
 
-A member is found by its place alone, so that a batch goes on after a restart without reading the
-archive from its begin (but for a gzipped one). Names are labels: nothing is ever written under one.
-Whatever an archive declares is bounded before it is believed.
-
-An archive of the object store, by its content.
+Archives are untrusted input: every size and count that an archive declares is checked against a
+limit before it is used, and member names are labels only, never paths to write to. A member is
+read by its offset, so that a batch continues after a restart without reading the archive from its
+beginning (except a gzipped one).
 """
 
 from __future__ import annotations
@@ -23,17 +22,24 @@ from shared.storage import ObjectStore
 
 
 def open_archive(store: ObjectStore, key: str, limits: ArchiveLimits) -> Archive:
-    """Raises Gone (`archive_gone`) and Unprocessable (`unsupported_archive`)."""
+    """Open an archive of the object store; its format is detected from its content.
+
+    Raises:
+        Gone: `archive_gone`: the object does not exist.
+        Unprocessable: `unsupported_archive`.
+    """
     info = store.head(key)
     if info is None:
         raise Gone("archive_gone", "The archive is no longer in the object store. Upload it again.")
-    found = detect_archive_format(store.read_range(key, 0, ARCHIVE_SIGNATURE_BYTES))
+    archive_format = detect_archive_format(store.read_range(key, 0, ARCHIVE_SIGNATURE_BYTES))
     file = open_buffered(store, key, info.size_bytes)
-    if found == ArchiveFormat.ZIP:
+    if archive_format == ArchiveFormat.ZIP:
         return ZipArchive(file, info.size_bytes, limits)
-    if found in (ArchiveFormat.TAR, ArchiveFormat.GZIP):
-        return TarArchive(file, limits, gzipped=found == ArchiveFormat.GZIP)
-    raise Unprocessable("unsupported_archive", f"By its content this is not {ACCEPTED_ARCHIVES}.")
+    if archive_format in (ArchiveFormat.TAR, ArchiveFormat.GZIP):
+        return TarArchive(file, limits, gzipped=archive_format == ArchiveFormat.GZIP)
+    raise Unprocessable(
+        "unsupported_archive", f"The content of the file is not {ACCEPTED_ARCHIVES}."
+    )
 
 
 __all__ = ["Archive", "ArchiveLimits", "ArchiveMember", "open_archive"]

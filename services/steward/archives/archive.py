@@ -1,9 +1,7 @@
-"""What every kind of archive gives: members, and the bytes of each.
+"""The interface of archive readers, their limits and errors, and a seekable file over an object.
 
-An object as a file of which each part is asked for anew.
-
-Nothing is kept open between two reads: a batch that waits for the extractors may rest for hours in
-the middle of an archive.
+Each read is a range request of its own; no connection stays open between two reads, because a batch
+that waits for the extractors may pause for hours in the middle of an archive.
 """
 
 from __future__ import annotations
@@ -28,21 +26,24 @@ ARCHIVE_READ_BYTES = 256 * 1024
 class MemberKind(StrEnum):
     FILE = "file"
     FOLDER = "folder"
-    OTHER = "other"  # a link, a device, a part of something larger
+    OTHER = "other"  # a link, a device, a sparse file
 
 
 @dataclass(frozen=True, slots=True)
 class ArchiveMember:
+    """An entry of an archive."""
+
     name: str
-    """As the archive says it: any text."""
+    """As stored in the archive: any text."""
     kind: MemberKind
     offset: int
-    """Where it begins in the archive (in the unpacked one, if that is gzipped), in bytes."""
+    """Its start in the archive (in the decompressed one, if it is gzipped), in bytes."""
     size_bytes: int
-    """Unpacked, as it is declared."""
+    """Declared size, uncompressed."""
     packed_bytes: int
+    """Declared size, compressed."""
     method: int = 0
-    """A zip's number of how it is packed; 0 is not at all."""
+    """A zip's compression method; 0 is stored."""
     crc32: int | None = None
     fault: PlacewiseError | None = None
     """Why it can't be read."""
@@ -50,11 +51,13 @@ class ArchiveMember:
 
 @dataclass(frozen=True, slots=True)
 class ArchiveLimits:
+    """Limits on the number of members and on their total uncompressed size."""
+
     members: int
     unpacked_bytes: int
 
     def check_members(self, count: int) -> None:
-        """TooLarge (`too_many_photos_error`)."""
+        """Raise TooLarge (`too_many_photos`) above the limit."""
         if count > self.members:
             raise TooLarge(
                 "too_many_photos",
@@ -62,49 +65,54 @@ class ArchiveLimits:
             )
 
     def check_unpacked(self, size_bytes: int) -> None:
-        """TooLarge (`batch_too_large_error`)."""
+        """Raise TooLarge (`batch_too_large`) above the limit."""
         if size_bytes > self.unpacked_bytes:
             raise TooLarge(
                 "batch_too_large",
-                f"Unpacked, the archive is larger than {self.unpacked_bytes} bytes "
+                f"The uncompressed archive is larger than {self.unpacked_bytes} bytes "
                 "(MAX_ARCHIVE_SIZE). Split it.",
             )
 
 
 class Archive(Protocol):
-    """Raises Unprocessable (`damaged_archive_error`, `damaged_member_error`) for what can't be
-    read, and what
-    the object store raises."""
+    """Interface of archive readers.
+
+    Both methods raise Unprocessable (`damaged_archive`, `damaged_member`) for content that can't be
+    read, and the errors of the object store.
+    """
 
     def members(self) -> Iterator[ArchiveMember]:
-        """All of them, in the archive's order; TooLarge as `Limits` says."""
+        """Yield all members in the archive's order; TooLarge as `ArchiveLimits` raises."""
 
     def read(self, member: ArchiveMember) -> Iterator[bytes]:
-        """The member's bytes in pieces of at most PIECE_BYTES, never more than it declares. Raises
-        its `fault`."""
+        """Yield the member's bytes in pieces of at most ARCHIVE_READ_BYTES.
+
+        Never yields more bytes than the member declares. Raises its `fault`, if it has one.
+        """
 
 
-def damaged_archive_error(what: str) -> PlacewiseError:
+def damaged_archive_error(reason: str) -> PlacewiseError:
     return Unprocessable(
-        "damaged_archive", f"The archive can't be read: {what}. Make it anew and upload it again."
+        "damaged_archive",
+        f"The archive can't be read: {reason}. Create it again, then upload it again.",
     )
 
 
-def damaged_member_error(what: str) -> PlacewiseError:
-    return Unprocessable("damaged_member", f"The archive's member can't be read: {what}.")
+def damaged_member_error(reason: str) -> PlacewiseError:
+    return Unprocessable("damaged_member", f"The archive member can't be read: {reason}.")
 
 
-def unsupported_member_error(what: str) -> PlacewiseError:
+def unsupported_member_error(description: str) -> PlacewiseError:
     return Unprocessable(
-        "unsupported_member", f"The archive's member is {what}, and no file of its own."
+        "unsupported_member", f"The archive member is {description}, not a regular file."
     )
 
 
-RANGE_BUFFER_BYTES = 256 * 1024  # one request
+RANGE_BUFFER_BYTES = 256 * 1024  # bytes per request
 
 
 class RangeReader(io.RawIOBase):
-    """Seekable and unbuffered; `open_buffered` gives it a buffer."""
+    """Seekable, unbuffered file over an object; each read is a range request."""
 
     def __init__(self, store: ObjectStore, key: str, size_bytes: int) -> None:
         super().__init__()
@@ -129,24 +137,24 @@ class RangeReader(io.RawIOBase):
 
     def readinto(self, buffer: WriteableBuffer) -> int:
         view = memoryview(buffer).cast("B")
-        wanted = min(len(view), self._size_bytes - self._position)
-        if wanted <= 0:
+        size = min(len(view), self._size_bytes - self._position)
+        if size <= 0:
             return 0
-        piece = self._store.read_range(self._key, self._position, wanted)
+        piece = self._store.read_range(self._key, self._position, size)
         view[: len(piece)] = piece
         self._position += len(piece)
         return len(piece)
 
 
 def open_buffered(store: ObjectStore, key: str, size_bytes: int) -> io.BufferedReader:
-    """The object of that size, buffered."""
+    """Open an object of the given size as a buffered, seekable file."""
     return io.BufferedReader(
         cast("io.RawIOBase", RangeReader(store, key, size_bytes)), RANGE_BUFFER_BYTES
     )
 
 
 def read_exactly(file: io.BufferedIOBase, size_bytes: int) -> bytes:
-    """So many bytes, fewer only at the end."""
+    """Read `size_bytes` bytes; fewer only at the end of the file."""
     data = b""
     while len(data) < size_bytes and (piece := file.read(size_bytes - len(data))):
         data += piece

@@ -1,6 +1,7 @@
-"""Tar archives, plain or gzipped: POSIX ustar and pax, GNU's long names and numbers.
+"""Reader for tar archives, plain or gzipped: POSIX ustar and pax, GNU long names and numbers.
 
-Not by `tarfile`, which reads a header of any declared size into memory and keeps every member.
+The standard library's `tarfile` reads a header of any declared size into memory and keeps every
+member. This reader has constant memory and checks declared sizes first.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ PAX_TYPE, PAX_GLOBAL_TYPE, GNU_LONG_NAME_TYPE, GNU_LONG_LINK_TYPE = b"x", b"g", 
 
 @dataclass(slots=True)
 class _TarHeader:
-    """One header, with what the ones before it said of its member."""
+    """The header of a member, with the pax records and the long name that precede it."""
 
     name: str
     type: bytes
@@ -51,6 +52,8 @@ class _TarHeader:
 
 
 class TarArchive:
+    """A tar archive; see `Archive`."""
+
     def __init__(self, file: io.BufferedReader, limits: ArchiveLimits, *, gzipped: bool) -> None:
         self._file: io.BufferedIOBase = gzip.GzipFile(mode="rb", fileobj=file) if gzipped else file
         self._gzipped = gzipped
@@ -65,7 +68,7 @@ class TarArchive:
             self._limits.check_members(headers // HEADERS_PER_MEMBER)
             data = position + BLOCK_BYTES
             position = data + _padded_to_block(header.size_bytes)
-            # Before seeking there: of a gzipped archive that means unpacking up to there.
+            # Checked before seeking, because a gzipped archive is decompressed up to there.
             self._limits.check_unpacked(position)
             if header.type == PAX_TYPE:
                 pax = _parse_pax(self._read_text(header.size_bytes))
@@ -87,40 +90,42 @@ class TarArchive:
     def read(self, member: ArchiveMember) -> Iterator[bytes]:
         if member.fault is not None:
             raise member.fault
-        left = member.size_bytes
+        remaining = member.size_bytes
         with _as_damaged_archive():
             self._file.seek(member.offset)
-        while left:
+        while remaining:
             with _as_damaged_archive():
-                piece = self._file.read(min(ARCHIVE_READ_BYTES, left))
+                piece = self._file.read(min(ARCHIVE_READ_BYTES, remaining))
             if not piece:
-                raise damaged_member_error("the archive ends in the middle of it")
-            left -= len(piece)
+                raise damaged_member_error("the archive is truncated")
+            remaining -= len(piece)
             yield piece
 
     def _read_header(self, position: int) -> _TarHeader | None:
-        """The header at the position; None at the archive's end mark."""
+        """Return the header at the position; None at the archive's end-of-archive block."""
         with _as_damaged_archive():
             self._file.seek(position)
             block = read_exactly(self._file, BLOCK_BYTES)
         if len(block) < BLOCK_BYTES:
-            raise damaged_archive_error("it ends in the middle, without a tar's end mark")
+            raise damaged_archive_error("it is truncated: the end-of-archive block is missing")
         if not any(block):
             return None
         if not is_tar_header(block):
             raise damaged_archive_error(
-                "it is not a tar" if position == 0 else f"at byte {position} there is no header"
+                "it is not a tar archive"
+                if position == 0
+                else f"there is no header at byte {position}"
             )
         name = _decode_text(block[:100])
         if block[257:262] == b"ustar" and block[263:265] == b"00" and block[345] != 0:
             name = f"{_decode_text(block[345:500])}/{name}"
         header = _TarHeader(name, block[156:157], _parse_number(block[124:136]))
         if header.type == FOLDER_TYPE or header.type in TYPES_WITHOUT_DATA:
-            header.size_bytes = 0  # whatever it says, none follows
+            header.size_bytes = 0  # no data follows, whatever size is declared
         return header
 
     def _verify_trailer(self, position: int) -> None:
-        """Behind the end mark, where a gzip's checksum stands."""
+        """Read to the end, so that gzip verifies its checksum."""
         with _as_damaged_archive():
             while piece := self._file.read(ARCHIVE_READ_BYTES):
                 position += len(piece)
@@ -128,14 +133,14 @@ class TarArchive:
 
     def _read_text(self, size_bytes: int) -> bytes:
         if size_bytes > MAX_HEADER_BYTES:
-            raise damaged_archive_error(f"a header of {size_bytes} bytes")
+            raise damaged_archive_error(f"it has a header of {size_bytes} bytes")
         with _as_damaged_archive():
             return read_exactly(self._file, size_bytes)
 
 
 @contextmanager
 def _as_damaged_archive() -> Iterator[None]:
-    """Turns what unpacking raises into `damaged_archive_error`."""
+    """Convert decompression errors into `damaged_archive_error`."""
     try:
         yield
     except (EOFError, zlib.error, gzip.BadGzipFile) as error:
@@ -176,7 +181,7 @@ def _decode_text(data: bytes) -> str:
 
 
 def _parse_number(data: bytes) -> int:
-    """Octal digits; or, GNU's way for what is larger, bytes behind one with the highest bit."""
+    """Parse octal digits, or GNU's base-256 form for large numbers (first byte 0x80)."""
     if data[0] == 0x80:
         return int.from_bytes(data[1:], "big")
     try:
@@ -184,27 +189,27 @@ def _parse_number(data: bytes) -> int:
     except ValueError:
         number = -1
     if number < 0:
-        raise damaged_archive_error(f"a member says that its size is {data!r}")
+        raise damaged_archive_error(f"a member declares the invalid size {data!r}")
     return number
 
 
 def _parse_pax(data: bytes) -> dict[str, str]:
-    """`LENGTH KEY=VALUE\\n`, again and again."""
-    found = {}
+    """Parse a sequence of `LENGTH KEY=VALUE\\n` records."""
+    records = {}
     while data.strip(b"\0"):
         digits, blank, _ = data.partition(b" ")
         if not blank or not digits.isdigit() or not len(digits) + 3 <= int(digits) <= len(data):
-            raise damaged_archive_error("a pax header is broken")
+            raise damaged_archive_error("a pax header is malformed")
         record, data = data[len(digits) + 1 : int(digits)], data[int(digits) :]
         key, _, value = record.rstrip(b"\n").partition(b"=")
-        found[_decode_text(key)] = _decode_text(value)
-    return found
+        records[_decode_text(key)] = _decode_text(value)
+    return records
 
 
 def _pax_size(pax: dict[str, str], size_bytes: int) -> int:
-    said = pax.get("size")
-    if said is None:
+    declared = pax.get("size")
+    if declared is None:
         return size_bytes
-    if not (said.isascii() and said.isdigit() and len(said) < 20):
-        raise damaged_archive_error(f"a member says that its size is {said!r}")
-    return int(said)
+    if not (declared.isascii() and declared.isdigit() and len(declared) < 20):
+        raise damaged_archive_error(f"a member declares the invalid size {declared!r}")
+    return int(declared)

@@ -1,7 +1,8 @@
-"""Zip archives (APPNOTE.TXT 6.3.10): the central directory first, then one member at a time.
+"""Reader for zip archives (APPNOTE.TXT 6.3.10): the central directory, then one member at a time.
 
-Not by `zipfile`, which reads and keeps the whole directory before it can be asked how long it is: a
-directory of 10 GB is a legal zip.
+The standard library's `zipfile` reads and keeps the whole central directory before its size can be
+checked, and a directory of 10 GB is legal. This reader has constant memory. Section numbers in the
+comments refer to APPNOTE.TXT.
 """
 
 from __future__ import annotations
@@ -28,15 +29,15 @@ from shared.errors import PlacewiseError, Unprocessable
 END_RECORD = struct.Struct("<4s4H2LH")  # 4.3.16
 END_SIGNATURE = b"PK\x05\x06"
 MAX_COMMENT_BYTES = 65_535
-LOCATOR_64_BYTES = 20  # 4.3.15: stands before END
-END_RECORD_64 = struct.Struct("<4sQ2H2L4Q")  # 4.3.14: stands before its locator
+LOCATOR_64_BYTES = 20  # 4.3.15: precedes END_RECORD
+END_RECORD_64 = struct.Struct("<4sQ2H2L4Q")  # 4.3.14: precedes its locator
 END_64_SIGNATURE = b"PK\x06\x06"
 DIRECTORY_ENTRY = struct.Struct("<4s6H3L5H2L")  # 4.3.12
 ENTRY_SIGNATURE = b"PK\x01\x02"
 LOCAL_HEADER = struct.Struct("<4s5H3L2H")  # 4.3.7
 LOCAL_SIGNATURE = b"PK\x03\x04"
 
-ZIP64_SENTINEL = 0xFFFF_FFFF  # 4.4.1.4: the value stands in the extra field
+ZIP64_SENTINEL = 0xFFFF_FFFF  # 4.4.1.4: the value is in the extra field
 ZIP64_SENTINEL_16 = 0xFFFF
 ZIP64_EXTRA_TAG = 0x0001
 ENCRYPTION_FLAGS = 0x0001 | 0x0040 | 0x2000  # 4.4.4
@@ -50,10 +51,12 @@ class _CentralDirectory:
     size_bytes: int
     entries: int
     offset_shift: int
-    """What stands before the archive, as in one that unpacks itself: offsets don't count it."""
+    """Bytes before the archive, as in a self-extracting one: offsets don't include them."""
 
 
 class ZipArchive:
+    """A zip archive; see `Archive`."""
+
     def __init__(self, file: io.BufferedReader, size_bytes: int, limits: ArchiveLimits) -> None:
         self._file = file
         self._size_bytes = size_bytes
@@ -82,7 +85,7 @@ class ZipArchive:
         self._file.seek(member.offset)
         header = read_exactly(self._file, LOCAL_HEADER.size)
         if len(header) < LOCAL_HEADER.size or not header.startswith(LOCAL_SIGNATURE):
-            raise damaged_member_error("it is not where the directory says")
+            raise damaged_member_error("it is not at the offset in the central directory")
         *_, name_bytes, extra_bytes = LOCAL_HEADER.unpack(header)
         self._file.seek(member.offset + LOCAL_HEADER.size + name_bytes + extra_bytes)
         size = crc = 0
@@ -90,21 +93,21 @@ class ZipArchive:
             size += len(piece)
             if size > member.size_bytes:
                 raise damaged_member_error(
-                    f"it unpacks to more than the {member.size_bytes} bytes said"
+                    f"its content is larger than the declared {member.size_bytes} bytes"
                 )
             crc = zlib.crc32(piece, crc)
             yield piece
         if size != member.size_bytes or crc != member.crc32:
-            raise damaged_member_error("its size or checksum is not the one said")
+            raise damaged_member_error("its size or checksum is not the declared one")
 
     def _unpack(self, member: ArchiveMember) -> Iterator[bytes]:
-        left = member.packed_bytes
+        remaining = member.packed_bytes
         inflater = zlib.decompressobj(-zlib.MAX_WBITS) if member.method == DEFLATED else None
-        while left:
-            packed = self._file.read(min(ARCHIVE_READ_BYTES, left))
+        while remaining:
+            packed = self._file.read(min(ARCHIVE_READ_BYTES, remaining))
             if not packed:
-                raise damaged_member_error("the archive ends in the middle of it")
-            left -= len(packed)
+                raise damaged_member_error("the archive is truncated")
+            remaining -= len(packed)
             if inflater is None:
                 yield packed
                 continue
@@ -115,10 +118,10 @@ class ZipArchive:
                     raise damaged_member_error(str(error)) from None
                 packed = inflater.unconsumed_tail
         if inflater is not None:
-            yield inflater.flush()  # at most the end of one match: all input was taken
+            yield inflater.flush()  # at most the rest of one match: all input was consumed
 
     def _find_directory(self) -> _CentralDirectory:
-        """4.3.1: its place stands at the end of the archive."""
+        """Locate the central directory by the record at the end of the archive (4.3.1)."""
         tail_begin = max(0, self._size_bytes - END_RECORD.size - MAX_COMMENT_BYTES)
         self._file.seek(tail_begin)
         tail = read_exactly(self._file, self._size_bytes - tail_begin)
@@ -133,17 +136,17 @@ class ZipArchive:
                 end = begin_64
                 *_, disk, _, _, entries, size_bytes, offset = END_RECORD_64.unpack(record)
         if disk:
-            raise damaged_archive_error("it is one part of several")
+            raise damaged_archive_error("it is one part of a split archive")
         shift = end - size_bytes - offset
         if shift < 0:
-            raise damaged_archive_error("its directory is not where it says")
+            raise damaged_archive_error("its central directory is not at the declared offset")
         return _CentralDirectory(end - size_bytes, size_bytes, entries, shift)
 
     def _read_entry(self, position: int, shift: int) -> tuple[ArchiveMember, int]:
-        """The directory's entry at the position, and where the next one begins."""
+        """Return the directory's entry at the position, and the position of the next one."""
         header = read_exactly(self._file, DIRECTORY_ENTRY.size)
         if len(header) < DIRECTORY_ENTRY.size or not header.startswith(ENTRY_SIGNATURE):
-            raise damaged_archive_error("its directory is broken")
+            raise damaged_archive_error("its central directory is malformed")
         (_, made_by, _, flags, method, _, _, crc, packed, size, name_bytes, extra_bytes) = (
             DIRECTORY_ENTRY.unpack(header)[:12]
         )
@@ -171,19 +174,22 @@ class ZipArchive:
 
 
 def _find_end_record(tail: bytes) -> int:
-    """Where END stands: its comment reaches to the archive's end, and may itself look like one."""
+    """Return the offset of END_RECORD, whose comment ends with the archive.
+
+    The comment may itself contain the record's signature.
+    """
     last = at = tail.rfind(END_SIGNATURE, 0, len(tail) - END_RECORD.size + len(END_SIGNATURE))
     while at >= 0:
         if at + END_RECORD.size + END_RECORD.unpack_from(tail, at)[-1] == len(tail):
             return at
         at = tail.rfind(END_SIGNATURE, 0, at)
     if last < 0:
-        raise damaged_archive_error("its end, where a zip's directory stands, is missing")
-    return last  # something was added to it
+        raise damaged_archive_error("it is truncated: the end of central directory is missing")
+    return last  # data was appended to the archive
 
 
 def _decode_name(name: bytes) -> str:
-    # Many zips hold UTF-8 without the flag that says so; 4.4.4 means code page 437 then.
+    # Many zips have UTF-8 names without the UTF-8 flag; by 4.4.4 that would be code page 437.
     try:
         return name.decode("utf-8")
     except UnicodeDecodeError:
@@ -191,7 +197,7 @@ def _decode_name(name: bytes) -> str:
 
 
 def _from_zip64(extra: bytes, size: int, packed: int, offset: int) -> tuple[int, int, int]:
-    """4.5.3: those of the three values that did not fit into 32 bits."""
+    """Replace the values that did not fit into 32 bits by those of the extra field (4.5.3)."""
     while len(extra) >= 4:
         tag, length = struct.unpack_from("<2H", extra)
         values = iter(struct.unpack_from(f"<{length // 8}Q", extra[4 : 4 + length].ljust(length)))
@@ -201,7 +207,7 @@ def _from_zip64(extra: bytes, size: int, packed: int, offset: int) -> tuple[int,
                 packed = next(values) if packed == ZIP64_SENTINEL else packed
                 offset = next(values) if offset == ZIP64_SENTINEL else offset
             except StopIteration:
-                raise damaged_archive_error("its directory is broken") from None
+                raise damaged_archive_error("its central directory is malformed") from None
         extra = extra[4 + length :]
     return size, packed, offset
 
@@ -209,12 +215,13 @@ def _from_zip64(extra: bytes, size: int, packed: int, offset: int) -> tuple[int,
 def _unsupported_reason(flags: int, method: int) -> PlacewiseError | None:
     if flags & ENCRYPTION_FLAGS:
         return Unprocessable(
-            "encrypted_member", "The archive's member is encrypted: pack it without a password."
+            "encrypted_member",
+            "The archive member is encrypted. Create the archive without a password.",
         )
     if method not in (STORED, DEFLATED):
         return Unprocessable(
             "unsupported_member",
-            f"The archive's member is packed by method {method}; Placewise reads what is stored or "
-            "deflated, as every zip program can do.",
+            f"The archive member uses compression method {method}; only stored and deflated "
+            "members are supported.",
         )
     return None

@@ -1,5 +1,4 @@
-"""Batches: `list_archive_photos` says what is in one, `bring_in` takes one photo, `worker` does
-them all.
+"""Batch imports: `listing` lists the photos of an archive or prefix, `worker` imports them.
 
-A module of the database's side is `shared.catalog.batch_items`.
+The tables of batches are in `shared.catalog.batch_items`.
 """

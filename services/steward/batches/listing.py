@@ -1,6 +1,6 @@
-"""From an archive to the items of a batch: its photos, with what its table says of them.
+"""Lists the photos of an archive, or of a prefix of the object store, as items of a batch.
 
-From a prefix of the object store to the items of a batch: every photo below it, by its key.
+An archive may contain a manifest (`photos.csv` or `manifest.jsonl`) with fields of its photos.
 """
 
 from __future__ import annotations
@@ -28,24 +28,30 @@ from shared.jobs import JobState
 from shared.storage import ObjectStore
 
 TABLE_NAME, MANIFEST_NAME = "photos.csv", "manifest.jsonl"
-# Archives inside of archives.
+# Suffixes of nested archives, which are not unpacked.
 ARCHIVE_SUFFIXES = {".zip", ".tar", ".tgz", ".gz", ".bz2", ".xz", ".zst", ".7z", ".rar"}
 MAX_LABEL_CHARACTERS = 1000
 
 
 @dataclass(slots=True)
 class BatchListing:
+    """The items of a batch."""
+
     items: list[dict[str, Any]] = field(default_factory=list)
     """Columns of BatchItem."""
     ignored: int = 0
-    """Members that are no photos and were not meant to be: folders, texts, what systems leave."""
+    """Number of members or objects that are not photos: folders, texts, system files."""
 
 
 def list_archive_photos(archive: Archive) -> BatchListing:
-    """What of the archive is to be brought in.
+    """List the photos of an archive with the fields of its manifest and of their file names.
 
-    Raises what `Archive.members` does, and Unprocessable or InvalidRequest: `no_photos`,
-    `bad_table`, `bad_manifest`, `several_manifests`.
+    An item that can't be imported is listed as failed, with its error.
+
+    Raises:
+        Unprocessable: `no_photos`, or as `Archive.members` raises.
+        InvalidRequest: `bad_table`, `bad_manifest` or `several_manifests`.
+        TooLarge: `manifest_too_large`, or as `Archive.members` raises.
     """
     listing = BatchListing()
     photos: list[tuple[str, ArchiveMember]] = []
@@ -63,21 +69,21 @@ def list_archive_photos(archive: Archive) -> BatchListing:
             listing.ignored += 1
     if not photos:
         raise Unprocessable(
-            "no_photos", f"The archive has no photo ({', '.join(sorted(PHOTO_SUFFIXES))}) in it."
+            "no_photos", f"The archive has no photos ({', '.join(sorted(PHOTO_SUFFIXES))})."
         )
-    said = _read_table(archive, tables, {name for name, _ in photos})
-    listing.items = list(_to_items(photos, said))
+    manifest_lines = _read_table(archive, tables, {name for name, _ in photos})
+    listing.items = list(_to_items(photos, manifest_lines))
     return listing
 
 
 def _display_name(name: str) -> str:
-    """What the member is called: for people, and for its line in the table. No path to anything."""
-    kept = "".join(c for c in name.replace("\\", "/") if c.isprintable())
-    return kept.removeprefix("./")[:MAX_LABEL_CHARACTERS] or "photo"
+    """Return the member's name for display and for its manifest line; never used as a path."""
+    printable = "".join(c for c in name.replace("\\", "/") if c.isprintable())
+    return printable.removeprefix("./")[:MAX_LABEL_CHARACTERS] or "photo"
 
 
 def _is_system_file(path: PurePosixPath) -> bool:
-    """What macOS and others leave behind: `__MACOSX/`, `._a.jpg`, `.DS_Store`, `.git/`."""
+    """Return whether it is hidden or made by macOS: `__MACOSX/`, `._a.jpg`, `.git/`."""
     return any(
         part == "__MACOSX" or (part.startswith(".") and part not in (".", ".."))
         for part in path.parts
@@ -87,7 +93,7 @@ def _is_system_file(path: PurePosixPath) -> bool:
 def _read_table(
     archive: Archive, tables: list[tuple[str, ArchiveMember]], names: set[str]
 ) -> dict[str, ManifestEntry]:
-    """What the outermost table says, by the photos' names."""
+    """Read the outermost manifest; return its lines by photo name."""
     if not tables:
         return {}
     depth = min(name.count("/") for name, _ in tables)
@@ -95,32 +101,35 @@ def _read_table(
     if len(outermost) > 1:
         raise InvalidRequest(
             "several_manifests",
-            f"The archive has {' and '.join(name for name, _ in outermost[:5])}: leave one.",
+            f"The archive has several manifests: {', '.join(name for name, _ in outermost[:5])}. "
+            "Remove all but one.",
         )
-    [(called, member)] = outermost
+    [(manifest_name, member)] = outermost
     if member.size_bytes > MAX_MANIFEST_BYTES:
-        raise TooLarge("manifest_too_large", f"{called} is larger than {MAX_MANIFEST_BYTES} bytes.")
+        raise TooLarge(
+            "manifest_too_large", f"{manifest_name} is larger than {MAX_MANIFEST_BYTES} bytes."
+        )
     data = b"".join(archive.read(member))
-    is_table = called.endswith(TABLE_NAME)
-    lines = read_csv_manifest(data, called) if is_table else read_jsonl_manifest(data, called)
-    # Names in it are relative to where it lies: people pack a folder as a whole.
-    folder = called[: called.rfind("/") + 1]
-    said = {folder + _display_name(line.name): line for line in lines}
-    strange = [
+    is_table = manifest_name.endswith(TABLE_NAME)
+    read_manifest = read_csv_manifest if is_table else read_jsonl_manifest
+    # Names in it are relative to its folder, because users pack a folder with its manifest.
+    folder = manifest_name[: manifest_name.rfind("/") + 1]
+    lines = {folder + _display_name(line.name): line for line in read_manifest(data, manifest_name)}
+    unknown = [
         (line.line, f"the archive has no photo {name!r}")
-        for name, line in said.items()
+        for name, line in lines.items()
         if name not in names
     ]
-    if strange:
+    if unknown:
         code = "bad_table" if is_table else "bad_manifest"
-        raise bad_lines_error(code, called, strange[:MAX_REPORTED_LINES])
-    return said
+        raise bad_lines_error(code, manifest_name, unknown[:MAX_REPORTED_LINES])
+    return lines
 
 
 def _to_items(
     photos: list[tuple[str, ArchiveMember]], manifest_lines: dict[str, ManifestEntry]
 ) -> Iterator[dict[str, Any]]:
-    times = Counter(name for name, _ in photos)
+    name_counts = Counter(name for name, _ in photos)
     for name, member in photos:
         line = manifest_lines.get(name)
         item: dict[str, Any] = {
@@ -129,29 +138,28 @@ def _to_items(
             "line": line.line if line else None,
         }
         try:
-            item["fields"] = _validate_member(name, member, line, times[name])
+            item["fields"] = _validate_member(name, member, line, name_counts[name])
         except PlacewiseError as error:
             item |= {"state": JobState.FAILED, "error": error.as_problem()}
         yield item
 
 
 def _validate_member(
-    name: str, member: ArchiveMember, manifest_line: ManifestEntry | None, times: int
+    name: str, member: ArchiveMember, manifest_line: ManifestEntry | None, name_count: int
 ) -> dict[str, str]:
-    """What is said of the photo; raises why it can't be brought in, as far as that can be told."""
+    """Return the photo's fields; raise the reason if it is already known not to be importable."""
     if member.fault is not None:
         raise member.fault
     path = PurePosixPath(name)
     if path.suffix.lower() in ARCHIVE_SUFFIXES:
         raise UnsupportedMedia(
-            "nested_archive", "An archive inside of an archive is not unpacked: upload it itself."
+            "nested_archive", "An archive in an archive is not unpacked. Upload it separately."
         )
-    if manifest_line is not None and times > 1:
+    if manifest_line is not None and name_count > 1:
         raise Unprocessable(
             "ambiguous_name",
-            f"{times} photos of the archive are called {name!r}, and line "
-            f"{manifest_line.line} of its table "
-            "does not say which of them it means.",
+            f"The archive has {name_count} photos named {name!r}, so line {manifest_line.line} of "
+            "its manifest is ambiguous. Rename them.",
         )
     return {
         **upload_fields_of_file_name(path.name, None),
@@ -160,7 +168,7 @@ def _validate_member(
 
 
 def member_location(member: ArchiveMember) -> dict[str, Any]:
-    """What is kept of a member to find it again: `member_from_location` reads it."""
+    """Return the location of a member as JSON, for `member_from_location`."""
     return {
         "offset": member.offset,
         "size_bytes": member.size_bytes,
@@ -170,16 +178,20 @@ def member_location(member: ArchiveMember) -> dict[str, Any]:
     }
 
 
-def member_from_location(name: str, place: dict[str, Any]) -> ArchiveMember:
-    """The member that `place_of` has kept."""
-    return ArchiveMember(name=name, kind=MemberKind.FILE, **place)
+def member_from_location(name: str, location: dict[str, Any]) -> ArchiveMember:
+    """Return the member at a location that `member_location` returned."""
+    return ArchiveMember(name=name, kind=MemberKind.FILE, **location)
 
 
 def list_prefix_photos(store: ObjectStore, prefix: str, max_photos: int) -> BatchListing:
-    """The photos below the prefix in the order of their keys, with what their names say of them.
+    """List the photos under a prefix by key, with the fields in their file names.
 
-    Objects that have no photo's suffix, or a hidden name, are passed over and counted. Raises
-    Unprocessable (`no_photos`), TooLarge (`too_many_photos_error`), Unavailable.
+    Objects without a photo suffix and hidden ones are ignored and counted.
+
+    Raises:
+        Unprocessable: `no_photos`.
+        TooLarge: `too_many_photos`: there are more than `max_photos`.
+        Unavailable: The object store can't be reached.
     """
     listing = BatchListing()
     keys: list[str] = []
@@ -193,11 +205,11 @@ def list_prefix_photos(store: ObjectStore, prefix: str, max_photos: int) -> Batc
         if len(keys) > max_photos:
             raise TooLarge(
                 "too_many_photos",
-                f"There are more than {max_photos} photos below {prefix} (MAX_BATCH_PHOTOS). "
-                "Name a longer prefix.",
+                f"There are more than {max_photos} photos under {prefix} (MAX_BATCH_PHOTOS). "
+                "Use a longer prefix.",
             )
     if not keys:
-        raise Unprocessable("no_photos", f"The object store has no photo below {prefix}.")
+        raise Unprocessable("no_photos", f"The object store has no photos under {prefix}.")
     listing.items = [_object_item(key) for key in sorted(keys)]
     return listing
 

@@ -1,12 +1,11 @@
-"""Batch jobs: brought in by slices, as fast as the extractors describe and no faster.
+"""Worker for batch jobs: imports the photos of a batch in slices, with backpressure.
 
-In a thread of its own, beside the steward's duties. A slice ends after SLICE_SECONDS, so that
-several batches take turns; what is brought in is never more than BATCH_AHEAD_PHOTOS ahead.
+It runs in a thread of its own, parallel to the periodic tasks. A slice ends after SLICE_SECONDS, so
+that several batches take turns, and at most BATCH_AHEAD_PHOTOS photos wait for the extractors.
 
-One photo of a batch, by the path of an upload: its bytes into the store, its checks, its row.
-
-The photo's row, its job's and the item's are one transaction, under the batch's lease. What is
-refused leaves no bytes; what a kill leaves is an orphan that no row knows.
+A photo takes the path of an upload: its bytes are stored and checked, then the photo row, its job
+and the item are written in one transaction, under the batch's lease. The bytes of a rejected photo
+are deleted; a crash leaves an orphan object.
 """
 
 from __future__ import annotations
@@ -69,11 +68,11 @@ from shared.storage.keys import new_original_key
 log = logging.getLogger(__name__)
 
 OBJECT_READ_BYTES = 256 * 1024
-MAX_OPEN_ARCHIVES = 4  # a gzipped one has to be unpacked from its begin when it is opened anew
+MAX_OPEN_ARCHIVES = 4  # reopening a gzipped archive decompresses it from its beginning
 
 
 class BatchItemImporter:
-    """Brings in items; keeps the archives open that it reads from."""
+    """Imports batch items; caches the open archives."""
 
     def __init__(
         self, catalog: Catalog, store: ObjectStore, hints: Wakeups, settings: Settings
@@ -86,7 +85,7 @@ class BatchItemImporter:
         self._archives: OrderedDict[UUID, Archive] = OrderedDict()
 
     def open_batch_archive(self, job: Job) -> Archive:
-        """The batch's archive. Raises as `open_archive` does."""
+        """Return the batch's archive, opened once. Raises as `open_archive` does."""
         if job.id not in self._archives:
             limits = ArchiveLimits(self._settings.max_batch_photos, self._settings.max_archive_size)
             self._archives[job.id] = open_archive(self._store, job.params["object_key"], limits)
@@ -96,31 +95,32 @@ class BatchItemImporter:
         return self._archives[job.id]
 
     def close_archive(self, job: Job) -> None:
-        """The batch has ended, or its archive can't be trusted to be where it was."""
+        """Drop the batch's archive from the cache."""
         self._archives.pop(job.id, None)
 
     def import_item(self, job: Job, item: BatchItem) -> None:
-        """Let the item become a photo with its job, or fail with its reason.
+        """Store the item as a photo with its job, or fail the item.
 
-        Raises Stopped when the batch is no longer ours, and Unavailable and OSError when the store
-        is away.
+        Raises:
+            JobInterrupted: The batch lost its lease.
+            Unavailable, OSError: The object store can't be reached.
         """
         uploaded = job.params["source"] == BatchSource.FILES
         key = item.object_key if uploaded and item.object_key else new_original_key()
         try:
-            received = (
+            stored_upload = (
                 self._received_upload(item) if uploaded else self._copy_to_store(job, item, key)
             )
             key_id = UUID(job.params["key_id"]) if "key_id" in job.params else None
-            incoming = validate_photo(
-                self._store, received, self._settings.max_image_pixels, key_id
+            photo = validate_photo(
+                self._store, stored_upload, self._settings.max_image_pixels, key_id
             )
-            with self._place_for(job, key_id):
-                stored = retry_on_conflict(lambda: self._commit(job, item, incoming))
+            with self._reserve_quota(job, key_id):
+                result = retry_on_conflict(lambda: self._commit(job, item, photo))
         except Unavailable:
             raise
         except JobInterrupted:
-            # Cancelled: its own, unlike an uploaded file, no other steward will go on with.
+            # Another steward would copy the member again; an uploaded file is needed by it.
             if not uploaded:
                 self._store.delete(key)
             raise
@@ -128,20 +128,20 @@ class BatchItemImporter:
             self._fail_with_line(job, item, error)
             self._store.delete(key)
             return
-        if stored.queued:
+        if result.queued:
             self._hints.send()
-        if stored.photo.object_key != key:
+        if result.photo.object_key != key:
             self._store.delete(key)
 
-    def _place_for(self, job: Job, key_id: UUID | None) -> AbstractContextManager[None]:
-        """In which a photo is stored through the key that the batch came in with.
-        TooManyRequests (`photo_quota_reached`)."""
+    def _reserve_quota(self, job: Job, key_id: UUID | None) -> AbstractContextManager[None]:
+        """Reserve a photo in the quota of the batch's API key; raises TooManyRequests
+        (`photo_quota_reached`)."""
         if key_id is None or job.params["max_photos"] is None:
             return contextlib.nullcontext()
         return self._quota.place(key_id, job.params["max_photos"])
 
     def _received_upload(self, item: BatchItem) -> StoredUpload:
-        """The file that the gateway has stored."""
+        """Return the file that the gateway has stored."""
         assert item.object_key is not None
         return StoredUpload(
             key=item.object_key,
@@ -153,15 +153,15 @@ class BatchItemImporter:
         )
 
     def _copy_to_store(self, job: Job, item: BatchItem, key: str) -> StoredUpload:
-        """The member or object, written under `key` while it is checked."""
-        file = StreamValidator(self._settings.max_file_size, check_photo_signature)
+        """Copy the member or object to `key` and validate it meanwhile."""
+        validator = StreamValidator(self._settings.max_file_size, check_photo_signature)
         writer = self._store.writer(key)
         try:
             for piece in self._read_item(job, item):
-                file.add(piece)
+                validator.add(piece)
                 writer.write(piece)
-            file.end()
-            if not file.size_bytes:
+            validator.end()
+            if not validator.size_bytes:
                 raise InvalidRequest("empty_file", "The file is empty.")
             writer.commit()
         finally:
@@ -169,9 +169,9 @@ class BatchItemImporter:
         return StoredUpload(
             key=key,
             filename=base_name(item.name),
-            size_bytes=file.size_bytes,
-            sha256=file.sha256,
-            begin=file.begin,
+            size_bytes=validator.size_bytes,
+            sha256=validator.sha256,
+            begin=validator.begin,
             fields=item.fields,
         )
 
@@ -185,15 +185,15 @@ class BatchItemImporter:
             while piece := file.read(OBJECT_READ_BYTES):
                 yield piece
 
-    def _commit(self, job: Job, item: BatchItem, incoming: ValidatedPhoto) -> StoreResult:
+    def _commit(self, job: Job, item: BatchItem, photo: ValidatedPhoto) -> StoreResult:
         with self._catalog.write() as session:
-            mine = self._lock_item(session, job, item)
-            stored = insert_photo(session, job.map_id, incoming, Priority.BATCH)
-            # Without a job it was described long ago; else the item ends as that job does.
-            mine.state = JobState.RUNNING if stored.job is not None else JobState.SUCCEEDED
-            mine.photo_id, mine.photo_job_id = stored.photo.id, stored.photo.job_id
-            mine.already_there = stored.photo.object_key != incoming.received.key
-            return stored
+            locked_item = self._lock_item(session, job, item)
+            result = insert_photo(session, job.map_id, photo, Priority.BATCH)
+            # A photo without a job is already described; else the item ends as that job does.
+            locked_item.state = JobState.RUNNING if result.job is not None else JobState.SUCCEEDED
+            locked_item.photo_id, locked_item.photo_job_id = result.photo.id, result.photo.job_id
+            locked_item.already_there = result.photo.object_key != photo.received.key
+            return result
 
     def _fail_with_line(self, job: Job, item: BatchItem, error: PlacewiseError) -> None:
         problem = error.as_problem()
@@ -202,29 +202,31 @@ class BatchItemImporter:
         self.fail_item(job, item, problem)
 
     def fail_item(self, job: Job, item: BatchItem, problem: dict[str, Any]) -> None:
-        """The item ends with the problem; Stopped when the batch is no longer ours."""
+        """Fail the item with the problem; JobInterrupted if the batch lost its lease."""
         with self._catalog.write() as session:
-            mine = self._lock_item(session, job, item)
-            mine.state, mine.error = JobState.FAILED, problem
+            locked_item = self._lock_item(session, job, item)
+            locked_item.state, locked_item.error = JobState.FAILED, problem
 
     @staticmethod
     def _lock_item(session: Session, job: Job, item: BatchItem) -> BatchItem:
-        """The queued item, under the batch's lock."""
-        for mine in lock_leased_jobs(session, get_lease_token(job), [job]):
-            mine.attempts = 0  # it gets on: what has killed a worker before was not this item
+        """Return the item under the batch's lock; JobInterrupted if the batch lost its lease."""
+        for leased in lock_leased_jobs(session, get_lease_token(job), [job]):
+            leased.attempts = 0  # progress: an earlier crash was not caused by this item
             return session.get_one(BatchItem, (job.id, item.number))
         raise JobInterrupted
 
 
 SLICE_SECONDS = 2.0
-PROGRESS_POLL_SECONDS = 0.5  # between two looks at what the extractors have done
-YIELD_SECONDS = 0.1  # in which another batch is taken first
-READ_ITEMS = 50  # items read from the catalog in one go
+PROGRESS_POLL_SECONDS = 0.5  # between two checks of the extractors' progress
+YIELD_SECONDS = 0.1  # pause of a batch, so that another one is claimed first
+READ_ITEMS = 50  # items per query
 
 
 def resume_batches(catalog: Catalog, settings: Settings) -> None:
-    """Let the batches that wait for disk space go on once MIN_FREE_BYTES are free. Of a bucket, how
-    much is free is not known: they try their next photo."""
+    """Wake the batches that wait for disk space once MIN_FREE_BYTES are free.
+
+    The free space of a bucket is unknown: its batches are woken and try their next photo.
+    """
     waits = (Job.kind == JobKind.BATCH) & (Job.waiting_for == WaitingFor.DISK_SPACE)
     with catalog.read() as session:
         if not session.scalar(select(exists(select(Job.id).where(waits)))):
@@ -238,7 +240,7 @@ def resume_batches(catalog: Catalog, settings: Settings) -> None:
 
 
 class BatchWorker:
-    """Does batch jobs; `run` until stopped."""
+    """Runs batch jobs in slices."""
 
     def __init__(
         self,
@@ -254,105 +256,104 @@ class BatchWorker:
         self._settings = settings
         self._disk = DiskSpace(settings)
         self._importer = BatchItemImporter(catalog, store, hints, settings)
-        counted = metrics or StewardMetrics(CollectorRegistry())
-        self._runner = JobRunner(catalog, settings, name, (JobKind.BATCH,), counted)
+        metrics = metrics or StewardMetrics(CollectorRegistry())
+        self._runner = JobRunner(catalog, settings, name, (JobKind.BATCH,), metrics)
 
     def run(self, stop: threading.Event) -> None:
-        """Take batches until `stop` is set."""
+        """Run batches until `stop` is set."""
         self._runner.run(stop, lambda job: self._run_slice(job, stop))
 
     def run_next(self, stop: threading.Event) -> bool:
-        """A slice of the next batch; False when there is none."""
+        """Run a slice of the next batch; False when there is none."""
         return self._runner.run_next(lambda job: self._run_slice(job, stop))
 
     def _run_slice(self, job: Job, stop: threading.Event) -> None:
-        until = time.monotonic() + SLICE_SECONDS
+        deadline = time.monotonic() + SLICE_SECONDS
         if not job.params["listed"]:
             self._list_items(job)
         elif job.attempts >= self._settings.max_attempts:
             self._fail_suspect_item(job)
         try:
-            while time.monotonic() < until and (items := self._next_items(job)):
+            while time.monotonic() < deadline and (items := self._next_items(job)):
                 for item in items:
                     if stop.is_set():
                         raise JobInterrupted
                     self._disk.check()
                     self._importer.import_item(job, item)
-                    if time.monotonic() > until:
+                    if time.monotonic() > deadline:
                         break
         except StorageFull as error:
-            log.warning("the batch %s waits for disk space: %s", job.id, error)
+            log.warning("batch %s waits for disk space: %s", job.id, error)
             self._finish_slice(job, WaitingFor.DISK_SPACE)
         else:
             self._finish_slice(job)
 
     def _list_items(self, job: Job) -> None:
-        """Archives and prefixes come without items: the gateway lists files and keys."""
+        """Write the items of an archive or prefix; the gateway writes those of files and keys."""
         with self._catalog.write() as session:
-            for mine in lock_leased_jobs(session, get_lease_token(job), [job]):
-                mine.stage = "list"
+            for leased in lock_leased_jobs(session, get_lease_token(job), [job]):
+                leased.stage = "list"
         if job.params["source"] == BatchSource.PREFIX:
-            most = self._settings.max_batch_photos
-            listing = list_prefix_photos(self._store, job.params["prefix"], most)
+            max_photos = self._settings.max_batch_photos
+            listing = list_prefix_photos(self._store, job.params["prefix"], max_photos)
         else:
             listing = list_archive_photos(self._importer.open_batch_archive(job))
         with self._catalog.write() as session:
-            for mine in lock_leased_jobs(session, get_lease_token(job), [job]):
-                mine.params = {**mine.params, "ignored": listing.ignored}
-                add_batch_items(session, mine, listing.items)
+            for leased in lock_leased_jobs(session, get_lease_token(job), [job]):
+                leased.params = {**leased.params, "ignored": listing.ignored}
+                add_batch_items(session, leased, listing.items)
                 return
         raise JobInterrupted
 
     def _fail_suspect_item(self, job: Job) -> None:
-        """Several workers have died since the last photo came in: the next one may be to blame."""
+        """Fail the next item: several workers died on it, since no photo was imported meanwhile."""
         error = PlacewiseError(
             "worker_fell",
-            f"The steward died {job.attempts} times while it brought this photo in. If the photo "
-            "is fine, look at the steward's log and memory, then upload it again.",
+            f"The steward died {job.attempts} times while it imported this photo. If the photo "
+            "is valid, check the steward's log and memory, then upload it again.",
         )
         with self._catalog.read() as session:
             suspects = next_queued_items(session, job.id, 1)
         if not suspects:
             raise error
-        log.error("item %d of the batch %s has killed its workers", suspects[0].number, job.id)
+        log.error("item %d of batch %s crashed its workers", suspects[0].number, job.id)
         self._importer.fail_item(job, suspects[0], error.as_problem())
 
     def _next_items(self, job: Job) -> list[BatchItem]:
-        """The next queued items, as many as the extractors have room for."""
-        most = self._settings.batch_ahead_photos
+        """Return the next queued items, up to the free capacity of the extractors' queue."""
+        max_queued = self._settings.batch_ahead_photos
         with self._catalog.read() as session:
-            room = most - count_queued_photos(session, most)
+            room = max_queued - count_queued_photos(session, max_queued)
             return next_queued_items(session, job.id, min(READ_ITEMS, room)) if room > 0 else []
 
     def _finish_slice(self, job: Job, waiting_for: WaitingFor | None = None) -> None:
-        """The slice's end: note the progress; end the batch, or say when its queued items go on, or
-        what they wait for."""
+        """Update the progress; complete the batch, or release it until its next slice."""
         with self._catalog.write() as session:
-            mine = lock_batch(session, job, get_lease_token(job))
-            if mine is None:
+            leased = lock_batch(session, job, get_lease_token(job))
+            if leased is None:
                 raise JobInterrupted
-            mine.attempts = 0
-            counts = sync_item_states(session, mine)
+            leased.attempts = 0
+            counts = sync_item_states(session, leased)
             if counts[JobState.QUEUED]:
-                pause = 0.0 if waiting_for else self._pause_seconds(session, mine)
-                release_job(mine, after_seconds=pause, waiting_for=waiting_for)
+                pause = 0.0 if waiting_for else self._pause_seconds(session, leased)
+                release_job(leased, after_seconds=pause, waiting_for=waiting_for)
                 return
             if counts[JobState.RUNNING]:
-                mine.stage = "describe"
-                waits = is_waiting_for_vocabulary(session, mine)
+                leased.stage = "describe"
+                waits = is_waiting_for_vocabulary(session, leased)
                 release_job(
-                    mine,
+                    leased,
                     after_seconds=PROGRESS_POLL_SECONDS,
                     waiting_for=WaitingFor.VOCABULARY if waits else None,
                 )
                 return
-            succeed_job(mine, summarise_batch(session, mine, counts))
-            update_batch_progress(mine, counts)
+            succeed_job(leased, summarise_batch(session, leased, counts))
+            update_batch_progress(leased, counts)
         self._importer.close_archive(job)
 
     def _pause_seconds(self, session: Session, job: Job) -> float:
-        most = self._settings.batch_ahead_photos
-        if count_queued_photos(session, most) == most:
+        max_queued = self._settings.batch_ahead_photos
+        if count_queued_photos(session, max_queued) == max_queued:
             return PROGRESS_POLL_SECONDS
         other = select(Job.id).where(claimable_condition((JobKind.BATCH,)), Job.id != job.id)
         return YIELD_SECONDS if session.scalar(select(exists(other))) else 0.0

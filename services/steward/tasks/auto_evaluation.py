@@ -1,5 +1,8 @@
-"""Evaluating maps that have changed, so that their answers can say "not in this map"; and then
-learning the weights of their words, where the vocabulary is their own."""
+"""Automatic evaluation: queues evaluations and word-weight fits for maps that have changed.
+
+An evaluation calibrates the threshold below which a query's answer is "not in this map". Word
+weights are fitted afterwards, for maps with a vocabulary of their own.
+"""
 
 from __future__ import annotations
 
@@ -19,57 +22,60 @@ from shared.ids import new_id
 from shared.jobs import Job, JobKind, JobState, Priority
 from shared.word_weights.record import parse_word_weights
 
-AUTO_SAMPLE_PHOTOS = 300  # enough for a threshold that one in twenty exceeds
-REEVALUATE_SHARE = 0.2  # of the photos: more, and what was measured is out of date
+AUTO_SAMPLE_PHOTOS = 300  # enough for a threshold at a false-accept rate of 5 %
+REEVALUATE_SHARE = 0.2  # change of the photo count after which a map is evaluated again
 
 
 @dataclass(frozen=True, slots=True)
 class DueJob:
-    """A job that a map should have now."""
+    """An evaluation or word-weight job that a map needs now."""
 
     kind: JobKind
     params: dict[str, Any]
 
 
-def evaluate_changed_maps(catalog: Catalog, least_photos: int, word_weights: bool) -> None:
-    """Queue an evaluation for each map that is at rest and has changed since its last one; with
-    `word_weights` also, once that is done, the learning of its weights."""
-    if not least_photos:
+def evaluate_changed_maps(catalog: Catalog, min_photos: int, word_weights: bool) -> None:
+    """Queue an evaluation for each idle map that has changed enough since its last one.
+
+    Args:
+        catalog: The catalog.
+        min_photos: Maps with fewer geotagged photos are skipped; 0 turns automatic evaluation off.
+        word_weights: Whether to fit word weights, too, once the evaluation is up to date.
+    """
+    if not min_photos:
         return
     with catalog.read() as session:
         due = [
             map_.id
             for map_ in list_maps(session)
-            if _due_job(session, map_.id, least_photos, word_weights)
+            if _due_job(session, map_.id, min_photos, word_weights)
         ]
     for map_id in due:
         with catalog.write() as session:
             lock_map(session, map_id)
-            wanted = _due_job(session, map_id, least_photos, word_weights)
-            if wanted is None:
-                continue  # another steward was first
+            due_job = _due_job(session, map_id, min_photos, word_weights)
+            if due_job is None:
+                continue  # another steward has queued it
             session.add(
                 Job(
                     id=new_id(),
                     map_id=map_id,
-                    kind=wanted.kind,
+                    kind=due_job.kind,
                     priority=Priority.EVALUATION,
-                    params=wanted.params,
+                    params=due_job.params,
                 )
             )
 
 
-def _due_job(
-    session: Session, map_id: UUID, least_photos: int, word_weights: bool
-) -> DueJob | None:
-    """The job that the map should have now, if any."""
+def _due_job(session: Session, map_id: UUID, min_photos: int, word_weights: bool) -> DueJob | None:
+    """Return the job that the map needs now, if any."""
     generation = active_generation(session, map_id)
     if generation is None or _is_busy(session, map_id):
         return None
-    figures, _ = get_map_statistics(session, map_id)
-    if figures.located < least_photos:
+    statistics, _ = get_map_statistics(session, map_id)
+    if statistics.located < min_photos:
         return None
-    searchable, queries = figures.searchable, figures.located_queries
+    searchable, queries = statistics.searchable, statistics.located_queries
     params = {
         "sample": AUTO_SAMPLE_PHOTOS,
         "seed": 0,
@@ -78,19 +84,23 @@ def _due_job(
         "searchable": searchable,
         "labelled_queries": queries,
     }
-    seen = _last_evaluated_counts(session, generation)
-    if seen is None or _changed_enough(searchable, seen[0]) or _changed_enough(queries, seen[1]):
+    evaluated = _last_evaluated_counts(session, generation)
+    if (
+        evaluated is None
+        or _changed_enough(searchable, evaluated[0])
+        or _changed_enough(queries, evaluated[1])
+    ):
         return DueJob(JobKind.EVALUATE, params)
     if not word_weights or not _has_own_vocabulary(session, generation):
         return None
-    learnt = _last_weighted_count(session, generation)
-    if learnt is None or _changed_enough(searchable, learnt):
+    weighted_count = _last_weighted_count(session, generation)
+    if weighted_count is None or _changed_enough(searchable, weighted_count):
         return DueJob(JobKind.WORD_WEIGHTS, params)
     return None
 
 
 def _is_busy(session: Session, map_id: UUID) -> bool:
-    """Photos are being described, or an evaluation is under way: what is found still changes."""
+    """Return whether the map has unfinished jobs other than queries, which may change results."""
     unfinished = exists().where(
         Job.map_id == map_id, Job.state.in_(UNFINISHED_STATES), Job.kind.not_in(QUERY_JOBS)
     )
@@ -98,7 +108,7 @@ def _is_busy(session: Session, map_id: UUID) -> bool:
 
 
 def _has_own_vocabulary(session: Session, generation: Generation) -> bool:
-    """Weights of a foreign vocabulary have never helped (benchmarks/RESULTS.md)."""
+    """Weights for a foreign vocabulary never improved recall (benchmarks/RESULTS.md)."""
     return (
         vocabulary_standing(session, generation) == "own"
         and word_weights_unavailable_reason(session, generation) is None
@@ -106,7 +116,7 @@ def _has_own_vocabulary(session: Session, generation: Generation) -> bool:
 
 
 def _last_evaluated_counts(session: Session, generation: Generation) -> tuple[int, int] | None:
-    """How many photos and labelled queries the last evaluation saw."""
+    """Return the numbers of photos and of labelled queries at the last evaluation."""
     if failed := _failed_job_params(session, generation, JobKind.EVALUATE):
         return failed["searchable"], failed["labelled_queries"]
     last = latest_evaluation(session, generation.id)
@@ -114,7 +124,7 @@ def _last_evaluated_counts(session: Session, generation: Generation) -> tuple[in
 
 
 def _last_weighted_count(session: Session, generation: Generation) -> int | None:
-    """Of how many photos the generation's word weights were learnt."""
+    """Return the number of searchable photos when the word weights were last fitted."""
     if failed := _failed_job_params(session, generation, JobKind.WORD_WEIGHTS):
         return int(failed["searchable"])
     record = parse_word_weights(generation.word_weights)
@@ -124,8 +134,10 @@ def _last_weighted_count(session: Session, generation: Generation) -> int | None
 def _failed_job_params(
     session: Session, generation: Generation, kind: JobKind
 ) -> dict[str, Any] | None:
-    """The parameters of the map's last job of this kind, if it was queued here and came to nothing:
-    its reason is in the job, and it is not tried for ever."""
+    """Return the params of the map's last job of this kind if it was queued here and failed.
+
+    It counts as done, or it would be queued again in every run; its error is in the job.
+    """
     job = session.scalar(
         select(Job)
         .where(Job.map_id == generation.map_id, Job.kind == kind)
@@ -142,5 +154,5 @@ def _failed_job_params(
     return None
 
 
-def _changed_enough(now: int, then: int) -> bool:
-    return abs(now - then) > REEVALUATE_SHARE * then
+def _changed_enough(current: int, previous: int) -> bool:
+    return abs(current - previous) > REEVALUATE_SHARE * previous

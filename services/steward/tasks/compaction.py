@@ -1,4 +1,4 @@
-"""Merging small chunks into one, inside their slot; rows of deleted photos are dropped."""
+"""Compaction: merges the small chunks of a slot into one and drops rows of deleted photos."""
 
 from __future__ import annotations
 
@@ -24,15 +24,24 @@ from shared.storage.read_retries import ReadRetries
 
 log = logging.getLogger(__name__)
 
-DEAD_ROW_SAMPLE_SLOTS = 100  # of which dead rows are counted in one round: 100,000 rows, some 0.2 s
-DEAD_ROW_SHARE = 0.2  # of a chunk's rows: more, and rewriting it is worth the reading
+DEAD_ROW_SAMPLE_SLOTS = 100  # slots whose dead rows one run counts: 100,000 rows, about 0.2 s
+DEAD_ROW_SHARE = 0.2  # of a slot's rows; with more, it is rewritten
 
 
 def merge_small_chunks(
     catalog: Catalog, store: ObjectStore, compact_chunks: int, retries: ReadRetries | None = None
 ) -> int:
-    """Merge every slot that is worth it; returns how many were merged. `retries` keeps the slots
-    whose chunks can't be read from being read with every round."""
+    """Merge every slot that needs it.
+
+    Args:
+        catalog: The catalog.
+        store: The object store with the chunks.
+        compact_chunks: An open slot is merged from this number of chunks on.
+        retries: Backoff for slots with unreadable chunks, so that not every run reads them.
+
+    Returns:
+        The number of slots merged.
+    """
     retries = retries or ReadRetries()
     merged = 0
     for generation_id, slot in _find_slots_to_merge(catalog, compact_chunks):
@@ -48,19 +57,23 @@ def merge_small_chunks(
 
 
 def merge_slot(catalog: Catalog, store: ObjectStore, generation_id: UUID, slot: int) -> bool:
-    """Write the slot's live rows into one new chunk; False when something changed meanwhile."""
+    """Write the slot's live rows into one new chunk.
+
+    Returns:
+        False if the slot's chunks changed meanwhile: the catalog is left unchanged.
+    """
     with catalog.read() as session:
         generation = session.get_one(Generation, generation_id)
         old = _slot_chunks(session, generation_id, slot)
-        kept = {chunk.id: list_live_rows(session, chunk.id) for chunk in old}
+        live_rows = {chunk.id: list_live_rows(session, chunk.id) for chunk in old}
     rows = [read_chunk(store, chunk.object_key, chunk.sha256) for chunk in old]
-    photo_ids = [photo_id for chunk in old for _, photo_id in kept[chunk.id]]
-    written, chunk_id = None, new_id()
+    photo_ids = [photo_id for chunk in old for _, photo_id in live_rows[chunk.id]]
+    new_chunk, chunk_id = None, new_id()
     if photo_ids:
         matrix = np.concatenate(
-            [part[[row for row, _ in kept[c.id]]] for c, part in zip(old, rows, strict=True)]
+            [part[[row for row, _ in live_rows[c.id]]] for c, part in zip(old, rows, strict=True)]
         )
-        written = write_chunk(
+        new_chunk = write_chunk(
             store,
             generation_id=generation_id,
             chunk_id=chunk_id,
@@ -71,25 +84,26 @@ def merge_slot(catalog: Catalog, store: ObjectStore, generation_id: UUID, slot: 
     with catalog.write() as session:
         lock_map(session, generation.map_id)
         generation = lock_generation(session, generation_id)
-        now = {chunk.id for chunk in _slot_chunks(session, generation_id, slot)}
-        if now != {chunk.id for chunk in old}:
-            return False  # another steward, or a new chunk in the slot: the new file is an orphan
+        current = {chunk.id for chunk in _slot_chunks(session, generation_id, slot)}
+        if current != {chunk.id for chunk in old}:
+            # Another steward merged the slot, or it has a new chunk: the new file is an orphan.
+            return False
         old_ids = [chunk.id for chunk in old]
-        # Rows of photos deleted meanwhile are copied but lead nowhere: dead rows of the new chunk.
+        # Rows of photos deleted meanwhile were copied, too: they are dead rows of the new chunk.
         present = set(
             session.scalars(select(Descriptor.photo_id).where(Descriptor.chunk_id.in_(old_ids)))
         )
         session.execute(delete(Descriptor).where(Descriptor.chunk_id.in_(old_ids)))
-        if written is not None:
+        if new_chunk is not None:
             session.add(
                 Chunk(
                     id=chunk_id,
                     generation_id=generation_id,
                     slot=slot,
-                    object_key=written.object_key,
-                    rows=written.rows,
-                    size_bytes=written.size_bytes,
-                    sha256=written.sha256,
+                    object_key=new_chunk.object_key,
+                    rows=new_chunk.rows,
+                    size_bytes=new_chunk.size_bytes,
+                    sha256=new_chunk.sha256,
                     sealed=slot < generation.open_slot,
                 )
             )
@@ -106,7 +120,7 @@ def merge_slot(catalog: Catalog, store: ObjectStore, generation_id: UUID, slot: 
             )
         session.execute(update(Chunk).where(Chunk.id.in_(old_ids)).values(superseded_at=db_now()))
         increment_map_version(session, generation.map_id)
-    log.info("slot %d of %s: %d chunks are one", slot, generation_id, len(old))
+    log.info("merged %d chunks of slot %d of generation %s", len(old), slot, generation_id)
     return True
 
 
@@ -125,10 +139,10 @@ def _slot_chunks(session: Session, generation_id: UUID, slot: int) -> list[Chunk
 
 
 def _find_slots_to_merge(catalog: Catalog, compact_chunks: int) -> list[tuple[UUID, int]]:
-    """Slots that are full but in pieces, open slots in many pieces, and slots with dead rows.
+    """Return full slots of several chunks, open slots of many chunks, and slots with dead rows.
 
-    Dead rows are counted in SLOTS_AT_ONCE slots only, drawn anew each time: counting all of a
-    large catalog would keep the database busy.
+    Dead rows are counted in a new random sample of DEAD_ROW_SAMPLE_SLOTS slots in each run:
+    counting those of a large catalog would load the database.
     """
     with catalog.read() as session:
         slots = session.execute(
@@ -148,10 +162,10 @@ def _find_slots_to_merge(catalog: Catalog, compact_chunks: int) -> list[tuple[UU
             )
             .group_by(Chunk.generation_id, Chunk.slot, Generation.open_slot)
         ).all()
-        drawn = random.sample(slots, min(DEAD_ROW_SAMPLE_SLOTS, len(slots)))
+        sampled = random.sample(slots, min(DEAD_ROW_SAMPLE_SLOTS, len(slots)))
         dead = {
             (generation_id, slot)
-            for generation_id, slot, _, _, rows in drawn
+            for generation_id, slot, _, _, rows in sampled
             if rows - _count_live_rows(session, generation_id, slot) > DEAD_ROW_SHARE * rows
         }
     return [
@@ -164,7 +178,7 @@ def _find_slots_to_merge(catalog: Catalog, compact_chunks: int) -> list[tuple[UU
 
 
 def _count_live_rows(session: Session, generation_id: UUID, slot: int) -> int:
-    """The rows of the slot that belong to live photos."""
+    """Count the rows of the slot that belong to live photos."""
     counted = (
         select(func.count())
         .select_from(Chunk)

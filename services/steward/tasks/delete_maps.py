@@ -1,7 +1,8 @@
-"""Removing what belonged to deleted maps: objects before the rows that remember them.
+"""Purges deleted maps: deletes their objects, then the rows that refer to them.
 
-A little at a time, from whatever is left: a crash repeats at most what is harmless. What a request
-that was under way still wrote into the map is found by the next round; the map's own row goes last.
+Works in small steps and continues from what is left, so a crash repeats at most one harmless step.
+Rows that a concurrent request still writes into the map are found by the next run. The map's own
+row is deleted last.
 """
 
 from __future__ import annotations
@@ -36,37 +37,37 @@ from shared.storage.keys import (
 
 log = logging.getLogger(__name__)
 
-ROWS_PER_TRANSACTION = 500  # rows removed in one transaction
-SLICE_SECONDS = 2.0  # then the steward's other duties have their turn
+ROWS_PER_TRANSACTION = 500  # rows deleted in one transaction
+SLICE_SECONDS = 2.0  # of one run, so that the steward's other tasks are not delayed
 
 
 def purge_deleted_maps(catalog: Catalog, store: ObjectStore) -> None:
-    """Go on removing every deleted map, for a few seconds."""
+    """Continue purging the deleted maps, for up to SLICE_SECONDS."""
     journal_deletions(catalog, store, Map)
     with catalog.read() as session:
-        gone = session.scalars(
+        map_ids = session.scalars(
             select(Map.id).where(Map.deleted_at.is_not(None), deletion_is_journaled(Map))
         ).all()
-    until = time.monotonic() + SLICE_SECONDS
-    for map_id in gone:
+    deadline = time.monotonic() + SLICE_SECONDS
+    for map_id in map_ids:
         while not _purge_next(catalog, store, map_id):
-            if time.monotonic() > until:
+            if time.monotonic() > deadline:
                 return
 
 
 def _purge_next(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
-    """Remove the next rows of the map with their objects; True when nothing more can be removed."""
+    """Delete the next rows of the map with their objects; True when nothing is left to delete."""
     with catalog.write() as session:
         cancel_jobs(session, Job.map_id == map_id)
-    for some_were_left in (
+    for purge_rows in (
         _purge_chunks,
         _purge_queries,
         _purge_batches,
         _purge_photos,
         _purge_presigned_uploads,
-        _purge_local_features,  # last: it asks the store, whatever is there
+        _purge_local_features,  # last: it always lists the store
     ):
-        if some_were_left(catalog, store, map_id):
+        if purge_rows(catalog, store, map_id):  # it deleted some; there may be more
             return False
     _purge_vocabulary_objects(catalog, store, map_id)
     with catalog.write() as session:
@@ -77,10 +78,10 @@ def _purge_next(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
         session.execute(delete(Generation).where(Generation.map_id == map_id))
         session.execute(delete(Vocabulary).where(Vocabulary.map_id == map_id))
         session.execute(delete(StoredWhitening).where(StoredWhitening.map_id == map_id))
-        # Without a word in the journal the map would come back when the catalog is rebuilt.
-        gone = session.execute(delete(Map).where(Map.id == map_id, is_journaled(Map)))
-    if affected_rows(gone):
-        log.info("the deleted map %s is gone", map_id)
+        # Not before the journal records it: else a rebuild of the catalog would restore the map.
+        deleted = session.execute(delete(Map).where(Map.id == map_id, is_journaled(Map)))
+    if affected_rows(deleted):
+        log.info("purged the deleted map %s", map_id)
     return True
 
 
@@ -119,7 +120,7 @@ def _purge_queries(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
 
 
 def _purge_batches(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
-    """Their archives, their items, and uploaded files that have not become photos."""
+    """Delete archives, batch items, and uploaded files that did not become photos."""
     with catalog.read() as session:
         params = session.scalars(
             select(Job.params).where(Job.map_id == map_id, Job.kind == JobKind.BATCH)
@@ -130,9 +131,9 @@ def _purge_batches(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
             .where(Job.map_id == map_id)
             .limit(ROWS_PER_TRANSACTION)
         ).all()
-    for archive in params:
-        if "object_key" in archive:
-            store.delete(archive["object_key"])
+    for job_params in params:
+        if "object_key" in job_params:
+            store.delete(job_params["object_key"])
     for item in items:
         if item.photo_id is None and item.object_key and item.object_key.startswith(ORIGINALS):
             store.delete(item.object_key)
@@ -154,7 +155,7 @@ def _purge_photos(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
             select(Photo).where(Photo.map_id == map_id).limit(ROWS_PER_TRANSACTION)
         ).all()
     for photo in photos:
-        if photo.object_key:  # empty: its bytes went when it was deleted
+        if photo.object_key:  # empty: its objects were deleted with the photo
             store.delete(photo.object_key)
         store.delete(thumbnail_key(photo.id))
     ids = [photo.id for photo in photos]
@@ -184,16 +185,17 @@ def _purge_presigned_uploads(catalog: Catalog, store: ObjectStore, map_id: UUID)
 def _purge_local_features(catalog: Catalog, store: ObjectStore, map_id: UUID) -> bool:
     with catalog.read() as session:
         ids = session.scalars(select(Generation.id).where(Generation.map_id == map_id)).all()
-    kept = chain.from_iterable(store.list(local_features_prefix(id_)) for id_ in ids)
-    keys = [info.key for info in islice(kept, ROWS_PER_TRANSACTION)]
+    objects = chain.from_iterable(store.list(local_features_prefix(id_)) for id_ in ids)
+    keys = [info.key for info in islice(objects, ROWS_PER_TRANSACTION)]
     for key in keys:
         store.delete(key)
     return bool(keys)
 
 
 def _purge_vocabulary_objects(catalog: Catalog, store: ObjectStore, map_id: UUID) -> None:
-    """Only the objects, also those of imports that never came to a row, those of whitenings, and
-    checkpoints that were sent under the map's name: the rows are few.
+    """Delete the objects of vocabularies, imports, whitenings and uploaded checkpoints.
+
+    Imports may have an object without a vocabulary row. The few rows are deleted by the caller.
     """
     with catalog.read() as session:
         keys = list(

@@ -1,8 +1,8 @@
-"""Chunks of a building generation that are damaged: their photos are described again.
+"""Repair of building generations: describes the photos of damaged chunks again.
 
-A generation is switched in once every live search worker has loaded it without a gap. A chunk that
-nobody can read would hold that up for ever, so its photos go back to the extractors. A chunk of the
-active generation is left to `placewise verify --repair`.
+A generation is activated once every live search worker has loaded all of it. An unreadable chunk
+would block that forever, so its photos are queued for the extractors again. Chunks of the active
+generation are repaired by `placewise verify --repair`.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from uuid import UUID
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from services.steward.tasks import model_changes as search_workers
+from services.steward.tasks import model_changes
 from shared.catalog.base import db_now_plus
 from shared.catalog.chunks import Chunk
 from shared.catalog.generations import Generation, GenerationState
@@ -31,15 +31,18 @@ from shared.storage.chunks import CORRUPT, read_chunk
 
 log = logging.getLogger(__name__)
 
-MAX_MENDED_CHUNKS = 10  # of one model change; more, and the store is at fault
-MENDED = "mended_chunks"
-"""In the params of a model change: how many chunks were described again."""
+MAX_REPAIRED_CHUNKS = 10  # per model change; with more, the store itself is faulty
+REPAIRED_PARAM = "mended_chunks"
+"""Key in the params of a model change: the number of chunks described again."""
 
 
-def mend_generations(catalog: Catalog, store: ObjectStore) -> None:
-    """Give up the chunks that a live search worker has reported for SLOW_SECONDS and that this
-    process finds damaged or missing, too. A model change with more than MAX_MENDED_CHUNKS of them
-    fails (`chunk_corrupt`)."""
+def repair_generations(catalog: Catalog, store: ObjectStore) -> None:
+    """Drop damaged chunks of building generations and queue their photos again.
+
+    A chunk is dropped when a live search worker reports it as unreadable, the generation has been
+    complete for SLOW_LOAD_SECONDS, and this process finds it damaged or missing, too. A model
+    change with more than MAX_REPAIRED_CHUNKS such chunks fails (`chunk_corrupt`).
+    """
     with catalog.read() as session:
         reported = session.scalars(
             select(Chunk)
@@ -48,17 +51,18 @@ def mend_generations(catalog: Catalog, store: ObjectStore) -> None:
                 Chunk.object_key.in_(unreadable_keys(session)),
                 Chunk.superseded_at.is_(None),
                 Generation.state == GenerationState.BUILDING,
-                Generation.complete_at < db_now_plus(-search_workers.SLOW_LOAD_SECONDS),
+                Generation.complete_at < db_now_plus(-model_changes.SLOW_LOAD_SECONDS),
             )
         ).all()
     for chunk in reported:
-        error = _damage(store, chunk)
+        error = _read_error(store, chunk)
         if error is not None:
-            catalog.run(partial(_mend, chunk_id=chunk.id, error=error))
+            catalog.run(partial(_repair, chunk_id=chunk.id, error=error))
 
 
-def _damage(store: ObjectStore, chunk: Chunk) -> PlacewiseError | None:
-    """What is wrong with the chunk; None where nothing is, or where the store is away."""
+def _read_error(store: ObjectStore, chunk: Chunk) -> PlacewiseError | None:
+    """Return the error of a damaged or missing chunk; None if it is readable or the store is
+    unavailable."""
     try:
         read_chunk(store, chunk.object_key, chunk.sha256)
     except NotFound as error:
@@ -68,7 +72,7 @@ def _damage(store: ObjectStore, chunk: Chunk) -> PlacewiseError | None:
     return None
 
 
-def _mend(session: Session, chunk_id: UUID, error: PlacewiseError) -> None:
+def _repair(session: Session, chunk_id: UUID, error: PlacewiseError) -> None:
     photos = give_up_chunk(session, chunk_id)
     chunk = session.get_one(Chunk, chunk_id)
     generation = session.get_one(Generation, chunk.generation_id)
@@ -83,13 +87,13 @@ def _mend(session: Session, chunk_id: UUID, error: PlacewiseError) -> None:
     )
     if job is None or generation.state != GenerationState.BUILDING:
         return
-    mended = int(job.params.get(MENDED, 0)) + 1
-    if mended > MAX_MENDED_CHUNKS:
+    repaired = int(job.params.get(REPAIRED_PARAM, 0)) + 1
+    if repaired > MAX_REPAIRED_CHUNKS:
         fail_job(job, error.as_problem())
         abandon_generation(session, job)
-        log.error("the model change %s fails: %s", job.id, error)
+        log.error("model change %s failed: %s", job.id, error)
         return
-    job.params = {**job.params, MENDED: mended}
-    # It is complete again once those photos are described: search has to load them, too.
+    job.params = {**job.params, REPAIRED_PARAM: repaired}
+    # Complete again once those photos are described: search workers have to load them, too.
     generation.complete_version = generation.complete_at = None
-    log.warning("%s; its %d photos are described again", error, photos)
+    log.warning("%s; its %d photos are queued to be described again", error, photos)

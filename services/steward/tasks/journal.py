@@ -1,4 +1,8 @@
-"""The steward's duty for the journal, and what waits for it."""
+"""Journal task: writes pending catalog rows to the journal in the object store.
+
+Also the conditions under which deleted rows may lose their objects: the journal has to record a
+deletion first, or a catalog rebuilt from it would restore the row.
+"""
 
 from __future__ import annotations
 
@@ -17,14 +21,18 @@ from shared.storage import ObjectStore
 
 log = logging.getLogger(__name__)
 
-# A full object store takes no journal, and only deleting makes room in it. What is deleted before
-# the journal tells of it does not come back either: a photo without its original is not rebuilt.
-PATIENCE_SECONDS = 60.0
+# A full object store accepts no journal segment, and only deletions free space. A photo that is
+# deleted before the journal records it does not come back either: without its original it is not
+# rebuilt.
+MAX_JOURNAL_WAIT_SECONDS = 60.0
 
 
-class JournalDuty:
-    """Writes what is pending. Compares the catalog with the store at the first round and while it
-    is behind; logs when that begins and ends."""
+class JournalTask:
+    """Writes pending rows to the journal, and reports a catalog that is older than its store.
+
+    The catalog is compared with the store in the first run and as long as it is behind. The log
+    says when that begins and ends.
+    """
 
     def __init__(self, catalog: Catalog, store: ObjectStore, metrics: StewardMetrics) -> None:
         self._catalog = catalog
@@ -44,12 +52,12 @@ class JournalDuty:
         if lag is not None and self._lag is None:
             log.error("the journal is not written: %s", lag.detail)
         elif lag is None and self._lag is not None:
-            log.info("the journal is written again: the catalog knows all that it holds")
+            log.info("the journal is written again: the catalog is no longer behind its store")
         self._lag = lag
 
 
 def journal_deletions(catalog: Catalog, store: ObjectStore, table: type[Photo] | type[Map]) -> None:
-    """Write the journal where deletions are pending; a store that takes nothing is logged."""
+    """Write the journal if it lacks deletions of the table; log a warning if the store refuses."""
     pending = select(table.id).where(table.deleted_at.is_not(None), ~is_journaled(table))
     with catalog.read() as session:
         if session.scalar(pending.limit(1)) is None:
@@ -57,10 +65,10 @@ def journal_deletions(catalog: Catalog, store: ObjectStore, table: type[Photo] |
     try:
         write_journal(catalog, store)
     except Unavailable as error:
-        log.warning("deletions are not journaled: %s", error)
+        log.warning("deletions could not be written to the journal: %s", error)
 
 
 def deletion_is_journaled(table: type[Photo] | type[Map]) -> Condition:
-    """True for deleted rows whose bytes may go: the journal tells of their deletion, or could not
-    be written for PATIENCE_SECONDS."""
-    return or_(is_journaled(table), table.deleted_at < db_now_plus(-PATIENCE_SECONDS))
+    """Condition for deleted rows whose objects may be deleted: the journal records the deletion, or
+    could not be written for MAX_JOURNAL_WAIT_SECONDS."""
+    return or_(is_journaled(table), table.deleted_at < db_now_plus(-MAX_JOURNAL_WAIT_SECONDS))

@@ -1,9 +1,6 @@
-"""The queue's duties: leases of dead workers come back, lost hints are sent again.
+"""Short maintenance tasks: expired leases, lost wake-ups, retention, cached map statistics.
 
-What is kept for a while only: finished jobs, the history of searches, the
-log of webhooks, idempotency keys.
-
-Counting large maps, so that no caller has to.
+Retention covers finished jobs, the search history, webhook deliveries and idempotency keys.
 """
 
 from __future__ import annotations
@@ -32,44 +29,50 @@ log = logging.getLogger(__name__)
 
 
 def release_expired_leases(catalog: Catalog, max_attempts: int, *, all_leases: bool = False) -> int:
-    """Give back what dead workers held; see `reclaim_expired_leases`."""
+    """Requeue or fail the jobs of dead workers; see `reclaim_expired_leases`."""
     with catalog.write() as session:
-        freed = reclaim_expired_leases(session, max_attempts, all_leases=all_leases)
-    if freed:
-        log.warning("%d jobs were held by workers that died: given back", freed)
-    return freed
+        reclaimed = reclaim_expired_leases(session, max_attempts, all_leases=all_leases)
+    if reclaimed:
+        log.warning("reclaimed %d jobs of workers that died", reclaimed)
+    return reclaimed
 
 
 def resend_hints(catalog: Catalog, hints: Wakeups) -> int:
-    """Wake a worker when there is work: the hint that was sent with it may be lost. Returns how
-    many hints were sent."""
+    """Wake a worker for each queue with claimable jobs: the first wake-up may have been lost.
+
+    Returns:
+        The number of wake-ups sent.
+    """
     sent = 0
     with catalog.read() as session:
-        for lane, condition in (
+        for queue, condition in (
             (WakeupQueue.QUERY, Job.priority >= Priority.QUERY),
             (WakeupQueue.BULK, Job.priority < Priority.QUERY),
         ):
             if session.scalar(
                 select(exists(select(Job.id).where(claimable_condition(), condition)))
             ):
-                hints.send(lane)
+                hints.send(queue)
                 sent += 1
     return sent
 
 
-RETENTION_ROWS_PER_TRANSACTION = 1000  # rows removed in one transaction
+RETENTION_ROWS_PER_TRANSACTION = 1000  # rows deleted in one transaction
 DAY_SECONDS = 86_400.0
 
 
 def delete_old_jobs(catalog: Catalog, retention_days: float) -> None:
-    """Jobs that ended long ago. One that left its photo undescribed stays: it holds the reason, and
-    the same bytes again, or a retry, queue it anew."""
-    of_a_photo = exists().where(Photo.id == Job.photo_id, Photo.job_id == Job.id)
+    """Delete jobs that ended more than `retention_days` ago.
+
+    An unsuccessful job that is its photo's current job stays: it has the reason why the photo is
+    not described, and a retry or another upload of the same bytes queues it again.
+    """
+    is_current_of_photo = exists().where(Photo.id == Job.photo_id, Photo.job_id == Job.id)
     old = (
         select(Job.id)
         .where(
             Job.finished_at < db_now_plus(-retention_days * DAY_SECONDS),
-            or_(Job.state == JobState.SUCCEEDED, ~of_a_photo),
+            or_(Job.state == JobState.SUCCEEDED, ~is_current_of_photo),
         )
         .limit(RETENTION_ROWS_PER_TRANSACTION)
         .with_for_update(skip_locked=True)
@@ -79,7 +82,7 @@ def delete_old_jobs(catalog: Catalog, retention_days: float) -> None:
 
 
 def delete_old_searches(catalog: Catalog, history_days: float) -> None:
-    """Searches that were asked long ago."""
+    """Delete searches from the history that are older than `history_days`."""
     old = (
         select(Search.id)
         .where(Search.searched_at < db_now_plus(-history_days * DAY_SECONDS))
@@ -90,7 +93,7 @@ def delete_old_searches(catalog: Catalog, history_days: float) -> None:
 
 
 def delete_old_deliveries(catalog: Catalog, retention_days: float) -> None:
-    """The log of what was sent to webhooks. Nothing waits as long as that."""
+    """Delete webhook deliveries older than `retention_days`: retries end long before that."""
     old = (
         select(Delivery.id)
         .where(Delivery.created_at < db_now_plus(-retention_days * DAY_SECONDS))
@@ -101,7 +104,7 @@ def delete_old_deliveries(catalog: Catalog, retention_days: float) -> None:
 
 
 def delete_expired_idempotency_keys(catalog: Catalog) -> None:
-    """Idempotency keys whose time is over."""
+    """Delete expired idempotency keys."""
     old = (
         select(IdempotencyRecord.id)
         .where(IdempotencyRecord.expires_at <= db_now())
@@ -115,7 +118,7 @@ def delete_expired_idempotency_keys(catalog: Catalog) -> None:
 
 
 def update_statistics_of_large_maps(catalog: Catalog) -> None:
-    """Count each live map that is too large to be counted when someone asks, and is due."""
+    """Refresh the cached statistics of each map that is too large to be counted per request."""
     with catalog.read() as session:
         maps = [map_.id for map_ in list_maps(session)]
         due = [

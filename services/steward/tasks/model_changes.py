@@ -1,11 +1,9 @@
-"""Model changes' duties: queue photos for a generation that is built, switch when it is complete.
+"""Model change tasks: queue photos for a new generation, and activate it when it is complete.
 
-Complete means: each live photo that the active generation can find has a descriptor in the new
-one, or a recorded failure there. Then every live search worker has to have loaded it. The last
-check and the switch are one transaction under the map's lock, which publishing takes as well: no
-photo can slip between them.
-
-Search workers' duties: dead ones are forgotten, live ones are waited for before a switch.
+A generation is complete when each live photo of the active generation has a descriptor or a
+recorded failure in it. It is activated once every live search worker has loaded it. The last check
+and the activation are one transaction under the map's lock, which publishing takes, too, so no
+photo can be missed between them. Search workers that died are removed, or they would block it.
 """
 
 from __future__ import annotations
@@ -39,40 +37,40 @@ from shared.jobs.transitions import succeed_job
 
 log = logging.getLogger(__name__)
 
-# Loading takes as long as reading; who takes longer than this is named, so that someone looks.
+# A search worker that takes longer to load a generation is named in the job and in the log.
 SLOW_LOAD_SECONDS = 60.0
 
 
 def remove_dead_search_workers(catalog: Catalog) -> None:
-    """Those that have not been heard of for long; a worker that only paused registers anew."""
+    """Unregister search workers without a recent heartbeat; a paused one registers again."""
     with catalog.write() as session:
-        gone = delete_dead_search_workers(session)
-    if gone:
-        log.warning("%d search workers were not heard of for long: forgotten", gone)
+        removed = delete_dead_search_workers(session)
+    if removed:
+        log.warning("removed %d search workers without a recent heartbeat", removed)
 
 
 def search_workers_have_loaded(session: Session, job: Job, generation: Generation) -> bool:
-    """Whether every live search worker can answer from the complete generation; if not, the job
-    waits for them.
+    """Return whether every live search worker has loaded the complete generation.
 
-    What counts is the version at which the generation was complete for the first time: photos
-    that were described since are few, and queries wait for them by `min_version`. A worker that
-    is alive is waited for as long as it takes: switching without it would lose its photos.
+    If not, the job is set to wait for them, for as long as they live: without a worker, the photos
+    that it serves would be missing from the results. A worker must have loaded the map version at
+    which the generation was first complete. Photos described since then are few, and queries wait
+    for them with `min_version`.
     """
     if generation.complete_version is None:
         generation.complete_version = session.get_one(Map, generation.map_id).version
         generation.complete_at = db_now()
         session.flush()
-    behind = list_lagging_workers(session, generation.id, generation.complete_version)
-    if not behind:
+    lagging = list_lagging_workers(session, generation.id, generation.complete_version)
+    if not lagging:
         return True
     job.waiting_for, job.stage = WaitingFor.SEARCH, "load"
     if _loading_is_slow(session, generation):
-        names = [worker.name for worker in behind]
+        names = [worker.name for worker in lagging]
         if names != job.awaited:
             log.warning(
-                "generation %s is complete, and these search workers have not loaded it for %g s: "
-                "%s. The switch waits for them as long as they live; their logs say what they lack",
+                "generation %s is complete, but these search workers have not loaded it after "
+                "%g s: %s. Its activation waits for them as long as they live; see their logs",
                 generation.id,
                 SLOW_LOAD_SECONDS,
                 ", ".join(names),
@@ -93,14 +91,14 @@ def _loading_is_slow(session: Session, generation: Generation) -> bool:
 
 ADVANCED_WAITS = (WaitingFor.DESCRIPTORS, WaitingFor.SEARCH)
 
-REINDEX_JOBS_PER_TRANSACTION = 2000  # reindex jobs queued in one transaction
+REINDEX_JOBS_PER_TRANSACTION = 2000
 
-# What `POST /vocabularies` with {} asks for; no `clusters` means the extractor's own number.
+# The defaults of `POST /vocabularies`; without `clusters` the extractor's own number is used.
 DEFAULT_FIT_PARAMS = {"clusters": None, "sample": 1000, "seed": 0}
 
 
 def advance_model_changes(catalog: Catalog, hints: Wakeups) -> None:
-    """One step for every model change that waits for descriptors, or for search to load them."""
+    """Advance every model change that waits for descriptors or for search workers by one step."""
     with catalog.read() as session:
         waiting = session.scalars(
             select(Job).where(Job.kind.in_(MODEL_CHANGE_JOBS), Job.waiting_for.in_(ADVANCED_WAITS))
@@ -116,24 +114,26 @@ def advance_model_changes(catalog: Catalog, hints: Wakeups) -> None:
 
 
 def auto_fit_vocabularies(catalog: Catalog, hints: Wakeups, auto_fit_photos: int) -> None:
-    """A map whose photos wait for a vocabulary gets one fitted once it has enough of them."""
+    """Start a vocabulary fit for each map with `auto_fit_photos` photos that wait for one."""
     with catalog.read() as session:
         maps = [map_.id for map_ in list_maps(session)]
         ready = [id_ for id_ in maps if _has_enough_waiting_photos(session, id_, auto_fit_photos)]
     for map_id in ready:
         with catalog.write() as session:
             if _last_change_failed(session, map_id):
-                continue  # the reason is in the job; a person has to act
+                continue  # the error is in the job; a user has to act
             try:
                 job = start_model_change(session, map_id, JobKind.FIT, dict(DEFAULT_FIT_PARAMS))
             except Conflict:
-                continue  # one is under way
-        log.info("map %s has enough photos: fitting a vocabulary (job %s)", map_id, job.id)
+                continue  # a model change is running
+        log.info(
+            "fitting a vocabulary for map %s, which has enough photos (job %s)", map_id, job.id
+        )
         hints.send()
 
 
-def _has_enough_waiting_photos(session: Session, map_id: UUID, least: int) -> bool:
-    """Whether `least` database photos of the map wait for a vocabulary."""
+def _has_enough_waiting_photos(session: Session, map_id: UUID, min_photos: int) -> bool:
+    """Return whether at least `min_photos` database photos of the map wait for a vocabulary."""
     waiting = (
         select(Job.id)
         .join(Photo, Photo.id == Job.photo_id)
@@ -143,13 +143,13 @@ def _has_enough_waiting_photos(session: Session, map_id: UUID, least: int) -> bo
             Job.kind == JobKind.INDEX,
             Photo.role == PhotoRole.DATABASE,
         )
-        .limit(least)
+        .limit(min_photos)
     )
-    return session.scalar(select(func.count()).select_from(waiting.subquery())) == least
+    return session.scalar(select(func.count()).select_from(waiting.subquery())) == min_photos
 
 
 def _advance_generation(session: Session, job: Job, generation_id: UUID) -> int:
-    """Queue what is missing, note the progress, or finish; returns how many jobs were queued."""
+    """Queue missing photos, update the progress, or finish; return the number of queued jobs."""
     generation = lock_generation(session, generation_id)
     if generation.state == GenerationState.BUILDING:
         queued = _queue_missing_photos(session, generation)
@@ -165,10 +165,10 @@ def _advance_generation(session: Session, job: Job, generation_id: UUID) -> int:
         select(exists().where(open_jobs, Job.state.in_(UNFINISHED_STATES)))
     ):
         before = int(job.params.get("done_before", 0))
-        done = estimate_described(session, generation_id)
-        # Also when it was complete before: photos have come since.
+        described = estimate_described(session, generation_id)
+        # Also if it was complete before: photos have been added since.
         job.waiting_for, job.stage, job.awaited = WaitingFor.DESCRIPTORS, "describe", None
-        job.progress_done = max(0, min(before + done, job.progress_total - 1))
+        job.progress_done = max(0, min(before + described, job.progress_total - 1))
         return queued
     failed = _count_jobs(session, open_jobs & (Job.state == JobState.FAILED))
     if generation.state == GenerationState.BUILDING:
@@ -193,14 +193,14 @@ def _advance_generation(session: Session, job: Job, generation_id: UUID) -> int:
             "failed": failed,
         },
     )
-    log.info("generation %s answers, with %d photos", generation_id, photos)
+    log.info("activated generation %s with %d photos", generation_id, photos)
     return 0
 
 
 def _queue_missing_photos(session: Session, generation: Generation) -> int:
-    """A reindex job for each photo that still needs one; up to FILL_JOBS of them."""
+    """Queue a reindex job for each photo without one, up to REINDEX_JOBS_PER_TRANSACTION."""
     active = active_generation(session, generation.map_id)
-    assert active is not None, "a generation is built only beside an active one"
+    assert active is not None, "a generation is built only while another is active"
     described, reindexed = aliased(Descriptor), aliased(Job)
     missing = (
         select(Photo.id)
@@ -217,7 +217,7 @@ def _queue_missing_photos(session: Session, generation: Generation) -> int:
             ~exists().where(
                 reindexed.photo_id == Photo.id,
                 reindexed.generation_id == generation.id,
-                reindexed.state != JobState.CANCELLED,  # by someone, alone: the photo is missing
+                reindexed.state != JobState.CANCELLED,  # by a user: the photo is still missing
             ),
         )
         .order_by(Photo.id)
@@ -240,12 +240,12 @@ def _queue_missing_photos(session: Session, generation: Generation) -> int:
 
 
 def _activate_generation(session: Session, generation: Generation) -> None:
-    """The new generation answers from this commit on."""
+    """Make the built generation the map's active one and retire the previous one."""
     active = active_generation(session, generation.map_id)
-    assert active is not None, "a generation is built only beside an active one"
+    assert active is not None, "a generation is built only while another is active"
     active.state = GenerationState.RETIRED
     active.ended_at = db_now()
-    session.flush()  # one generation of a map may be active at a time, also inside a transaction
+    session.flush()  # a map has one active generation at any time, also inside a transaction
     generation.state = GenerationState.ACTIVE
     generation.activated_at = db_now()
     map_ = session.get_one(Map, generation.map_id)
@@ -261,7 +261,7 @@ def _activate_generation(session: Session, generation: Generation) -> None:
         },
     )
     reindex = (Job.kind == JobKind.REINDEX) & (Job.generation_id == generation.id)
-    # A photo that could not be described anew says so through its own job from now on.
+    # A failed reindex job becomes its photo's own job, so that the photo shows the error.
     failed = select(Job.photo_id, Job.id).where(reindex, Job.state == JobState.FAILED)
     for photo_id, job_id in session.execute(failed).all():
         session.execute(update(Photo).where(Photo.id == photo_id).values(job_id=job_id))

@@ -1,4 +1,4 @@
-"""Indexes that are built and dropped while traffic goes on."""
+"""Creates and drops indexes without blocking traffic (PostgreSQL: CONCURRENTLY)."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ from typing import Any
 from alembic import op
 from sqlalchemy import text
 
-# NULL: there is none; false: a build was broken off, and the index is no good.
+# NULL: the index does not exist; false: its build was interrupted, and it is unusable.
 IS_VALID = text("SELECT indisvalid FROM pg_index WHERE indexrelid = to_regclass(:name)")
 
 
 def create_index(name: str, table: str, columns: list[Any], **options: Any) -> None:
-    """Build the index without keeping writers out (PostgreSQL: CONCURRENTLY).
+    """Create the index without blocking writes.
 
-    It takes no part in the migration's transaction, which ends before it. So a migration that has
-    one does nothing else, and can begin again after it was broken off.
+    It runs outside of the migration's transaction, which ends before it. A migration with such an
+    index therefore has to do nothing else, and can be run again after an interruption.
     """
     context = op.get_context()
     if context.dialect.name == "sqlite":
@@ -31,7 +31,7 @@ def create_index(name: str, table: str, columns: list[Any], **options: Any) -> N
 
 
 def drop_index(name: str, table: str) -> None:
-    """Drop the index without keeping anyone out; see `create_index`."""
+    """Drop the index without blocking reads or writes; see `create_index`."""
     context = op.get_context()
     if context.dialect.name == "sqlite":
         op.drop_index(name, table)

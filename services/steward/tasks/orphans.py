@@ -1,0 +1,349 @@
+"""Orphan collection: finds objects that no catalog row refers to and moves them to the trash.
+
+Orphans are left by a crash between writing an object and committing its row. The walk lists every
+prefix of the store in batches and looks the keys of a batch up with one query
+(`REFERENCED_BY_PREFIX`). Orphans are first counted: where there are suspiciously many, or the
+catalog is older than its store, collection is held until an operator confirms it
+(`placewise storage collect --confirm`). Objects in the trash are deleted after TRASH_DAYS.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
+from datetime import datetime, timedelta
+from itertools import groupby, islice
+from uuid import UUID
+
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from shared.catalog.base import db_now
+from shared.catalog.batch_items import BatchItem
+from shared.catalog.chunks import Chunk, Descriptor
+from shared.catalog.jobs import UNFINISHED_STATES, Job, JobKind, JobState
+from shared.catalog.models import Model
+from shared.catalog.photos import Photo, PresignedUpload
+from shared.catalog.session import Catalog
+from shared.catalog.vocabularies import StoredWhitening, Vocabulary
+from shared.errors import Conflict
+from shared.journal.outbox import accept_segments, catalog_lag
+from shared.storage import ObjectStore, OwnedStore
+from shared.storage.chunks import codes_key, manifest_key
+from shared.storage.keys import (
+    ARCHIVES,
+    CHECKPOINTS,
+    FEATURES,
+    INCOMING,
+    MODELS,
+    ORIGINALS,
+    QUERIES,
+    THUMBNAILS,
+    VOCABULARIES,
+    WHITENINGS,
+    incoming_key,
+    is_original_key,
+    local_features_key,
+    query_object_keys,
+    thumbnail_key,
+)
+from shared.storage.protocol import ObjectInfo
+from shared.storage.trash import (
+    Hold,
+    HoldReason,
+    TrashSize,
+    end_hold,
+    expire_trash,
+    move_to_trash,
+    read_hold,
+    write_hold,
+)
+
+log = logging.getLogger(__name__)
+
+OBJECTS_PER_LOOKUP = 500  # keys looked up in one query
+MAX_REMEMBERED_ORPHANS = 10_000  # with more, the store is walked a second time to move the rest
+HOLD_MIN_ORPHANS = 100  # so few are never held: in a small store they are a large share
+
+
+class CollectionHeld(Conflict):
+    """Orphan collection is held until an operator confirms it."""
+
+    def __init__(self, hold: Hold) -> None:
+        super().__init__("collection_held", hold.describe())
+        self.hold = hold
+
+
+@dataclass(slots=True)
+class StoreCount:
+    """The objects and orphans counted during a walk over the store."""
+
+    objects: int = 0
+    orphans: Counter[str] = field(default_factory=Counter)
+    """Prefix -> number of orphans."""
+    orphan_bytes: Counter[str] = field(default_factory=Counter)
+    """Prefix -> bytes of its orphans."""
+
+
+def collect_orphans(
+    catalog: Catalog,
+    store: OwnedStore,
+    age_seconds: float,
+    *,
+    max_share: float = 1.0,
+    confirmed: bool = False,
+) -> int:
+    """Move objects that no catalog row refers to to the trash.
+
+    Args:
+        catalog: The catalog that refers to the objects.
+        store: The catalog's object store.
+        age_seconds: Younger objects stay, because their rows may not be committed yet.
+        max_share: Largest share of all objects that may be moved without a confirmation. Up to
+            HOLD_MIN_ORPHANS orphans are moved in any case.
+        confirmed: Move the orphans also where collection would be held. Also ends the lag of a
+            catalog that is older than its store: the objects that only newer catalogs knew are in
+            the trash then, and the journal continues.
+
+    Returns:
+        The number of objects moved.
+
+    Raises:
+        CollectionHeld: Nothing was moved, because the catalog is older than its store, because it
+            adopted a store whose objects it does not know, or because the orphans exceed
+            `max_share`. A note in the store records the hold.
+    """
+    count, first_orphans = StoreCount(), list[ObjectInfo]()
+    for info in find_orphans(catalog, store, age_seconds, count):
+        if len(first_orphans) < MAX_REMEMBERED_ORPHANS:
+            first_orphans.append(info)
+    orphans, previous_hold = count.orphans.total(), read_hold(store)
+    if orphans and not confirmed:
+        reason = None
+        if previous_hold is not None and previous_hold.reason == HoldReason.ADOPTED:
+            reason = HoldReason.ADOPTED
+        elif catalog_lag(catalog, store) is not None:
+            reason = HoldReason.CATALOG_BEHIND
+        elif orphans > max(HOLD_MIN_ORPHANS, max_share * count.objects):
+            reason = HoldReason.SHARE
+        if reason is not None:
+            hold = Hold(reason, orphans, count.orphan_bytes.total(), count.objects)
+            if hold != previous_hold:
+                write_hold(store, hold)
+            raise CollectionHeld(hold)
+    moved = _move_orphans(catalog, store, first_orphans)
+    if orphans > len(first_orphans):
+        moved += _move_orphans(catalog, store, find_orphans(catalog, store, age_seconds))
+    if confirmed:
+        accept_segments(catalog, store)
+    if previous_hold is not None and (confirmed or previous_hold.reason != HoldReason.ADOPTED):
+        end_hold(store)
+    if moved:
+        log.info("moved %d orphaned objects to the trash", moved)
+    return moved
+
+
+def count_store(catalog: Catalog | None, store: ObjectStore) -> StoreCount:
+    """Count all objects and the orphans of any age; without a catalog, every object is an orphan.
+
+    Objects under `originals/` whose keys Placewise did not make are never orphans.
+    """
+    count = StoreCount()
+    if catalog is not None:
+        for _ in find_orphans(catalog, store, 0.0, count):
+            pass
+        return count
+    for prefix in REFERENCED_BY_PREFIX:
+        for info in _count_objects(store.list(prefix), count):
+            if prefix != ORIGINALS or is_original_key(info.key):
+                count.orphans[prefix] += 1
+                count.orphan_bytes[prefix] += info.size_bytes
+    return count
+
+
+def find_orphans(
+    catalog: Catalog, store: ObjectStore, age_seconds: float, count: StoreCount | None = None
+) -> Iterator[ObjectInfo]:
+    """Yield the objects older than `age_seconds` that no catalog row refers to.
+
+    `count`, if given, is updated during the iteration.
+    """
+    count = StoreCount() if count is None else count
+    cutoff = _now(catalog) - timedelta(seconds=age_seconds)
+    for prefix in REFERENCED_BY_PREFIX:
+        for batch in _batches(_count_objects(store.list(prefix), count)):
+            old = [info for info in batch if info.modified_at < cutoff]
+            for info in _select_orphans(catalog, prefix, old):
+                count.orphans[prefix] += 1
+                count.orphan_bytes[prefix] += info.size_bytes
+                yield info
+
+
+def _count_objects(objects: Iterable[ObjectInfo], count: StoreCount) -> Iterator[ObjectInfo]:
+    for info in objects:
+        count.objects += 1
+        yield info
+
+
+def _batches(objects: Iterable[ObjectInfo]) -> Iterator[list[ObjectInfo]]:
+    iterator = iter(objects)
+    while batch := list(islice(iterator, OBJECTS_PER_LOOKUP)):
+        yield batch
+
+
+def _select_orphans(catalog: Catalog, prefix: str, batch: list[ObjectInfo]) -> list[ObjectInfo]:
+    """Return the objects of the batch, all under the prefix, that no catalog row refers to."""
+    if not batch:
+        return []
+    with catalog.read() as session:
+        referenced = set(REFERENCED_BY_PREFIX[prefix](session, [info.key for info in batch]))
+    return [info for info in batch if info.key not in referenced]
+
+
+def _move_orphans(catalog: Catalog, store: OwnedStore, orphans: Iterable[ObjectInfo]) -> int:
+    """Move the objects that are still orphans to today's trash; return how many were moved."""
+    today, moved = _now(catalog).date(), 0
+    for prefix, same_prefix in groupby(orphans, lambda info: info.key.partition("/")[0] + "/"):
+        for batch in _batches(same_prefix):
+            for info in _select_orphans(catalog, prefix, batch):
+                moved += move_to_trash(store, info.key, today)
+    return moved
+
+
+def empty_expired_trash(
+    catalog: Catalog, store: ObjectStore, trash_days: float
+) -> tuple[int, TrashSize]:
+    """Delete objects that were moved to the trash more than `trash_days` ago.
+
+    Returns:
+        The number of deleted objects, and the size of the remaining trash.
+    """
+    return expire_trash(store, _now(catalog) - timedelta(days=trash_days))
+
+
+def _now(catalog: Catalog) -> datetime:
+    with catalog.read() as session:
+        return session.execute(select(db_now())).scalar_one()
+
+
+def _referenced_originals(session: Session, keys: list[str]) -> Iterable[str]:
+    """Keys of photos and of queued batch items, and all keys that Placewise did not make.
+
+    `UPLOAD_DIR` may hold the operator's own files, which must not be removed.
+    """
+    stored = session.scalars(select(Photo.object_key).where(Photo.object_key.in_(keys)))
+    waiting = session.scalars(
+        select(BatchItem.object_key).where(
+            BatchItem.object_key.in_(keys), BatchItem.state == JobState.QUEUED
+        )
+    )
+    return [*stored, *filter(None, waiting), *(key for key in keys if not is_original_key(key))]
+
+
+def _referenced_by_unfinished_jobs(kind: JobKind) -> Callable[[Session, list[str]], Iterable[str]]:
+    """Make a lookup of the files that were uploaded for unfinished jobs of this kind."""
+
+    def referenced(session: Session, keys: list[str]) -> Iterable[str]:
+        unfinished = session.scalars(
+            select(Job.params).where(Job.kind == kind, Job.state.in_(UNFINISHED_STATES))
+        )
+        return [params["object_key"] for params in unfinished if "object_key" in params]
+
+    return referenced
+
+
+def _referenced_incoming(session: Session, keys: list[str]) -> Iterable[str]:
+    """Keys of presigned uploads that are not completed.
+
+    An object of a completed upload was sent again while its URL was still valid.
+    """
+    upload_ids = _parse_uuids(key.removeprefix(INCOMING) for key in keys)
+    waiting = session.scalars(
+        select(PresignedUpload.id).where(
+            PresignedUpload.id.in_(upload_ids), PresignedUpload.answer.is_(None)
+        )
+    )
+    return [incoming_key(upload_id) for upload_id in waiting]
+
+
+def _referenced_thumbnails(session: Session, keys: list[str]) -> Iterable[str]:
+    photo_ids = _parse_uuids(key.removeprefix(THUMBNAILS).removesuffix(".jpg") for key in keys)
+    live = session.scalars(
+        select(Photo.id).where(Photo.id.in_(photo_ids), Photo.deleted_at.is_(None))
+    )
+    return [thumbnail_key(photo_id) for photo_id in live]
+
+
+def _referenced_chunks(session: Session, keys: list[str]) -> Iterable[str]:
+    arrays = {key.rpartition(".")[0] + ".npy" for key in keys}
+    stored = session.scalars(select(Chunk.object_key).where(Chunk.object_key.in_(arrays)))
+    return [name for key in stored for name in (key, manifest_key(key), codes_key(key))]
+
+
+def _referenced_vocabularies(session: Session, keys: list[str]) -> Iterable[str]:
+    stored = session.scalars(select(Vocabulary.object_key).where(Vocabulary.object_key.in_(keys)))
+    waiting = session.scalars(
+        select(Job.params).where(Job.kind == JobKind.IMPORT, Job.state.in_(UNFINISHED_STATES))
+    )
+    return [*stored, *(params["object_key"] for params in waiting)]
+
+
+def _referenced_whitenings(session: Session, keys: list[str]) -> Iterable[str]:
+    return session.scalars(
+        select(StoredWhitening.object_key).where(StoredWhitening.object_key.in_(keys))
+    )
+
+
+def _referenced_models(session: Session, keys: list[str]) -> Iterable[str]:
+    return filter(None, session.scalars(select(Model.object_key).where(Model.object_key.in_(keys))))
+
+
+def _referenced_queries(session: Session, keys: list[str]) -> Iterable[str]:
+    job_ids = _parse_uuids(key.removeprefix(QUERIES).partition(".")[0] for key in keys)
+    stored = session.scalars(select(Job.id).where(Job.id.in_(job_ids)))
+    return [key for job_id in stored for key in query_object_keys(job_id)]
+
+
+def _referenced_local_features(session: Session, keys: list[str]) -> Iterable[str]:
+    """Keys of live photos in generations that still have their descriptors."""
+    parts = [key.removeprefix(FEATURES).removesuffix(".npy").split("/") for key in keys]
+    generation_ids = _parse_uuids(names[0] for names in parts)
+    photo_ids = _parse_uuids(names[-1] for names in parts)
+    stored = session.execute(
+        select(Descriptor.generation_id, Descriptor.photo_id)
+        .join(Photo, Photo.id == Descriptor.photo_id)
+        .where(
+            Descriptor.generation_id.in_(generation_ids),
+            Descriptor.photo_id.in_(photo_ids),
+            Photo.deleted_at.is_(None),
+        )
+    )
+    return [local_features_key(generation_id, photo_id) for generation_id, photo_id in stored]
+
+
+def _parse_uuids(names: Iterable[str]) -> set[UUID]:
+    """Return the names that are UUIDs; an object with another name belongs to no row."""
+    ids = set()
+    for name in names:
+        with contextlib.suppress(ValueError):
+            ids.add(UUID(name))
+    return ids
+
+
+# Prefix -> which of the keys under it a catalog row refers to; more keys may be returned.
+REFERENCED_BY_PREFIX: dict[str, Callable[[Session, list[str]], Iterable[str]]] = {
+    INCOMING: _referenced_incoming,
+    ARCHIVES: _referenced_by_unfinished_jobs(JobKind.BATCH),
+    CHECKPOINTS: _referenced_by_unfinished_jobs(JobKind.ADD_MODEL),
+    MODELS: _referenced_models,
+    ORIGINALS: _referenced_originals,
+    THUMBNAILS: _referenced_thumbnails,
+    "chunks/": _referenced_chunks,
+    VOCABULARIES: _referenced_vocabularies,
+    WHITENINGS: _referenced_whitenings,
+    QUERIES: _referenced_queries,
+    FEATURES: _referenced_local_features,
+}
