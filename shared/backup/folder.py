@@ -92,7 +92,7 @@ class BackupFolder:
     @functools.cached_property
     def objects(self) -> FolderStore:
         """May lie on a medium that can only be read."""
-        return FolderStore(self.path / "objects", alone=False)
+        return FolderStore(self.path / "objects", exclusive=False)
 
     def about(self) -> BackupManifest | None:
         """None for a folder in which no backup was ever finished."""
