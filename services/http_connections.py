@@ -30,7 +30,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from shared.config.settings import Settings
 from shared.errors import PlacewiseError, RequestTimeout, TooManyRequests, Unavailable
-from shared.http.problem_details import CLOSED_WITH
+from shared.http.problem_details import CLOSED_STATUS_SCOPE_KEY
 
 log = logging.getLogger(__name__)
 
@@ -316,7 +316,7 @@ class LimitedProtocol(H11Protocol):
         if not (under_way and self.cycle.response_started):
             self.transport.write(_answer(error))
         if under_way:
-            cast(dict[str, Any], self.scope)[CLOSED_WITH] = error.status
+            cast(dict[str, Any], self.scope)[CLOSED_STATUS_SCOPE_KEY] = error.status
             self.cycle.disconnected = True  # what the application answers is not sent any more
             self.cycle.message_event.set()
         self.transport.close()

@@ -11,7 +11,7 @@ from typing import Any
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from shared.http.problem_details import CLIENT_GONE, CLOSED_WITH, REQUEST_ID_SCOPE_KEY
+from shared.http.problem_details import CLIENT_GONE, CLOSED_STATUS_SCOPE_KEY, REQUEST_ID_SCOPE_KEY
 from shared.telemetry.tracing import REQUEST_ID_HEADER, request_id_context, request_id_or_new, span
 
 log = logging.getLogger(__name__)
@@ -94,8 +94,8 @@ class RequestLogMiddleware:
             try:
                 await self._app(scope, counted, marked)
             finally:
-                if gone or CLOSED_WITH in scope:
-                    call.status = scope.get(CLOSED_WITH, CLIENT_GONE)
+                if gone or CLOSED_STATUS_SCOPE_KEY in scope:
+                    call.status = scope.get(CLOSED_STATUS_SCOPE_KEY, CLIENT_GONE)
                 call.route = _route_template(scope)
                 describe(f"{method} {call.route}", status=call.status)
                 self._on_end(call)
