@@ -163,7 +163,7 @@ def place_for_photo(request: Request, settings: Settings) -> AbstractContextMana
     """In which the caller's photo is stored. TooManyRequests (`photo_quota_reached`)."""
     quota: PhotoQuota = request.app.state.photo_quota
     limited = photo_limit(get_caller(request), settings)
-    return contextlib.nullcontext() if limited is None else quota.place(*limited)
+    return contextlib.nullcontext() if limited is None else quota.reserve(*limited)
 
 
 def photo_limit(caller: Caller, settings: Settings) -> tuple[UUID, int] | None:

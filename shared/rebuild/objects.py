@@ -296,10 +296,10 @@ def _is_known(session: Session, key: str) -> bool:
 
 
 def _receive(store: ObjectStore, key: str, size_bytes: int) -> StoredUpload:
-    digest, begin = hashlib.sha256(), b""
+    digest, first_bytes = hashlib.sha256(), b""
     with store.open(key) as file:
         while piece := file.read(PIECE_BYTES):
-            begin = begin or piece[:PHOTO_SIGNATURE_BYTES]
+            first_bytes = first_bytes or piece[:PHOTO_SIGNATURE_BYTES]
             digest.update(piece)
     name = f"{key.removeprefix(ORIGINALS)}.photo"
-    return StoredUpload(key, name, size_bytes, digest.hexdigest(), begin)
+    return StoredUpload(key, name, size_bytes, digest.hexdigest(), first_bytes)

@@ -138,7 +138,7 @@ class BatchItemImporter:
         TooManyRequests (`photo_quota_reached`)."""
         if key_id is None or job.params["max_photos"] is None:
             return contextlib.nullcontext()
-        return self._quota.place(key_id, job.params["max_photos"])
+        return self._quota.reserve(key_id, job.params["max_photos"])
 
     def _received_upload(self, item: BatchItem) -> StoredUpload:
         """The file that the gateway has stored."""
@@ -148,7 +148,7 @@ class BatchItemImporter:
             filename=base_name(item.name),
             size_bytes=item.source["size_bytes"],
             sha256=item.source["sha256"],
-            begin=self._store.read_range(item.object_key, 0, PHOTO_SIGNATURE_BYTES),
+            first_bytes=self._store.read_range(item.object_key, 0, PHOTO_SIGNATURE_BYTES),
             fields=item.fields,
         )
 
@@ -171,7 +171,7 @@ class BatchItemImporter:
             filename=base_name(item.name),
             size_bytes=file.size_bytes,
             sha256=file.sha256,
-            begin=file.begin,
+            first_bytes=file.first_bytes,
             fields=item.fields,
         )
 
