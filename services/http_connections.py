@@ -31,7 +31,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from shared.config.settings import Settings
 from shared.errors import PlacewiseError, RequestTimeout, TooManyRequests, Unavailable
-from shared.http.problem_details import CLOSED_WITH
+from shared.http.problem_details import CLOSED_STATUS_SCOPE_KEY
 
 log = logging.getLogger(__name__)
 
@@ -328,7 +328,7 @@ class LimitedProtocol(H11Protocol):
         if not (in_flight and self.cycle.response_started):
             self.transport.write(_problem_response_bytes(error))
         if in_flight:
-            cast(dict[str, Any], self.scope)[CLOSED_WITH] = error.status
+            cast(dict[str, Any], self.scope)[CLOSED_STATUS_SCOPE_KEY] = error.status
             self.cycle.disconnected = True  # uvicorn drops the response of the application
             self.cycle.message_event.set()
         self.transport.close()

@@ -11,7 +11,7 @@ from typing import Any
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from shared.http.problem_details import CLIENT_GONE, CLOSED_WITH, REQUEST_ID_SCOPE_KEY
+from shared.http.problem_details import CLIENT_GONE, CLOSED_STATUS_SCOPE_KEY, REQUEST_ID_SCOPE_KEY
 from shared.telemetry.tracing import REQUEST_ID_HEADER, request_id_context, request_id_or_new, span
 
 log = logging.getLogger(__name__)
@@ -101,8 +101,8 @@ class RequestLogMiddleware:
             try:
                 await self._app(scope, counted_receive, send_with_request_id)
             finally:
-                if disconnected or CLOSED_WITH in scope:
-                    record.status = scope.get(CLOSED_WITH, CLIENT_GONE)
+                if disconnected or CLOSED_STATUS_SCOPE_KEY in scope:
+                    record.status = scope.get(CLOSED_STATUS_SCOPE_KEY, CLIENT_GONE)
                 record.route = _route_template(scope)
                 describe(f"{method} {record.route}", status=record.status)
                 self._on_end(record)

@@ -1,4 +1,4 @@
-"""Every error that a caller can meet, with its HTTP status and its stable code.
+"""The exceptions of Placewise, each with an HTTP status and a stable error code.
 
 PlacewiseError
 ├── InvalidRequest 400          no_file, empty_file, malformed_body, bad_manifest, ...
@@ -12,14 +12,14 @@ PlacewiseError
 ├── TooLarge 413                file_too_large, batch_too_large, ...
 ├── UnsupportedMedia 415        unsupported_photo, unsupported_body, unsupported_archive
 ├── Unprocessable 422           invalid_field, undecodable_photo, too_many_pixels, ...
-├── TooManyRequests 429         queue_full, too_many_requests, ... (come again after `Retry-After`)
-├── Unavailable 503             search_behind, codes_being_made, ... (may be tried again)
+├── TooManyRequests 429         queue_full, too_many_requests, ... (retry after `Retry-After`)
+├── Unavailable 503             search_behind, codes_being_made, ... (transient, retryable)
 │   │                       object_store_unavailable, catalog_damaged, ...
 │   └── StorageFull 507         disk_full, object_store_full
 └── Misconfigured 500           weights_missing, no_gpu, ... (an operator must act)
 
-`shared.errors` knows nothing of HTTP libraries: the gateway turns these into RFC 9457 problems,
-the extractor stores them in `jobs.error`, the command line prints `detail`.
+`shared.errors` imports no HTTP library: the gateway converts these exceptions into RFC 9457
+problem documents, the extractor stores them in `jobs.error`, the command line prints `detail`.
 """
 
 from __future__ import annotations
@@ -29,15 +29,17 @@ from typing import Any, ClassVar
 
 
 class PlacewiseError(Exception):
-    """Something that can be explained to whoever asked.
+    """Base class of the errors that are reported to the caller.
 
-    `detail` says what is wrong with which thing and what to do next. `extra` holds members that a
-    program can read (they become extension members of the problem document). One of them,
-    `retry_after_seconds`, becomes the header `Retry-After` as well.
+    Attributes:
+        code: stable identifier for programs.
+        detail: message for people: what happened, which value, what to do.
+        extra: extension members of the problem document. `retry_after_seconds` also becomes the
+            header `Retry-After`.
     """
 
     status: ClassVar[int] = 500
-    title: ClassVar[str] = "Placewise could not do this"
+    title: ClassVar[str] = "The operation failed"
 
     def __init__(self, code: str, detail: str, **extra: Any) -> None:
         super().__init__(detail)
@@ -46,11 +48,11 @@ class PlacewiseError(Exception):
         self.extra = extra
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # Keyword arguments don't survive the default pickling, and errors cross processes.
+        # The default pickling loses keyword arguments, and errors are sent between processes.
         return _unpickle_error, (type(self), self.code, self.detail, self.extra)
 
     def as_problem(self) -> dict[str, Any]:
-        """The RFC 9457 members, without `instance`."""
+        """Return the members of the RFC 9457 problem document, without `instance`."""
         return {
             "type": f"urn:placewise:problem:{self.code}",
             "title": self.title,
@@ -73,7 +75,7 @@ class InvalidRequest(PlacewiseError):
 
 
 class Unauthorized(PlacewiseError):
-    """The gateway adds `WWW-Authenticate`."""
+    """Authentication failed; the gateway adds `WWW-Authenticate`."""
 
     status = 401
     title = "A key is needed"
@@ -90,25 +92,25 @@ class NotFound(PlacewiseError):
 
 
 class RequestTimeout(PlacewiseError):
-    """The request came too slowly; nothing was done. The connection is closed."""
+    """The request arrived too slowly. It had no effect, and the connection is closed."""
 
     status = 408
-    title = "The request came too slowly"
+    title = "The request arrived too slowly"
 
 
 class Conflict(PlacewiseError):
     status = 409
-    title = "Not possible in the present state"
+    title = "Conflict with the current state"
 
 
 class Gone(PlacewiseError):
     status = 410
-    title = "No longer kept"
+    title = "No longer available"
 
 
 class LengthRequired(PlacewiseError):
     status = 411
-    title = "The length must be said"
+    title = "Content-Length is required"
 
 
 class TooLarge(PlacewiseError):
@@ -127,32 +129,35 @@ class Unprocessable(PlacewiseError):
 
 
 class TooManyRequests(PlacewiseError):
-    """Nothing was done; the same call is welcome after `retry_after_seconds`, which it needs."""
+    """Rate limit, quota or backpressure. The request had no effect; `retry_after_seconds` is
+    required."""
 
     status = 429
-    title = "Too much at once"
+    title = "Too many requests"
 
 
 class Unavailable(PlacewiseError):
-    """The same call may work a little later: the gateway adds `Retry-After`."""
+    """A transient failure: the same request may succeed later. The gateway adds `Retry-After`."""
 
     status = 503
     title = "Not available right now"
 
 
 class StorageFull(Unavailable):
-    """No room for more bytes until someone makes some; nothing was stored."""
+    """The disk or the object store is full; nothing was stored."""
 
     status = 507
-    title = "No room left"
+    title = "The storage is full"
 
 
 class Misconfigured(PlacewiseError):
+    """The installation or its settings need an operator."""
+
     title = "The installation needs attention"
 
 
 def invalid_field_error(field: str, detail: str) -> Unprocessable:
-    """The 422 for one value that is out of range or can't be read; it names the field."""
+    """Return the 422 for one field whose value is out of range or can't be parsed."""
     return Unprocessable(
         "invalid_field",
         f"{field}: {detail}",
@@ -188,10 +193,10 @@ _PROXY_ERRORS_BY_STATUS: dict[int, type[PlacewiseError]] = {
 
 
 def error_from_response(status: int, body: str) -> PlacewiseError:
-    """The error that a server answered with, made from its problem document.
+    """Convert an HTTP error response into the exception that its problem document describes.
 
-    A code of `bad_answer` for whatever is no problem document: a proxy's page, say. Of the proxy's
-    word that the server is away or busy, too, the kind of error is what it means.
+    A body that is not a problem document, for example a proxy's error page, gives the code
+    `bad_answer`; the exception class then follows from the status for 429, 502, 503, 504 and 507.
     """
     try:
         problem: dict[str, Any] = json.loads(body)

@@ -1,4 +1,7 @@
-"""Distances and boxes on the sphere, the same in Python, NumPy and (see `catalog.base`) in SQL."""
+"""Distances and bounding boxes on the sphere, in Python and NumPy.
+
+`shared.catalog.base` has the same formulas in SQL.
+"""
 
 from __future__ import annotations
 
@@ -15,55 +18,67 @@ DegreesArray = NDArray[np.float64]
 
 
 def flush_to_zero(degrees: float) -> float:
-    """0 for what is next to 0, else the same: PostgreSQL refuses to compute with numbers whose
-    squares are too small for a double, and one such photo would end every search."""
+    """Return 0 for a value within ZERO_TOLERANCE_DEGREES of 0, otherwise the value.
+
+    PostgreSQL raises an underflow error for numbers whose squares are too small for a double, and
+    one such photo would make every search fail.
+    """
     return 0.0 if abs(degrees) < ZERO_TOLERANCE_DEGREES else degrees
 
 
 def distance_m(
     latitude_1: float, longitude_1: float, latitude_2: float, longitude_2: float
 ) -> float:
-    """Great-circle distance in metres of two points in degrees (haversine, Sinnott 1984).
+    """Return the great-circle distance between two points (haversine, Sinnott 1984).
 
-    Within 0.6 % of the distance on the ellipsoid; exact to a millimetre on the sphere, also for
-    points a metre apart, across the antimeridian, at the poles, and near the antipodes: there the
-    haversine alone loses metres to rounding, and the distance to the antipode, `g`, decides.
+    The result is within 0.6 % of the distance on the ellipsoid, and exact to a millimetre on the
+    sphere, also for points a metre apart, across the antimeridian, at the poles and near the
+    antipodes. There the haversine alone loses metres to rounding, so that the formula also uses
+    `g`, the haversine of the distance to the antipode.
+
+    Args:
+        latitude_1, longitude_1, latitude_2, longitude_2: degrees.
+
+    Returns:
+        Metres.
     """
     phi_1, phi_2 = math.radians(latitude_1), math.radians(latitude_2)
     half_lambda = math.radians(longitude_2 - longitude_1) / 2
-    shrunk = math.cos(phi_1) * math.cos(phi_2)
-    h = math.sin((phi_2 - phi_1) / 2) ** 2 + shrunk * math.sin(half_lambda) ** 2
-    g = math.sin((phi_2 + phi_1) / 2) ** 2 + shrunk * math.cos(half_lambda) ** 2
+    cos_product = math.cos(phi_1) * math.cos(phi_2)
+    h = math.sin((phi_2 - phi_1) / 2) ** 2 + cos_product * math.sin(half_lambda) ** 2
+    g = math.sin((phi_2 + phi_1) / 2) ** 2 + cos_product * math.cos(half_lambda) ** 2
     return 2 * EARTH_RADIUS_M * math.atan2(math.sqrt(h), math.sqrt(g))
 
 
 def distances_m(
     latitude: float, longitude: float, latitudes: DegreesArray, longitudes: DegreesArray
 ) -> DegreesArray:
-    """`distance_m` from one point to (n,) others; NaN where a point has no coordinates."""
+    """Return `distance_m` from one point to (n,) points; NaN where a point has no coordinates."""
     phi, phis = np.radians(latitude), np.radians(latitudes)
     half_lambdas = np.radians(longitudes - longitude) / 2
-    shrunk = np.cos(phi) * np.cos(phis)
-    h = np.sin((phis - phi) / 2) ** 2 + shrunk * np.sin(half_lambdas) ** 2
-    g = np.sin((phis + phi) / 2) ** 2 + shrunk * np.cos(half_lambdas) ** 2
+    cos_product = np.cos(phi) * np.cos(phis)
+    h = np.sin((phis - phi) / 2) ** 2 + cos_product * np.sin(half_lambdas) ** 2
+    g = np.sin((phis + phi) / 2) ** 2 + cos_product * np.cos(half_lambdas) ** 2
     metres: DegreesArray = 2 * EARTH_RADIUS_M * np.arctan2(np.sqrt(h), np.sqrt(g))
     return metres
 
 
 def latitude_bounds(latitude: float, radius_m: float) -> tuple[float, float]:
-    """Latitudes outside of which nothing lies within `radius_m`: what an index can sort out."""
-    reach = math.degrees(radius_m / EARTH_RADIUS_M) * (1 + 1e-9) + 1e-9
-    return latitude - reach, latitude + reach
+    """Return the latitudes that enclose every point within `radius_m`, for a query by index."""
+    margin = math.degrees(radius_m / EARTH_RADIUS_M) * (1 + 1e-9) + 1e-9
+    return latitude - margin, latitude + margin
 
 
 def longitude_half_width(latitude: float, radius_m: float) -> float | None:
-    """Degrees of longitude to both sides, outside of which nothing lies within `radius_m` of a
-    point at this latitude; None where that is every longitude, or nearly so (around a pole)."""
+    """Return the half width, in degrees of longitude, that encloses every point within `radius_m`.
+
+    None where that is every longitude, or nearly so (around a pole).
+    """
     angle = radius_m / EARTH_RADIUS_M
     if angle >= math.pi / 2:
         return None
     sine = math.sin(angle) / max(math.cos(math.radians(latitude)), ZERO_TOLERANCE_DEGREES)
-    if sine > 0.999:  # from here on the arc's own rounding grows
+    if sine > 0.999:  # beyond, the rounding error of asin grows
         return None
     return math.degrees(math.asin(sine)) * (1 + 1e-9) + 1e-9
 
@@ -71,9 +86,10 @@ def longitude_half_width(latitude: float, radius_m: float) -> float | None:
 def weighted_centroid(
     latitudes: DegreesArray, longitudes: DegreesArray, weights: DegreesArray
 ) -> tuple[float, float]:
-    """The weighted centre of (n,) points as latitude and longitude: the mean of their vectors.
+    """Return latitude and longitude of the weighted centroid of (n,) points, in degrees.
 
-    So that points on both sides of the antimeridian or around a pole meet between each other.
+    It is the direction of the weighted mean of their unit vectors, so that points on both sides of
+    the antimeridian or around a pole have their centroid between them.
     """
     phi, lam = np.radians(latitudes), np.radians(longitudes)
     x = float(np.sum(weights * np.cos(phi) * np.cos(lam)))

@@ -1,4 +1,4 @@
-"""Identifiers are UUIDv7: they sort by the time they were made."""
+"""Identifiers: UUIDv7, which sort by creation time."""
 
 from __future__ import annotations
 
@@ -8,5 +8,5 @@ import uuid_utils.compat
 
 
 def new_id() -> UUID:
-    """A fresh UUIDv7."""
+    """Return a new UUIDv7."""
     return uuid_utils.compat.uuid7()

@@ -189,7 +189,7 @@ def reserve_photo_quota(request: Request, settings: Settings) -> AbstractContext
     """
     quota: PhotoQuota = request.app.state.photo_quota
     key_limit = get_photo_limit(get_caller(request), settings)
-    return contextlib.nullcontext() if key_limit is None else quota.place(*key_limit)
+    return contextlib.nullcontext() if key_limit is None else quota.reserve(*key_limit)
 
 
 def get_photo_limit(caller: Caller, settings: Settings) -> tuple[UUID, int] | None:

@@ -275,7 +275,7 @@ class _BatchPartHandler:
         if file is self.batch.archive:
             limit = self._settings.max_archive_size
             return StreamValidator(
-                limit, _check_archive_signature, begin_bytes=ARCHIVE_SIGNATURE_BYTES
+                limit, _check_archive_signature, signature_bytes=ARCHIVE_SIGNATURE_BYTES
             )
         return StreamValidator(self._settings.max_file_size, check_photo_signature)
 

@@ -221,9 +221,9 @@ async def store_form_file(
         filename=parts.filename,
         size_bytes=parts.file.size_bytes,
         sha256=parts.file.sha256,
-        begin=parts.file.begin,
+        first_bytes=parts.file.first_bytes,
         fields=parts.fields,
-        whole=small_file,
+        content=small_file,
     )
 
 

@@ -1,4 +1,4 @@
-"""Making a backup of a Placewise that runs."""
+"""Creates and updates a backup of a running Placewise."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from shared.integrity.referenced_objects import list_referenced_objects
 from shared.storage import ObjectStore
 from shared.storage.keys import JOURNAL
 
-MAX_COPY_PASSES = 5  # of reading the catalog anew because something it named went away meanwhile
+MAX_COPY_PASSES = 5  # snapshots of the catalog, when referenced objects are deleted meanwhile
 
 
 def create_backup(
@@ -38,54 +38,65 @@ def create_backup(
     import_prefix: str,
     progress: BackupProgress = lambda what, done, total: None,
 ) -> BackupManifest:
-    """Bring the folder `path` to what the service is now; what is there already is not copied
-    again, whether it is of an earlier backup or of one that was interrupted.
+    """Create or update the backup in the folder `path`.
 
-    Until the end, the earlier backup in the folder stays whole. Raises Misconfigured:
-    `not_a_backup`, `other_installation` for the backup of another Placewise; Conflict
-    `backup_in_use`; Unavailable where a part is away, and `backup_overtaken` when what the catalog
-    names goes away faster than it is copied.
+    Objects of an earlier or interrupted backup in the folder are not copied again. The earlier
+    backup stays complete until the new one is finished.
+
+    Args:
+        catalog: the catalog.
+        store: the object store.
+        installation_id: id of the catalog.
+        path: folder of the backup.
+        import_prefix: key prefix of the operator's own objects, which are not backed up.
+        progress: called after each object and for the rows.
+
+    Raises:
+        Misconfigured: `not_a_backup`; `other_installation` for the backup of another Placewise.
+        Conflict: `backup_in_use`.
+        Unavailable: the catalog or the store is unavailable; `backup_overtaken` when referenced
+            objects are deleted faster than they are copied.
     """
     folder = BackupFolder(path)
     folder.open_for_writing()
     with folder.exclusive_lock():
-        before = folder.about()
-        if before is not None and before.installation_id != str(installation_id):
+        previous = folder.about()
+        if previous is not None and previous.installation_id != str(installation_id):
             raise Misconfigured(
                 "other_installation",
-                f"{path} holds a backup of another Placewise. Give each a folder of its own.",
+                f"{path} has a backup of another Placewise. Use a separate folder for each.",
             )
-        seen = _copy_all(store, folder, import_prefix, progress)
+        copied = _copy_all(store, folder, import_prefix, progress)
         unlimited = catalog.with_timeouts(NO_TIMEOUTS)
         for _ in range(MAX_COPY_PASSES):
             with unlimited.read() as session:
-                # The first statement fixes what is seen.
+                # The first statement starts the snapshot.
                 now = session.execute(select(db_now())).scalar_one()
                 name = f"catalog-{now:%Y%m%dT%H%M%S%f}"
                 counts = dump_rows(session, path / name, progress)
                 schema = _revision(session)
-                named = {found.key: found for found in list_referenced_objects(session)}
+                referenced = {r.key: r for r in list_referenced_objects(session)}
                 sequence = session.scalar(select(Installation.journal_sequence)) or 0
-            # Read after the catalog: it holds all that the catalog's rows are marked as journaled.
+            # Listed after the snapshot: it has every state that the rows are marked as journaled.
             journal = {info.key for info in store.list(JOURNAL)}
-            gone = _copy_missing(store, folder, [*named, *journal], progress)
-            missing = _still_referenced(unlimited, gone)
-            if missing == gone:
+            deleted = _copy_missing(store, folder, [*referenced, *journal], progress)
+            missing = _still_referenced(unlimited, deleted)
+            if missing == deleted:
                 break
         else:
             raise Unavailable(
                 "backup_overtaken",
-                "What the catalog names is deleted or merged faster than it can be copied. Run the "
-                "backup again: what is copied stays, and the next one is shorter.",
+                "Objects are deleted or merged faster than they can be copied. Run the backup "
+                "again: it keeps the copied objects and has less to copy.",
             )
         damaged = sorted(
             key
-            for key, found in named.items()
-            if found.sha256 is not None
+            for key, expected in referenced.items()
+            if expected.sha256 is not None
             and key in folder.index
-            and folder.index[key].sha256 != found.sha256
+            and folder.index[key].sha256 != expected.sha256
         )
-        keep = (seen | named.keys() | journal) & folder.index.keys()
+        keep = (copied | referenced.keys() | journal) & folder.index.keys()
         about = BackupManifest(
             installation_id=str(installation_id),
             schema=schema,
@@ -106,41 +117,41 @@ def create_backup(
 def _copy_all(
     store: ObjectStore, folder: BackupFolder, import_prefix: str, progress: BackupProgress
 ) -> set[str]:
-    """Every object as it is now; the keys."""
-    there = list(list_backup_objects(store, import_prefix))
-    for done, info in enumerate(there, start=1):
+    """Copy every object that is new or has changed; return the keys of all."""
+    objects = list(list_backup_objects(store, import_prefix))
+    for done, info in enumerate(objects, start=1):
         if not is_backed_up(folder, info):
             with contextlib.suppress(NotFound):  # deleted since it was listed
                 back_up_object(store, folder, info)
-        progress("objects", done, len(there))
-    return {info.key for info in there}
+        progress("objects", done, len(objects))
+    return {info.key for info in objects}
 
 
 def _copy_missing(
-    store: ObjectStore, folder: BackupFolder, named: list[str], progress: BackupProgress
+    store: ObjectStore, folder: BackupFolder, keys: list[str], progress: BackupProgress
 ) -> set[str]:
-    """What is named and not there yet; the keys of those that the store does not have."""
-    rest = [key for key in named if key not in folder.index]
-    gone = set()
-    for done, key in enumerate(rest, start=1):
+    """Copy the objects that the backup lacks; return the keys that the store does not have."""
+    missing = [key for key in keys if key not in folder.index]
+    deleted = set()
+    for done, key in enumerate(missing, start=1):
         info = store.head(key)
         try:
             if info is None:
-                gone.add(key)
+                deleted.add(key)
             else:
                 back_up_object(store, folder, info)
         except NotFound:
-            gone.add(key)
-        progress("objects that came meanwhile", done, len(rest))
-    return gone
+            deleted.add(key)
+        progress("new objects", done, len(missing))
+    return deleted
 
 
-def _still_referenced(catalog: Catalog, gone: set[str]) -> set[str]:
-    """Those that are named even now: they are lost, not overtaken."""
-    if not gone:
+def _still_referenced(catalog: Catalog, keys: set[str]) -> set[str]:
+    """Return the keys that the catalog still references: their objects are lost."""
+    if not keys:
         return set()
     with catalog.read() as session:
-        return {found.key for found in list_referenced_objects(session) if found.key in gone}
+        return {r.key for r in list_referenced_objects(session) if r.key in keys}
 
 
 def _revision(session: Session) -> str:

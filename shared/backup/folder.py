@@ -1,15 +1,11 @@
-"""The folder of a backup.
+"""The folder of a backup: its files, its objects and the dump of the catalog's rows.
 
 ```
-backup.json        what it is, of when, and which of the catalog-* folders counts: written last
-catalog-<time>/    <table>.jsonl.gz, a row a line
+backup.json        the manifest, which names the valid catalog-* folder; written last
+catalog-<time>/    <table>.jsonl.gz, one row per line
 objects/<key>      the objects
-objects.jsonl      key, size, SHA-256 and time of each of them, a line each
+objects.jsonl      key, size, SHA-256 and time of each object, one per line
 ```
-
-Copying one object from store to store, hashed on the way.
-
-The catalog's rows as JSON lines, the same from SQLite and PostgreSQL.
 """
 
 from __future__ import annotations
@@ -29,7 +25,7 @@ from filelock import FileLock, Timeout
 from sqlalchemy import Table, func, insert, select
 from sqlalchemy.orm import Session
 
-import shared.catalog.tables  # noqa: F401  (every table has to be known)
+import shared.catalog.tables  # noqa: F401  (registers every table)
 from shared.catalog.base import Base, from_json, to_json
 from shared.catalog.installation import Installation
 from shared.catalog.photos import PresignedUpload
@@ -48,7 +44,7 @@ LOCK_FILE = ".backup.lock"
 
 @dataclass(frozen=True, slots=True)
 class BackedUpObject:
-    """An object in the backup. `modified` is when the original was written, ISO 8601."""
+    """An object in the backup. `modified` is the modification time of the original, ISO 8601."""
 
     key: str
     size_bytes: int
@@ -58,31 +54,31 @@ class BackedUpObject:
 
 @dataclass(frozen=True, slots=True)
 class BackupManifest:
-    """What `backup.json` says."""
+    """Content of `backup.json`."""
 
     installation_id: str
     schema: str
     """The revision of the catalog's schema."""
     release: str
     made_at: str
-    """When the catalog was read, by its own clock: ISO 8601, UTC."""
+    """Time of the catalog's snapshot by its own clock: ISO 8601, UTC."""
     catalog: str
-    """The folder of its rows."""
+    """Name of the folder with the catalog's rows."""
     rows: dict[str, int]
-    """By table."""
+    """Number of rows by table."""
     objects: int
     object_bytes: int
     missing: list[str] = field(default_factory=list)
-    """Objects that the catalog names and the store did not have."""
+    """Referenced objects that the store did not have."""
     damaged: list[str] = field(default_factory=list)
-    """Objects whose bytes are not those that the catalog knows."""
+    """Objects whose hash differs from the catalog's."""
     journal_sequence: int = 0
-    """Of the last journal segment that the catalog had written."""
+    """Sequence number of the last journal segment that the catalog had written."""
     format: int = BACKUP_FORMAT
 
 
 class BackupFolder:
-    """One backup. `index` says which objects are there; it is read when the folder is opened."""
+    """A backup in a folder. `index` has its objects by key, once the folder was opened."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -91,34 +87,35 @@ class BackupFolder:
 
     @functools.cached_property
     def objects(self) -> FolderStore:
-        """May lie on a medium that can only be read."""
-        return FolderStore(self.path / "objects", alone=False)
+        """The store of the objects; the folder may be read-only."""
+        return FolderStore(self.path / "objects", exclusive=False)
 
     def about(self) -> BackupManifest | None:
-        """None for a folder in which no backup was ever finished."""
+        """Return the manifest; None for a folder without a finished backup."""
         try:
-            said: dict[str, Any] = json.loads((self.path / "backup.json").read_text())
+            manifest: dict[str, Any] = json.loads((self.path / "backup.json").read_text())
         except FileNotFoundError:
             return None
         except ValueError as error:
             raise _unreadable(self.path, "backup.json") from error
-        if said.get("format") != BACKUP_FORMAT:
+        if manifest.get("format") != BACKUP_FORMAT:
             raise Misconfigured(
                 "backup_of_another_release",
-                f"{self.path} has the format {said.get('format')!r}, and this release reads "
-                f"{BACKUP_FORMAT}. Use the release that made it: {said.get('release')}.",
+                f"{self.path} has the format {manifest.get('format')!r}, but this release reads "
+                f"{BACKUP_FORMAT}. Use the release that created it: {manifest.get('release')}.",
             )
-        return BackupManifest(**said)
+        return BackupManifest(**manifest)
 
     @contextlib.contextmanager
     def exclusive_lock(self) -> Iterator[None]:
-        """For this process alone; Conflict (`backup_in_use`) while another one has it."""
+        """Lock the folder for this process; Conflict (`backup_in_use`) while another has it."""
         lock = FileLock(self.path / LOCK_FILE, timeout=0, mode=FILE_MODE)
         try:
             lock.acquire()
         except Timeout:
             raise Conflict(
-                "backup_in_use", f"Another command works on {self.path}. Wait for its end."
+                "backup_in_use",
+                f"Another command is using {self.path}. Wait until it has finished.",
             ) from None
         try:
             yield
@@ -126,44 +123,46 @@ class BackupFolder:
             lock.release()
 
     def open_for_writing(self) -> None:
-        """Make the folder, or go on with what is there. Misconfigured (`not_a_backup`) for one that
-        holds something else."""
+        """Create the folder, or open an existing backup to continue it.
+
+        Raises:
+            Misconfigured: `not_a_backup` for a folder with other files.
+        """
         make_private_folder(self.path)
-        there = {entry.name for entry in self.path.iterdir()} - {LOCK_FILE}
-        if there and not there & {"objects.jsonl", "backup.json"}:
+        present = {entry.name for entry in self.path.iterdir()} - {LOCK_FILE}
+        if present and not present & {"objects.jsonl", "backup.json"}:
             raise Misconfigured(
                 "not_a_backup",
-                f"{self.path} holds something that is no backup. Give an empty folder, or one "
-                "that a backup was begun in.",
+                f"{self.path} contains files that are not a backup. Use an empty folder, or one "
+                "with a backup.",
             )
         self._index_file.touch(FILE_MODE)
         self.read_index()
 
     def read_index(self) -> None:
-        """Later lines count; a last one that was cut off by a kill does not."""
+        """Read the index. The last line of a key counts; a truncated one is ignored."""
         self.index = {}
         with contextlib.suppress(FileNotFoundError):
             for line in self._index_file.read_text().splitlines():
                 with contextlib.suppress(ValueError, TypeError):
-                    kept = BackedUpObject(**json.loads(line))
-                    self.index[kept.key] = kept
+                    entry = BackedUpObject(**json.loads(line))
+                    self.index[entry.key] = entry
 
-    def note(self, kept: BackedUpObject) -> None:
-        """The object is there, whole."""
-        self.index[kept.key] = kept
+    def add_to_index(self, entry: BackedUpObject) -> None:
+        """Record that the object is completely in the backup."""
+        self.index[entry.key] = entry
         with self._index_file.open("a") as lines:
-            # Begins a line: what a kill has cut off before ends here.
-            lines.write("\n" + json.dumps(asdict(kept)))
+            # The line feed comes first and ends a line that a killed process left truncated.
+            lines.write("\n" + json.dumps(asdict(entry)))
 
     def finish(self, about: BackupManifest, keep: set[str]) -> None:
-        """From here on the folder is this backup. Objects that are not in `keep`, and the rows of
-        the backup before, go."""
+        """Write the manifest, then delete objects not in `keep` and the previous backup's rows."""
         write_private(self.path / "backup.json", json.dumps(asdict(about), indent=2) + "\n")
         objects = self.objects
         for key in self.index.keys() - keep:
             objects.delete(key)
             del self.index[key]
-        lines = (json.dumps(asdict(kept)) + "\n" for kept in self.index.values())
+        lines = (json.dumps(asdict(entry)) + "\n" for entry in self.index.values())
         write_private(self._index_file, "".join(lines))
         for old in self.path.glob("catalog-*"):
             if old.name != about.catalog:
@@ -171,14 +170,17 @@ class BackupFolder:
 
 
 def open_backup(path: Path) -> tuple[BackupFolder, BackupManifest]:
-    """A finished backup, to be read. Misconfigured: `no_backup`, `backup_of_another_release`,
-    `backup_unreadable`."""
+    """Open a finished backup for reading.
+
+    Raises:
+        Misconfigured: `no_backup`, `backup_of_another_release`, `backup_unreadable`.
+    """
     folder = BackupFolder(path)
     about = folder.about()
     if about is None:
         raise Misconfigured(
             "no_backup",
-            f"{path} holds no finished backup (it has no backup.json). If one was interrupted, run "
+            f"{path} has no finished backup (no backup.json). If a backup was interrupted, run "
             "`placewise backup` on it again.",
         )
     folder.read_index()
@@ -186,53 +188,55 @@ def open_backup(path: Path) -> tuple[BackupFolder, BackupManifest]:
 
 
 def _unreadable(path: Path, name: str) -> Misconfigured:
-    return Misconfigured("backup_unreadable", f"{path / name} can't be read. Take another backup.")
+    return Misconfigured("backup_unreadable", f"{path / name} can't be read. Use another backup.")
 
 
 COPY_BLOCK_BYTES = 1024 * 1024
-# Notes of the store itself; made again when they are wanted; of calls that have ended by the time
-# of a restore; orphans.
+# Not backed up: notes of the store, objects that can be recomputed, temporary objects of requests
+# and jobs, and orphans.
 EXCLUDED_PREFIXES = (OWNER_MARK, INCOMING, QUERIES, FEATURES, TRASH, WORK)
 
 
 def list_backup_objects(store: ObjectStore, import_prefix: str) -> Iterator[ObjectInfo]:
-    """What belongs into a backup of the store, whether rows name it or not (thumbnails, codes).
-    What lies under `import_prefix`, or was put into UPLOAD_DIR by hand, is its owner's."""
+    """Iterate over the objects to back up, referenced by rows or not (thumbnails, codes).
+
+    Objects under `import_prefix` and files that people put into UPLOAD_DIR are the operator's.
+    """
     for info in store.list(""):
-        others = info.key.startswith(ORIGINALS) and not is_original_key(info.key)
-        if others or info.key.startswith((*EXCLUDED_PREFIXES, import_prefix)):
+        is_foreign = info.key.startswith(ORIGINALS) and not is_original_key(info.key)
+        if is_foreign or info.key.startswith((*EXCLUDED_PREFIXES, import_prefix)):
             continue
         yield info
 
 
 def is_backed_up(folder: BackupFolder, info: ObjectInfo) -> bool:
-    """Whether the backup has the object as it is now."""
-    kept = folder.index.get(info.key)
+    """Return whether the backup has the current version of the object."""
+    entry = folder.index.get(info.key)
     return (
-        kept is not None
-        and kept.size_bytes == info.size_bytes
-        and kept.modified == info.modified_at.isoformat()
+        entry is not None
+        and entry.size_bytes == info.size_bytes
+        and entry.modified == info.modified_at.isoformat()
         and folder.objects.path(info.key).is_file()
     )
 
 
 def back_up_object(store: ObjectStore, folder: BackupFolder, info: ObjectInfo) -> int:
-    """Copy the object into the backup; its bytes. NotFound when it is gone."""
+    """Copy the object into the backup; return its size. NotFound when it no longer exists."""
     size, sha256 = copy_object(store, folder.objects, info.key)
-    folder.note(BackedUpObject(info.key, size, sha256, info.modified_at.isoformat()))
+    folder.add_to_index(BackedUpObject(info.key, size, sha256, info.modified_at.isoformat()))
     return size
 
 
 def copy_object(source: ObjectStore, target: ObjectStore, key: str) -> tuple[int, str]:
-    """Copy the object; its size in bytes and its SHA-256. NotFound where there is none."""
+    """Copy an object; return its size in bytes and SHA-256. NotFound when it is missing."""
     digest, size = hashlib.sha256(), 0
     with source.open(key) as file:
         writer = target.writer(key)
         try:
-            while piece := file.read(COPY_BLOCK_BYTES):
-                digest.update(piece)
-                writer.write(piece)
-                size += len(piece)
+            while block := file.read(COPY_BLOCK_BYTES):
+                digest.update(block)
+                writer.write(block)
+                size += len(block)
             writer.commit()
         finally:
             writer.abort()
@@ -240,37 +244,37 @@ def copy_object(source: ObjectStore, target: ObjectStore, key: str) -> tuple[int
 
 
 def hash_object(store: ObjectStore, key: str) -> tuple[int, str]:
-    """The object's size in bytes and its SHA-256. NotFound where there is none."""
+    """Return an object's size in bytes and SHA-256. NotFound when it is missing."""
     digest, size = hashlib.sha256(), 0
     with store.open(key) as file:
-        while piece := file.read(COPY_BLOCK_BYTES):
-            digest.update(piece)
-            size += len(piece)
+        while block := file.read(COPY_BLOCK_BYTES):
+            digest.update(block)
+            size += len(block)
     return size, digest.hexdigest()
 
 
 ROWS_PER_STATEMENT = 1000
-GZIP_LEVEL = 1  # of gzip: rows shrink to a fifth, and the disk stays the slower part
+GZIP_LEVEL = 1  # reduces rows to a fifth, and is faster than the disk
 
-# What says nothing elsewhere or later: who is alive now, addresses that expire, the schema's own.
+# Not backed up: running processes, presigned uploads that expire, the schema's compatibility.
 EXCLUDED_TABLES = frozenset(
     table.__tablename__
     for table in (RegisteredSearchWorker, RegisteredProcess, PresignedUpload, SchemaCompatibility)
 )
-# The target has its own: `shared.backup.restore`.
+# The target has its own row (`shared.backup.restore`).
 NOT_RESTORED_TABLES = frozenset({Installation.__tablename__})
 
 BackupProgress = Callable[[str, int, int], object]
-"""Told what is done, how much of it, and of how much."""
+"""Progress callback: what is done, number done, total."""
 
 
 def backup_tables() -> list[Table]:
-    """Those that a backup holds; each comes after those that its foreign keys lead to."""
+    """Return the tables of a backup, each after those that it references."""
     return [table for table in Base.metadata.sorted_tables if table.name not in EXCLUDED_TABLES]
 
 
 def dump_rows(session: Session, folder: Path, progress: BackupProgress) -> dict[str, int]:
-    """Every row into `<table>.jsonl.gz`; how many each table has."""
+    """Write every row to `<table>.jsonl.gz`; return the number of rows by table."""
     folder.mkdir(FOLDER_MODE)
     counts = {}
     for table in backup_tables():
@@ -294,16 +298,19 @@ def dump_rows(session: Session, folder: Path, progress: BackupProgress) -> dict[
 def load_rows(
     session: Session, folder: Path, counts: dict[str, int], progress: BackupProgress
 ) -> None:
-    """Insert what `dump_rows` has written. Misconfigured (`backup_damaged`) when a table has other
-    than `counts` rows, or can't be read."""
+    """Insert the rows that `dump_rows` has written.
+
+    Raises:
+        Misconfigured: `backup_damaged` when a table does not have `counts` rows, or is unreadable.
+    """
     for table in backup_tables():
         if table.name in NOT_RESTORED_TABLES:
             continue
         done = 0
         try:
-            for some in _read(folder / f"{table.name}.jsonl.gz", table):
-                session.execute(insert(table), some)
-                done += len(some)
+            for rows in _read_batches(folder / f"{table.name}.jsonl.gz", table):
+                session.execute(insert(table), rows)
+                done += len(rows)
                 progress(f"rows of {table.name}", done, counts[table.name])
         except (OSError, EOFError, ValueError, KeyError) as error:
             raise _damaged_error(table, str(error)) from error
@@ -311,22 +318,21 @@ def load_rows(
             raise _damaged_error(table, f"{done} rows of {counts.get(table.name)}")
 
 
-def _read(file: Path, table: Table) -> Iterator[list[dict[str, Any]]]:
-    some: list[dict[str, Any]] = []
+def _read_batches(file: Path, table: Table) -> Iterator[list[dict[str, Any]]]:
+    batch: list[dict[str, Any]] = []
     with gzip.open(file, "rt") as lines:
         for line in lines:
             values = json.loads(line)
-            some.append({c.name: from_json(c, values[c.name]) for c in table.columns})
-            if len(some) == ROWS_PER_STATEMENT:
-                yield some
-                some = []
-    if some:
-        yield some
+            batch.append({c.name: from_json(c, values[c.name]) for c in table.columns})
+            if len(batch) == ROWS_PER_STATEMENT:
+                yield batch
+                batch = []
+    if batch:
+        yield batch
 
 
-def _damaged_error(table: Table, why: str) -> Misconfigured:
+def _damaged_error(table: Table, reason: str) -> Misconfigured:
     return Misconfigured(
         "backup_damaged",
-        f"The rows of {table.name} in the backup are not what was written ({why}). Take another "
-        "backup.",
+        f"The rows of {table.name} in the backup are damaged ({reason}). Use another backup.",
     )

@@ -1,7 +1,7 @@
-"""Making an empty Placewise what a backup holds.
+"""Restores a backup into an empty Placewise.
 
-Objects come first, then all rows in one transaction: a restore that is interrupted has no row yet,
-and goes on with the objects that it lacks.
+Objects are copied first, then all rows are inserted in one transaction: an interrupted restore has
+no rows yet, and can be repeated, which copies the missing objects.
 """
 
 from __future__ import annotations
@@ -39,12 +39,14 @@ MAX_NAMES_IN_ERROR = 5
 
 @dataclass(frozen=True, slots=True)
 class RestoreResult:
+    """Counts of a restore."""
+
     rows: int
     objects: int
     copied_objects: int
-    """The others were there already: of a restore that was interrupted, or in the same bucket."""
+    """Objects that were copied; the others already existed in the store."""
     cancelled_jobs: int
-    """Queries, and fits whose half-done work a backup does not hold."""
+    """Queries, and fits whose intermediate state is not in the backup."""
 
 
 def restore_backup(
@@ -57,13 +59,21 @@ def restore_backup(
     *,
     store_owner: str | None = None,
 ) -> RestoreResult:
-    """The catalog, its schema up to date, and the store become what the backup holds.
+    """Restore a backup into an empty catalog with the current schema, and an object store.
 
-    `store_owner` is the installation id that the store is marked with, None for a store without a
-    mark. `open_store` is called once the catalog has the backup's installation id, or has kept its
-    own because the store is marked with that. Raises Conflict
-    (`target_not_empty`) where something else lies, and Misconfigured: `backup_of_another_release`,
-    `backup_damaged` (the target then stays without rows).
+    Args:
+        folder: the backup.
+        about: its manifest.
+        catalog: the target catalog.
+        open_store: opens the target store. It is called when the catalog has the backup's
+            installation id, or has kept its own because the store is marked with that.
+        import_prefix: key prefix of the operator's own objects.
+        progress: called after each object and for the rows.
+        store_owner: installation id that the store is marked with; None without a mark.
+
+    Raises:
+        Conflict: `target_not_empty`.
+        Misconfigured: `backup_of_another_release`, `backup_damaged`; the target then has no rows.
     """
     unlimited = catalog.with_timeouts(NO_TIMEOUTS)
     with unlimited.write() as session:
@@ -73,12 +83,12 @@ def restore_backup(
         if installation.bucket is None and store_owner != str(installation.id):
             installation.id = UUID(about.installation_id)
     store = open_store()
-    strange = next(
+    unknown_key = next(
         (i.key for i in list_backup_objects(store, import_prefix) if i.key not in folder.index),
         None,
     )
-    if strange is not None:
-        raise _not_empty_error(f"the object store has {strange!r}, which the backup does not know")
+    if unknown_key is not None:
+        raise _not_empty_error(f"the object store has {unknown_key!r}, which is not in the backup")
     copied = _copy_objects(folder, store, progress)
     with unlimited.write() as session:
         _check_catalog_empty(session)
@@ -86,7 +96,7 @@ def restore_backup(
         session.execute(delete(Map))
         load_rows(session, folder.path / about.catalog, about.rows, progress)
         session.flush()
-        # Else the restored catalog would take the journal's segments for a later catalog's.
+        # Otherwise the restored catalog would appear to be older than the journal.
         get_or_create_installation(session).journal_sequence = about.journal_sequence
         cancelled = _cancel_unfinished_work(session)
     rows = sum(count for name, count in about.rows.items() if name not in NOT_RESTORED_TABLES)
@@ -98,13 +108,13 @@ def _check_schema(session: Session, about: BackupManifest) -> None:
     if present != about.schema:
         raise Misconfigured(
             "backup_of_another_release",
-            f"The backup's schema is {about.schema}, this release's is {present}. Restore it with "
-            f"the release that made it ({about.release}), then upgrade.",
+            f"The backup has the schema {about.schema}, but this release has {present}. Restore it "
+            f"with the release that created it ({about.release}), then upgrade.",
         )
 
 
 def _check_catalog_empty(session: Session) -> None:
-    """Empty: as `placewise migrate`, or a first start, has left it."""
+    """Raise Conflict unless the catalog is as after `placewise migrate` or a first start."""
     for table in backup_tables():
         if table.name in (*NOT_RESTORED_TABLES, Map.__tablename__):
             continue
@@ -114,53 +124,54 @@ def _check_catalog_empty(session: Session) -> None:
         raise _not_empty_error("it has maps")
 
 
-def _not_empty_error(why: str) -> Conflict:
+def _not_empty_error(reason: str) -> Conflict:
     return Conflict(
         "target_not_empty",
-        f"A backup is restored into an empty Placewise only, and this one is not: {why}. Give "
-        "another PLACEWISE_HOME, or a new database (DATABASE_URL) and an empty bucket (S3_BUCKET).",
+        f"A backup can only be restored into an empty Placewise, and this one is not: {reason}. "
+        "Set another PLACEWISE_HOME, or a new database (DATABASE_URL) and an empty bucket "
+        "(S3_BUCKET).",
     )
 
 
 def _copy_objects(folder: BackupFolder, store: ObjectStore, progress: BackupProgress) -> int:
-    """Every object that is not there yet, checked against its hash; how many those were."""
-    source, copied, bad = folder.objects, 0, []
-    for done, kept in enumerate(folder.index.values(), start=1):
-        there = store.head(kept.key)
-        if there is None or there.size_bytes != kept.size_bytes:
+    """Verify and copy the objects that the store lacks; return their number."""
+    source, copied, damaged = folder.objects, 0, []
+    for done, entry in enumerate(folder.index.values(), start=1):
+        existing = store.head(entry.key)
+        if existing is None or existing.size_bytes != entry.size_bytes:
             try:
-                if hash_object(source, kept.key) != (kept.size_bytes, kept.sha256):
-                    bad.append(kept.key)
+                if hash_object(source, entry.key) != (entry.size_bytes, entry.sha256):
+                    damaged.append(entry.key)
                 else:
-                    copy_object(source, store, kept.key)
+                    copy_object(source, store, entry.key)
                     copied += 1
             except NotFound:
-                bad.append(kept.key)
+                damaged.append(entry.key)
         progress("objects", done, len(folder.index))
-    if bad:
-        named = ", ".join(bad[:MAX_NAMES_IN_ERROR]) + (
-            " ..." if len(bad) > MAX_NAMES_IN_ERROR else ""
+    if damaged:
+        names = ", ".join(damaged[:MAX_NAMES_IN_ERROR]) + (
+            " ..." if len(damaged) > MAX_NAMES_IN_ERROR else ""
         )
         raise Misconfigured(
             "backup_damaged",
-            f"{len(bad)} objects of the backup are gone or changed: {named}. Take another backup. "
-            "To restore the rest without them: delete their lines from objects.jsonl, and run "
-            "`placewise verify --repair` afterwards.",
+            f"{len(damaged)} objects of the backup are missing or damaged: {names}. Use another "
+            "backup. To restore the rest without them, delete their lines from objects.jsonl, and "
+            "run `placewise verify --repair` afterwards.",
         )
     return copied
 
 
 def _cancel_unfinished_work(session: Session) -> int:
-    """Nobody works on anything here yet. What can't go on is cancelled; how many jobs."""
+    """Release all leases, and cancel jobs that can't be resumed; return their number."""
     for job in session.scalars(select(Job).where(Job.lease_token.is_not(None))).all():
         release_job(job)
-    lost = session.scalars(
+    jobs = session.scalars(
         select(Job).where(
             Job.state.in_(UNFINISHED_STATES),
             Job.kind.in_(QUERY_JOBS)
             | (Job.kind.in_(MODEL_CHANGE_JOBS) & Job.generation_id.is_(None)),
         )
     ).all()
-    for job in lost:
+    for job in jobs:
         cancel_job(job) if job.kind in QUERY_JOBS else cancel_model_change(session, job)
-    return len(lost)
+    return len(jobs)

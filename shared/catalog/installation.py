@@ -27,7 +27,7 @@ from shared.ids import new_id
 from shared.storage import OwnedStore
 from shared.storage.folder import OWNER_MARK
 from shared.storage.open_store import open_store
-from shared.storage.ownership import Place, check_free, claim_store, place_of
+from shared.storage.ownership import BucketLocation, bucket_location, check_free, claim_store
 
 SAMPLE_KEYS = 20  # per table
 REBUILDING = -1  # special value of `Installation.journal_sequence`
@@ -41,7 +41,7 @@ class Installation(Base):
     number: Mapped[int] = mapped_column(Integer, primary_key=True, autoincrement=False, default=1)
     id: Mapped[UUID] = mapped_column(Uuid, default=new_id)
     # Endpoint and name of the bucket with the objects; null if they are in a folder.
-    bucket: Mapped[Place | None] = mapped_column(JsonValue)
+    bucket: Mapped[BucketLocation | None] = mapped_column(JsonValue)
     # Number of the last journal segment that this catalog has written (`shared.journal`), or
     # REBUILDING until `placewise rebuild-catalog` has finished.
     journal_sequence: Mapped[int] = mapped_column(BigInteger, default=0, server_default="0")
@@ -107,7 +107,7 @@ def adopt_store(catalog: Catalog, store: OwnedStore) -> None:
     with catalog.write() as session:
         installation = get_or_create_installation(session)
         store.write_note(OWNER_MARK, str(installation.id).encode())
-        installation.bucket = place_of(store)
+        installation.bucket = bucket_location(store)
 
 
 def _sample_referenced_keys(catalog: Catalog) -> list[str]:

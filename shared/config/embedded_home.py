@@ -1,4 +1,4 @@
-"""The folder of an embedded Placewise: who serves it, and where that server listens."""
+"""The folder of an embedded Placewise: its lock, and the address of the server that serves it."""
 
 from __future__ import annotations
 
@@ -21,55 +21,59 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class RunningServer:
-    """A server as whoever may read its folder finds it."""
+    """Address of a running server, as its folder gives it."""
 
     url: str
     key: str | None = field(default=None, repr=False)
-    """Good until that server ends; None where no key is needed."""
+    """API key, valid until that server ends; None where no key is needed."""
 
 
 def server_address_file(home: Path) -> Path:
-    """Says where the server that holds the lock listens, and a key for this user's commands."""
+    """The file with the server's URL and an API key for the commands of the same user."""
     return home / "server.json"
 
 
 def find_running_server(home: Path) -> RunningServer | None:
-    """The server that serves the folder now, or None."""
+    """Return the server that serves the folder now, or None."""
     if not _lock_file(home).exists():
         return None
     with contextlib.suppress(Timeout), FileLock(_lock_file(home), timeout=0, mode=FILE_MODE):
         return None
     with contextlib.suppress(FileNotFoundError, ValueError, KeyError):
-        said = json.loads(server_address_file(home).read_text())
-        return RunningServer(said["url"], said.get("key"))
+        address = json.loads(server_address_file(home).read_text())
+        return RunningServer(address["url"], address.get("key"))
     return None
 
 
 def running_server_url(home: Path) -> str | None:
-    """The address of the server that serves the folder now, or None."""
+    """Return the URL of the server that serves the folder now, or None."""
     running = find_running_server(home)
     return running.url if running else None
 
 
 @contextlib.contextmanager
 def lock_home(home: Path) -> Iterator[None]:
-    """The folder for this process alone; Misconfigured (`home_in_use`, `home_unwritable`)."""
+    """Lock the folder for this process while the block runs.
+
+    Raises:
+        Misconfigured: `home_in_use`, `home_unwritable`.
+    """
     try:
         make_private_folder(home)
         lock = FileLock(_lock_file(home), timeout=0, mode=FILE_MODE)
         lock.acquire()
     except Timeout:
-        where = running_server_url(home) or "another process"
+        user = running_server_url(home) or "another process"
         raise Misconfigured(
             "home_in_use",
-            f"The folder {home} is served already, by {where}. Use that server, stop it, or give "
-            "this one another PLACEWISE_HOME.",
+            f"The folder {home} is already in use by {user}. Use that server, stop it, or set "
+            "another PLACEWISE_HOME.",
         ) from None
     except OSError as error:
         raise Misconfigured(
             "home_unwritable",
-            f"Can't write into the folder {home}: {error.strerror}. Check its permissions, or "
-            "choose another PLACEWISE_HOME.",
+            f"Can't write to the folder {home}: {error.strerror}. Check its permissions, or "
+            "set another PLACEWISE_HOME.",
         ) from error
     try:
         yield
@@ -79,16 +83,16 @@ def lock_home(home: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def announce_server(home: Path, url: str, key: str | None = None) -> Iterator[None]:
-    """While the block runs, this user's commands find the server at `url` through its folder."""
-    said = {"url": url, "pid": os.getpid()} | ({"key": key} if key else {})
+    """Write the server's URL and key to its folder while the block runs, for local commands."""
+    address = {"url": url, "pid": os.getpid()} | ({"key": key} if key else {})
     try:
-        write_private(server_address_file(home), json.dumps(said))
+        write_private(server_address_file(home), json.dumps(address))
     except OSError as error:
         if error.errno not in DISK_FULL:
             raise
-        server_address_file(home).unlink(missing_ok=True)  # of a killed server
+        server_address_file(home).unlink(missing_ok=True)  # may be left over from a killed server
         log.warning(
-            "the disk of %s is full: commands don't find this server by its folder, and need "
+            "the disk of %s is full: commands can't find this server by its folder and need "
             "--server %s",
             home,
             url,

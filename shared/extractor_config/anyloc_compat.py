@@ -1,8 +1,8 @@
-"""The predecessor's variables for the same choice: which DINOv2, and what VLAD makes of it.
+"""AnyLoc's environment variables as an extractor name.
 
     DINO_MODEL=dinov2_vitg14 DESC_LAYER=31 DESC_FACET=value VLAD_CLUSTERS=32 VLAD_DESC_DIM=1536
 
-means the extractor `anyloc-vitg14:clusters=32`. What contradicts is refused, never guessed.
+means the extractor `anyloc-vitg14:clusters=32`. Contradicting values are rejected.
 """
 
 from __future__ import annotations
@@ -25,9 +25,12 @@ def extractor_from_dino_settings(
     vlad_clusters: int | None,
     vlad_desc_dim: int | None,
 ) -> str:
-    """The canonical name of the extractor that the variables mean; None leaves the model's own.
+    """Return the canonical name of the extractor that the variables describe.
 
-    ValueError names the variable that can't be used, its value, and what is allowed.
+    None selects the model's default.
+
+    Raises:
+        ValueError: with the variable, its value and the allowed ones.
     """
     base = EXTRACTORS_BY_DINO_MODEL.get(dino_model)
     if base is None:
@@ -41,19 +44,19 @@ def extractor_from_dino_settings(
         ("VLAD_CLUSTERS", "clusters", vlad_clusters),
     ):
         if value is not None:
-            written = f"{option}={value}"
+            option_text = f"{option}={value}"
             try:
-                get_extractor_config(f"{base}:{written}", allow_test_extractors=False)
+                get_extractor_config(f"{base}:{option_text}", allow_test_extractors=False)
             except Misconfigured as error:
                 raise ValueError(
                     f"{variable}={value} with DINO_MODEL={dino_model}: {error.detail}"
                 ) from error
-            options.append(written)
+            options.append(option_text)
     name = f"{base}:{','.join(options)}" if options else base
-    recipe = get_extractor_config(name, allow_test_extractors=False)
-    if vlad_desc_dim not in (None, recipe.width):
+    config = get_extractor_config(name, allow_test_extractors=False)
+    if vlad_desc_dim not in (None, config.width):
         raise ValueError(
             f"VLAD_DESC_DIM={vlad_desc_dim} contradicts DINO_MODEL={dino_model}, whose features "
-            f"have {recipe.width} dimensions. Unset VLAD_DESC_DIM, or choose the other model"
+            f"have {config.width} dimensions. Unset VLAD_DESC_DIM, or choose another model"
         )
-    return recipe.name
+    return config.name

@@ -1,16 +1,17 @@
-"""Extractors by name: which backbone, preprocessing and aggregator make a descriptor.
+"""Extractor configurations by name: backbone, preprocessing and aggregator of a global descriptor.
 
-    get_recipe("anyloc-vitb14", allow_test_extractors=False)
-    get_recipe("anyloc-vitb14:clusters=32,facet=key,layer=9", allow_test_extractors=False)
-    get_recipe("anyloc-vitg14:preprocessing=paper480x640", allow_test_extractors=False)
-    get_recipe("torchhub:/models/mine:my_entry", allow_test_extractors=False)
-    get_recipe("gsv:night-walks", allow_test_extractors=False)
+    get_extractor_config("anyloc-vitb14", allow_test_extractors=False)
+    get_extractor_config("anyloc-vitb14:clusters=32,facet=key,layer=9", ...)
+    get_extractor_config("anyloc-vitg14:preprocessing=paper480x640", ...)
+    get_extractor_config("torchhub:/models/mine:my_entry", ...)
+    get_extractor_config("gsv:night-walks", ...)
 
-A name may carry options. Their canonical order is the alphabet's and what equals the extractor's
-own default is left out, so that one extractor has one name wherever it is stored or compared.
+A name may carry options. In the canonical name, options are in alphabetical order and options with
+the extractor's default are left out, so that each configuration has one name wherever it is stored
+or compared.
 
-Imports no torch: the settings and the gateway choose extractors without loading one.
-`shared.descriptors.extractor` turns a recipe into descriptors.
+Imports no torch: the settings and the gateway validate extractors without loading one.
+`shared.descriptors.extractor` builds the extractor of a configuration.
 """
 
 from __future__ import annotations
@@ -33,11 +34,11 @@ from shared.extractor_config.names import TRAINED_MODEL_PREFIX as TRAINED_PREFIX
 
 FACETS = ("query", "key", "value", "token")
 EXTRACTOR_AGGREGATORS = ("vlad", "soft-vlad", "gem", "avg")
-# Of the network's published figures: rankings with them are to be those of its authors.
+# The preprocessing of AnyLoc's published results, which these names reproduce.
 ANYLOC_PREPROCESSING_NAMES = ("demo1024", "paper480x640", "round14")
 PREPROCESSING_NAMES = ("square224", *ANYLOC_PREPROCESSING_NAMES)
 MAX_CLUSTERS = 4096
-MAX_PCA_DIMENSION = 1024  # dimensions after PCA: its time and memory grow with the square
+MAX_PCA_DIMENSION = 1024  # dimensions after PCA, whose time and memory grow quadratically
 TORCHHUB_BACKBONE = "torchhub"  # the backbone that is a torch.hub entry
 TRAINED_BACKBONE = "gsv"  # the backbone that is a model of `placewise train`
 SLOW_TEST_BACKBONE = "test-slow"  # the backbone whose width and time are options
@@ -48,61 +49,61 @@ MAX_TEMPERATURE = 1000
 
 @dataclass(frozen=True, slots=True)
 class ExtractorConfig:
-    """How the extractor `name` is put together."""
+    """Configuration of one extractor."""
 
     name: str
-    """Canonical, with the options that differ from the extractor's defaults."""
+    """Canonical name, with the options that differ from the extractor's defaults."""
     backbone: str
     """One of `shared.descriptors.extractor.BACKBONES`."""
     width: int | None
-    """Length of one local feature; None where only the loaded network tells."""
+    """Dimension of a local feature; None where only the loaded network determines it."""
     parameters: int | None
-    """Of the whole backbone, rounded up; each takes 4 bytes. None as above."""
+    """Number of parameters of the backbone, rounded up, 4 bytes each; None as for `width`."""
     preprocessing: str | None
-    """A name that `shared.imaging.preprocessing.get_preprocessing` knows; None where only the
-    loaded
-    network tells.
-    """
+    """A name of `shared.imaging.preprocessing.get_preprocessing`; None as for `width`."""
     aggregator: str
-    """One of AGGREGATORS. VLAD, hard or soft, needs a vocabulary; GeM and the mean do without. Or
-    `none`: the backbone makes one feature of a photo, and that is its descriptor.
+    """One of EXTRACTOR_AGGREGATORS, or `none` where the backbone computes the global descriptor.
+
+    Hard and soft VLAD need a vocabulary; GeM and average pooling don't.
     """
     depth: int | None = None
-    """Blocks of a transformer; None where neither layer nor facet can be chosen."""
+    """Number of transformer blocks; None where layer and facet can't be chosen."""
     layer: int | None = None
-    """Index of the block that the features come from, counted from 0."""
+    """Index of the block whose features are used, from 0."""
     facet: str | None = None
-    """What is taken from that block: one of FACETS."""
+    """Facet of that block: one of FACETS."""
     temperature: float = 1.0
-    """Of soft VLAD: by what the cosines are multiplied before the softmax."""
+    """Temperature of soft VLAD: factor of the cosines before the softmax."""
     clusters: int = 64
-    """Centres that a fit makes unless it says otherwise; any vocabulary's own number goes first."""
+    """Default number of centres of a fit; the number of an existing vocabulary takes precedence."""
     shipped_vocabulary: str | None = None
-    """File below `shared/descriptors/vocabularies/`, learnt on photographs of elsewhere: a new map
-    answers with it at once, whatever `clusters` says about later fits.
+    """File in `shared/descriptors/vocabularies/`, fitted on photos of other places.
+
+    A new map uses it immediately, whatever `clusters` is for later fits.
     """
     hub: TorchHubEntry | None = None
-    """The torch.hub entry that makes the descriptors, for `torchhub:` names."""
+    """The torch.hub entry that computes the descriptors, for `torchhub:` names."""
     trained: TrainedModelName | None = None
-    """The model that makes the descriptors, for `gsv:` names."""
+    """The trained model that computes the descriptors, for `gsv:` names."""
     for_tests: bool = False
     milliseconds: int = 0
-    """Time that a photo takes, slept, of an extractor for tests."""
+    """Simulated time per photo (a sleep), of an extractor for tests."""
 
     @property
     def needs_vocabulary(self) -> bool:
+        """Whether the aggregator is VLAD, hard or soft."""
         return self.aggregator in ("vlad", "soft-vlad")
 
     @property
     def has_local_features(self) -> bool:
-        """Whether the backbone makes local features: several of a photo, each of a patch."""
+        """Whether the backbone computes local features, one for each patch of a photo."""
         return self.aggregator != "none"
 
     @property
     def dimension(self) -> int | None:
-        """Length of a descriptor once a fit has made `clusters` centres; None as for `width`.
+        """Dimension of the descriptor with a vocabulary of `clusters` centres; None as for `width`.
 
-        A generation carries its own in any case.
+        A generation has its own, which depends on its vocabulary.
         """
         if self.width is None:
             return None
@@ -110,7 +111,7 @@ class ExtractorConfig:
 
     @property
     def local_features(self) -> tuple[int | str | TorchHubEntry | TrainedModelName | None, ...]:
-        """Recipes that agree in this can share one loaded backbone."""
+        """Cache key of the backbone: configurations with an equal key can share a loaded one."""
         return (
             self.backbone,
             self.width,
@@ -127,7 +128,7 @@ def _anyloc_config(
 ) -> ExtractorConfig:
     """AnyLoc (Keetha et al., RA-L 2023): DINOv2 value features and VLAD.
 
-    The layers are those that its authors recommend for each size of the network.
+    The layers are those that the authors recommend for each size of the network.
     """
     return ExtractorConfig(
         name=f"anyloc-{size}",
@@ -143,8 +144,8 @@ def _anyloc_config(
 
 
 EXTRACTOR_CONFIGS = {
-    recipe.name: recipe
-    for recipe in (
+    config.name: config
+    for config in (
         ExtractorConfig(
             name="efficientnet-lite0-vlad",
             backbone="efficientnet-lite0",
@@ -182,7 +183,7 @@ EXTRACTOR_CONFIGS = {
             backbone=SLOW_TEST_BACKBONE,
             width=7168,
             parameters=1_000,
-            preprocessing="square224",  # so that what is around it does its real work
+            preprocessing="square224",  # decoding and resizing do their real work
             aggregator="avg",
             for_tests=True,
         ),
@@ -191,44 +192,50 @@ EXTRACTOR_CONFIGS = {
 
 
 def get_extractor_config(name: str, *, allow_test_extractors: bool) -> ExtractorConfig:
-    """The recipe that `name` and its options mean; its own name is the canonical one.
+    """Parse an extractor name with options into its configuration.
 
-    Misconfigured: `unknown_extractor`, `test_extractor` (for tests, and not allowed),
-    `bad_extractor_option` (naming the option, its value, and what is allowed), and those of
-    `parse_torchhub_name` and `parse_trained_model_name`. Whether a torch.hub entry may be loaded,
-    `Settings.recipe` knows; whether a model was added, the catalog.
+    Whether a torch.hub entry may be loaded is up to `Settings.recipe`; whether a trained model was
+    added, up to the catalog.
+
+    Returns:
+        The configuration; its `name` is the canonical one.
+
+    Raises:
+        Misconfigured: `unknown_extractor`; `test_extractor` where extractors for tests are not
+            allowed; `bad_extractor_option` with the option, its value and the allowed ones; those
+            of `parse_torchhub_name` and `parse_trained_model_name`.
     """
     if name.startswith(TORCHHUB_PREFIX):
         return _torchhub_config(parse_torchhub_name(name))
     if name.startswith(TRAINED_PREFIX):
         return _trained_config(parse_trained_model_name(name))
-    base, colon, written = name.partition(":")
-    recipe = EXTRACTOR_CONFIGS.get(base)
-    if recipe is None:
-        known = ", ".join(sorted(r.name for r in EXTRACTOR_CONFIGS.values() if not r.for_tests))
+    base, colon, options = name.partition(":")
+    config = EXTRACTOR_CONFIGS.get(base)
+    if config is None:
+        known = ", ".join(sorted(c.name for c in EXTRACTOR_CONFIGS.values() if not c.for_tests))
         raise Misconfigured(
             "unknown_extractor",
-            f"There is no extractor {base!r}. Known: {known}, "
+            f"There is no extractor {base!r}. Available: {known}, "
             f"{TORCHHUB_PREFIX}OWNER/NAME@COMMIT:ENTRY, and "
-            f"{TRAINED_PREFIX}NAME of a model that was added (EXTRACTOR).",
+            f"{TRAINED_PREFIX}NAME for a model that was added.",
         )
-    if recipe.for_tests and not allow_test_extractors:
+    if config.for_tests and not allow_test_extractors:
         raise Misconfigured(
             "test_extractor",
-            f"The extractor {base!r} exists for tests and knows nothing of places. "
-            "Tests set ALLOW_TEST_EXTRACTORS=true.",
+            f"The extractor {base!r} is only for tests and can't recognise places. "
+            "Set ALLOW_TEST_EXTRACTORS=true in tests, or choose another one.",
         )
-    return _apply_options(recipe, written) if colon else recipe
+    return _apply_options(config, options) if colon else config
 
 
 def _torchhub_config(hub: TorchHubEntry) -> ExtractorConfig:
-    usual = hub.height == hub.width == DEFAULT_INPUT_SIDE_PIXELS
+    is_default_size = hub.height == hub.width == DEFAULT_INPUT_SIDE_PIXELS
     return ExtractorConfig(
         name=hub.name,
         backbone=TORCHHUB_BACKBONE,
         width=None,
         parameters=None,
-        preprocessing="square224" if usual else f"resize{hub.height}x{hub.width}",
+        preprocessing="square224" if is_default_size else f"resize{hub.height}x{hub.width}",
         aggregator="none",
         hub=hub,
     )
@@ -247,82 +254,80 @@ def _trained_config(trained: TrainedModelName) -> ExtractorConfig:
 
 
 def add_extractor_options(name: str, options: Mapping[str, object]) -> str:
-    """The name of an extractor, which may carry options, with further ones; None is left out."""
-    written = [f"{option}={value}" for option, value in options.items() if value is not None]
-    if not written:
+    """Append options to an extractor name, which may have options; None values are left out."""
+    texts = [f"{option}={value}" for option, value in options.items() if value is not None]
+    if not texts:
         return name
-    return name + ("," if ":" in name else ":") + ",".join(written)
+    return name + ("," if ":" in name else ":") + ",".join(texts)
 
 
-def _apply_options(recipe: ExtractorConfig, written: str) -> ExtractorConfig:
-    """`recipe` with the options of `option=value,option=value`."""
-    own = recipe
+def _apply_options(base: ExtractorConfig, options: str) -> ExtractorConfig:
+    """Return `base` with the options of `option=value,option=value`."""
+    config = base
     values: dict[str, str] = {}
-    for part in written.split(","):
+    for part in options.split(","):
         option, _, value = part.partition("=")
         if option in values:
-            raise _bad_option(f"The option {option} of {own.name} is given twice.")
+            raise _bad_option_error(f"The option {option} of {base.name} is given twice.")
         values[option] = value
-    # First: some options are about one aggregator only.
+    # The aggregator first: some options exist for one aggregator only.
     for option in sorted(values, key=lambda option: option != "aggregator"):
-        allowed = _allowed_options(own, recipe)
+        allowed = _allowed_options(base, config)
         if option not in allowed:
-            raise _bad_option(
-                f"The extractor {own.name} has no option {option!r}"
-                + (f" with {recipe.aggregator}" if recipe.aggregator != own.aggregator else "")
+            raise _bad_option_error(
+                f"The extractor {base.name} has no option {option!r}"
+                + (f" with {config.aggregator}" if config.aggregator != base.aggregator else "")
                 + (f". Its options: {', '.join(sorted(allowed))}." if allowed else ". It has none.")
             )
-        read, expected = allowed[option]
+        parse, expected = allowed[option]
         try:
-            recipe = replace(recipe, **{option: read(values[option])})
+            config = replace(config, **{option: parse(values[option])})
         except ValueError:
-            raise _bad_option(
-                f"The option {option}={values[option]} of {own.name} can't be used: "
+            raise _bad_option_error(
+                f"The option {option}={values[option]} of {base.name} can't be used: "
                 f"{option} is {expected}."
             ) from None
-    differing = {
-        option: f"{option}={_text(getattr(recipe, option))}"
+    changed = {
+        option: f"{option}={_format_value(getattr(config, option))}"
         for option in sorted(values)
-        if getattr(recipe, option) != getattr(own, option)
+        if getattr(config, option) != getattr(base, option)
     }
-    if not differing:
-        return own
+    if not changed:
+        return base
     return replace(
-        recipe,
-        name=f"{own.name}:{','.join(differing.values())}",
-        shipped_vocabulary=own.shipped_vocabulary if recipe.needs_vocabulary else None,
+        config,
+        name=f"{base.name}:{','.join(changed.values())}",
+        shipped_vocabulary=base.shipped_vocabulary if config.needs_vocabulary else None,
     )
 
 
 OptionParser = tuple[Callable[[str], Any], str]
 
 
-def _allowed_options(own: ExtractorConfig, chosen: ExtractorConfig) -> dict[str, OptionParser]:
-    """How options are read, and what a refusal says is allowed: those of the recipe `own`, once
-    its aggregator is that of `chosen`.
-    """
+def _allowed_options(base: ExtractorConfig, config: ExtractorConfig) -> dict[str, OptionParser]:
+    """Return parser and description of the options of `base`, with the aggregator of `config`."""
     allowed: dict[str, OptionParser] = {}
-    if own.needs_vocabulary:
+    if base.needs_vocabulary:
         allowed["aggregator"] = _one_of(EXTRACTOR_AGGREGATORS)
         allowed["preprocessing"] = _one_of(PREPROCESSING_NAMES)
-    if chosen.needs_vocabulary:
+    if config.needs_vocabulary:
         allowed["clusters"] = (
             _integer_between(1, MAX_CLUSTERS),
             f"a whole number from 1 to {MAX_CLUSTERS}",
         )
-    if chosen.aggregator == "soft-vlad":
+    if config.aggregator == "soft-vlad":
         allowed["temperature"] = (
-            _temperature,
+            _parse_temperature,
             f"a number above 0 and up to {MAX_TEMPERATURE}, such as 0.5",
         )
-    if own.depth is not None:
-        last = own.depth - 1
+    if base.depth is not None:
+        last = base.depth - 1
         allowed["facet"] = _one_of(FACETS)
         allowed["layer"] = (
             _integer_between(0, last),
-            f"a whole number from 0 to {last} ({own.backbone} has {own.depth} blocks)",
+            f"a whole number from 0 to {last} ({base.backbone} has {base.depth} blocks)",
         )
-    if own.backbone == SLOW_TEST_BACKBONE:
+    if base.backbone == SLOW_TEST_BACKBONE:
         allowed["milliseconds"] = (
             _integer_between(0, MAX_MILLISECONDS),
             f"a whole number from 0 to {MAX_MILLISECONDS}, for each photo",
@@ -334,27 +339,27 @@ def _allowed_options(own: ExtractorConfig, chosen: ExtractorConfig) -> dict[str,
     return allowed
 
 
-def _integer_between(least: int, most: int) -> Callable[[str], int]:
-    def read(value: str) -> int:
-        # int() would also take "+9", "1_0" and other scripts' digits.
-        if not (value.isascii() and value.isdigit()) or not least <= int(value) <= most:
+def _integer_between(minimum: int, maximum: int) -> Callable[[str], int]:
+    def parse(value: str) -> int:
+        # int() would also accept "+9", "1_0" and the digits of other scripts.
+        if not (value.isascii() and value.isdigit()) or not minimum <= int(value) <= maximum:
             raise ValueError(value)
         return int(value)
 
-    return read
+    return parse
 
 
 def _one_of(names: tuple[str, ...]) -> OptionParser:
-    def read(value: str) -> str:
+    def parse(value: str) -> str:
         if value not in names:
             raise ValueError(value)
         return value
 
-    return read, f"one of {', '.join(names)}"
+    return parse, f"one of {', '.join(names)}"
 
 
-def _temperature(value: str) -> float:
-    # float() would also take "1e3", "1_0" and "inf"; six digits are written again as they were.
+def _parse_temperature(value: str) -> float:
+    # float() would also accept "1e3", "1_0" and "inf". Up to six decimals are reproduced exactly.
     if not re.fullmatch(r"[0-9]{1,4}(\.[0-9]{1,6})?", value):
         raise ValueError(value)
     if not 0 < float(value) <= MAX_TEMPERATURE:
@@ -362,10 +367,10 @@ def _temperature(value: str) -> float:
     return float(value)
 
 
-def _text(value: object) -> str:
-    """As the option is written in a canonical name: 2 for 2.0."""
+def _format_value(value: object) -> str:
+    """Format an option's value as in a canonical name: 2 for 2.0."""
     return f"{value:.6f}".rstrip("0").rstrip(".") if isinstance(value, float) else str(value)
 
 
-def _bad_option(detail: str) -> Misconfigured:
+def _bad_option_error(detail: str) -> Misconfigured:
     return Misconfigured("bad_extractor_option", detail)

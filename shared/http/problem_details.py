@@ -1,4 +1,7 @@
-"""Every error leaves as an RFC 9457 problem with a stable `code`, never with a trace."""
+"""Exception handlers that convert every error into an RFC 9457 problem document.
+
+Each has a stable `code`; a traceback is never sent, only logged.
+"""
 
 from __future__ import annotations
 
@@ -21,18 +24,20 @@ from shared.telemetry.tracing import REQUEST_ID_HEADER
 
 log = logging.getLogger(__name__)
 
-RETRY_AFTER_SECONDS = 2  # of a 503 that knows no better
+RETRY_AFTER_SECONDS = 2  # default of a 503 without `retry_after_seconds`
 REQUEST_ID_SCOPE_KEY = "placewise.request_id"
-"""Of an ASGI scope: the call's id, where the service gives its calls ids."""
-CLOSED_WITH = "placewise.closed_with"
-"""Of an ASGI scope: what the server answered itself before it closed the connection."""
+"""ASGI scope key of the request id, in services that assign one."""
+CLOSED_STATUS_SCOPE_KEY = "placewise.closed_with"
+"""ASGI scope key of the status that the server sent itself before it closed the connection."""
 CLIENT_GONE = 499
-"""The status of a call whose client has closed the connection: for logs and figures alone."""
+"""Status of a request whose client closed the connection; only for logs and metrics."""
 HTTP_CODES = {400: "malformed_body", 404: "path_not_found", 405: "method_not_allowed"}
 
 
 class Problem(BaseModel):
-    """RFC 9457; `code` is stable, `detail` is for people. More members may follow."""
+    """An RFC 9457 problem document; `code` is stable, `detail` is for people.
+
+    There may be further members."""
 
     model_config = ConfigDict(extra="allow")
 
@@ -43,53 +48,60 @@ class Problem(BaseModel):
     code: str
 
 
-# What the description of every call promises beside its success.
+# The error responses of every operation in the OpenAPI description.
 PROBLEM_RESPONSES: dict[int | str, dict[str, Any]] = {
     "4XX": {
-        "description": "The request can't be met; `code` says why.",
+        "description": "The request was rejected; `code` gives the reason.",
         "content": {"application/problem+json": {"schema": Problem.model_json_schema()}},
     },
     "5XX": {
-        "description": "Not the caller's fault; with `Retry-After` it may work later.",
+        "description": "A failure of the server; retry after `Retry-After` seconds if it is set.",
         "content": {"application/problem+json": {"schema": Problem.model_json_schema()}},
     },
 }
 
-# The same for whoever calls without a key, with too little of one, or too often.
+# The error responses of authentication, authorization and the rate limit.
 AUTHENTICATION_RESPONSES: dict[int | str, dict[str, Any]] = {
-    401: {**PROBLEM_RESPONSES["4XX"], "description": "No key, or one that is no longer good."},
-    403: {**PROBLEM_RESPONSES["4XX"], "description": "The key lacks the scope of this call."},
+    401: {
+        **PROBLEM_RESPONSES["4XX"],
+        "description": "The API key is missing, unknown, revoked or expired.",
+    },
+    403: {
+        **PROBLEM_RESPONSES["4XX"],
+        "description": "The API key lacks the scope of this operation.",
+    },
     429: {
         **PROBLEM_RESPONSES["4XX"],
-        "description": "Too much at once; again after `Retry-After` seconds.",
+        "description": "Rate limit, quota or backpressure; retry after `Retry-After` seconds.",
     },
 }
 
 
 def install_exception_handlers(app: FastAPI) -> None:
-    """Turn whatever is raised in a route into a problem document."""
+    """Register the handlers that convert exceptions of routes into problem documents."""
     app.add_exception_handler(PlacewiseError, _handle_placewise_error)
     app.add_exception_handler(RequestValidationError, _handle_validation_error)
     app.add_exception_handler(HTTPException, _handle_http_exception)
     app.add_exception_handler(SQLAlchemyError, _handle_database_error)
-    app.add_exception_handler(ClientDisconnect, _on_client_gone)
+    app.add_exception_handler(ClientDisconnect, _handle_client_disconnect)
     app.add_exception_handler(Exception, handle_unexpected_error)
 
 
 def problem_response(error: PlacewiseError, request: Request) -> JSONResponse:
+    """Return the problem document of an error, with its headers."""
     headers = {}
-    # Where the call's log does not reach: the handler of what nobody foresaw.
+    # Set here too, since the response of an unhandled exception bypasses the request log.
     if (request_id := request.scope.get(REQUEST_ID_SCOPE_KEY)) is not None:
         headers[REQUEST_ID_HEADER] = request_id
     if error.status == 401:
         headers["WWW-Authenticate"] = "Bearer"
-    wait = error.extra.get("retry_after_seconds")
-    if wait is None and error.status == 503:
-        wait = RETRY_AFTER_SECONDS
-    if wait is not None:
-        headers["Retry-After"] = str(math.ceil(wait))
+    retry_after = error.extra.get("retry_after_seconds")
+    if retry_after is None and error.status == 503:
+        retry_after = RETRY_AFTER_SECONDS
+    if retry_after is not None:
+        headers["Retry-After"] = str(math.ceil(retry_after))
     if error.status == 413:
-        headers["Connection"] = "close"  # the rest of the body stays unread
+        headers["Connection"] = "close"  # the rest of the body is not read
     return JSONResponse(
         {**error.as_problem(), "instance": request.url.path},
         status_code=error.status,
@@ -109,24 +121,24 @@ async def _handle_placewise_error(request: Request, error: Exception) -> JSONRes
 
 async def _handle_validation_error(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, RequestValidationError)
-    faults = error.errors()
-    if any(fault["type"] == "json_invalid" for fault in faults):
+    failures = error.errors()
+    if any(failure["type"] == "json_invalid" for failure in failures):
         problem: PlacewiseError = InvalidRequest("malformed_body", "The body is not valid JSON.")
     else:
         errors = [
             {
-                "field": ".".join(str(part) for part in fault["loc"][1:]),
-                "detail": fault["msg"],
+                "field": ".".join(str(part) for part in failure["loc"][1:]),
+                "detail": failure["msg"],
             }
-            for fault in faults
+            for failure in failures
         ]
-        named = "; ".join(f"{e['field'] or 'body'}: {e['detail']}" for e in errors)
-        problem = Unprocessable("invalid_field", named, errors=errors)
+        detail = "; ".join(f"{e['field'] or 'body'}: {e['detail']}" for e in errors)
+        problem = Unprocessable("invalid_field", detail, errors=errors)
     return problem_response(problem, request)
 
 
 async def _handle_http_exception(request: Request, error: Exception) -> JSONResponse:
-    """Unknown paths and methods, as Starlette raises them."""
+    """Handle Starlette's exceptions, for example of unknown paths and methods."""
     assert isinstance(error, HTTPException)
     code = HTTP_CODES.get(error.status_code, "http_error")
     return JSONResponse(
@@ -146,17 +158,17 @@ async def _handle_http_exception(request: Request, error: Exception) -> JSONResp
 
 async def _handle_database_error(request: Request, error: Exception) -> JSONResponse:
     unavailable = to_unavailable(error)
-    if unavailable is None:  # a bug: another try would meet it again
+    if unavailable is None:  # a bug, which a retry would not fix
         return await handle_unexpected_error(request, error)
     return await _handle_placewise_error(request, unavailable)
 
 
-async def _on_client_gone(request: Request, error: Exception) -> Response:
-    return Response(status_code=CLIENT_GONE)  # nobody gets it
+async def _handle_client_disconnect(request: Request, error: Exception) -> Response:
+    return Response(status_code=CLIENT_GONE)  # never received; for logs and metrics
 
 
 async def handle_unexpected_error(request: Request, error: Exception) -> JSONResponse:
-    """What is said of a fault of ours: an id, by which the log tells the rest."""
+    """Convert an unhandled exception into an opaque 500 with the request id, and log it."""
     request_id = request.scope.get(REQUEST_ID_SCOPE_KEY) or str(new_id())
     log.error(
         "%s %s failed (request %s)",
@@ -168,7 +180,8 @@ async def handle_unexpected_error(request: Request, error: Exception) -> JSONRes
     )
     problem = PlacewiseError(
         "internal_error",
-        f"Something went wrong here; the server's log says what, at {request_id}.",
+        f"An unexpected error occurred. The server's log has its details under the request id "
+        f"{request_id}.",
         request_id=request_id,
     )
     return problem_response(problem, request)

@@ -1,5 +1,5 @@
-"""How a photo comes in: the same for one upload and for each photo of a batch.
+"""Photo ingestion, the same for single uploads and for each photo of a batch.
 
-`received` watches its bytes while they go into the object store, `incoming` checks what lies there,
-`store_photo` makes its row and its job. `manifest` reads what lists say of many photos.
+`validation` checks the bytes while they are written to the object store and reads the header,
+`photo_metadata` parses form fields and manifests, `store_photo` inserts the photo and its job.
 """

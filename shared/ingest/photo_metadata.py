@@ -1,10 +1,8 @@
-"""What people say of a photo: read from form fields and JSON alike, each error naming its field.
+"""Photo metadata of uploads: form fields, CSV tables and JSONL manifests.
 
-Lists that say where many photos were taken: CSV tables and JSONL manifests.
-
-Both give the upload form's fields by a photo's name. A list that can't be understood is refused
-as a whole, and the refusal names its lines; a value that is wrong (a latitude of 95) is its photo's
-own error, found when that photo comes in.
+Every error names its field. CSV tables and JSONL manifests give the fields of the upload form by
+photo name. A manifest that can't be parsed is rejected as a whole, with its line numbers. A wrong
+value (a latitude of 95) is an error of its photo alone, reported when that photo is stored.
 """
 
 from __future__ import annotations
@@ -24,16 +22,16 @@ from shared.errors import InvalidRequest, PlacewiseError, TooLarge, invalid_fiel
 
 MAX_TAGS = 50
 MAX_METADATA_CHARACTERS = 100_000
-MAX_METADATA_DEPTH = 32  # what writes answers gives up at 255 levels
+MAX_METADATA_DEPTH = 32  # serialising a response fails at 255 levels
 MAX_TEXT_CHARACTERS = 500  # characters of a tag or a place
 
-# A NUL as JSON writes it; after an escaped backslash the same letters are plain text.
+# An escaped NUL in JSON; after an escaped backslash the same characters are plain text.
 JSON_NUL = re.compile(r"(?<!\\)(?:\\\\)*\\u0000")
 
 
 @dataclass(frozen=True, slots=True)
 class PhotoFields:
-    """None means "not said"."""
+    """Metadata of a photo as the client sent it; None for a missing field."""
 
     latitude: float | None = None
     longitude: float | None = None
@@ -49,37 +47,51 @@ FORM_FIELDS = tuple(PhotoFields.__slots__)
 
 
 def read_form_fields(form: dict[str, str]) -> PhotoFields:
-    """The form's text fields; an empty one counts as not said, an unknown one is refused."""
+    """Parse the text fields of the upload form.
+
+    An empty field counts as missing.
+
+    Raises:
+        Unprocessable: `invalid_field` for an invalid value or an unknown field.
+    """
     for name in form:
         if name not in FORM_FIELDS:
-            raise invalid_field_error(name, f"is unknown; known are {', '.join(FORM_FIELDS)}")
-    said = {name: value.strip() for name, value in form.items() if value.strip()}
+            raise invalid_field_error(
+                name, f"is unknown; the known fields are {', '.join(FORM_FIELDS)}"
+            )
+    values = {name: value.strip() for name, value in form.items() if value.strip()}
     fields = PhotoFields(
-        latitude=_number(said, "latitude", -90, 90),
-        longitude=_number(said, "longitude", -180, 180),
-        heading=_heading(said),
-        captured_at=parse_time("captured_at", said["captured_at"])
-        if "captured_at" in said
+        latitude=_number(values, "latitude", -90, 90),
+        longitude=_number(values, "longitude", -180, 180),
+        heading=_heading(values),
+        captured_at=parse_time("captured_at", values["captured_at"])
+        if "captured_at" in values
         else None,
-        place=_text("place", said["place"]) if "place" in said else None,
-        tags=parse_tags(said["tags"].split(",")) if "tags" in said else None,
-        metadata=_metadata(said["metadata"]) if "metadata" in said else None,
-        role=_role(said["role"]) if "role" in said else None,
+        place=_text("place", values["place"]) if "place" in values else None,
+        tags=parse_tags(values["tags"].split(",")) if "tags" in values else None,
+        metadata=_metadata(values["metadata"]) if "metadata" in values else None,
+        role=_role(values["role"]) if "role" in values else None,
     )
     check_coordinate_pair(fields.latitude, fields.longitude)
     return fields
 
 
 def check_coordinate_pair(latitude: float | None, longitude: float | None) -> None:
-    """Coordinates come in pairs."""
+    """Raise Unprocessable (`invalid_field`) where only one coordinate is set."""
     if (latitude is None) != (longitude is None):
         missing = "latitude" if latitude is None else "longitude"
-        raise invalid_field_error(missing, "is missing: coordinates come in pairs")
+        raise invalid_field_error(
+            missing, "is missing: set both latitude and longitude, or neither"
+        )
 
 
 def parse_time(field: str, text: str) -> datetime:
-    """ISO 8601; a time without an offset is taken as UTC."""
-    # In an address `+` means a blank, and few people write %2B.
+    """Parse an ISO 8601 time into UTC; without an offset it is UTC.
+
+    Raises:
+        Unprocessable: `invalid_field`.
+    """
+    # A `+` in a query string is decoded as a blank unless the client wrote %2B.
     text = re.sub(r"(?<=:\d\d) (?=\d\d:?\d\d$)", "+", text)
     try:
         parsed = datetime.fromisoformat(text)
@@ -95,27 +107,29 @@ def parse_time(field: str, text: str) -> datetime:
 
 
 def parse_tags(tags: list[str]) -> list[str]:
-    """Trimmed, without doubles, in the order given."""
-    kept = list(dict.fromkeys(_text("tags", tag.strip()) for tag in tags if tag.strip()))
-    if len(kept) > MAX_TAGS:
-        raise invalid_field_error("tags", f"at most {MAX_TAGS} tags")
-    return kept
+    """Strip and deduplicate tags, keeping their order."""
+    unique = list(dict.fromkeys(_text("tags", tag.strip()) for tag in tags if tag.strip()))
+    if len(unique) > MAX_TAGS:
+        raise invalid_field_error("tags", f"at most {MAX_TAGS} tags are allowed")
+    return unique
 
 
-def _number(said: dict[str, str], field: str, least: float, most: float) -> float | None:
-    if field not in said:
+def _number(values: dict[str, str], field: str, minimum: float, maximum: float) -> float | None:
+    if field not in values:
         return None
     try:
-        number = float(said[field])
+        number = float(values[field])
     except ValueError:
-        raise invalid_field_error(field, f"{said[field]!r} is not a number") from None
-    if not math.isfinite(number) or not least <= number <= most:
-        raise invalid_field_error(field, f"{said[field]} is not between {least:g} and {most:g}")
+        raise invalid_field_error(field, f"{values[field]!r} is not a number") from None
+    if not math.isfinite(number) or not minimum <= number <= maximum:
+        raise invalid_field_error(
+            field, f"{values[field]} is not between {minimum:g} and {maximum:g}"
+        )
     return number
 
 
-def _heading(said: dict[str, str]) -> float | None:
-    heading = _number(said, "heading", 0, 360)
+def _heading(values: dict[str, str]) -> float | None:
+    heading = _number(values, "heading", 0, 360)
     return None if heading is None else heading % 360
 
 
@@ -123,7 +137,7 @@ def _text(field: str, text: str) -> str:
     if len(text) > MAX_TEXT_CHARACTERS:
         raise invalid_field_error(field, f"is longer than {MAX_TEXT_CHARACTERS} characters")
     if "\0" in text:
-        raise invalid_field_error(field, "holds a NUL character")
+        raise invalid_field_error(field, "contains a NUL character")
     return text
 
 
@@ -137,19 +151,24 @@ def _role(text: str) -> PhotoRole:
 
 
 def _metadata(text: str) -> dict[str, Any]:
-    refusal: PlacewiseError = invalid_field_error("metadata", "is not a JSON object")
+    error: PlacewiseError = invalid_field_error("metadata", "is not a JSON object")
     try:
         value = json.loads(text, parse_constant=_reject_constant)
     except (ValueError, RecursionError):
-        raise refusal from None
+        raise error from None
     if not isinstance(value, dict):
-        raise refusal
+        raise error
     check_metadata(value)
     return value
 
 
 def check_metadata(value: dict[str, Any]) -> None:
-    """Refuse what a JSON column can't hold, and what no answer could carry."""
+    """Reject metadata that a JSON column can't store or a response can't contain.
+
+    Raises:
+        Unprocessable: `invalid_field`.
+        TooLarge: `fields_too_large`.
+    """
     if _is_deeper_than(MAX_METADATA_DEPTH, value):
         raise invalid_field_error(
             "metadata", f"is nested more than {MAX_METADATA_DEPTH} levels deep"
@@ -158,15 +177,15 @@ def check_metadata(value: dict[str, Any]) -> None:
         text = json.dumps(value, ensure_ascii=False, allow_nan=False)
         text.encode()
     except UnicodeEncodeError:
-        raise invalid_field_error("metadata", "holds half of a surrogate pair") from None
+        raise invalid_field_error("metadata", "contains an unpaired surrogate") from None
     except ValueError:
-        raise invalid_field_error("metadata", "holds a number that is not finite") from None
+        raise invalid_field_error("metadata", "contains a number that is not finite") from None
     if len(text) > MAX_METADATA_CHARACTERS:
         raise TooLarge(
             "fields_too_large", f"metadata is longer than {MAX_METADATA_CHARACTERS} characters."
         )
     if JSON_NUL.search(text):
-        raise invalid_field_error("metadata", "holds a NUL character")
+        raise invalid_field_error("metadata", "contains a NUL character")
 
 
 def _reject_constant(name: str) -> Any:
@@ -174,39 +193,44 @@ def _reject_constant(name: str) -> Any:
 
 
 def _is_deeper_than(levels: int, value: Any) -> bool:
-    """Are more than `levels` objects and lists nested in each other? Asked without recursion."""
-    left = [(value, 1)]
-    while left:
-        item, depth = left.pop()
+    """Return whether objects and lists are nested deeper than `levels`, without recursion."""
+    stack = [(value, 1)]
+    while stack:
+        item, depth = stack.pop()
         if isinstance(item, dict | list):
             if depth > levels:
                 return True
             children = item.values() if isinstance(item, dict) else item
-            left.extend((child, depth + 1) for child in children)
+            stack.extend((child, depth + 1) for child in children)
     return False
 
 
 MAX_MANIFEST_BYTES = 32 * 1024 * 1024
 NAME_COLUMNS = ("filename", "file", "path")
 CSV_COLUMNS = ("latitude", "longitude", "heading", "captured_at", "place", "tags")
-KEY_FIELD = "key"  # of a manifest of objects that lie in the store
-MAX_REPORTED_LINES = 20  # bad lines that a refusal names
+KEY_FIELD = "key"  # in a manifest of objects to import
+MAX_REPORTED_LINES = 20  # bad lines in an error message
 
 
 @dataclass(frozen=True, slots=True)
 class ManifestEntry:
-    """What one line says of one photo."""
+    """One line of a manifest: the metadata of one photo."""
 
     line: int
     name: str
     fields: dict[str, str]
-    """In the upload form's names; what is empty is left out."""
+    """Values by the names of the upload form, without empty ones."""
 
 
 def read_csv_manifest(data: bytes, source_name: str) -> list[ManifestEntry]:
-    """The rows of a table with a column of names (NAME_COLUMNS) and any of CSV_COLUMNS.
+    """Parse a CSV table with a column of names (NAME_COLUMNS) and any of CSV_COLUMNS.
 
-    Raises InvalidRequest (`bad_table`) that calls the table `source_name`.
+    Args:
+        data: the file's bytes, UTF-8.
+        source_name: name of the table in error messages.
+
+    Raises:
+        InvalidRequest: `bad_table`.
     """
     try:
         reader = csv.DictReader(io.StringIO(data.decode("utf-8-sig"), newline=""))
@@ -215,23 +239,23 @@ def read_csv_manifest(data: bytes, source_name: str) -> list[ManifestEntry]:
         if name_column is None:
             raise InvalidRequest(
                 "bad_table",
-                f"{source_name} has no column {' or '.join(NAME_COLUMNS)}; "
-                f"beside it may stand {', '.join(CSV_COLUMNS)}. Its first line, read as "
-                f"separated by commas, is {', '.join(columns) or 'empty'}.",
+                f"{source_name} has no column {' or '.join(NAME_COLUMNS)}. Further columns may be "
+                f"{', '.join(CSV_COLUMNS)}. The first line, split at commas, is "
+                f"{', '.join(columns) or 'empty'}.",
             )
         unknown = [c for c in columns if c not in (name_column, *CSV_COLUMNS)]
         if unknown:
             raise InvalidRequest(
                 "bad_table",
-                f"{source_name}: the columns {', '.join(unknown)} mean nothing here. Known are "
-                f"{name_column}, {', '.join(CSV_COLUMNS)}: rename them, or take them out.",
+                f"{source_name}: the columns {', '.join(unknown)} are unknown. Rename or remove "
+                f"them; the known columns are {name_column}, {', '.join(CSV_COLUMNS)}.",
             )
-        said: list[ManifestEntry] = []
+        entries: list[ManifestEntry] = []
         seen: dict[str, int] = {}
         for row in reader:
             name = row[name_column] or ""  # a short row has None
             if name in seen:
-                fault = f"{name!r} stands in line {seen[name]} already"
+                fault = f"{name!r} is already in line {seen[name]}"
                 raise bad_lines_error("bad_table", source_name, [(reader.line_num, fault)])
             seen[name] = reader.line_num
             if None in row:
@@ -240,11 +264,11 @@ def read_csv_manifest(data: bytes, source_name: str) -> list[ManifestEntry]:
                 )
             if any("\0" in cell for cell in row.values() if cell):
                 raise bad_lines_error(
-                    "bad_table", source_name, [(reader.line_num, "holds a NUL character")]
+                    "bad_table", source_name, [(reader.line_num, "contains a NUL character")]
                 )
             fields = {c: row[c] for c in CSV_COLUMNS if row.get(c)}
-            said.append(ManifestEntry(reader.line_num, name, fields))
-        return said
+            entries.append(ManifestEntry(reader.line_num, name, fields))
+        return entries
     except (UnicodeDecodeError, csv.Error) as error:
         raise InvalidRequest("bad_table", f"Can't read {source_name}: {error}") from error
 
@@ -252,35 +276,42 @@ def read_csv_manifest(data: bytes, source_name: str) -> list[ManifestEntry]:
 def read_jsonl_manifest(
     data: bytes, source_name: str, name_fields: Sequence[str] = NAME_COLUMNS
 ) -> list[ManifestEntry]:
-    """The lines of a manifest: JSON objects with a name and any of the upload form's fields.
+    """Parse a JSONL manifest: objects with a name and any of the upload form's fields.
 
-    `tags` may be a list, `metadata` an object. Empty lines are passed over. Raises InvalidRequest
-    (`bad_manifest`), which names the first MOST_NAMED bad lines.
+    `tags` may be a list, `metadata` an object. Empty lines are skipped.
+
+    Args:
+        data: the file's bytes, UTF-8.
+        source_name: name of the manifest in error messages.
+        name_fields: members that may contain the name.
+
+    Raises:
+        InvalidRequest: `bad_manifest`, with the first MAX_REPORTED_LINES bad lines.
     """
-    said: list[ManifestEntry] = []
+    entries: list[ManifestEntry] = []
     bad: list[tuple[int, str]] = []
     seen: dict[str, int] = {}
     for number, line in _lines(data):
         try:
-            one = _read_line(number, line, name_fields)
+            entry = _parse_line(number, line, name_fields)
         except ValueError as error:
             bad.append((number, str(error)))
         else:
-            if one.name in seen:
-                bad.append((number, f"{one.name!r} stands in line {seen[one.name]} already"))
-            seen.setdefault(one.name, number)
-            said.append(one)
+            if entry.name in seen:
+                bad.append((number, f"{entry.name!r} is already in line {seen[entry.name]}"))
+            seen.setdefault(entry.name, number)
+            entries.append(entry)
         if len(bad) == MAX_REPORTED_LINES:
             break
     if bad:
         raise bad_lines_error("bad_manifest", source_name, bad)
-    return said
+    return entries
 
 
 def bad_lines_error(
     code: str, source_name: str, lines: Sequence[tuple[int, str]]
 ) -> PlacewiseError:
-    """The refusal of a list for what is wrong in its lines, by their numbers from 1."""
+    """Return the error for bad lines of a manifest: (line number from 1, detail)."""
     return InvalidRequest(
         code,
         "; ".join(f"{source_name}, line {line}: {detail}" for line, detail in lines) + ".",
@@ -294,8 +325,8 @@ def _lines(data: bytes) -> Iterator[tuple[int, bytes]]:
             yield number, line
 
 
-def _read_line(number: int, line: bytes, name_fields: Sequence[str]) -> ManifestEntry:
-    """ValueError says what is wrong with the line."""
+def _parse_line(number: int, line: bytes, name_fields: Sequence[str]) -> ManifestEntry:
+    """Parse one line; ValueError with the reason for a bad one."""
     try:
         values = json.loads(line)
     except (ValueError, RecursionError):
@@ -307,19 +338,19 @@ def _read_line(number: int, line: bytes, name_fields: Sequence[str]) -> Manifest
         raise ValueError(f"has no {' or '.join(name_fields)}")
     name = values.pop(name_field)
     if not isinstance(name, str) or not name:
-        raise ValueError(f"{name_field} is no text")
+        raise ValueError(f"{name_field} is not a non-empty string")
     _check_text(name_field, name)
     fields = {}
     for field, value in values.items():
         if field not in FORM_FIELDS:
-            raise ValueError(f"{field} is unknown; known are {', '.join(FORM_FIELDS)}")
+            raise ValueError(f"{field} is unknown; the known fields are {', '.join(FORM_FIELDS)}")
         if value is not None:
             fields[field] = _as_form_text(field, value)
     return ManifestEntry(number, name, fields)
 
 
 def _as_form_text(field: str, value: Any) -> str:
-    """A JSON value as the upload form has it."""
+    """Convert a JSON value to the text of the upload form."""
     if isinstance(value, str):
         _check_text(field, value)
         return value
@@ -327,7 +358,7 @@ def _as_form_text(field: str, value: Any) -> str:
         return json.dumps(value)
     if field == "tags" and isinstance(value, list):
         if not all(isinstance(tag, str) and "," not in tag for tag in value):
-            raise ValueError("tags are texts without commas")
+            raise ValueError("tags must be strings without commas")
         return _as_form_text(field, ",".join(value))
     if field in ("latitude", "longitude", "heading") and type(value) in (int, float):
         return repr(value)
@@ -335,10 +366,10 @@ def _as_form_text(field: str, value: Any) -> str:
 
 
 def _check_text(field: str, text: str) -> None:
-    """ValueError for what no database keeps."""
+    """Raise ValueError for text that the database can't store."""
     if "\0" in text:
-        raise ValueError(f"{field} holds a NUL character")
+        raise ValueError(f"{field} contains a NUL character")
     try:
         text.encode()
     except UnicodeEncodeError:
-        raise ValueError(f"{field} holds half of a surrogate pair") from None
+        raise ValueError(f"{field} contains an unpaired surrogate") from None

@@ -1,9 +1,7 @@
-"""From a received file to an acknowledged photo: its row and its job in one transaction.
+"""Storing a validated photo: its row and its job in one transaction, and the photo quota of keys.
 
-The bytes lie in the object store before the transaction begins. Whoever finds the same bytes
-already there, or loses the race for them, deletes its own object.
-
-How many photos may be stored through one key. Deleted photos make room again.
+The bytes are in the object store before the transaction begins. A caller whose photo already
+exists, or that loses a race for the same bytes, deletes its own object.
 """
 
 from __future__ import annotations
@@ -37,14 +35,16 @@ Result = TypeVar("Result")
 
 @dataclass(frozen=True, slots=True)
 class StoreResult:
+    """The stored photo and its job."""
+
     photo: Photo
     job: Job | None
     queued: bool
-    """False: the same bytes were there already and need no work."""
+    """False where the photo existed and needs no job."""
 
 
 BeforeCommit = Callable[[Session, StoreResult], StoreResult]
-"""Writes down what was stored in the transaction that stores it, and hands it on."""
+"""Callback inside the transaction that stores a photo; returns the result to use."""
 
 
 def store_photo(
@@ -54,10 +54,18 @@ def store_photo(
     incoming: ValidatedPhoto,
     before_commit: BeforeCommit,
 ) -> StoreResult:
-    """Acknowledge the photo, or the one with the same bytes that the map has already.
+    """Store a photo and queue its job, or return the map's photo with the same bytes.
 
-    Raises NotFound (`map_not_found`), and Conflict (`photo_differs`) when something else was said
-    of that one.
+    Args:
+        catalog: the catalog.
+        hints: notified when a job was queued.
+        map_name: name of the map.
+        incoming: the validated photo.
+        before_commit: called in the transaction with the result.
+
+    Raises:
+        NotFound: `map_not_found`.
+        Conflict: `photo_differs` when the same image exists with different metadata.
     """
     stored = retry_on_conflict(lambda: _store(catalog, map_name, incoming, before_commit))
     if stored.queued:
@@ -66,28 +74,29 @@ def store_photo(
 
 
 def retry_on_conflict(store: Callable[[], Result]) -> Result:
-    """`store`, a transaction with `insert_photo`; once more when it lost the race for its bytes."""
+    """Run a transaction with `insert_photo`; retry once when it lost a race for the same bytes."""
     try:
         return store()
     except IntegrityError:
-        # The same bytes were committed between our look and our insert: look again.
+        # The same bytes were committed between the lookup and the insert.
         return store()
 
 
 def insert_photo(
     session: Session, map_id: UUID, incoming: ValidatedPhoto, priority: Priority = Priority.UPLOAD
 ) -> StoreResult:
-    """The photo's row and its job's, in the caller's transaction.
+    """Insert the rows of a photo and its job in the caller's transaction.
 
-    Raises Conflict (`photo_differs`), and IntegrityError when the same bytes were committed since
-    the transaction has looked for them.
+    Raises:
+        Conflict: `photo_differs`.
+        IntegrityError: the same bytes were committed after the lookup in this transaction.
     """
     received, header, fields = incoming.received, incoming.header, incoming.fields
     existing = find_photo_by_sha256(session, map_id, received.sha256)
     if existing is not None:
         return _match_existing_photo(session, existing, fields)
     photo_id, job_id = new_id(), new_id()
-    said_where = fields.latitude is not None
+    has_coordinates = fields.latitude is not None
     photo = Photo(
         id=photo_id,
         map_id=map_id,
@@ -99,8 +108,8 @@ def insert_photo(
         size_bytes=received.size_bytes,
         width=header.width,
         height=header.height,
-        latitude=fields.latitude if said_where else header.latitude,
-        longitude=fields.longitude if said_where else header.longitude,
+        latitude=fields.latitude if has_coordinates else header.latitude,
+        longitude=fields.longitude if has_coordinates else header.longitude,
         heading=fields.heading if fields.heading is not None else header.heading,
         captured_at=fields.captured_at or header.captured_at,
         place=fields.place,
@@ -118,10 +127,11 @@ def insert_photo(
 
 
 def _store(
-    catalog: Catalog, map_name: str, incoming: ValidatedPhoto, keep: BeforeCommit
+    catalog: Catalog, map_name: str, incoming: ValidatedPhoto, before_commit: BeforeCommit
 ) -> StoreResult:
     with catalog.write() as session:
-        return keep(session, insert_photo(session, get_map(session, map_name).id, incoming))
+        stored = insert_photo(session, get_map(session, map_name).id, incoming)
+        return before_commit(session, stored)
 
 
 def _match_existing_photo(session: Session, photo: Photo, fields: PhotoFields) -> StoreResult:
@@ -129,8 +139,8 @@ def _match_existing_photo(session: Session, photo: Photo, fields: PhotoFields) -
     if differing:
         raise Conflict(
             "photo_differs",
-            "The map has a photo with the same bytes of which something else was said: "
-            f"{', '.join(differing)}. To change that: PATCH /api/v1/uploads/{photo.id}, or "
+            "The map already has the same image with different metadata: "
+            f"{', '.join(differing)}. To change it: PATCH /api/v1/uploads/{photo.id}, or "
             "`placewise index --update`.",
             file_id=str(photo.id),
             differing=differing,
@@ -143,7 +153,7 @@ def _match_existing_photo(session: Session, photo: Photo, fields: PhotoFields) -
 
 
 def _differing_fields(photo: Photo, fields: PhotoFields) -> list[str]:
-    """The fields that say something else of the photo than is stored."""
+    """Return the sent fields whose values differ from the stored ones."""
     stored = {
         "latitude": photo.latitude,
         "longitude": photo.longitude,
@@ -154,18 +164,18 @@ def _differing_fields(photo: Photo, fields: PhotoFields) -> list[str]:
         "metadata": photo.attributes,
         "role": photo.role,
     }
-    said = {name: getattr(fields, name) for name in stored}
+    sent = {name: getattr(fields, name) for name in stored}
     return [
         name
-        for name, value in said.items()
+        for name, value in sent.items()
         if value is not None and not _values_match(value, stored[name])
     ]
 
 
-def _values_match(said: Any, stored: Any) -> bool:
-    if isinstance(said, float) and isinstance(stored, float):
-        return abs(said - stored) <= COORDINATE_TOLERANCE_DEGREES
-    return bool(said == stored)
+def _values_match(sent: Any, stored: Any) -> bool:
+    if isinstance(sent, float) and isinstance(stored, float):
+        return abs(sent - stored) <= COORDINATE_TOLERANCE_DEGREES
+    return bool(sent == stored)
 
 
 RECOUNT_SECONDS = 10.0
@@ -175,56 +185,61 @@ QUOTA_RETRY_SECONDS = 3600
 
 @dataclass(slots=True)
 class KeyPhotos:
-    """The photos of one key as this process knows them, under `lock`."""
+    """Cached photo count of one key, guarded by `lock`."""
 
     lock: threading.Lock = field(default_factory=threading.Lock)
     counted_at: float = -RECOUNT_SECONDS
     counted: int = 0
-    """In the catalog, at `counted_at` (monotonic seconds)."""
+    """Count in the catalog at `counted_at` (monotonic seconds)."""
     stored: int = 0
-    """By this process since then, at most: bytes that were there already are no further photo."""
+    """Upper bound of the photos stored by this process since then (an existing one adds none)."""
 
 
 class PhotoQuota:
-    """Counts the photos of each key. Thread-safe.
+    """The quota of stored photos per key. Thread-safe.
 
-    One process never passes a limit: it stores the photos of a limited key one after the other.
-    What other processes store is known after LOOK_SECONDS at the latest.
+    A single process never exceeds a limit, because it stores the photos of a limited key
+    sequentially. Photos of other processes are counted within RECOUNT_SECONDS. Deleting photos
+    frees quota.
     """
 
     def __init__(self, catalog: Catalog) -> None:
         self._catalog = catalog
         self._keys: dict[UUID, KeyPhotos] = {}
 
-    def check(self, key_id: UUID, most: int) -> None:
-        """Refuse early, before a photo is received. TooManyRequests (`photo_quota_reached`)."""
+    def check(self, key_id: UUID, limit: int) -> None:
+        """Raise TooManyRequests (`photo_quota_reached`) before a photo is received."""
         photos = self._keys.setdefault(key_id, KeyPhotos())
         with photos.lock:
-            self._check(photos, key_id, most)
+            self._check(photos, key_id, limit)
 
     @contextlib.contextmanager
-    def place(self, key_id: UUID, most: int) -> Iterator[None]:
-        """Room for one photo, which the block stores. TooManyRequests (`photo_quota_reached`)."""
+    def reserve(self, key_id: UUID, limit: int) -> Iterator[None]:
+        """Reserve quota for one photo that the block stores.
+
+        Raises:
+            TooManyRequests: `photo_quota_reached`.
+        """
         photos = self._keys.setdefault(key_id, KeyPhotos())
         with photos.lock:
-            self._check(photos, key_id, most)
-            photos.stored += 1  # also where the block raises: its transaction may be committed
+            self._check(photos, key_id, limit)
+            photos.stored += 1  # even if the block raises: its transaction may be committed
             yield
 
-    def _check(self, photos: KeyPhotos, key_id: UUID, most: int) -> None:
+    def _check(self, photos: KeyPhotos, key_id: UUID, limit: int) -> None:
         age_seconds = time.monotonic() - photos.counted_at
-        seems_full = photos.counted < most <= photos.counted + photos.stored
+        seems_full = photos.counted < limit <= photos.counted + photos.stored
         if seems_full or age_seconds >= (
-            RECOUNT_SECONDS if photos.counted < most else FULL_RECOUNT_SECONDS
+            RECOUNT_SECONDS if photos.counted < limit else FULL_RECOUNT_SECONDS
         ):
             with self._catalog.read() as session:
-                photos.counted = count_photos_of_key(session, key_id, most)
+                photos.counted = count_photos_of_key(session, key_id, limit)
             photos.counted_at, photos.stored = time.monotonic(), 0
-        if photos.counted >= most:
+        if photos.counted >= limit:
             raise TooManyRequests(
                 "photo_quota_reached",
-                f"{most} photos are stored through this key, and no more may be. Delete some, or "
-                "ask an admin for a key with a higher limit.",
+                f"The API key has reached its limit of {limit} photos. Delete some, or ask an "
+                "administrator for a key with a higher limit.",
                 retry_after_seconds=QUOTA_RETRY_SECONDS,
-                limit=most,
+                limit=limit,
             )

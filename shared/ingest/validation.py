@@ -1,7 +1,4 @@
-"""What is learnt of a file while its bytes go into the object store.
-
-From received bytes to a photo that may be stored: checked without decoding a pixel.
-"""
+"""Validation of uploads: size, hash, signature and header, without decoding any pixels."""
 
 from __future__ import annotations
 
@@ -24,91 +21,101 @@ MAX_NAME_CHARACTERS = 255
 
 @dataclass(slots=True)
 class StoredUpload:
-    """A file that lies whole under `key` of the object store, and what is said of it."""
+    """A completely received file in the object store, with its form fields."""
 
     key: str
     filename: str
     size_bytes: int
     sha256: str
-    begin: bytes
-    """The file's first bytes, as many as tell its format."""
+    first_bytes: bytes
+    """The file's first bytes, enough to detect its format."""
     fields: dict[str, str] = field(default_factory=dict)
-    """In the upload form's names."""
-    whole: bytes | None = None
-    """All of its bytes where they are few, and at hand."""
+    """Values by the names of the upload form."""
+    content: bytes | None = None
+    """The whole file, if it is small and still in memory."""
 
     def open(self, store: ObjectStore) -> BinaryIO:
-        """The file, from memory or from the store."""
-        return store.open(self.key) if self.whole is None else io.BytesIO(self.whole)
+        """Open the file, from memory or from the store."""
+        return store.open(self.key) if self.content is None else io.BytesIO(self.content)
 
 
 class StreamValidator:
-    """Counts, hashes and checks a file of which only a piece is there at a time."""
+    """Counts, hashes and checks a file block by block."""
 
     def __init__(
         self,
         max_bytes: int,
-        check_begin: Callable[[bytes], object] = lambda begin: None,
+        check_signature: Callable[[bytes], object] = lambda first_bytes: None,
         *,
-        begin_bytes: int = PHOTO_SIGNATURE_BYTES,
+        signature_bytes: int = PHOTO_SIGNATURE_BYTES,
         too_large: Callable[[int], PlacewiseError] | None = None,
     ) -> None:
-        """`check_begin` sees the first `begin_bytes` as soon as they are there, and may raise;
-        `too_large` makes the refusal of more than `max_bytes`."""
+        """
+        Args:
+            max_bytes: size limit.
+            check_signature: called with the first `signature_bytes` as soon as they have arrived;
+                it may raise.
+            signature_bytes: number of bytes that `check_signature` needs.
+            too_large: returns the error for a file larger than `max_bytes`.
+        """
         self.size_bytes = 0
-        self.begin = b""
+        self.first_bytes = b""
         self._max_bytes = max_bytes
-        self._begin_bytes = begin_bytes
+        self._signature_bytes = signature_bytes
         self._too_large = too_large or file_too_large_error
-        self._check_begin = check_begin
+        self._check_signature = check_signature
         self._checked = False
         self._hash = hashlib.sha256()
 
     @property
     def sha256(self) -> str:
-        """Of what has passed, in hexadecimal digits."""
+        """Hash of the bytes so far, hexadecimal."""
         return self._hash.hexdigest()
 
-    def add(self, piece: bytes) -> None:
-        """The next bytes. Raises TooLarge (`file_too_large_error`, unless another refusal was
-        given) and what `check_begin` raises."""
-        self.size_bytes += len(piece)
+    def add(self, block: bytes) -> None:
+        """Process the next bytes.
+
+        Raises TooLarge (`file_too_large`, unless `too_large` returns another error) and what
+        `check_signature` raises.
+        """
+        self.size_bytes += len(block)
         if self.size_bytes > self._max_bytes:
             raise self._too_large(self._max_bytes)
-        if len(self.begin) < self._begin_bytes:
-            self.begin = (self.begin + piece)[: self._begin_bytes]
-        if not self._checked and len(self.begin) == self._begin_bytes:
+        if len(self.first_bytes) < self._signature_bytes:
+            self.first_bytes = (self.first_bytes + block)[: self._signature_bytes]
+        if not self._checked and len(self.first_bytes) == self._signature_bytes:
             self._check_first_bytes()
-        self._hash.update(piece)
+        self._hash.update(block)
 
     def end(self) -> None:
-        """That was all: a file shorter than its signature is checked now; an empty one never."""
+        """End the file: check one that is shorter than the signature, unless it is empty."""
         if not self._checked and self.size_bytes:
             self._check_first_bytes()
 
     def _check_first_bytes(self) -> None:
         self._checked = True
-        self._check_begin(self.begin)
+        self._check_signature(self.first_bytes)
 
 
 def check_photo_signature(first_bytes: bytes) -> str:
-    """The photo's media type by its content; 415 for anything that is not accepted."""
+    """Return the photo's media type by its content; UnsupportedMedia (`unsupported_photo`)."""
     media_type = detect_media_type(first_bytes)
     if media_type is None:
         raise UnsupportedMedia(
             "unsupported_photo",
-            f"By its content this is not a photo that Placewise reads: send {ACCEPTED_PHOTOS}.",
+            f"The file is not a photo in a supported format. Send {ACCEPTED_PHOTOS}.",
         )
     return media_type
 
 
 def base_name(filename: str) -> str:
-    """The last part of what someone calls a file, on either kind of system."""
+    """Return the last component of a POSIX or Windows path, without unprintable characters."""
     name = PurePosixPath(PureWindowsPath(filename).name).name
     return "".join(c for c in name if c.isprintable())[:MAX_NAME_CHARACTERS] or "photo"
 
 
 def file_too_large_error(max_bytes: int) -> PlacewiseError:
+    """Return the error for a file larger than MAX_FILE_SIZE."""
     return TooLarge(
         "file_too_large",
         f"The file is larger than {max_bytes} bytes (MAX_FILE_SIZE).",
@@ -118,25 +125,26 @@ def file_too_large_error(max_bytes: int) -> PlacewiseError:
 
 @dataclass(frozen=True, slots=True)
 class ValidatedPhoto:
-    """A checked photo whose bytes lie in the object store."""
+    """A validated photo whose bytes are in the object store."""
 
     received: StoredUpload
     media_type: str
     header: PhotoHeader
     fields: PhotoFields
     key_id: UUID | None = None
-    """That it came in with."""
+    """The API key of the upload."""
 
 
 def validate_photo(
     store: ObjectStore, upload: StoredUpload, max_pixels: int, key_id: UUID | None = None
 ) -> ValidatedPhoto:
-    """What the photo is and what is said of it.
+    """Validate a photo's signature, form fields and header.
 
-    Raises UnsupportedMedia (`unsupported_photo`) and Unprocessable (`invalid_field_error`,
-    `undecodable_photo`, `too_many_pixels`).
+    Raises:
+        UnsupportedMedia: `unsupported_photo`.
+        Unprocessable: `invalid_field`, `undecodable_photo`, `too_many_pixels`.
     """
-    media_type = check_photo_signature(upload.begin)
+    media_type = check_photo_signature(upload.first_bytes)
     fields = read_form_fields(upload.fields)
     with upload.open(store) as file:
         header = read_photo_header(file, max_pixels)

@@ -1,1 +1,1 @@
-"""Does the object store hold what the catalog says, and is it what was written?"""
+"""Integrity checks: does the object store hold what the catalog references, undamaged?"""

@@ -1,5 +1,7 @@
-"""Which objects the catalog's rows name, and what it knows of them: what a backup must hold, and
-what `placewise verify` looks for."""
+"""Lists the objects that the catalog's rows reference, with their expected size and hash.
+
+Backups must contain these objects, and `placewise verify` checks them.
+"""
 
 from __future__ import annotations
 
@@ -26,35 +28,40 @@ ROWS_PER_QUERY = 1000
 
 
 class ObjectKind(StrEnum):
+    """What an object is."""
+
     ORIGINAL = "original"
     CHUNK = "chunk"
     MANIFEST = "manifest"
     VOCABULARY = "vocabulary"
     WHITENING = "whitening"
     MODEL = "model"
-    CHECKPOINT = "checkpoint"  # of a model that is being added
-    ARCHIVE = "archive"  # of a batch that is not finished
-    FILE = "file"  # of such a batch, not a photo yet
+    CHECKPOINT = "checkpoint"  # upload of a model that is being added
+    ARCHIVE = "archive"  # upload of an unfinished batch
+    FILE = "file"  # of an unfinished batch, not yet a photo
 
 
 KIND_BY_JOB = {JobKind.BATCH: ObjectKind.ARCHIVE, JobKind.ADD_MODEL: ObjectKind.CHECKPOINT}
-"""What came with a job, and goes when it ends."""
+"""Uploads that belong to a job and are deleted when it ends."""
 
 
 @dataclass(frozen=True, slots=True)
 class ReferencedObject:
+    """An object that a row of the catalog references."""
+
     key: str
     what: ObjectKind
     row_id: UUID
-    """Of the photo, chunk, vocabulary, whitening, model or job."""
+    """Id of the photo, chunk, vocabulary, whitening, model or job."""
     size_bytes: int | None = None
-    """None: not known."""
+    """Expected size; None if unknown."""
     sha256: str | None = None
-    """Of the object's bytes, hexadecimal; None: not known."""
+    """Expected SHA-256 of the object's bytes, hexadecimal; None if unknown."""
 
 
 def list_referenced_objects(session: Session) -> Iterator[ReferencedObject]:
-    """Those of live photos and of what answers or is being built, of maps that are not deleted."""
+    """Iterate over the objects of live photos, models, unfinished jobs and the generations that are
+    active or being built, of maps that are not deleted."""
     photos = select(Photo.id, Photo.object_key, Photo.size_bytes, Photo.sha256).join(
         Map, Map.id == Photo.map_id
     )
@@ -80,10 +87,10 @@ def list_referenced_objects(session: Session) -> Iterator[ReferencedObject]:
         (Vocabulary, ObjectKind.VOCABULARY),
         (StoredWhitening, ObjectKind.WHITENING),
     ):
-        # Their hashes are those of the numbers inside.
-        found = select(table.id, table.object_key).join(Map, Map.id == table.map_id)
-        for one in session.execute(found.where(Map.deleted_at.is_(None))):
-            yield ReferencedObject(one.object_key, what, one.id)
+        # Their stored hashes are of the array's numbers, not of the object's bytes.
+        objects = select(table.id, table.object_key).join(Map, Map.id == table.map_id)
+        for stored in session.execute(objects.where(Map.deleted_at.is_(None))):
+            yield ReferencedObject(stored.object_key, what, stored.id)
     models = select(Model.id, Model.object_key, Model.size_bytes, Model.sha256)
     for model in session.execute(models.where(Model.object_key.is_not(None))):
         yield ReferencedObject(

@@ -1,13 +1,9 @@
-"""What a look at the whole store has found.
+"""Verification of the object store against the catalog, and repair of lost descriptors.
 
-One chunk against its hash, its manifest and the catalog's rows.
-
-Every object that the catalog names, read and compared with what the catalog knows of it.
-
-The service may run meanwhile: what looks wrong is looked up again, and only what the catalog still
-names counts.
-
-Describing photos again whose descriptors are lost. Their originals are all that it needs.
+`verify_store` reads every object that the catalog references and compares it with size and hash in
+the catalog. The service may run meanwhile: a fault only counts if the catalog still references the
+object afterwards. `repair_descriptors` queues the photos of damaged chunks again, which only needs
+their originals.
 """
 
 from __future__ import annotations
@@ -46,14 +42,18 @@ from shared.storage.chunks import decode_rows, manifest_key, rows_are_valid
 
 
 class FaultKind(StrEnum):
-    MISSING = "missing"  # the catalog names an object that is not there
+    """What is wrong with an object or a photo."""
+
+    MISSING = "missing"  # the catalog references an object that does not exist
     DAMAGED = "damaged"  # its bytes are not those that were written
-    DIFFERENT = "different"  # the catalog says something else of it than it does itself
-    NOT_DESCRIBED = "not_described"  # the job succeeded, and no descriptor is there
+    DIFFERENT = "different"  # its content contradicts the catalog
+    NOT_DESCRIBED = "not_described"  # the job succeeded, but the photo has no descriptor
 
 
 @dataclass(frozen=True, slots=True)
 class IntegrityFault:
+    """One fault, and what has to be repaired."""
+
     wrong: FaultKind
     what: str
     """`original`, `chunk`, `manifest`, ..., or `photo`."""
@@ -61,19 +61,21 @@ class IntegrityFault:
     """The object's key, or the photo's id."""
     detail: str
     chunk_id: UUID | None = None
-    """The chunk that it makes useless."""
+    """The chunk that is unusable."""
     photo_id: UUID | None = None
-    """The photo that has to be described again."""
+    """The photo whose descriptor has to be computed again."""
 
 
 @dataclass(slots=True)
 class IntegrityReport:
+    """Result of a verification."""
+
     checked: Counter[str] = field(default_factory=Counter)
-    """By what they are."""
+    """Number of checked objects by kind."""
     read_bytes: int = 0
     faults: list[IntegrityFault] = field(default_factory=list)
     orphans: int = 0
-    """Objects that no row knows. The steward moves them to the trash when they are old enough."""
+    """Objects that no row references. The steward moves old ones to the trash."""
     orphan_bytes: int = 0
     trash_objects: int = 0
     trash_bytes: int = 0
@@ -88,8 +90,17 @@ def verify_chunk(
     catalog_rows: list[tuple[int, UUID]],
     report: IntegrityReport,
 ) -> Iterator[IntegrityFault]:
-    """What is wrong with the chunk; `catalog_rows` is the row of each of its photos by the
-    catalog."""
+    """Compare a chunk with its hash, its manifest and the catalog.
+
+    Args:
+        store: the object store.
+        chunk_id, object_key, sha256, rows: the chunk in the catalog.
+        catalog_rows: (row, photo id) of each of its photos in the catalog.
+        report: counts what is read.
+
+    Yields:
+        The first fault; nothing for an intact chunk.
+    """
     manifest = manifest_key(object_key)
     try:
         data = store.get(object_key)
@@ -103,15 +114,15 @@ def verify_chunk(
     if hashlib.sha256(data).hexdigest() != sha256:
         yield IntegrityFault(FaultKind.DAMAGED, "chunk", object_key, "its hash differs", chunk_id)
         return
-    found = decode_rows(data)
-    if len(found) != rows or not rows_are_valid(found).all():
-        detail = f"it has {len(found)} rows of {rows}, or rows that are no unit vectors"
+    vectors = decode_rows(data)
+    if len(vectors) != rows or not rows_are_valid(vectors).all():
+        detail = f"it has {len(vectors)} of {rows} rows, or rows that are not unit vectors"
         yield IntegrityFault(FaultKind.DIFFERENT, "chunk", object_key, detail, chunk_id)
         return
     try:
-        said = json.loads(store.get(manifest))
-        photo_ids = [UUID(photo_id) for photo_id in said["photo_ids"]]
-        fits = said["sha256"] == sha256 and len(photo_ids) == rows
+        content = json.loads(store.get(manifest))
+        photo_ids = [UUID(photo_id) for photo_id in content["photo_ids"]]
+        matches_chunk = content["sha256"] == sha256 and len(photo_ids) == rows
     except NotFound:
         yield IntegrityFault(
             FaultKind.MISSING, "manifest", manifest, "it is not in the store", chunk_id
@@ -121,25 +132,25 @@ def verify_chunk(
         yield IntegrityFault(FaultKind.DAMAGED, "manifest", manifest, "it can't be read", chunk_id)
         return
     report.checked["manifest"] += 1
-    if not fits:
+    if not matches_chunk:
         yield IntegrityFault(
-            FaultKind.DIFFERENT, "manifest", manifest, "it is of another chunk", chunk_id
+            FaultKind.DIFFERENT, "manifest", manifest, "it belongs to another chunk", chunk_id
         )
         return
-    astray = [
+    misplaced = [
         photo_id
         for row, photo_id in catalog_rows
         if not 0 <= row < rows or photo_ids[row] != photo_id
     ]
-    if astray:
-        detail = f"{len(astray)} photos have another row by the catalog, the first is {astray[0]}"
+    if misplaced:
+        detail = f"{len(misplaced)} photos have another row in the catalog, first {misplaced[0]}"
         yield IntegrityFault(FaultKind.DIFFERENT, "chunk", object_key, detail, chunk_id)
 
 
 READ_BLOCK_BYTES = 1024 * 1024
 
 VerifyProgress = Callable[[str, int, int], object]
-"""Told what is looked at, how many of them, and of how many."""
+"""Progress callback: kind of objects, number done, total."""
 
 
 def verify_store(
@@ -149,16 +160,24 @@ def verify_store(
     originals: bool,
     progress: VerifyProgress = lambda what, done, total: None,
 ) -> IntegrityReport:
-    """Read every chunk, and with `originals` every photo; of the others, whether they are there.
+    """Verify every referenced object, and that every described photo has a descriptor.
 
-    Raises Unavailable where catalog or store are away, and SQLAlchemyError as they do.
+    Args:
+        catalog: the catalog.
+        store: the object store.
+        originals: read every original photo and verify its hash, instead of only its size.
+        progress: called after each object.
+
+    Raises:
+        Unavailable: the catalog or the store is unavailable.
+        SQLAlchemyError: as the catalog does.
     """
     report = IntegrityReport()
     with catalog.read() as session:
-        named = list(list_referenced_objects(session))
-    total = {what: sum(one.what == what for one in named) for what in ObjectKind}
+        referenced = list(list_referenced_objects(session))
+    total = {what: sum(one.what == what for one in referenced) for what in ObjectKind}
     done: dict[ObjectKind, int] = dict.fromkeys(ObjectKind, 0)
-    for one in named:
+    for one in referenced:
         faults = list(_verify_object(catalog, store, one, originals, report))
         if faults and _is_still_referenced(catalog, one):
             report.faults += faults
@@ -177,22 +196,22 @@ def _verify_object(
     report: IntegrityReport,
 ) -> Iterator[IntegrityFault]:
     if one.what == ObjectKind.MANIFEST:
-        return  # with its chunk
+        return  # verified with its chunk
     if one.what == ObjectKind.CHUNK:
         with catalog.read() as session:
             chunk = session.get(Chunk, one.row_id)
             if chunk is None:
                 return
-            placed = session.execute(
+            catalog_rows = session.execute(
                 select(Descriptor.row, Descriptor.photo_id).where(Descriptor.chunk_id == chunk.id)
             ).all()
-        rows = [(row, photo_id) for row, photo_id in placed]
+        rows = [(row, photo_id) for row, photo_id in catalog_rows]
         yield from verify_chunk(
             store, chunk.id, chunk.object_key, chunk.sha256, chunk.rows, rows, report
         )
         return
     if one.what == ObjectKind.MODEL or (one.what == ObjectKind.ORIGINAL and originals):
-        yield from _read_whole(store, one, report)
+        yield from _verify_content(store, one, report)
         return
     info = store.head(one.key)
     if info is None:
@@ -200,21 +219,21 @@ def _verify_object(
         return
     report.checked[one.what] += 1
     if one.size_bytes is not None and info.size_bytes != one.size_bytes:
-        detail = f"it has {info.size_bytes} bytes, {one.size_bytes} were written"
+        detail = f"it has {info.size_bytes} bytes instead of {one.size_bytes}"
         yield IntegrityFault(FaultKind.DAMAGED, one.what, one.key, detail)
     elif one.what == ObjectKind.VOCABULARY:
-        yield from _read_vocabulary(catalog, store, one, report)
+        yield from _verify_vocabulary(catalog, store, one, report)
 
 
-def _read_whole(
+def _verify_content(
     store: ObjectStore, one: ReferencedObject, report: IntegrityReport
 ) -> Iterator[IntegrityFault]:
     digest = hashlib.sha256()
     try:
         with store.open(one.key) as file:
-            while piece := file.read(READ_BLOCK_BYTES):
-                digest.update(piece)
-                report.read_bytes += len(piece)
+            while block := file.read(READ_BLOCK_BYTES):
+                digest.update(block)
+                report.read_bytes += len(block)
     except NotFound:
         yield IntegrityFault(FaultKind.MISSING, one.what, one.key, "it is not in the store")
         return
@@ -225,7 +244,7 @@ def _read_whole(
         )
 
 
-def _read_vocabulary(
+def _verify_vocabulary(
     catalog: Catalog, store: ObjectStore, one: ReferencedObject, report: IntegrityReport
 ) -> Iterator[IntegrityFault]:
     with catalog.read() as session:
@@ -235,10 +254,10 @@ def _read_vocabulary(
     data = store.get(one.key)
     report.read_bytes += len(data)
     try:
-        same = hashlib.sha256(decode_rows(data).tobytes()).hexdigest() == stored.sha256
-    except (ValueError, KeyError):  # not even its header
-        same = False
-    if not same:
+        intact = hashlib.sha256(decode_rows(data).tobytes()).hexdigest() == stored.sha256
+    except (ValueError, KeyError):  # its header is damaged
+        intact = False
+    if not intact:
         yield IntegrityFault(
             FaultKind.DAMAGED, one.what, one.key, "its centres are not those that were stored"
         )
@@ -256,11 +275,11 @@ def _is_still_referenced(catalog: Catalog, one: ReferencedObject) -> bool:
 
 
 def _find_missing_descriptors(session: Session) -> list[IntegrityFault]:
-    """Live photos whose job says that they are searchable, and that are not."""
-    there = select(Descriptor.photo_id).where(
+    """Return live photos whose job succeeded, but that have no descriptor."""
+    descriptor = select(Descriptor.photo_id).where(
         Descriptor.photo_id == Photo.id, Descriptor.generation_id == Generation.id
     )
-    found = session.execute(
+    missing = session.execute(
         select(Photo.id, Generation.id)
         .join(Map, Map.id == Photo.map_id)
         .join(Job, Job.id == Photo.job_id)
@@ -270,7 +289,7 @@ def _find_missing_descriptors(session: Session) -> list[IntegrityFault]:
             Map.deleted_at.is_(None),
             Generation.state == GenerationState.ACTIVE,
             Job.state == JobState.SUCCEEDED,
-            ~there.exists(),
+            ~descriptor.exists(),
         )
     )
     return [
@@ -278,35 +297,35 @@ def _find_missing_descriptors(session: Session) -> list[IntegrityFault]:
             FaultKind.NOT_DESCRIBED,
             "photo",
             str(photo_id),
-            f"it has no row in generation {generation_id}, which answers",
+            f"it has no row in the active generation {generation_id}",
             photo_id=photo_id,
         )
-        for photo_id, generation_id in found
+        for photo_id, generation_id in missing
     ]
 
 
 def repair_descriptors(catalog: Catalog, hints: Wakeups, report: IntegrityReport) -> int:
-    """Queue the photos of damaged chunks, and those without a descriptor; how many.
+    """Queue the photos of damaged chunks and those without a descriptor; return their number.
 
-    The chunks' rows leave the catalog in the same transaction: until a photo is described again, it
-    is not found, and nothing wrong is.
+    The rows of the chunks are deleted in the same transaction: until a photo is described again, it
+    is not found, but no wrong result is either.
     """
     queued = 0
     for chunk_id in dict.fromkeys(f.chunk_id for f in report.faults if f.chunk_id is not None):
-        queued += catalog.run(partial(give_up_chunk, chunk_id=chunk_id))
-    lost = [fault.photo_id for fault in report.faults if fault.photo_id is not None]
-    if lost:
-        queued += catalog.run(lambda session: _queue_photos(session, lost))
+        queued += catalog.run(partial(discard_chunk, chunk_id=chunk_id))
+    photo_ids = [fault.photo_id for fault in report.faults if fault.photo_id is not None]
+    if photo_ids:
+        queued += catalog.run(lambda session: _queue_photos(session, photo_ids))
     if queued:
         hints.send()
     return queued
 
 
-def give_up_chunk(session: Session, chunk_id: UUID) -> int:
-    """Let the chunk's photos be described again, and its rows leave the catalog; how many."""
+def discard_chunk(session: Session, chunk_id: UUID) -> int:
+    """Delete a chunk's rows and queue its photos again; return the number of photos."""
     chunk = session.get(Chunk, chunk_id)
     if chunk is None or chunk.superseded_at is not None:
-        return 0  # merged or mended meanwhile
+        return 0  # compacted or repaired meanwhile
     generation = lock_generation(session, chunk.generation_id)
     lock_map(session, generation.map_id)
     photo_ids = list(
@@ -317,7 +336,7 @@ def give_up_chunk(session: Session, chunk_id: UUID) -> int:
     increment_map_version(session, generation.map_id)
     if generation.state == GenerationState.ACTIVE:
         return _queue_photos(session, photo_ids)
-    # Of one that is being built: the steward queues what has neither a row nor a job there.
+    # In a generation being built, the steward queues photos that have neither a row nor a job.
     session.execute(
         delete(Job).where(
             Job.kind == JobKind.REINDEX,

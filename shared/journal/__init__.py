@@ -1,11 +1,11 @@
-"""The journal: what the catalog knows of photos and maps, written beside the objects.
+"""The journal: the state of photos, maps and models, written to the object store.
 
-It lets a lost catalog be rebuilt (`shared.rebuild`) and shows when a catalog is older than its
-object store (`shared.journal.outbox`). It is an outbox: every transaction that changes a row of
-`TABLES` marks it (`shared.catalog.base`), and the steward writes marked rows as the next
-*segment* into the store, then clears the marks (`shared.journal.outbox`).
+A lost catalog can be rebuilt from it (`shared.rebuild`), and it shows when a catalog is older than
+its object store (`shared.journal.outbox`). It follows the transactional outbox pattern: every
+transaction that changes a row of `TABLES` marks the row (`shared.catalog.base`), and the steward
+writes marked rows to the store as the next *segment*, then clears the marks.
 
-A line of a segment is the whole state of a row, with the row's revision. Of several lines of one
-row the highest revision counts, so the order of segments does not matter, and a segment may be
-there twice: two stewards, or one that was killed half way, do no harm.
+A line of a segment is the complete state of a row, with the row's revision. Among several lines of
+one row the highest revision counts. So the order of segments does not matter, and a line may be
+written twice, by two stewards or after one was killed.
 """

@@ -1,6 +1,4 @@
-"""Which tables the journal holds, and their rows as lines.
-
-Journal segments: gzip files of JSON lines in the object store. Knows no database.
+"""Journal segments: gzip files of JSON lines in the object store, and the rows that they contain.
 
 ```
 journal/<first>-<last>-<uuid>.jsonl.gz     sequence numbers of 12 digits
@@ -8,7 +6,7 @@ journal/<first>-<last>-<uuid>.jsonl.gz     sequence numbers of 12 digits
 {"table": "photos", "id": "...", "revision": 3, "row": {"filename": "...", ...}}
 ```
 
-The UUID keeps two processes that write the same number from overwriting each other.
+The UUID prevents two processes that write the same number from overwriting each other's segment.
 """
 
 from __future__ import annotations
@@ -41,15 +39,15 @@ log = logging.getLogger(__name__)
 
 FORMAT = 1
 KEY = re.compile(rf"{JOURNAL}(\d{{12}})-(\d{{12}})-[0-9a-f-]{{36}}\.jsonl\.gz")
-LEVEL = 6  # of gzip
+GZIP_LEVEL = 6
 
-MERGED_FROM = 100  # segments below FULL_BYTES
-FULL_BYTES = 2 * 1024 * 1024  # a segment of this size is not merged any more
+MIN_SEGMENTS_TO_MERGE = 100  # segments smaller than FULL_SEGMENT_BYTES
+FULL_SEGMENT_BYTES = 2 * 1024 * 1024  # a segment of this size is not merged again
 
 
 @dataclass(frozen=True, slots=True, order=True)
 class Segment:
-    """One object of the journal, with the sequence numbers that it holds, both included."""
+    """One object of the journal, with its first and last sequence number (inclusive)."""
 
     first: int
     last: int
@@ -60,7 +58,7 @@ class Segment:
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """The state of one row at one revision; `row` holds JSON values by column name."""
+    """The state of a row at a revision; `row` has JSON values by column name."""
 
     table: str
     id: UUID
@@ -68,50 +66,53 @@ class Line:
     row: dict[str, Any]
 
     def encode(self) -> str:
-        """The line's JSON, without a line feed."""
+        """Return the line as JSON, without a line feed."""
         values = {"table": self.table, "id": str(self.id), "revision": self.revision}
         return json.dumps({**values, "row": self.row}, ensure_ascii=False)
 
 
 @dataclass(frozen=True, slots=True)
 class SegmentContent:
+    """Decoded content of a segment."""
+
     installation_id: UUID
-    """Of the catalog that wrote it."""
+    """Id of the catalog that wrote it."""
     lines: list[Line]
 
 
 def list_segments(store: ObjectStore) -> list[Segment]:
-    """Every segment in the store, by sequence number."""
-    found = []
+    """Return all segments of the store, sorted by sequence number."""
+    segments = []
     for info in store.list(JOURNAL):
         if match := KEY.fullmatch(info.key):
             first, last = int(match[1]), int(match[2])
-            found.append(Segment(first, last, info.key, info.size_bytes, info.modified_at))
-    return sorted(found)
+            segments.append(Segment(first, last, info.key, info.size_bytes, info.modified_at))
+    return sorted(segments)
 
 
 def put_segment(
     store: ObjectStore, first: int, last: int, installation_id: UUID, lines: Iterable[str]
 ) -> str:
-    """Write encoded lines as one segment; its key."""
+    """Write encoded lines as one segment; return its key."""
     key = f"{JOURNAL}{first:012}-{last:012}-{new_id()}.jsonl.gz"
     head = {"placewise_journal": FORMAT, "installation_id": str(installation_id)}
     text = "\n".join([json.dumps(head), *lines])
-    store.put(key, gzip.compress(text.encode(), LEVEL, mtime=0))
+    store.put(key, gzip.compress(text.encode(), GZIP_LEVEL, mtime=0))
     return key
 
 
 def read_segment(store: ObjectStore, key: str) -> SegmentContent:
-    """The segment's content.
+    """Read and decode a segment.
 
-    Raises NotFound when it was merged into another one meanwhile, and Unavailable
-    (`journal_damaged`) when its bytes are not those of a segment that this release can read.
+    Raises:
+        NotFound: it was merged into another one meanwhile.
+        Unavailable: `journal_damaged` for a damaged segment or an unknown format.
     """
     data = store.get(key)
     try:
         head, *lines = (json.loads(line) for line in gzip.decompress(data).splitlines())
         if head["placewise_journal"] != FORMAT:
-            raise ValueError(f"its format is {head['placewise_journal']}")
+            raise ValueError(f"unknown format {head['placewise_journal']}")
         return SegmentContent(
             UUID(head["installation_id"]),
             [Line(one["table"], UUID(one["id"]), one["revision"], one["row"]) for one in lines],
@@ -125,23 +126,23 @@ def read_segment(store: ObjectStore, key: str) -> SegmentContent:
 
 
 def last_states(lines: Iterable[Line]) -> list[Line]:
-    """Of each row the line with the highest revision."""
-    found: dict[tuple[str, UUID], Line] = {}
+    """Return the line with the highest revision of each row."""
+    latest: dict[tuple[str, UUID], Line] = {}
     for line in lines:
-        known = found.get((line.table, line.id))
+        known = latest.get((line.table, line.id))
         if known is None or line.revision > known.revision:
-            found[line.table, line.id] = line
-    return list(found.values())
+            latest[line.table, line.id] = line
+    return list(latest.values())
 
 
 def merge_segments(store: ObjectStore, segments: list[Segment]) -> None:
-    """Merge small segments into one once there are MERGED_FROM of them.
+    """Merge small segments into one if there are at least MIN_SEGMENTS_TO_MERGE of them.
 
-    The merged segment is written before the others are deleted: at every moment the store holds
-    each line at least once. Damaged segments stay as they are.
+    The merged segment is written before the others are deleted, so that the store has each line at
+    least once at any time. Damaged segments are not changed.
     """
-    small = [segment for segment in segments if segment.size_bytes < FULL_BYTES]
-    if len(small) < MERGED_FROM:
+    small = [segment for segment in segments if segment.size_bytes < FULL_SEGMENT_BYTES]
+    if len(small) < MIN_SEGMENTS_TO_MERGE:
         return
     merged: list[Segment] = []
     lines: list[Line] = []
@@ -151,7 +152,7 @@ def merge_segments(store: ObjectStore, segments: list[Segment]) -> None:
         try:
             content = read_segment(store, segment.key)
         except NotFound:
-            return  # another steward merges them
+            return  # another steward is merging them
         except Unavailable as error:
             if error.code != "journal_damaged":
                 raise
@@ -161,7 +162,7 @@ def merge_segments(store: ObjectStore, segments: list[Segment]) -> None:
         lines += content.lines
         installation_id = content.installation_id
         size_bytes += segment.size_bytes
-        if size_bytes >= FULL_BYTES:
+        if size_bytes >= FULL_SEGMENT_BYTES:
             break
     if len(merged) < 2 or installation_id is None:
         return
@@ -172,7 +173,7 @@ def merge_segments(store: ObjectStore, segments: list[Segment]) -> None:
         store.delete(segment.key)
 
 
-# Each after those that its foreign keys lead to.
+# In the order of foreign keys: a table comes after those that it references.
 TABLES: dict[str, type[Journaled]] = {
     "models": Model,
     "maps": Map,
@@ -182,32 +183,31 @@ TABLES: dict[str, type[Journaled]] = {
     "photos": Photo,
 }
 
-# Of the catalog's own bookkeeping: they mean nothing in another one.
-LEFT_OUT = {
+# Columns for the catalog's own bookkeeping, which have no meaning in another catalog.
+UNJOURNALED_COLUMNS = {
     "photos": {"job_id", "changed_version"},
     "maps": {"version"},
     "generations": {"open_slot", "open_slot_rows", "complete_version", "complete_at"},
 }
-MARKS = {"revision", "journaled_revision"}
+REVISION_COLUMNS = {"revision", "journaled_revision"}
 
 
 def table_of(name: str) -> Table:
-    """The table; KeyError for one that the journal does not hold."""
+    """Return the table of this name; KeyError for one that is not journaled."""
     table = TABLES[name].__table__  # type: ignore[attr-defined]
     assert isinstance(table, Table)
     return table
 
 
 def line_of(name: str, row: RowMapping) -> Line:
-    """The row's present state."""
-    left_out = MARKS | LEFT_OUT.get(name, set())
-    values = {key: to_json(value) for key, value in row.items() if key not in left_out}
+    """Return the current state of a row."""
+    excluded = REVISION_COLUMNS | UNJOURNALED_COLUMNS.get(name, set())
+    values = {key: to_json(value) for key, value in row.items() if key not in excluded}
     return Line(name, row["id"], row["revision"], values)
 
 
 def columns_of(line: Line) -> dict[str, Any]:
-    """The row's columns, by name, without the marks; columns that this release does not know are
-    left out."""
+    """Return the line's values by column name, without the revisions and unknown columns."""
     table = table_of(line.table)
     known = {c.name: c for c in table.columns}
     return {

@@ -1,5 +1,5 @@
-"""Rebuilding the catalog from its object store: journal, chunk manifests and originals.
+"""Rebuilds the catalog from its object store: from journal, chunk manifests and originals.
 
-`take_in` brings everything that the store holds and the catalog does not know into the catalog. On
-an empty catalog that is a rebuild; on one that is older than its store it is a repair.
+`recover_catalog` inserts everything that the store has and the catalog lacks. On an empty catalog
+this is a rebuild, on a catalog that is older than its store a repair.
 """

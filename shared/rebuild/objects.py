@@ -1,7 +1,7 @@
-"""Chunks that lie in the store, back into the generations that answer.
+"""Recovers chunks of active generations, and originals that are not in the journal.
 
-Originals that no journal names: uploads of the catalog's last seconds, or of a home from before
-the journal.
+Such originals are uploads of the last seconds before the catalog was lost, or are from a release
+without a journal.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from shared.errors import Misconfigured, NotFound, PlacewiseError, Unavailable
 from shared.imaging.file_formats import PHOTO_SIGNATURE_BYTES
 from shared.ingest.store_photo import insert_photo, retry_on_conflict
 from shared.ingest.validation import StoredUpload, ValidatedPhoto, validate_photo
-from shared.rebuild.rows import AT_ONCE, Progress
+from shared.rebuild.rows import ROWS_PER_STATEMENT, Progress
 from shared.storage import ObjectStore
 from shared.storage.chunks import decode_rows, manifest_key, rows_are_valid
 from shared.storage.keys import ORIGINALS
@@ -44,14 +44,16 @@ CHUNKS = "chunks/"
 
 
 @dataclass(slots=True)
-class ChunksTakenIn:
+class RecoveredChunks:
+    """Counts of the recovered chunks."""
+
     chunks: int = 0
     descriptors: int = 0
     damaged: list[str] = field(default_factory=list)
-    """Keys of chunks that are not what their manifests say."""
+    """Keys of chunks that contradict their manifests."""
     unnamed_rows: int = 0
     newest_extractor: str | None = None
-    """That of the newest chunk of a generation that the catalog does not know."""
+    """Extractor of the newest chunk whose generation is not in the catalog."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,15 +65,15 @@ class _Manifest:
     extractor: str
 
 
-def take_in_chunks(
+def recover_chunks(
     catalog: Catalog, store: ObjectStore, slot_rows: int, progress: Progress
-) -> ChunksTakenIn:
-    """Register the chunks that hold rows of photos which have none in their active generation.
+) -> RecoveredChunks:
+    """Register the chunks with rows of photos that lack a descriptor in their active generation.
 
-    Newest first: merging writes a new chunk beside the older ones, and a row is the same in each.
-    Every chunk is read against the hash of its manifest.
+    Newest chunks first: compaction writes a new chunk with the same rows as the older ones. Every
+    chunk is verified against the hash in its manifest.
     """
-    found = ChunksTakenIn()
+    recovered = RecoveredChunks()
     with catalog.read() as session:
         states: dict[UUID, GenerationState] = {
             row.id: row.state for row in session.execute(select(Generation.id, Generation.state))
@@ -84,38 +86,38 @@ def take_in_chunks(
     for done, key in enumerate(keys, start=1):
         manifest = _read_manifest(store, key)
         if manifest is None:
-            found.damaged.append(key)
+            recovered.damaged.append(key)
         elif manifest.generation_id not in states:
-            found.unnamed_rows += len(manifest.photo_ids)
-            found.newest_extractor = found.newest_extractor or manifest.extractor
+            recovered.unnamed_rows += len(manifest.photo_ids)
+            recovered.newest_extractor = recovered.newest_extractor or manifest.extractor
         elif states[manifest.generation_id] == GenerationState.ACTIVE:
-            _take_in(catalog, store, key, manifest, slot_rows, found)
+            _recover_chunk(catalog, store, key, manifest, slot_rows, recovered)
         progress("chunks", done, len(keys))
-    return found
+    return recovered
 
 
-def _take_in(
+def _recover_chunk(
     catalog: Catalog,
     store: ObjectStore,
     key: str,
     manifest: _Manifest,
     slot_rows: int,
-    found: ChunksTakenIn,
+    recovered: RecoveredChunks,
 ) -> None:
     with catalog.read() as session:
         known = session.scalar(select(Chunk.id).where(Chunk.object_key == key))
-        if known is not None or not _without_row(session, manifest):
+        if known is not None or not _missing_descriptors(session, manifest):
             return
     try:
         data = store.get(key)
     except NotFound:
-        return  # superseded, and collected meanwhile
+        return  # compacted and deleted meanwhile
     if hashlib.sha256(data).hexdigest() != manifest.sha256:
-        found.damaged.append(key)
+        recovered.damaged.append(key)
         return
     rows = decode_rows(data)
     if len(rows) != len(manifest.photo_ids) or not rows_are_valid(rows).all():
-        found.damaged.append(key)
+        recovered.damaged.append(key)
         return
     descriptors = catalog.run(
         partial(
@@ -127,8 +129,8 @@ def _take_in(
             slot_rows=slot_rows,
         )
     )
-    found.chunks += bool(descriptors)
-    found.descriptors += descriptors
+    recovered.chunks += bool(descriptors)
+    recovered.descriptors += descriptors
 
 
 def _commit(
@@ -140,11 +142,11 @@ def _commit(
     size_bytes: int,
     slot_rows: int,
 ) -> int:
-    """Chunk and descriptors; how many of these."""
+    """Insert the chunk and its missing descriptors; return their number."""
     map_id = session.get_one(Generation, manifest.generation_id).map_id
     lock_map(session, map_id)
     generation = lock_generation(session, manifest.generation_id)
-    missing = _without_row(session, manifest)
+    missing = _missing_descriptors(session, manifest)
     if not missing:
         return 0
     chunk = Chunk(
@@ -172,88 +174,96 @@ def _commit(
     return len(descriptors)
 
 
-def _without_row(session: Session, manifest: _Manifest) -> list[tuple[int, UUID]]:
-    """(row, photo) of the chunk's photos that are live and have no descriptor in the generation."""
+def _missing_descriptors(session: Session, manifest: _Manifest) -> list[tuple[int, UUID]]:
+    """Return (row, photo id) of the chunk's live photos without a descriptor in the generation."""
     map_id = session.get_one(Generation, manifest.generation_id).map_id
     described: set[UUID] = set()
     live: set[UUID] = set()
-    for begin in range(0, len(manifest.photo_ids), AT_ONCE):
-        some = manifest.photo_ids[begin : begin + AT_ONCE]
-        live |= {p.id for p in get_live_photos(session, some).values() if p.map_id == map_id}
+    for begin in range(0, len(manifest.photo_ids), ROWS_PER_STATEMENT):
+        batch = manifest.photo_ids[begin : begin + ROWS_PER_STATEMENT]
+        live |= {p.id for p in get_live_photos(session, batch).values() if p.map_id == map_id}
         described |= set(
             session.scalars(
                 select(Descriptor.photo_id).where(
                     Descriptor.generation_id == manifest.generation_id,
-                    Descriptor.photo_id.in_(some),
+                    Descriptor.photo_id.in_(batch),
                 )
             )
         )
-    wanted = live - described
-    # A photo may have two rows in a chunk that was merged while it was described again.
-    rows = {photo_id: row for row, photo_id in enumerate(manifest.photo_ids) if photo_id in wanted}
+    missing = live - described
+    # A photo may have two rows in a chunk that was compacted while it was described again.
+    rows = {photo_id: row for row, photo_id in enumerate(manifest.photo_ids) if photo_id in missing}
     return [(row, photo_id) for photo_id, row in rows.items()]
 
 
 def _read_manifest(store: ObjectStore, key: str) -> _Manifest | None:
-    """None for one that is missing, or none."""
+    """Return the manifest of a chunk; None if it is missing or invalid."""
     try:
-        said = json.loads(store.get(manifest_key(key)))
+        content = json.loads(store.get(manifest_key(key)))
         return _Manifest(
-            UUID(said["chunk_id"]),
-            UUID(said["generation_id"]),
-            str(said["sha256"]),
-            [UUID(photo_id) for photo_id in said["photo_ids"]],
-            str(said["spec"]["extractor"]),
+            UUID(content["chunk_id"]),
+            UUID(content["generation_id"]),
+            str(content["sha256"]),
+            [UUID(photo_id) for photo_id in content["photo_ids"]],
+            str(content["spec"]["extractor"]),
         )
     except (NotFound, ValueError, KeyError, TypeError, AttributeError):
         return None
 
 
-PIECE_BYTES = 1024 * 1024
+BLOCK_BYTES = 1024 * 1024
 
 
 @dataclass(slots=True)
-class OriginalsTakenIn:
+class RecoveredOriginals:
+    """Counts of the recovered originals."""
+
     photos: int = 0
     unreadable: list[str] = field(default_factory=list)
-    """Keys of what can't be taken for a photo."""
+    """Keys of originals that are not valid photos."""
 
 
-def take_in_originals(
+def recover_originals(
     catalog: Catalog,
     store: ObjectStore,
     settings: Settings,
     unnamed: list[tuple[str, int, float]],
     extractor: str | None,
     progress: Progress,
-) -> OriginalsTakenIn:
-    """Make photos of the default map of those that no row knows, with what EXIF says of them; but
-    not of bytes that a live photo has already. They go the way of every upload.
+) -> RecoveredOriginals:
+    """Add originals that no row references to the default map, with their EXIF data.
 
-    `unnamed`: key, size in bytes and time (seconds since 1970). `extractor` is the default map's,
-    where it is made now and this release has an extractor of that name.
+    They are stored like uploads. Originals with the bytes of a live photo are skipped.
+
+    Args:
+        catalog: the catalog.
+        store: the object store.
+        settings: limits and the extractor of new maps.
+        unnamed: key, size in bytes and time (seconds since 1970) of the originals.
+        extractor: extractor of the default map, if it is created now and may be loaded here.
+        progress: called for each original.
     """
-    taken = OriginalsTakenIn()
+    recovered = RecoveredOriginals()
     for done, (key, size_bytes, modified_at) in enumerate(unnamed, start=1):
-        progress("originals that the journal does not name", done, len(unnamed))
+        progress("originals that are not in the journal", done, len(unnamed))
         with catalog.read() as session:
             if _is_known(session, key):
                 continue
         try:
-            received = _receive(store, key, size_bytes)
+            received = _read_upload(store, key, size_bytes)
             incoming = validate_photo(store, received, settings.max_image_pixels)
         except NotFound:
             continue  # deleted since it was listed
         except Unavailable:
             raise
         except PlacewiseError:
-            taken.unreadable.append(key)
+            recovered.unreadable.append(key)
             continue
         uploaded_at = datetime.fromtimestamp(modified_at, UTC)
-        taken.photos += retry_on_conflict(
+        recovered.photos += retry_on_conflict(
             partial(_store, catalog, settings, incoming, uploaded_at, extractor)
         )
-    return taken
+    return recovered
 
 
 def _store(
@@ -268,26 +278,26 @@ def _store(
             Photo.sha256 == incoming.received.sha256, Photo.deleted_at.is_(None)
         )
         if session.scalar(same.limit(1)) is not None:
-            return False  # a second upload of the same bytes, which was not acknowledged
+            return False  # an unacknowledged second upload of the same bytes
         map_id = _default_map(session, settings, extractor)
         insert_photo(session, map_id, incoming).photo.uploaded_at = uploaded_at
         return True
 
 
 def _default_map(session: Session, settings: Settings, extractor: str | None) -> UUID:
-    found = session.scalar(select(Map.id).where(Map.name == DEFAULT_MAP))
-    if found is not None:
-        return found
+    existing_id = session.scalar(select(Map.id).where(Map.name == DEFAULT_MAP))
+    if existing_id is not None:
+        return existing_id
     name = settings.new_map_extractor
     if extractor is not None:
-        # Else one that this installation may not load any more: its photos are described anew.
+        # The extractor may not be loadable here; the photos are then described with the default.
         with contextlib.suppress(Misconfigured):
             name = settings.recipe(extractor).name
     return get_or_create_default_map(session, name).id
 
 
 def _is_known(session: Session, key: str) -> bool:
-    """Whether a photo, or a batch that is under way, has the object."""
+    """Return whether a photo or an unfinished batch references the object."""
     return (
         session.scalar(select(Photo.id).where(Photo.object_key == key).limit(1)) is not None
         or session.scalar(select(BatchItem.job_id).where(BatchItem.object_key == key).limit(1))
@@ -295,11 +305,11 @@ def _is_known(session: Session, key: str) -> bool:
     )
 
 
-def _receive(store: ObjectStore, key: str, size_bytes: int) -> StoredUpload:
-    digest, begin = hashlib.sha256(), b""
+def _read_upload(store: ObjectStore, key: str, size_bytes: int) -> StoredUpload:
+    digest, first_bytes = hashlib.sha256(), b""
     with store.open(key) as file:
-        while piece := file.read(PIECE_BYTES):
-            begin = begin or piece[:PHOTO_SIGNATURE_BYTES]
-            digest.update(piece)
+        while block := file.read(BLOCK_BYTES):
+            first_bytes = first_bytes or block[:PHOTO_SIGNATURE_BYTES]
+            digest.update(block)
     name = f"{key.removeprefix(ORIGINALS)}.photo"
-    return StoredUpload(key, name, size_bytes, digest.hexdigest(), begin)
+    return StoredUpload(key, name, size_bytes, digest.hexdigest(), first_bytes)

@@ -1,7 +1,7 @@
-"""The last state of every journaled row, in a temporary database: a journal may be larger than
-memory.
+"""Recovers the rows of the journal: their latest states, and their insertion into the catalog.
 
-The journal's rows into the catalog.
+The states are collected in a temporary SQLite database, since a journal may be larger than the
+memory.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ from shared.journal.segments import Line, columns_of, list_segments, read_segmen
 from shared.storage import ObjectInfo, ObjectStore
 from shared.storage.keys import ORIGINALS, is_original_key
 
-AT_ONCE = 500  # rows
-LOOKS = 5  # at a journal that is merged meanwhile
+ROWS_PER_STATEMENT = 500
+MAX_READ_ATTEMPTS = 5  # when segments are merged meanwhile
 
 Progress = Callable[[str, int, int], object]
-"""Told what is done, how much of it, and of how much."""
+"""Progress callback: what is done, number done, total."""
 
 SCHEMA = """
 PRAGMA synchronous = OFF;
@@ -49,18 +49,20 @@ CREATE TABLE states (
 CREATE INDEX states_object_key ON states (object_key);
 CREATE TABLE originals (key TEXT PRIMARY KEY, size_bytes INTEGER, modified_at REAL) WITHOUT ROWID;
 """
-ADD = """
+UPSERT_STATE = """
 INSERT INTO states VALUES (?, ?, ?, ?, ?) ON CONFLICT DO UPDATE SET
     revision = excluded.revision, row = excluded.row, object_key = excluded.object_key
 WHERE excluded.revision > states.revision
 """
 
 
-class LastStates:
-    """What the store's journal says, and which originals lie in the store.
+class LatestStates:
+    """The latest state of each journaled row, and the originals in the store.
 
-    `sequence` is the journal's highest number, 0 without a journal; `installation_id` that of the
-    catalog which wrote it; `damaged` names the segments that can't be read.
+    Attributes:
+        sequence: highest sequence number of the journal, 0 without a journal.
+        installation_id: id of the catalog that wrote the journal.
+        damaged: keys of unreadable segments.
     """
 
     def __init__(self) -> None:
@@ -86,20 +88,20 @@ class LastStates:
         self._folder.cleanup()
 
     def read(self, store: ObjectStore, progress: Progress) -> None:
-        """Read the whole journal, and list the originals. Raises Unavailable as the store does."""
-        for look in range(LOOKS):
+        """Read the journal and list the originals. Raises Unavailable as the store does."""
+        for attempt in range(MAX_READ_ATTEMPTS):
             try:
                 self._read_journal(store, progress)
                 break
             except NotFound:
-                if look == LOOKS - 1:
+                if attempt == MAX_READ_ATTEMPTS - 1:
                     raise
-        for some in _batches(store.list(ORIGINALS)):
+        for batch in _batches(store.list(ORIGINALS)):
             self._database.executemany(
                 "INSERT OR REPLACE INTO originals VALUES (?, ?, ?)",
                 (
                     (info.key, info.size_bytes, info.modified_at.timestamp())
-                    for info in some
+                    for info in batch
                     if is_original_key(info.key)
                 ),
             )
@@ -123,7 +125,7 @@ class LastStates:
     def _add(self, lines: Iterable[Line]) -> None:
         self._database.execute("BEGIN")
         self._database.executemany(
-            ADD,
+            UPSERT_STATE,
             (
                 (
                     line.table,
@@ -138,7 +140,7 @@ class LastStates:
         self._database.execute("COMMIT")
 
     def count(self, table: str) -> int:
-        """How many rows of the table the journal knows."""
+        """Return the number of rows of a table in the journal."""
         return int(
             self._database.execute(
                 "SELECT count(*) FROM states WHERE table_name = ?", (table,)
@@ -146,15 +148,17 @@ class LastStates:
         )
 
     def lines(self, table: str) -> Iterator[list[Line]]:
-        """The last states of the table's rows, some at a time, by id."""
+        """Iterate over the latest states of a table's rows in batches, by id."""
         rows = self._database.execute(
             "SELECT id, revision, row FROM states WHERE table_name = ? ORDER BY id", (table,)
         )
-        while some := rows.fetchmany(AT_ONCE):
-            yield [Line(table, UUID(id_), revision, json.loads(row)) for id_, revision, row in some]
+        while batch := rows.fetchmany(ROWS_PER_STATEMENT):
+            yield [
+                Line(table, UUID(id_), revision, json.loads(row)) for id_, revision, row in batch
+            ]
 
-    def stored(self, keys: Iterable[str]) -> set[str]:
-        """Those of the originals that lie in the store."""
+    def stored_originals(self, keys: Iterable[str]) -> set[str]:
+        """Return the keys of the originals that exist in the store."""
         return {
             key
             for key in keys
@@ -162,57 +166,61 @@ class LastStates:
         }
 
     def unnamed_originals(self, before: float) -> list[tuple[str, int, float]]:
-        """Key, size and time of the originals that the journal does not name and that are older
-        than `before` (seconds since 1970)."""
-        found: list[tuple[str, int, float]] = self._database.execute(
+        """Return key, size and time of the originals that no journaled row references.
+
+        Only those modified earlier than `before` (seconds since 1970).
+        """
+        originals: list[tuple[str, int, float]] = self._database.execute(
             "SELECT key, size_bytes, modified_at FROM originals WHERE modified_at < ? AND NOT"
             " EXISTS (SELECT 1 FROM states WHERE states.object_key = originals.key) ORDER BY key",
             (before,),
         ).fetchall()
-        return found
+        return originals
 
 
 def _batches(infos: Iterator[ObjectInfo]) -> Iterator[list[ObjectInfo]]:
-    some: list[ObjectInfo] = []
+    batch: list[ObjectInfo] = []
     for info in infos:
-        some.append(info)
-        if len(some) == AT_ONCE:
-            yield some
-            some = []
-    yield some
+        batch.append(info)
+        if len(batch) == ROWS_PER_STATEMENT:
+            yield batch
+            batch = []
+    yield batch
 
 
 Columns = dict[str, Any]
 
 
 @dataclass(slots=True)
-class RowsTakenIn:
+class RecoveredRows:
+    """Counts of the recovered rows."""
+
     maps: int = 0
     renamed_maps: dict[str, str] = field(default_factory=dict)
-    """New name by the one that another map of the catalog has."""
+    """New names by old names, of maps whose names other maps have."""
     photos: int = 0
     changed_photos: int = 0
-    """Photos that the catalog knew in an older state."""
+    """Photos that the catalog had in an older state."""
     deleted_photos: int = 0
-    """Photos that the catalog knew, and that were deleted later."""
+    """Photos that the catalog had, and that were deleted later."""
     lost_originals: int = 0
-    """Photos of the journal whose original is gone: they stay out."""
+    """Photos of the journal whose originals are missing: not recovered."""
     doubled_photos: int = 0
-    """Photos whose bytes the map has under another id: they stay out."""
+    """Photos whose bytes the map has under another id: not recovered."""
     generations: int = 0
     vocabularies: int = 0
 
 
-def take_in_rows(
+def recover_rows(
     catalog: Catalog,
     store: ObjectStore,
-    states: LastStates,
-    taken: RowsTakenIn,
+    states: LatestStates,
+    recovered: RecoveredRows,
     progress: Progress,
 ) -> None:
     """Insert and update the rows of every journaled table."""
-    rows = _Rows(store, states, taken)
-    for name, take_in in (
+    rows = _RowRecovery(store, states, recovered)
+    for name, prepare in (
         ("models", rows.model),
         ("maps", rows.map),
         ("vocabularies", rows.vocabulary),
@@ -225,22 +233,22 @@ def take_in_rows(
         for lines in states.lines(name):
             with catalog.write() as session:
                 rows.begin(session, lines)
-                _write(session, name, lines, take_in)
+                _write(session, name, lines, prepare)
             done += len(lines)
             progress(f"{name} of the journal", done, total)
 
 
-TakeIn = Callable[[Session, Line, Line | None, Columns], bool]
-"""Whether the line is to be written; it may change the columns."""
+PrepareRow = Callable[[Session, Line, Line | None, Columns], bool]
+"""Returns whether the line is to be written; may change the columns."""
 
 
-def _write(session: Session, name: str, lines: list[Line], take_in: TakeIn) -> None:
+def _write(session: Session, name: str, lines: list[Line], prepare: PrepareRow) -> None:
     table = table_of(name)
     new: dict[frozenset[str], list[Columns]] = defaultdict(list)
     for line, known in unknown_lines(session, lines):
         columns = {**columns_of(line), "revision": line.revision}
         columns["journaled_revision"] = line.revision
-        if not take_in(session, line, known, columns):
+        if not prepare(session, line, known, columns):
             continue
         if known is None:
             new[frozenset(columns)].append(columns)
@@ -252,25 +260,25 @@ def _write(session: Session, name: str, lines: list[Line], take_in: TakeIn) -> N
         session.connection().execute(insert(table), rows)
 
 
-class _Rows:
-    """Decides of each line what becomes of it."""
+class _RowRecovery:
+    """Decides for each line whether it is written, and adapts its columns."""
 
-    def __init__(self, store: ObjectStore, states: LastStates, taken: RowsTakenIn) -> None:
+    def __init__(self, store: ObjectStore, states: LatestStates, recovered: RecoveredRows) -> None:
         self._store = store
         self._states = states
-        self._taken = taken
-        self._same_model: dict[UUID, UUID] = {}
+        self._recovered = recovered
+        self._existing_models: dict[UUID, UUID] = {}
         self._live_maps: set[UUID] = set()
         self._stored: set[str] = set()
         self._live_bytes: dict[tuple[UUID, str], UUID] = {}
         self._versions: dict[UUID, int] = {}
 
     def begin(self, session: Session, lines: list[Line]) -> None:
-        """Look up what the lines of one transaction need."""
+        """Load what the lines of one transaction need."""
         self._live_maps = set(session.scalars(select(Map.id).where(Map.deleted_at.is_(None))))
         self._versions = {}
         if lines[0].table == "photos":
-            self._stored = self._states.stored(line.row["object_key"] for line in lines)
+            self._stored = self._states.stored_originals(line.row["object_key"] for line in lines)
             live = session.execute(
                 select(Photo.map_id, Photo.sha256, Photo.id).where(
                     Photo.sha256.in_([line.row["sha256"] for line in lines]),
@@ -281,20 +289,20 @@ class _Rows:
 
     def model(self, session: Session, line: Line, known: Line | None, columns: Columns) -> bool:
         if known is None:
-            same = session.scalar(
+            existing_id = session.scalar(
                 select(Model.id).where(
                     Model.name == columns["name"], Model.fingerprint == columns["fingerprint"]
                 )
             )
-            if same is not None:
-                self._same_model[line.id] = same
+            if existing_id is not None:
+                self._existing_models[line.id] = existing_id
                 return False
         return True
 
     def map(self, session: Session, line: Line, known: Line | None, columns: Columns) -> bool:
         if columns["deleted_at"] is not None:
             if known is None:
-                return False  # what is left of it belongs to no row
+                return False  # nothing in the catalog refers to it
             columns["name"] = f"{DELETED_NAME_PREFIX}{line.id}"
         elif known is not None and known.row["deleted_at"] is not None:
             return False
@@ -303,10 +311,10 @@ class _Rows:
         )
         if taken_name is not None:
             name = f"{columns['name'][:80]}-{line.id.hex[-8:]}"
-            self._taken.renamed_maps[columns["name"]] = name
+            self._recovered.renamed_maps[columns["name"]] = name
             columns |= {"name": name, "revision": line.revision + 1}
         if known is None:
-            self._taken.maps += 1
+            self._recovered.maps += 1
         return True
 
     def vocabulary(
@@ -314,7 +322,7 @@ class _Rows:
     ) -> bool:
         if columns["map_id"] not in self._live_maps:
             return False
-        self._taken.vocabularies += known is None
+        self._recovered.vocabularies += known is None
         return True
 
     def whitening(self, session: Session, line: Line, known: Line | None, columns: Columns) -> bool:
@@ -331,7 +339,7 @@ class _Rows:
         if columns["state"] == GenerationState.BUILDING:
             if known is not None:
                 return False
-            # The job that built it is not in the journal.
+            # Its job is not in the journal.
             columns |= {"state": GenerationState.ABANDONED, "revision": line.revision + 1}
             columns["ended_at"] = session.scalar(select(db_now()))
         return self._generation(session, columns, known)
@@ -348,21 +356,21 @@ class _Rows:
                 Generation.id != line.id,
             )
         )
-        if other is not None:  # the catalog has gone another way since
+        if other is not None:  # the catalog has activated another generation since
             return False
         return self._generation(session, columns, known)
 
     def _generation(self, session: Session, columns: Columns, known: Line | None) -> bool:
         if columns["map_id"] not in self._live_maps:
             return False
-        columns["model_id"] = self._same_model.get(columns["model_id"], columns["model_id"])
+        columns["model_id"] = self._existing_models.get(columns["model_id"], columns["model_id"])
         for table, name in ((Vocabulary, "vocabulary_id"), (Model, "model_id")):
             if columns[name] is not None and session.get(table, columns[name]) is None:
-                return False  # in a damaged segment
+                return False  # its row is in a damaged segment
         whitening_id = columns["whitening_id"]
         if whitening_id is not None and session.get(StoredWhitening, whitening_id) is None:
             columns["whitening_id"] = None
-        self._taken.generations += known is None
+        self._recovered.generations += known is None
         return True
 
     def photo(self, session: Session, line: Line, known: Line | None, columns: Columns) -> bool:
@@ -371,20 +379,20 @@ class _Rows:
         if columns["deleted_at"] is not None:
             if known is None:
                 return False
-            self._taken.deleted_photos += known.row["deleted_at"] is None
+            self._recovered.deleted_photos += known.row["deleted_at"] is None
         elif known is not None and known.row["deleted_at"] is not None:
             return False
         elif known is None:
             if columns["object_key"] not in self._stored:
-                self._taken.lost_originals += 1
+                self._recovered.lost_originals += 1
                 return False
-            bytes_ = (columns["map_id"], columns["sha256"])
-            if self._live_bytes.setdefault(bytes_, line.id) != line.id:
-                self._taken.doubled_photos += 1
+            content = (columns["map_id"], columns["sha256"])
+            if self._live_bytes.setdefault(content, line.id) != line.id:
+                self._recovered.doubled_photos += 1
                 return False
-            self._taken.photos += 1
+            self._recovered.photos += 1
         else:
-            self._taken.changed_photos += 1
+            self._recovered.changed_photos += 1
         map_id = columns["map_id"]
         if map_id not in self._versions:
             self._versions[map_id] = increment_map_version(session, map_id)

@@ -1,8 +1,8 @@
-"""Keys of the HTTP API: what one looks like, what it may do, and when none is needed.
+"""API keys: format, scopes, hashing, and the loopback exemption.
 
-A key is 32 random bytes. A plain SHA-256 of it is what the catalog keeps: slow hashes and salts
-protect what people choose, and nobody can try out 2**256 keys. It costs a microsecond a call, and
-whoever reads the catalog or a backup finds no key that could be used.
+A key is 32 random bytes, and the catalog stores its plain SHA-256. Slow, salted hashes protect
+passwords that people choose; a random key of 256 bits can't be guessed. A plain hash costs a
+microsecond per request, and a leaked catalog or backup contains no usable key.
 """
 
 from __future__ import annotations
@@ -13,48 +13,49 @@ import secrets
 from collections.abc import Collection
 from enum import StrEnum
 
-API_KEY_PREFIX = "pw_"  # so that people and secret scanners know one when they see it
+API_KEY_PREFIX = "pw_"  # recognised by people and secret scanners
 KEY_BYTES = 32
-SHOWN_PREFIX_CHARACTERS = 11  # of a key, in lists: enough to know it by, and 48 of its 256 bits
+SHOWN_PREFIX_CHARACTERS = 11  # identifies a key in lists; reveals 48 of its 256 bits
 
 
 class Scope(StrEnum):
-    """What a key may do. None of the first two implies the other: a camera only writes."""
+    """Permissions of a key. `write` does not imply `read`: a camera only writes."""
 
-    READ = "read"  # look at photos, jobs and figures, and ask which place a photo shows
-    WRITE = "write"  # put in, change and delete photos; fit, evaluate, make maps
-    ADMIN = "admin"  # everything, also keys and webhooks
+    READ = "read"  # read photos, jobs and statistics; query by photo
+    WRITE = "write"  # upload, change and delete photos; fit, evaluate, create maps
+    ADMIN = "admin"  # everything, including keys and webhooks
 
 
 ALL_SCOPES = frozenset(Scope)
 
 
 def expand_scopes(scopes: Collection[Scope]) -> frozenset[Scope]:
-    """What a key with these scopes may do."""
+    """Return all scopes that these scopes imply."""
     return ALL_SCOPES if Scope.ADMIN in scopes else frozenset(scopes)
 
 
 def generate_api_key() -> str:
+    """Return a new random key."""
     return API_KEY_PREFIX + secrets.token_urlsafe(KEY_BYTES)
 
 
 def generate_local_key() -> str:
-    """A key for the commands of the user who runs the server, good until it ends."""
+    """Return a new key for local commands of the user who runs the server, valid until it ends."""
     return f"{API_KEY_PREFIX}local_{secrets.token_urlsafe(KEY_BYTES)}"
 
 
 def api_key_prefix(key: str) -> str:
-    """The part of a key that lists show."""
+    """Return the part of a key that is shown in lists."""
     return key[:SHOWN_PREFIX_CHARACTERS]
 
 
 def hash_api_key(key: str) -> str:
-    """SHA-256, hexadecimal."""
+    """Return the SHA-256 of a key, hexadecimal."""
     return hashlib.sha256(key.encode()).hexdigest()
 
 
 def is_loopback(host: str) -> bool:
-    """Does only this machine reach the address? A name that isn't `localhost` may lead anywhere."""
+    """Return whether only this machine can reach the address; False for names but `localhost`."""
     try:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:

@@ -1,9 +1,9 @@
-"""Where a webhook may lead: to the public internet, and to no machine of our own.
+"""Validation of webhook URLs, and protection against server-side request forgery (SSRF).
 
-Whoever may make webhooks must not reach through them what only the steward reaches: databases,
-admin pages, the metadata service of a cloud. A name is looked up each time before it is connected
-to, and the connection goes to the very address that was checked: what the name means a moment later
-(DNS rebinding) makes no difference.
+A webhook may only lead to the public internet: otherwise anyone who may create one could reach
+what the steward can reach, for example databases, admin pages or a cloud's metadata service. The
+host name is resolved before each connection, and the connection uses the very address that was
+checked, so that DNS rebinding has no effect.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from shared.errors import PlacewiseError, Unprocessable, invalid_field_error
 
 MAX_URL_CHARACTERS = 2000
 DEFAULT_PORTS = {"http": 80, "https": 443}
-NAT64 = ipaddress.ip_network("64:ff9b::/96")  # RFC 6052: an IPv4 address in its last 32 bits
-# Of protocols and not of machines (RFC 6890); the standard library calls parts of them global.
+NAT64 = ipaddress.ip_network("64:ff9b::/96")  # RFC 6052: the last 32 bits are an IPv4 address
+# Reserved for protocols (RFC 6890); `is_global` of the standard library is True for parts of them.
 NON_PUBLIC_NETWORKS = tuple(
     map(ipaddress.ip_network, ("192.0.0.0/24", "192.88.99.0/24", "64:ff9b:1::/48"))
 )
@@ -29,13 +29,13 @@ Address = ipaddress.IPv4Address | ipaddress.IPv6Address
 
 @dataclass(frozen=True, slots=True)
 class WebhookTarget:
-    """The parts of a webhook's URL that a connection needs."""
+    """The parts of a webhook URL that a connection needs."""
 
     scheme: str
     host: str
     port: int
     path: str
-    """With its query; what goes into the request line."""
+    """Path and query, as in the request line."""
 
     @property
     def host_header(self) -> str:
@@ -44,59 +44,68 @@ class WebhookTarget:
 
 
 def parse_webhook_url(url: str, *, allow_private: bool) -> WebhookTarget:
-    """The URL's parts. Unprocessable (`invalid_field_error`) for what no webhook may be: it
-    needs HTTPS,
-    unless private addresses are allowed, and holds no user, password or fragment."""
+    """Parse and validate a webhook URL.
+
+    Args:
+        url: must use HTTPS unless private addresses are allowed, and must not contain a user,
+            password or fragment.
+        allow_private: allow private addresses and plain HTTP.
+
+    Raises:
+        Unprocessable: `invalid_field` for any other URL.
+    """
     schemes = ("https", "http") if allow_private else ("https",)
     if len(url) > MAX_URL_CHARACTERS or not re.fullmatch(r"[!-~]+", url):
         raise invalid_field_error(
-            "url", f"has at most {MAX_URL_CHARACTERS} ASCII characters, no blanks"
+            "url", f"must have at most {MAX_URL_CHARACTERS} ASCII characters and no blanks"
         )
     try:
         parts = urlsplit(url)
         port, host = parts.port, parts.hostname
     except ValueError:
-        raise invalid_field_error("url", "is no address") from None
+        raise invalid_field_error("url", "is not a URL") from None
     if parts.scheme not in schemes or not host:
-        raise invalid_field_error("url", f"begins with {' or '.join(schemes)}:// and names a host")
+        raise invalid_field_error("url", f"must begin with {' or '.join(schemes)}:// and a host")
     if parts.username is not None or parts.password is not None or parts.fragment:
-        raise invalid_field_error("url", "holds no user, no password and no fragment")
+        raise invalid_field_error("url", "must not contain a user, a password or a fragment")
     if port == 0:
-        raise invalid_field_error("url", "has no port 0")
+        raise invalid_field_error("url", "must not have the port 0")
     path = (parts.path or "/") + (f"?{parts.query}" if parts.query else "")
     return WebhookTarget(parts.scheme, host, port or DEFAULT_PORTS[parts.scheme], path)
 
 
 def resolve_webhook_target(target: WebhookTarget, *, allow_private: bool) -> str:
-    """An address that the target may be connected at, now.
+    """Resolve the target's host name; return the IP address to connect to.
 
-    Raises Unprocessable (`webhook_address_forbidden`) where one of the name's addresses is not
-    public, also if others are, and PlacewiseError (`webhook_name_unknown`) where it has none.
+    Raises:
+        Unprocessable: `webhook_address_forbidden` when one of the addresses is not public, even
+            if others are.
+        PlacewiseError: `webhook_name_unknown` when the name has no address.
     """
     try:
-        found = socket.getaddrinfo(target.host, target.port, type=socket.SOCK_STREAM)
+        address_infos = socket.getaddrinfo(target.host, target.port, type=socket.SOCK_STREAM)
     except (OSError, UnicodeError) as error:
         raise PlacewiseError(
             "webhook_name_unknown", f"{target.host} has no address: {error}"
         ) from error
-    addresses = [str(entry[4][0]) for entry in found]
+    addresses = [str(entry[4][0]) for entry in address_infos]
     if not allow_private:
         for address in addresses:
             if not is_public_address(ipaddress.ip_address(address)):
                 raise Unprocessable(
                     "webhook_address_forbidden",
-                    f"{target.host} leads to {address}, which is no public address. Webhooks to "
-                    "machines of one's own need WEBHOOK_PRIVATE_ADDRESSES.",
+                    f"{target.host} resolves to {address}, which is not a public address. To allow "
+                    "webhooks to private addresses, set WEBHOOK_PRIVATE_ADDRESSES.",
                 )
     return addresses[0]
 
 
 def is_public_address(address: Address) -> bool:
-    """Is it a machine of the internet, whichever way the address is written?"""
+    """Return whether the address, or an IPv4 address embedded in it, is on the public internet."""
     if isinstance(address, ipaddress.IPv6Address):
-        inner = _embedded_ipv4(address)
-        if inner is not None:
-            return is_public_address(inner)
+        embedded = _embedded_ipv4(address)
+        if embedded is not None:
+            return is_public_address(embedded)
         if address.scope_id is not None or address.is_site_local:
             return False
     if any(address in network for network in NON_PUBLIC_NETWORKS):
@@ -107,7 +116,7 @@ def is_public_address(address: Address) -> bool:
 
 
 def _embedded_ipv4(address: ipaddress.IPv6Address) -> ipaddress.IPv4Address | None:
-    """The IPv4 address that an IPv6 one leads to: mapped, NAT64, 6to4, Teredo."""
+    """Return the IPv4 address in an IPv6 one: mapped, NAT64, 6to4 or Teredo; else None."""
     if address.ipv4_mapped is not None:
         return address.ipv4_mapped
     if address in NAT64:

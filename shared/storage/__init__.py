@@ -1,28 +1,29 @@
-"""The object store: bytes under keys. A folder when embedded; S3 for many machines.
+"""Object store: immutable bytes under string keys, in a local folder or an S3 bucket.
 
-`shared.storage.open_store` chooses between the two by the settings.
+`shared.storage.open_store.open_store` selects the implementation by the settings.
 
-| keys | what lies there |
+| keys | contents |
 |---|---|
 | `originals/<uuid>` | an uploaded photo |
-| `incoming/<upload>` | what a caller sent straight to the bucket, until the upload is completed |
-| `archives/<uuid>` | an uploaded archive, until its photos are in |
-| `checkpoints/<uuid>` | a checkpoint that was sent, until it is a model or refused |
-| `models/<sha256>/<uuid>.safetensors` | a model that was added: its configuration and weights |
-| `thumbnails/<photo>` | its thumbnail, JPEG |
-| `chunks/<generation>/<chunk>.npy`, `.json`, `.codes` | descriptor rows, what they are, codes |
+| `incoming/<upload>` | a presigned upload, until it is completed |
+| `archives/<uuid>` | an uploaded archive, until its photos are stored |
+| `checkpoints/<uuid>` | an uploaded checkpoint, until it is added as a model or rejected |
+| `models/<sha256>/<uuid>.safetensors` | an added model: its configuration and weights |
+| `thumbnails/<photo>` | a photo's thumbnail, JPEG |
+| `chunks/<generation>/<chunk>.npy`, `.json`, `.codes` | descriptor rows, manifest, sign codes |
 | `journal/<first>-<last>-<uuid>.jsonl.gz` | rows of the catalog (`shared.journal`) |
 | `vocabularies/<uuid>.npy` | VLAD centres |
 | `whitenings/<uuid>.safetensors` | PCA whitenings |
 | `queries/<job>`, `queries/<job>.npy` | a query photo that is not stored, and its descriptor |
-| `queries/<job>.json` | what a comparison has come to |
+| `queries/<job>.json` | the result of a comparison |
 | `features/<generation>/<photo>.npy` | a photo's local features, with LOCAL_FEATURES=keep |
-| `work/<job>/...` | what a sliced job keeps between its slices |
-| `trash/<day>/<key>` | an orphan that was moved there on that day, until TRASH_DAYS are over |
-| `imports/...` (IMPORT_PREFIX) | what others have put there; it is only read |
+| `work/<job>/...` | checkpoints of a job that runs in several steps |
+| `trash/<day>/<key>` | an orphan moved to the trash on that day, deleted after TRASH_DAYS |
+| `imports/...` (IMPORT_PREFIX) | the operator's files, which Placewise only reads |
 
-Notes of the store itself are no objects: `.placewise` (whose store it is, `store_owner`) and
-`.placewise-hold` (orphans are not collected until someone decides, `collection_hold`).
+Notes are small files of the store itself and not objects: `.placewise` (the catalog that owns the
+store, `shared.storage.ownership`) and `.placewise-hold` (garbage collection is suspended,
+`shared.storage.trash`).
 """
 
 from shared.storage.folder import FolderStore

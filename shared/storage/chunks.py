@@ -1,10 +1,10 @@
-"""The chunk format: descriptor rows as an immutable `.npy` file with a `.json` beside it.
+"""Chunk files: descriptor rows as an immutable `.npy` file, with a manifest and sign codes.
 
 `<chunk>.npy` is a C-contiguous (rows, dimension) array, float32, each row L2-normalised.
-`<chunk>.json` says what the rows are (spec, photo ids in row order, hash), so that a lost catalog
-can be rebuilt from the object store.
-`<chunk>.codes` holds the codes that search begins with (`shared.codes`), of chunks that are long
-enough to need any.
+`<chunk>.json`, the manifest, describes the rows (extractor spec, photo ids in row order, hash), so
+that a lost catalog can be rebuilt from the object store.
+`<chunk>.codes` has the sign codes that search scans first (`shared.codes`), for chunks that are
+large enough.
 """
 
 from __future__ import annotations
@@ -27,24 +27,22 @@ from shared.storage import ObjectStore
 Rows = NDArray[np.float32]
 Row = NDArray[np.float32]
 
-# From these on, codes lie beside a chunk: below, search compares rows as fast, or makes the few
-# codes in no time.
+# Sign codes are stored with a chunk of at least this dimension and size. For smaller ones, search
+# compares the rows as fast, or computes the codes quickly.
 CODED_DIMENSION = 7000
 CODED_BYTES = 8_000_000
 
-# Rows are unit vectors, or zero: with a length further off than this, one is damaged.
+# A row is a unit vector or zero. One whose norm differs by more than this is damaged.
 NORM_TOLERANCE = 1e-3
 
 CORRUPT = "chunk_corrupt"
 
-CORRUPT = "chunk_corrupt"
-
-HEADER_READ_BYTES = 1024  # what is read to find out where the rows begin: NumPy's header has 128
+HEADER_READ_BYTES = 1024  # enough for the header: NumPy writes 128 bytes
 
 
 @dataclass(frozen=True, slots=True)
 class WrittenChunk:
-    """What the catalog has to know of a chunk that lies in the object store."""
+    """A chunk in the object store, as the catalog registers it."""
 
     object_key: str
     rows: int
@@ -57,32 +55,32 @@ def chunk_key(generation_id: UUID, chunk_id: UUID) -> str:
 
 
 def manifest_key(object_key: str) -> str:
-    """The key of the `.json` beside a chunk."""
+    """Return the key of a chunk's manifest."""
     return object_key.removesuffix(".npy") + ".json"
 
 
 def codes_key(object_key: str) -> str:
-    """The key of the codes beside a chunk."""
+    """Return the key of a chunk's sign codes."""
     return object_key.removesuffix(".npy") + ".codes"
 
 
 def encode_rows(rows: Rows) -> bytes:
-    """(n, dimension) float32 rows as the bytes of a `.npy` file."""
+    """Encode (n, dimension) float32 rows as the bytes of a `.npy` file."""
     if rows.dtype != np.float32 or rows.ndim != 2:
-        raise ValueError(f"a chunk is 2-D float32, not {rows.ndim}-D {rows.dtype}")
+        raise ValueError(f"a chunk must be 2-D float32, not {rows.ndim}-D {rows.dtype}")
     buffer = io.BytesIO()
     np.save(buffer, np.ascontiguousarray(rows), allow_pickle=False)
     return buffer.getvalue()
 
 
 def decode_rows(data: bytes | mmap.mmap) -> Rows:
-    """The rows of a `.npy` file, sharing memory with `data`."""
+    """Decode the (rows, dimension) float32 array of a `.npy` file, without copying `data`."""
     shape, offset = _read_header(bytes(memoryview(data)[:HEADER_READ_BYTES]))
     return np.frombuffer(data, dtype=np.float32, offset=offset).reshape(shape)
 
 
 def _read_header(data: bytes) -> tuple[tuple[int, int], int]:
-    """(rows, dimension), and where the rows begin. ValueError when it is no chunk's."""
+    """Return (rows, dimension) and the offset of the rows; ValueError for another file."""
     buffer = io.BytesIO(data)
     major, _ = np.lib.format.read_magic(buffer)
     read_header = {
@@ -104,9 +102,15 @@ def write_chunk(
     photo_ids: list[UUID],
     spec: dict[str, Any],
 ) -> WrittenChunk:
-    """Put the chunk and its manifest into the store; the catalog does not know of them yet.
+    """Write a chunk, its manifest and, if it is large enough, its sign codes to the store.
 
-    The chunk goes last: it never lies there without its description.
+    The chunk is written last, so that it never exists without its manifest. Registering it in the
+    catalog is up to the caller.
+
+    Args:
+        rows: (n, dimension) float32, L2-normalised.
+        photo_ids: the photo of each row.
+        spec: the extractor spec, part of the manifest.
     """
     if len(photo_ids) != len(rows):
         raise ValueError(f"{len(rows)} rows for {len(photo_ids)} photos")
@@ -125,7 +129,7 @@ def write_chunk(
     }
     store.put(manifest_key(key), json.dumps(manifest).encode())
     if rows.shape[1] >= CODED_DIMENSION and rows.nbytes >= CODED_BYTES:
-        from shared.codes.serialization import encode_sign_codes  # numba takes a while to load
+        from shared.codes.serialization import encode_sign_codes  # importing numba is slow
 
         store.put(codes_key(key), encode_sign_codes(rows, sha256))
     store.put(key, data)
@@ -133,7 +137,7 @@ def write_chunk(
 
 
 def read_chunk(store: ObjectStore, object_key: str, sha256: str) -> Rows:
-    """The chunk's rows, checked against the catalog's hash; Unavailable when they differ."""
+    """Read a chunk and verify its SHA-256; Unavailable (`chunk_corrupt`) when it differs."""
     data = store.get(object_key)
     if hashlib.sha256(data).hexdigest() != sha256:
         raise chunk_corrupt_error(object_key)
@@ -141,10 +145,10 @@ def read_chunk(store: ObjectStore, object_key: str, sha256: str) -> Rows:
 
 
 def chunk_corrupt_error(object_key: str) -> Unavailable:
-    """A chunk's bytes are not those of its hash."""
+    """Return the error for a chunk whose bytes do not match its hash."""
     return Unavailable(
         CORRUPT,
-        f"The chunk {object_key} is not what was written (its hash differs). "
+        f"The chunk {object_key} is damaged (its hash differs). "
         "Restore the object from a backup, or describe its photos again: placewise verify "
         "--repair.",
         object_key=object_key,
@@ -152,49 +156,56 @@ def chunk_corrupt_error(object_key: str) -> Unavailable:
 
 
 def read_row(store: ObjectStore, object_key: str, row: int) -> Row:
-    """One row of a chunk, (dimension,); otherwise as `read_rows`."""
-    found: Row = read_rows(store, object_key, [row])[0]
-    return found
+    """Read one row of a chunk, (dimension,); otherwise as `read_rows`."""
+    vector: Row = read_rows(store, object_key, [row])[0]
+    return vector
 
 
 def read_rows(store: ObjectStore, object_key: str, rows: Sequence[int]) -> Rows:
-    """These rows of a chunk, (n, dimension) in their order, fetching little more than them.
+    """Read single rows of a chunk with range requests.
 
-    No hash is checked: that of a chunk is of all its bytes. IndexError when there is no such row,
-    ValueError for what is no chunk or ends too early, NotFound when the object is missing.
+    The hash is not verified, since it covers the whole chunk.
+
+    Returns:
+        (n, dimension) float32, in the order of `rows`.
+
+    Raises:
+        IndexError: the chunk has no such row.
+        ValueError: the object is not a chunk, or is truncated.
+        NotFound: the object is missing.
     """
     with store.open(object_key) as file:
-        (there, dimension), offset = _read_header(_read_up_to(file, HEADER_READ_BYTES))
+        (row_count, dimension), offset = _read_header(_read_up_to(file, HEADER_READ_BYTES))
         size = dimension * np.dtype(np.float32).itemsize
-        found = np.empty((len(rows), dimension), dtype=np.float32)
-        for place, row in enumerate(rows):
-            if row >= there:
+        vectors = np.empty((len(rows), dimension), dtype=np.float32)
+        for position, row in enumerate(rows):
+            if row >= row_count:
                 raise IndexError(row)
             file.seek(offset + row * size)
             data = _read_up_to(file, size)
             if len(data) < size:
-                raise ValueError(f"the object ends {size - len(data)} bytes too early")
-            found[place] = np.frombuffer(data, dtype=np.float32)
-    return found
+                raise ValueError(f"the object is {size - len(data)} bytes too short")
+            vectors[position] = np.frombuffer(data, dtype=np.float32)
+    return vectors
 
 
 def rows_are_valid(rows: Rows) -> NDArray[np.bool_]:
-    """(n,) which of (n, dimension) rows can be what was written: those of length 1, or zero."""
-    lengths = np.linalg.norm(rows, axis=1)
-    return np.asarray((lengths == 0) | (np.abs(lengths - 1) < NORM_TOLERANCE))
+    """Return an (n,) mask of the (n, dimension) rows that are unit vectors or zero."""
+    norms = np.linalg.norm(rows, axis=1)
+    return np.asarray((norms == 0) | (np.abs(norms - 1) < NORM_TOLERANCE))
 
 
 def _read_up_to(file: BinaryIO, size: int) -> bytes:
-    """Up to `size` bytes; fewer only at the end. (A network's file may give less at a time.)"""
-    pieces = []
-    while size and (piece := file.read(size)):
-        pieces.append(piece)
-        size -= len(piece)
-    return b"".join(pieces)
+    """Read `size` bytes, fewer only at the end; one read of a network stream may return less."""
+    blocks = []
+    while size and (block := file.read(size)):
+        blocks.append(block)
+        size -= len(block)
+    return b"".join(blocks)
 
 
 def delete_chunk(store: ObjectStore, object_key: str) -> None:
-    """Remove the chunk, its codes and its manifest."""
+    """Delete a chunk, its sign codes and its manifest."""
     store.delete(object_key)
     store.delete(codes_key(object_key))
     store.delete(manifest_key(object_key))

@@ -1,7 +1,7 @@
-"""Objects as files below one folder, written whole: temporary file, fsync, rename.
+"""Object store in a local folder: objects are files, written atomically.
 
-One kind of object may lie elsewhere: the files of `originals/...` in a folder of their own, which
-may be on another disk.
+A write goes to a temporary file, which is fsynced and renamed. The objects of a top-level name,
+such as `originals/...`, may be stored in a folder of their own, also on another disk.
 """
 
 from __future__ import annotations
@@ -26,40 +26,45 @@ from shared.storage.protocol import ObjectInfo
 
 log = logging.getLogger(__name__)
 
-# No file there, or a folder on the way or at the end: to a store of keys it is all the same.
+# A missing file, a file among the parents, or a folder: for a store of keys, all are missing keys.
 NOT_FOUND_ERRORS = (FileNotFoundError, NotADirectoryError, IsADirectoryError)
-PARTIAL_SUFFIX = (
-    ".partial"  # the folder of files being written: same file system, so rename is atomic
-)
-OWNER_MARK = ".placewise"  # the file that says whose folder it is (`shared.storage.open_store`)
-# Another folder's part of the trash, on its own disk: so a move into the trash is a rename.
-TRASH_ELSEWHERE = f"{OWNER_MARK}-trash"
+# The folder of files being written, on the same file system, so that a rename is atomic.
+PARTIAL_SUFFIX = ".partial"
+OWNER_MARK = ".placewise"  # the note with the id of the owner (`shared.storage.ownership`)
+# The trash of such a separate folder, on the same disk, so that moving there is a rename.
+SEPARATE_TRASH = f"{OWNER_MARK}-trash"
 FULL_RETRY_SECONDS = 60
-PIECE_BYTES = 1024 * 1024
-KEPT_FREE_BYTES = 16 * 1024 * 1024  # the last of the disk is the catalog's: it deletes with that
+BLOCK_BYTES = 1024 * 1024
+RESERVED_FREE_BYTES = 16 * 1024 * 1024  # left to the catalog, which needs space to delete rows
 
 
 class FolderStore:
-    """An object store in a local folder. What killed writers left half written goes at start."""
+    """An object store in a local folder; partial files of killed writers are deleted at start."""
 
     def __init__(
-        self, root: Path, elsewhere: Mapping[str, Path] | None = None, *, alone: bool = True
+        self,
+        root: Path,
+        separate_folders: Mapping[str, Path] | None = None,
+        *,
+        exclusive: bool = True,
     ) -> None:
-        """`elsewhere` says in which other folder the keys lie that begin with a name and a slash:
-        `{"originals": Path("/photos")}` keeps `originals/a` as `/photos/a`.
-
-        `alone` says that no other process writes there now, so that what is half written is left
-        over from one that was killed.
+        """
+        Args:
+            root: folder of all objects that have no separate folder.
+            separate_folders: folders of top-level names: `{"originals": Path("/photos")}` stores
+                `originals/a` as `/photos/a`.
+            exclusive: no other process writes to the folder now, so that partial files are left
+                over from a killed process and can be deleted.
         """
         self.root = root
-        self._elsewhere = dict(elsewhere or {})
+        self._separate_folders = dict(separate_folders or {})
         for folder in self._folders():
             make_private_folder(folder / PARTIAL_SUFFIX)
-            for left_over in (folder / PARTIAL_SUFFIX).iterdir() if alone else ():
-                left_over.unlink()
+            for partial in (folder / PARTIAL_SUFFIX).iterdir() if exclusive else ():
+                partial.unlink()
 
     def path(self, key: str) -> Path:
-        """The file of a key. Keys are names joined by single slashes, none of them `.` or `..`."""
+        """Return the file of a key; ValueError for an invalid key."""
         folder, parts = self._locate(key)
         return folder.joinpath(*parts)
 
@@ -87,7 +92,7 @@ class FolderStore:
         try:
             return self.path(key).open("rb")
         except NOT_FOUND_ERRORS:
-            raise _not_found(key) from None
+            raise _not_found_error(key) from None
 
     def read_range(self, key: str, begin: int, size_bytes: int) -> bytes:
         with self.open(key) as file:
@@ -108,39 +113,39 @@ class FolderStore:
         path = self.path(key)
         with contextlib.suppress(*NOT_FOUND_ERRORS):
             path.unlink()
-        if key.startswith(TRASH):  # or a folder would be left for each day
+        if key.startswith(TRASH):  # otherwise an empty folder of each day would remain
             _remove_empty_folders(path.parent, self._trash_of(self._locate(key)[0]))
 
     def list(self, prefix: str) -> Iterator[ObjectInfo]:
         yield from self._list_folder(self.root, "", prefix)
-        for name, folder in self._elsewhere.items():
+        for name, folder in self._separate_folders.items():
             yield from self._list_folder(folder, f"{name}/", prefix)
             if TRASH.startswith(prefix) or prefix.startswith(TRASH):
                 with contextlib.suppress(*NOT_FOUND_ERRORS):
-                    for day in sorted((folder / TRASH_ELSEWHERE).iterdir()):
+                    for day in sorted((folder / SEPARATE_TRASH).iterdir()):
                         yield from self._list_folder(day, f"{TRASH}{day.name}/{name}/", prefix)
 
     def move(self, source: str, target: str) -> None:
         old, new = self.path(source), self.path(target)
         if self.head(source) is None:
-            raise _not_found(source)
+            raise _not_found_error(source)
         try:
             os.utime(old)
-            made = _make_parents(new)
+            changed_folders = _make_parents(new)
             try:
                 old.replace(new)
             except OSError as error:
                 if error.errno != errno.EXDEV:
                     raise
-                self._copy(old, target)  # one of the folders is a mount of its own
+                self._copy(old, target)  # one of the folders is a mount point
                 old.unlink()
         except NOT_FOUND_ERRORS:
-            raise _not_found(source) from None
-        for folder in (*made, old.parent):
+            raise _not_found_error(source) from None
+        for folder in (*changed_folders, old.parent):
             _sync_folder(folder)
 
-    def free_trash(self, least_free_bytes: int) -> int:
-        return sum(self._empty_trash(folder, least_free_bytes) for folder in self._folders())
+    def free_trash(self, min_free_bytes: int) -> int:
+        return sum(self._empty_trash(folder, min_free_bytes) for folder in self._folders())
 
     def read_note(self, name: str) -> bytes | None:
         try:
@@ -155,7 +160,7 @@ class FolderStore:
             partial.replace(note)
         else:
             with contextlib.suppress(FileExistsError):
-                note.hardlink_to(partial)  # of two at the same moment one succeeds
+                note.hardlink_to(partial)  # of two concurrent writers one succeeds
             partial.unlink()
         _sync_folder(self.root)
 
@@ -171,26 +176,26 @@ class FolderStore:
                 probe.unlink()
             except OSError as error:
                 if error.errno in DISK_FULL:
-                    raise _full() from error
+                    raise _disk_full_error() from error
                 raise Unavailable(
                     "object_store_unavailable",
-                    f"Can't write below {folder.name}: {error.strerror}. "
+                    f"Can't write to the folder {folder.name}: {error.strerror}. "
                     "Check the disk's free space and the folder's permissions.",
                 ) from error
 
     def _folders(self) -> Iterator[Path]:
         yield self.root
-        yield from self._elsewhere.values()
+        yield from self._separate_folders.values()
 
     def _locate(self, key: str) -> tuple[Path, Sequence[str]]:
-        """The folder that a key lies in, and the names that lead to it from there."""
+        """Return the folder of a key, and the path of its file relative to it."""
         folder, parts = self.root, check_key(key).split("/")
-        if f"{parts[0]}/" == TRASH and len(parts) > 3 and parts[2] in self._elsewhere:
-            return self._elsewhere[parts[2]], [TRASH_ELSEWHERE, parts[1], *parts[3:]]
-        if parts[0] in self._elsewhere and len(parts) > 1:
-            folder, parts = self._elsewhere[parts[0]], parts[1:]
+        if f"{parts[0]}/" == TRASH and len(parts) > 3 and parts[2] in self._separate_folders:
+            return self._separate_folders[parts[2]], [SEPARATE_TRASH, parts[1], *parts[3:]]
+        if parts[0] in self._separate_folders and len(parts) > 1:
+            folder, parts = self._separate_folders[parts[0]], parts[1:]
         if _is_reserved(parts[0]):
-            raise ValueError(f"the name {parts[0]} is the store's own: {key!r}")
+            raise ValueError(f"the name {parts[0]} is reserved by the store: {key!r}")
         return folder, parts
 
     def _note(self, name: str) -> Path:
@@ -199,16 +204,18 @@ class FolderStore:
         return self.root / name
 
     def _trash_of(self, folder: Path) -> Path:
-        return folder / (TRASH.rstrip("/") if folder == self.root else TRASH_ELSEWHERE)
+        return folder / (TRASH.rstrip("/") if folder == self.root else SEPARATE_TRASH)
 
-    def _empty_trash(self, folder: Path, least_free_bytes: int | None = None) -> int:
-        """Delete what lies in the trash of this folder, oldest day first, all or until its disk has
-        this much free; how many files."""
+    def _empty_trash(self, folder: Path, min_free_bytes: int | None = None) -> int:
+        """Delete the trash of this folder, oldest day first; return the number of files.
+
+        With `min_free_bytes`, stop when its disk has this much free.
+        """
         trash, deleted = self._trash_of(folder), 0
         with contextlib.suppress(*NOT_FOUND_ERRORS):
             for day in sorted(trash.iterdir()):
                 free = shutil.disk_usage(folder).free
-                if least_free_bytes is not None and free >= least_free_bytes:
+                if min_free_bytes is not None and free >= min_free_bytes:
                     break
                 for directory, _, names in os.walk(day):
                     for name in names:
@@ -218,84 +225,86 @@ class FolderStore:
                 for directory, _, _ in os.walk(day, topdown=False):
                     _remove_empty_folders(Path(directory), trash)
         if deleted:
-            log.warning("no room on the disk: %d objects of the trash were deleted", deleted)
+            log.warning("low disk space: %d objects in the trash were deleted", deleted)
         return deleted
 
     def _copy(self, path: Path, key: str) -> None:
         writer = self.writer(key)
         try:
             with path.open("rb") as file:
-                while piece := file.read(PIECE_BYTES):
-                    writer.write(piece)
+                while block := file.read(BLOCK_BYTES):
+                    writer.write(block)
             writer.commit()
         finally:
             writer.abort()
 
-    def _list_folder(self, folder: Path, begin: str, prefix: str) -> Iterator[ObjectInfo]:
-        """The objects in one of the folders, whose keys begin with `begin`."""
-        if not (prefix.startswith(begin) or begin.startswith(prefix)):
+    def _list_folder(self, folder: Path, base_key: str, prefix: str) -> Iterator[ObjectInfo]:
+        """Iterate over the objects of one folder, whose keys begin with `base_key`."""
+        if not (prefix.startswith(base_key) or base_key.startswith(prefix)):
             return
-        below = prefix.removeprefix(begin) if prefix.startswith(begin) else ""
+        below = prefix.removeprefix(base_key) if prefix.startswith(base_key) else ""
         start = folder.joinpath(*PurePosixPath(below).parts[: below.count("/")])
         for directory, folders, names in os.walk(start):
             if Path(directory) == folder:
                 folders[:] = [name for name in folders if not _is_reserved(name)]
             for name in names:
                 path = Path(directory, name)
-                inside = path.relative_to(folder)
-                key = begin + inside.as_posix()
+                relative_path = path.relative_to(folder)
+                key = base_key + relative_path.as_posix()
                 if (
-                    _is_reserved(inside.parts[0])
+                    _is_reserved(relative_path.parts[0])
                     or not key.startswith(prefix)
                     or not is_valid_key(key)
                 ):
                     continue
                 if self.path(key) != path:
-                    continue  # in the root's own folder of a name that lies elsewhere
+                    continue  # under the root, but its name has a separate folder
                 with contextlib.suppress(FileNotFoundError):  # deleted since it was listed
                     yield _info(key, path.stat())
 
 
 @contextlib.contextmanager
 def _raise_storage_full() -> Iterator[None]:
-    """StorageFull (`disk_full`) for a disk, or a quota, that takes no more."""
+    """Convert the errors of a full disk or quota to StorageFull (`disk_full`)."""
     try:
         yield
     except OSError as error:
         if error.errno not in DISK_FULL:
             raise
-        raise _full() from error
+        raise _disk_full_error() from error
 
 
-def _full() -> StorageFull:
+def _disk_full_error() -> StorageFull:
     return StorageFull(
         "disk_full",
-        "The disk of the object store is full: make room on it, or delete photos or maps.",
+        "The disk of the object store is full. Free disk space, or delete photos or maps.",
         retry_after_seconds=FULL_RETRY_SECONDS,
     )
 
 
 class FolderWriter:
-    """Writes beside the target and renames on `commit`. On a full disk it goes on where
-    `make_room` could delete something."""
+    """Writes a partial file and renames it on `commit`.
+
+    On a full disk it calls `free_space` and continues while that returns True.
+    """
 
     @_raise_storage_full()
-    def __init__(self, target: Path, partial: Path, make_room: Callable[[], bool]) -> None:
+    def __init__(self, target: Path, partial: Path, free_space: Callable[[], bool]) -> None:
         self._target = target
         self._partial = partial
-        self._make_room = make_room
-        while shutil.disk_usage(partial.parent).free < KEPT_FREE_BYTES:
-            if not make_room():
+        self._make_room = free_space
+        while shutil.disk_usage(partial.parent).free < RESERVED_FREE_BYTES:
+            if not free_space():
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        # Unbuffered: what a full disk did not take is not tried again by closing the file.
+        # Unbuffered: closing the file must not retry a write that a full disk rejected.
         self._file = create_private_file(partial, buffering=0)
 
     @_raise_storage_full()
     def write(self, data: bytes) -> None:
-        left = memoryview(data)
-        while left:
+        remaining = memoryview(data)
+        while remaining:
             try:
-                left = left[self._file.write(left) :]
+                remaining = remaining[self._file.write(remaining) :]
             except OSError as error:
                 if error.errno not in DISK_FULL or not self._make_room():
                     raise
@@ -305,13 +314,13 @@ class FolderWriter:
         os.fsync(self._file.fileno())
         self._file.close()
         try:
-            made = _make_parents(self._target)
+            changed_folders = _make_parents(self._target)
             self._partial.replace(self._target)
         except (FileExistsError, IsADirectoryError, NotADirectoryError) as error:
             raise ValueError(
-                f"{self._target.name!r}: one object's key continues another object's key"
+                f"{self._target.name!r}: an object's key must not be the parent of another key"
             ) from error
-        for folder in made:
+        for folder in changed_folders:
             _sync_folder(folder)
 
     def abort(self) -> None:
@@ -319,18 +328,20 @@ class FolderWriter:
         self._partial.unlink(missing_ok=True)
 
 
-def _not_found(key: str) -> NotFound:
-    return NotFound("object_not_found", f"The object store has no {key!r}.", key=key)
+def _not_found_error(key: str) -> NotFound:
+    return NotFound("object_not_found", f"The object store has no object {key!r}.", key=key)
 
 
 def _is_reserved(name: str) -> bool:
-    """Whether a name directly in one of the folders is the store's own: no object lies there."""
+    """Return whether the store uses a top-level name itself, so that no object may have it."""
     return name == PARTIAL_SUFFIX or name.startswith(OWNER_MARK)
 
 
 def _make_parents(file: Path) -> Sequence[Path]:
-    """Create the folders of a file that is to be renamed. Those that changed by that: the rename
-    has to survive a power cut, and so has every folder made for it."""
+    """Create the parents of a file; return the folders to fsync after it was renamed.
+
+    The rename must survive a power loss, and so must every folder created for it.
+    """
     changed = [file.parent]
     while not changed[-1].exists():
         changed.append(changed[-1].parent)
@@ -339,7 +350,7 @@ def _make_parents(file: Path) -> Sequence[Path]:
 
 
 def _remove_empty_folders(folder: Path, top: Path) -> None:
-    """The folder and those above it, up to `top`, as far as they are empty."""
+    """Delete the folder and its parents, up to `top`, while they are empty."""
     with contextlib.suppress(OSError):
         while folder.is_relative_to(top):
             folder.rmdir()

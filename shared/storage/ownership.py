@@ -1,8 +1,8 @@
-"""The owner of an object store: each store belongs to one catalog, whose id it carries as a mark.
+"""Ownership of an object store: each store belongs to one catalog and carries its id.
 
-In a store that another catalog uses as well, each Placewise would collect the objects that its own
-catalog does not know. A store that is not the one of before holds none of the photos. A folder and
-a bucket carry the same mark, the note `.placewise`.
+The id is in the note `.placewise` of the folder or bucket. The check prevents two failures. If two
+catalogs used the same store, each would collect the objects that its own rows do not reference. If
+the store is not the one used before, all photos would be missing.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from shared.storage.s3 import S3Store
 
 log = logging.getLogger(__name__)
 
-WAYS_OUT = (
+RECOVERY_ADVICE = (
     "Restore the catalog (the file itself, or `placewise restore` into an empty one) or correct "
     "DATABASE_URL; rebuild the catalog from the objects: placewise rebuild-catalog; or make this "
-    "catalog the owner, which does not know those objects: placewise storage adopt."
+    "catalog, which does not know those objects, the owner: placewise storage adopt."
 )
 
 
-class Place(TypedDict):
-    """Where a bucket is."""
+class BucketLocation(TypedDict):
+    """Endpoint and name of a bucket."""
 
     endpoint: str
     bucket: str
@@ -38,112 +38,126 @@ class Place(TypedDict):
 def claim_store(
     store: OwnedStore,
     owner: UUID,
-    before: Place | None,
+    previous: BucketLocation | None,
     folder: Path,
-    named_keys: Callable[[], Collection[str]],
+    sample_keys: Callable[[], Collection[str]],
     import_prefix: str,
-) -> Place | None:
-    """Mark a store that is used for the first time; check the mark at every other start.
+) -> BucketLocation | None:
+    """Mark a store that is used for the first time; check its owner at every other start.
 
-    `owner` is the catalog's id, `before` the bucket that the catalog remembers, `folder` where its
-    objects lie without a bucket, `named_keys` gives a sample of the keys that the catalog's rows
-    name: a store without a mark that has them is marked. Returns the bucket, None for a folder.
-    Safe to call from several processes of one catalog at once.
+    Several processes of one catalog may call it concurrently.
 
-    Raises Misconfigured: `bucket_taken`, `folder_taken` for a store that is not this catalog's;
-    `object_store_changed` where the objects that the catalog knows would be out of reach. Raises
-    Unavailable as `check` does.
+    Args:
+        owner: the catalog's id.
+        previous: the bucket that the catalog has recorded; None for a folder.
+        folder: where the catalog's objects are when it uses no bucket.
+        sample_keys: returns a sample of the keys that the catalog's rows reference. A store
+            without a mark that has them is marked.
+        import_prefix: key prefix of the operator's own objects.
+
+    Returns:
+        The location of the bucket; None for a folder.
+
+    Raises:
+        Misconfigured: `bucket_taken`, `folder_taken` for a store of another catalog;
+            `object_store_changed` where the catalog's objects would be missing.
+        Unavailable: as `check`.
     """
-    place = place_of(store)
-    if place is None and before is not None:
+    location = bucket_location(store)
+    if location is None and previous is not None:
         raise Misconfigured(
             "object_store_changed",
-            f"The objects lie in the bucket {before['bucket']} at {before['endpoint']}, and "
-            "S3_ENDPOINT is not set. Set it with its keys.",
+            f"The objects are in the bucket {previous['bucket']} at {previous['endpoint']}, but "
+            "S3_ENDPOINT is not set. Set it, with S3_ACCESS_KEY and S3_SECRET_KEY.",
         )
-    if place is not None:
+    if location is not None:
         store.check()
-    found = read_owner(store)
-    if found is None:
-        if place is not None and before is not None and before != place:
+    current_owner = read_owner(store)
+    if current_owner is None:
+        if location is not None and previous is not None and previous != location:
             raise Misconfigured(
                 "object_store_changed",
-                f"The objects lie in the bucket {before['bucket']} at {before['endpoint']}; "
-                f"S3_BUCKET is {place['bucket']} at {place['endpoint']}, which has no "
-                f"{OWNER_MARK} of "
-                f"it. To move them: copy the whole bucket, {OWNER_MARK} too.",
+                f"The objects are in the bucket {previous['bucket']} at {previous['endpoint']}, "
+                f"but S3_BUCKET is {location['bucket']} at {location['endpoint']}, which has no "
+                f"object {OWNER_MARK}. To move the objects, copy the whole bucket, including "
+                f"{OWNER_MARK}.",
             )
-        if place is not None and before is None:
+        if location is not None and previous is None:
             _check_no_objects(folder)
-        _check_unmarked(store, named_keys(), import_prefix)
+        _check_unmarked(store, sample_keys(), import_prefix)
         store.write_note(OWNER_MARK, str(owner).encode(), replace=False)
-        found = read_owner(store)  # another catalog's process may have come at the same moment
-    if found != str(owner):
-        raise taken(store, "belongs to another catalog than this one")
-    return place
+        current_owner = read_owner(store)  # another catalog may have claimed it concurrently
+    if current_owner != str(owner):
+        raise store_taken_error(store, "belongs to another catalog than this one")
+    return location
 
 
-def place_of(store: OwnedStore) -> Place | None:
-    """The bucket; None for a folder."""
+def bucket_location(store: OwnedStore) -> BucketLocation | None:
+    """Return the location of a bucket; None for a folder."""
     if not isinstance(store, S3Store):
         return None
-    return Place(endpoint=store.bucket.endpoint, bucket=store.bucket.name)
+    return BucketLocation(endpoint=store.bucket.endpoint, bucket=store.bucket.name)
 
 
 def read_owner(store: OwnedStore) -> str | None:
-    """The id of the catalog that owns the store; None for a store without a mark."""
+    """Return the id of the catalog that owns the store; None for a store without a mark."""
     mark = store.read_note(OWNER_MARK)
     return None if mark is None else mark.decode().strip()
 
 
 def check_free(store: OwnedStore, import_prefix: str) -> None:
-    """Misconfigured as `claim_store`, for a store that a new catalog can't own."""
+    """Raise Misconfigured as `claim_store` for a store that a new catalog can't own."""
     if read_owner(store) is not None:
-        raise taken(store, "belongs to a catalog, and this one is new")
+        raise store_taken_error(store, "belongs to a catalog, and this one is new")
     _check_unmarked(store, (), import_prefix)
 
 
-def taken(store: OwnedStore, why: str) -> Misconfigured:
-    """The refusal to use a store that is not this catalog's; it names what the operator can do."""
+def store_taken_error(store: OwnedStore, reason: str) -> Misconfigured:
+    """Return the error for a store of another catalog, with advice for the operator."""
     code = "bucket_taken" if isinstance(store, S3Store) else "folder_taken"
     return Misconfigured(
         code,
-        f"{_name_of(store)} {why} (DATABASE_URL, or PLACEWISE_HOME where that is not set). Nothing "
-        f"was changed. {WAYS_OUT}",
+        f"{_display_name(store)} {reason} (DATABASE_URL, or PLACEWISE_HOME where that is not set). "
+        f"Nothing was changed. {RECOVERY_ADVICE}",
     )
 
 
-def _check_unmarked(store: OwnedStore, named: Collection[str], import_prefix: str) -> None:
-    """Refuse a store without a mark, unless it is empty or has what the catalog names."""
-    there = sum(store.head(key) is not None for key in named)
-    if named and 2 * there >= len(named):  # single lost objects are for `placewise verify`
-        log.info("%s has the catalog's objects, and is marked as the catalog's", _name_of(store))
+def _check_unmarked(store: OwnedStore, sample: Collection[str], import_prefix: str) -> None:
+    """Reject a store without a mark, unless it is empty or has the sample of referenced keys."""
+    present = sum(store.head(key) is not None for key in sample)
+    if sample and 2 * present >= len(sample):  # `placewise verify` reports single lost objects
+        log.info(
+            "%s has the catalog's objects and is now marked as owned by it", _display_name(store)
+        )
         return
-    if _holds_objects(store, import_prefix):
-        raise taken(store, "holds objects that this catalog does not know")
-    if named:
+    if _has_objects(store, import_prefix):
+        raise store_taken_error(store, "has objects that this catalog does not know")
+    if sample:
         raise Misconfigured(
             "object_store_changed",
-            f"{_name_of(store)} is empty, and the catalog has photos or models that lie elsewhere. "
-            "Is its disk mounted? Otherwise correct PLACEWISE_HOME or S3_BUCKET, or restore the "
+            f"{_display_name(store)} is empty, but the catalog references photos or models. "
+            "Is the disk mounted? Otherwise correct PLACEWISE_HOME or S3_BUCKET, or restore the "
             "objects from a backup (placewise restore).",
         )
 
 
-def _holds_objects(store: OwnedStore, import_prefix: str) -> bool:
-    """Whether it holds objects of some Placewise. What lies under IMPORT_PREFIX is its owner's. In
-    a folder, which earlier releases did not mark, neither does count what was put into UPLOAD_DIR
-    by hand, nor what a query has left for an hour."""
+def _has_objects(store: OwnedStore, import_prefix: str) -> bool:
+    """Return whether the store has objects that a Placewise has written.
+
+    Objects under IMPORT_PREFIX belong to the operator. In a folder, which earlier releases did not
+    mark, files that people put into UPLOAD_DIR and temporary objects of queries and jobs don't
+    count either.
+    """
     for info in store.list(""):
         if info.key.startswith((OWNER_MARK, import_prefix)):
             continue
-        by_hand = info.key.startswith(ORIGINALS) and not is_original_key(info.key)
-        if isinstance(store, S3Store) or not (by_hand or info.key.startswith((QUERIES, WORK))):
+        is_foreign = info.key.startswith(ORIGINALS) and not is_original_key(info.key)
+        if isinstance(store, S3Store) or not (is_foreign or info.key.startswith((QUERIES, WORK))):
             return True
     return False
 
 
-def _name_of(store: OwnedStore) -> str:
+def _display_name(store: OwnedStore) -> str:
     if isinstance(store, S3Store):
         return f"The bucket {store.bucket.name} (S3_BUCKET) at {store.bucket.endpoint}"
     assert isinstance(store, FolderStore), "there are two kinds"
@@ -155,6 +169,6 @@ def _check_no_objects(folder: Path) -> None:
     if any(PARTIAL_SUFFIX not in path.parts for path in files):
         raise Misconfigured(
             "object_store_changed",
-            f"Objects lie in {folder} already, and would be out of reach in a bucket. Unset "
-            "S3_ENDPOINT, or take another PLACEWISE_HOME for the bucket.",
+            f"There are objects in {folder}, which would be missing with a bucket. Unset "
+            "S3_ENDPOINT, or set another PLACEWISE_HOME for the bucket.",
         )

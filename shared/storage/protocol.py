@@ -1,4 +1,4 @@
-"""What every object store can do. One contract test serves all of them."""
+"""The interface of object stores; one contract test covers all implementations."""
 
 from __future__ import annotations
 
@@ -11,48 +11,51 @@ from typing import BinaryIO, Protocol
 
 @dataclass(frozen=True, slots=True)
 class ObjectInfo:
+    """Metadata of a stored object."""
+
     key: str
     size_bytes: int
     modified_at: datetime
-    """When it was written, by the store's clock, UTC."""
+    """Time of the write by the store's clock, UTC."""
 
 
 @dataclass(frozen=True, slots=True)
 class PresignedPut:
-    """An address at which one object may be put, without keys."""
+    """A presigned PUT request for one object, which needs no credentials."""
 
     url: str
     headers: dict[str, str]
-    """To be sent with it, as they stand: they are part of the signature."""
+    """Headers that must be sent unchanged: they are part of the signature."""
 
 
 class ObjectWriter(Protocol):
-    """Writes one object piece by piece; nothing is visible before `commit`."""
+    """Writes one object block by block; nothing is visible before `commit`."""
 
     def write(self, data: bytes) -> None: ...
 
     def commit(self) -> None:
-        """Make the whole object visible and durable at once.
+        """Make the object visible and durable atomically.
 
-        When it raises Unavailable, the object is whole or absent, and no one knows which.
+        After Unavailable the object is either complete or absent; the caller can't know which.
         """
 
     def abort(self) -> None:
-        """Forget what was written; harmless after `commit`. Raises nothing."""
+        """Discard what was written; a no-op after `commit`. Never raises."""
 
 
 class ObjectStore(Protocol):
-    """Objects are whole or absent: a crash never leaves a part of one under its key.
+    """A store of objects with atomic writes: a crash never leaves a partial object under its key.
 
-    A key is names joined by single slashes (`shared.storage.keys.check_key`); ValueError for
-    anything else. No key may continue another one's after a slash: `a` and `a/b` are a file and a
-    folder of one name. A folder refuses the second one with ValueError, a bucket keeps both.
+    A key consists of names joined by single slashes (`shared.storage.keys.check_key`); ValueError
+    for anything else. No key may be another key followed by a slash and more: `a` and `a/b` would
+    be a file and a folder of the same name. A folder rejects the second one with ValueError, a
+    bucket stores both.
 
-    `get`, `open` and `read_range` raise NotFound (`object_not_found`) for a missing key. Everything
-    raises Unavailable while a store on another machine can't be used: `object_store_unavailable`,
-    `object_store_busy`, `object_store_refused`, `bucket_not_found`; writing raises its kind
-    StorageFull (`object_store_full`, `disk_full`) when there is no room. Reading from what `open`
-    has given raises so, too.
+    `get`, `open` and `read_range` raise NotFound (`object_not_found`) for a missing key. Every
+    operation raises Unavailable while a remote store can't be used: `object_store_unavailable`,
+    `object_store_busy`, `object_store_refused`, `bucket_not_found`. Writing raises the subclass
+    StorageFull (`object_store_full`, `disk_full`) when the store is full. Reads from a file that
+    `open` returned raise the same errors.
     """
 
     def writer(self, key: str) -> ObjectWriter: ...
@@ -62,23 +65,28 @@ class ObjectStore(Protocol):
     def get(self, key: str) -> bytes: ...
 
     def open(self, key: str) -> BinaryIO:
-        """A seekable reader that fetches only what is read."""
+        """Open a seekable reader that fetches only the parts that are read."""
 
     def read_range(self, key: str, begin: int, size_bytes: int) -> bytes:
-        """Up to `size_bytes` from the offset `begin`, fewer only where the object ends before; for
-        readers that rest between two ranges longer than a server keeps a connection."""
+        """Read up to `size_bytes` from the offset `begin`; fewer only at the object's end.
+
+        For readers that pause between two ranges for longer than a server keeps a connection open.
+        """
 
     def file(self, key: str) -> Path | None:
-        """The file that an object is, where objects are files of this machine: it may be read and
-        mapped, never written. None elsewhere."""
+        """Return the object's local file, to be read or memory-mapped but never written.
 
-    def head(self, key: str) -> ObjectInfo | None: ...
+        None for a remote store.
+        """
+
+    def head(self, key: str) -> ObjectInfo | None:
+        """Return the object's metadata, or None when it is missing."""
 
     def delete(self, key: str) -> None:
-        """Remove the object; a missing one is not an error."""
+        """Delete the object; a missing one is not an error."""
 
     def list(self, prefix: str) -> Iterator[ObjectInfo]:
-        """Every object whose key begins with `prefix`, in no particular order."""
+        """Iterate over the objects whose keys begin with `prefix`, in no particular order."""
 
     def check(self) -> None:
         """Raise Unavailable when objects can't be written now."""
@@ -87,36 +95,40 @@ class ObjectStore(Protocol):
 class OwnedStore(ObjectStore, Protocol):
     """A store that belongs to one catalog (`shared.storage.ownership`) and has a trash.
 
-    A *note* is a small file of the store itself, beside the objects and no object: its name begins
-    with `.placewise`, which no key may do.
+    A *note* is a small file of the store itself. It is not an object: its name begins with
+    `.placewise`, and no key does.
     """
 
     def move(self, source: str, target: str) -> None:
-        """Give the object another key. `modified_at` becomes the time of the move; an object at
-        `target` is replaced. After a crash it is at `source`, at `target`, or whole at both.
-        NotFound where there is no `source`."""
+        """Rename an object; an existing one at `target` is replaced.
 
-    def free_trash(self, least_free_bytes: int) -> int:
-        """Delete objects of the trash, oldest day first, until each local disk that has some of it
-        has this much free; how many. 0 for a store on another machine."""
+        `modified_at` becomes the time of the move. After a crash the object is complete at
+        `source`, at `target` or at both. NotFound when `source` is missing.
+        """
+
+    def free_trash(self, min_free_bytes: int) -> int:
+        """Delete objects in the trash, oldest day first, until each local disk has this much free.
+
+        Returns the number of deleted objects; 0 for a remote store.
+        """
 
     def read_note(self, name: str) -> bytes | None:
-        """None where there is no note of this name."""
+        """Return the note's content, or None when there is no such note."""
 
     def write_note(self, name: str, data: bytes, *, replace: bool = True) -> None:
-        """Write the note whole. With `replace=False` one that is there already stays."""
+        """Write the note atomically. With `replace=False` an existing note is unchanged."""
 
     def delete_note(self, name: str) -> None:
-        """Remove the note; a missing one is not an error."""
+        """Delete the note; a missing one is not an error."""
 
 
 class PresigningStore(OwnedStore, Protocol):
-    """A store that callers may send objects to themselves: a bucket."""
+    """A store with presigned uploads: a bucket."""
 
     def presign_put(
         self, key: str, *, size_bytes: int, sha256: str, expires_seconds: int
     ) -> PresignedPut:
-        """An address for an object of this size and SHA-256 (hexadecimal), good for so long."""
+        """Return a presigned PUT for an object of this size and SHA-256 (hexadecimal)."""
 
     def copy(self, source: str, target: str) -> None:
-        """`target` is what `source` is now, and stays so. NotFound where there is no `source`."""
+        """Copy the object to `target`. NotFound when `source` is missing."""

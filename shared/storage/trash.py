@@ -1,11 +1,11 @@
-"""The trash of an object store: collected orphans lie there for TRASH_DAYS before they are deleted.
+"""The trash of an object store, and the hold that suspends garbage collection.
 
-Only orphans go there. What users delete is deleted at once, so that its space is free at once.
+Orphans are moved to the trash and deleted after TRASH_DAYS. Objects that a user deletes are not
+moved there: they are deleted immediately, so that their space is free.
 
-The hold: a note in the store that says why orphans are not collected until someone decides.
-
-The steward writes it, `placewise doctor` reads it, and `placewise storage collect --confirm` ends
-it.
+The hold is a note in the store that gives the reason why orphans are not collected until an
+operator decides. The steward writes it, `placewise doctor` reads it, and
+`placewise storage collect --confirm` ends it.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class TrashSize:
 
 
 def move_to_trash(store: OwnedStore, key: str, day: date) -> bool:
-    """Move the object to the trash of this day (UTC); False where it is gone already."""
+    """Move an object to the trash of this day (UTC); False when it no longer exists."""
     try:
         store.move(key, trash_key(key, day))
     except NotFound:
@@ -38,7 +38,7 @@ def move_to_trash(store: OwnedStore, key: str, day: date) -> bool:
 
 
 def measure_trash(store: ObjectStore) -> TrashSize:
-    """Count what lies in the trash: walks over it."""
+    """Count the objects in the trash by listing them."""
     size = TrashSize()
     for info in store.list(TRASH):
         size.objects += 1
@@ -47,24 +47,27 @@ def measure_trash(store: ObjectStore) -> TrashSize:
 
 
 def expire_trash(store: ObjectStore, before: datetime) -> tuple[int, TrashSize]:
-    """Delete what was moved to the trash before this time; how many objects, and what is left."""
-    deleted, left = 0, TrashSize()
+    """Delete objects moved to the trash before this time; return their number and the rest."""
+    deleted, remaining = 0, TrashSize()
     for info in store.list(TRASH):
         if info.modified_at < before:
             store.delete(info.key)
             deleted += 1
         else:
-            left.objects += 1
-            left.size_bytes += info.size_bytes
-    return deleted, left
+            remaining.objects += 1
+            remaining.size_bytes += info.size_bytes
+    return deleted, remaining
 
 
 def restore_trash(store: OwnedStore, prefix: str = "") -> Iterator[tuple[ObjectInfo, bool]]:
-    """Move objects of the trash back to their keys, those whose key begins with `prefix`.
+    """Move objects of the trash whose original keys begin with `prefix` back to these keys.
 
-    Yields each with whether it is back; False where another object has its key by now: the one in
-    the trash stays there. What is back counts as written now, so that it is not collected again
-    before ORPHAN_AGE_SECONDS are over.
+    A restored object counts as modified now, so that it is not collected again before
+    ORPHAN_AGE_SECONDS.
+
+    Yields:
+        Each object in the trash, and whether it was restored; False when another object has its
+        key now, and it stays in the trash.
     """
     for info in list(store.list(TRASH)):
         key = key_before_trash(info.key)
@@ -79,44 +82,48 @@ def restore_trash(store: OwnedStore, prefix: str = "") -> Iterator[tuple[ObjectI
         yield info, is_free
 
 
-HOLD = f"{OWNER_MARK}-hold"
+HOLD_NOTE = f"{OWNER_MARK}-hold"
 
 
 class HoldReason(StrEnum):
+    """Why garbage collection is suspended."""
+
     SHARE = "share"
     """More than COLLECT_MAX_SHARE of all objects are orphans."""
     ADOPTED = "adopted"
-    """A catalog became the owner that did not know some of the objects."""
+    """A catalog adopted the store without knowing some of its objects."""
     CATALOG_BEHIND = "catalog_behind"
     """The catalog is older than the store."""
 
 
 @dataclass(frozen=True, slots=True)
 class Hold:
+    """A suspension of garbage collection, with the counts at that time."""
+
     reason: HoldReason
     orphans: int
     orphan_bytes: int
     objects: int
-    """All objects of the prefixes in which orphans are looked for."""
+    """All objects under the prefixes that are searched for orphans."""
 
     def describe(self) -> str:
-        """What is held, why, and what the operator can do: whole sentences."""
+        """Return sentences for the operator: what happened, why, and what to do."""
         why = {
-            HoldReason.SHARE: "that is more than COLLECT_MAX_SHARE allows",
+            HoldReason.SHARE: "they are a larger share than COLLECT_MAX_SHARE allows",
             HoldReason.ADOPTED: "this catalog adopted the store without knowing them",
             HoldReason.CATALOG_BEHIND: "the catalog is older than the store",
         }[self.reason]
         return (
-            f"{self.orphans} of {self.objects} objects ({self.orphan_bytes / 1e6:.1f} MB) are "
-            f"known to no row of the catalog, and {why}: nothing was collected. If the catalog is "
-            "not the right one, put the right one back, or run `placewise verify --repair`. If "
-            "they are garbage: `placewise storage collect` lists them, and with --confirm it moves "
-            "them to the trash."
+            f"No row of the catalog references {self.orphans} of {self.objects} objects "
+            f"({self.orphan_bytes / 1e6:.1f} MB), and {why}: nothing was collected. If this is "
+            "the wrong catalog, restore the right one, or run `placewise verify --repair`. If the "
+            "objects are garbage, `placewise storage collect` lists them, and with --confirm it "
+            "moves them to the trash."
         )
 
 
 def read_hold(store: OwnedStore) -> Hold | None:
-    note = store.read_note(HOLD)
+    note = store.read_note(HOLD_NOTE)
     if note is None:
         return None
     fields = json.loads(note)
@@ -124,8 +131,8 @@ def read_hold(store: OwnedStore) -> Hold | None:
 
 
 def write_hold(store: OwnedStore, hold: Hold) -> None:
-    store.write_note(HOLD, json.dumps(asdict(hold)).encode())
+    store.write_note(HOLD_NOTE, json.dumps(asdict(hold)).encode())
 
 
 def end_hold(store: OwnedStore) -> None:
-    store.delete_note(HOLD)
+    store.delete_note(HOLD_NOTE)

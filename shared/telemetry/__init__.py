@@ -1,2 +1,1 @@
-"""What a running Placewise tells of itself: logs, traces, and the id that leads from a request
-through its jobs to a chunk."""
+"""Observability: logs, traces, metrics, heartbeats, and the request id that correlates them."""

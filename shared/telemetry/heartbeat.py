@@ -1,8 +1,8 @@
-"""Heartbeats: a file that a service's loop touches, so that a health check sees whether it turns.
+"""Heartbeat files, for the health checks of services without an HTTP server.
 
-For services that answer no HTTP. `python -m shared.telemetry.heartbeat FILE SECONDS` is the
-check: exit code
-0 when the file was touched within that many seconds. It imports nothing, because it is run often.
+The main loop of a service touches the file. `python -m shared.telemetry.heartbeat FILE SECONDS` is
+the check: it exits with 0 when the file was touched within that many seconds. This module imports
+no other package, because the check runs often.
 """
 
 from __future__ import annotations
@@ -13,19 +13,19 @@ from pathlib import Path
 
 
 class Heartbeat:
-    """Beats by touching `file`; None for no file, and then a beat does nothing."""
+    """Touches `file` on each beat; does nothing for None."""
 
     def __init__(self, file: Path | None) -> None:
         self._file = file
 
     def beat(self) -> None:
-        """The loop has gone round once more. Raises OSError where the file can't be written."""
+        """Record an iteration of the main loop. Raises OSError when the file can't be written."""
         if self._file is not None:
             self._file.touch()
 
 
 def seconds_since_heartbeat(file: Path) -> float:
-    """Seconds since the last beat; infinite when there was none."""
+    """Return the seconds since the last beat; infinite without one."""
     try:
         return time.time() - file.stat().st_mtime
     except FileNotFoundError:
@@ -33,11 +33,11 @@ def seconds_since_heartbeat(file: Path) -> float:
 
 
 def main(arguments: list[str]) -> int:
-    """The check, with a line for whoever reads the orchestrator's log."""
-    file, most_seconds = Path(arguments[0]), float(arguments[1])
-    silent = seconds_since_heartbeat(file)
-    print(f"last beat {silent:.0f} s ago, {most_seconds:g} s are allowed")  # noqa: T201
-    return 0 if silent <= most_seconds else 1
+    """Run the check and print its result for the orchestrator's log."""
+    file, max_age_seconds = Path(arguments[0]), float(arguments[1])
+    age_seconds = seconds_since_heartbeat(file)
+    print(f"last beat {age_seconds:.0f} s ago, {max_age_seconds:g} s are allowed")  # noqa: T201
+    return 0 if age_seconds <= max_age_seconds else 1
 
 
 if __name__ == "__main__":

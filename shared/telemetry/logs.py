@@ -1,10 +1,10 @@
-"""One format for every line of a process's log: ours, uvicorn's, Celery's.
+"""Log configuration: one format for all lines of a process, also those of uvicorn and Celery.
 
-`text` is for people, `json` one object a line for programs. What a call passes as `extra` becomes
-members of the object, or `name=value` behind the message.
+`text` is for people, `json` writes one object per line. Values passed as `extra` become members of
+the object, or are appended to the message as `name=value`.
 
-Values from callers can neither start a line nor control a terminal: both formats escape control
-characters, line breaks of every kind and bidirectional overrides.
+Log injection: values from clients can neither start a new line nor control a terminal. Both formats
+escape control characters, line breaks of every kind and bidirectional overrides.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ from shared.telemetry.tracing import current_request_id, current_trace_id
 
 TEXT_FORMAT = "%(asctime)s %(levelname)s %(name)s: %(message)s"
 OWN_LOGGERS = ("services", "shared")
-# Of others, never each statement, call or message.
+# Third-party loggers, limited to warnings.
 QUIET_LOGGERS = ("alembic", "celery", "httpx2", "kombu", "opentelemetry", "sqlalchemy", "urllib3")
 
-# C0 and C1 controls, DEL, Unicode's line breaks and bidirectional controls, halves of characters.
+# C0 and C1 controls, DEL, Unicode's line breaks and bidirectional controls, surrogates.
 UNSAFE = re.compile("[\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
 
-# What every record has; the rest came as `extra`. `taskName` is asyncio's.
+# Attributes of every record; any others came as `extra`. `taskName` is set by asyncio.
 STANDARD_ATTRIBUTES = frozenset(logging.makeLogRecord({}).__dict__) | {
     "asctime",
-    "color_message",  # uvicorn's message once more, for terminals
+    "color_message",  # uvicorn's message with colours
     "message",
     "request_id",
     "service",
@@ -39,7 +39,7 @@ STANDARD_ATTRIBUTES = frozenset(logging.makeLogRecord({}).__dict__) | {
 
 
 class ContextFilter(logging.Filter):
-    """Adds to each record the service, the request and the trace that it belongs to."""
+    """Adds the service name, the request id and the trace id to each record."""
 
     def __init__(self, service: str) -> None:
         super().__init__()
@@ -47,7 +47,7 @@ class ContextFilter(logging.Filter):
 
     def filter(self, record: logging.LogRecord) -> bool:
         record.service = self._service
-        # A line that speaks of another request than the one at hand says so itself.
+        # A record about another request than the current one has its id already.
         if not hasattr(record, "request_id"):
             record.request_id = current_request_id()
         record.trace_id = current_trace_id()
@@ -55,8 +55,10 @@ class ContextFilter(logging.Filter):
 
 
 class JsonFormatter(logging.Formatter):
-    """One JSON object a line: `time` (UTC), `level`, `logger`, `service`, `message`, then
-    `request_id` and `trace_id` where there are any, `error` with a trace, and what came as `extra`.
+    """Formats a record as one JSON object per line.
+
+    Members: `time` (UTC), `level`, `logger`, `service`, `message`, `request_id` and `trace_id` if
+    set, `error` with a traceback, and the values passed as `extra`.
     """
 
     def format(self, record: logging.LogRecord) -> str:
@@ -74,31 +76,33 @@ class JsonFormatter(logging.Formatter):
         if record.exc_info:
             line["error"] = self.formatException(record.exc_info)
         text = json.dumps(line, ensure_ascii=False, default=str)
-        return UNSAFE.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
+        return UNSAFE.sub(lambda match: f"\\u{ord(match[0]):04x}", text)
 
 
 class TextFormatter(logging.Formatter):
-    """A line for people; the request's id and what came as `extra` stand at its end. The lines of a
-    traceback are indented: whatever an error says, no line of it can look like one of the log."""
+    """Formats a record for people, with the request id and the `extra` values at the end.
+
+    The lines of a traceback are indented, so that no text of an error can look like a log line.
+    """
 
     def __init__(self) -> None:
         super().__init__(TEXT_FORMAT)
 
     def format(self, record: logging.LogRecord) -> str:
         line, *trace = super().format(record).split("\n")
-        return "\n".join([line, *(f"  {_escaped(one)}" for one in trace)])
+        return "\n".join([line, *(f"  {_escape(trace_line)}" for trace_line in trace)])
 
     def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802  (logging's name)
-        said = super().formatMessage(record)
-        facts = _extra(record)
+        message = super().formatMessage(record)
+        fields = _extra(record)
         if (request_id := getattr(record, "request_id", None)) is not None:
-            facts["request_id"] = request_id
-        return _escaped(" ".join([said, *(f"{name}={value}" for name, value in facts.items())]))
+            fields["request_id"] = request_id
+        return _escape(" ".join([message, *(f"{name}={value}" for name, value in fields.items())]))
 
 
-def _escaped(text: str) -> str:
-    """The text with unsafe characters as Python writes them: `\\n`, `\\x1b`, `\\u2028`."""
-    return UNSAFE.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
+def _escape(text: str) -> str:
+    """Replace unsafe characters by Python's escape sequences: `\\n`, `\\x1b`, `\\u2028`."""
+    return UNSAFE.sub(lambda match: match[0].encode("unicode_escape").decode(), text)
 
 
 def _extra(record: logging.LogRecord) -> dict[str, Any]:
@@ -108,8 +112,10 @@ def _extra(record: logging.LogRecord) -> dict[str, Any]:
 
 
 def configure_logging(settings: Settings, service: str) -> None:
-    """Every line of this process to stderr, in the format of LOG_FORMAT; ours in detail with DEBUG.
-    What was set up before goes."""
+    """Log to stderr in the format of LOG_FORMAT, with debug lines of Placewise if DEBUG is set.
+
+    Replaces the existing handlers of the root logger.
+    """
     handler = logging.StreamHandler()
     handler.addFilter(ContextFilter(service))
     handler.setFormatter(JsonFormatter() if settings.log_format == "json" else TextFormatter())

@@ -1,4 +1,4 @@
-"""`GET /metrics` on METRICS_PORT: for services that answer no HTTP, and without a key for all."""
+"""The metrics server on METRICS_PORT: `GET /metrics` without a key, for services without HTTP."""
 
 from __future__ import annotations
 
@@ -14,13 +14,19 @@ from shared.errors import Misconfigured
 log = logging.getLogger(__name__)
 
 METRICS_CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
-"""Of Prometheus' text format."""
+"""Content type of Prometheus' text format."""
 
 
 @contextlib.contextmanager
 def serve_metrics(settings: Settings, registry: CollectorRegistry) -> Iterator[int | None]:
-    """While the block runs, the registry's figures are answered on HOST and METRICS_PORT, from a
-    thread; gives the port, None where none is set. Misconfigured: `address_in_use`."""
+    """Serve the registry's metrics on HOST and METRICS_PORT in a thread while the block runs.
+
+    Yields:
+        The port; None where METRICS_PORT is not set.
+
+    Raises:
+        Misconfigured: `address_in_use`.
+    """
     if settings.metrics_port is None:
         yield None
         return
@@ -32,9 +38,9 @@ def serve_metrics(settings: Settings, registry: CollectorRegistry) -> Iterator[i
         raise Misconfigured(
             "address_in_use",
             f"Can't listen on {settings.host}:{settings.metrics_port} (METRICS_PORT): "
-            f"{error.strerror or error}. Choose another one.",
+            f"{error.strerror or error}. Choose another port.",
         ) from error
-    log.info("metrics on port %d", server.server_port)
+    log.info("serving metrics on port %d", server.server_port)
     try:
         yield server.server_port
     finally:

@@ -1,4 +1,4 @@
-"""The one module that speaks to OpenTelemetry's SDK."""
+"""The OpenTelemetry tracer; the only module that imports the OpenTelemetry SDK."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from opentelemetry.trace.propagation.tracecontext import TraceContextTextMapProp
 
 from shared.telemetry.tracing import Attribute, SpanUpdate
 
-MAX_SPAN_LINKS = 64  # of a span: more are cut off by most backends anyway
+MAX_SPAN_LINKS = 64  # per span; most backends drop further ones
 
 
 class OpenTelemetryTracer:
-    """Sends spans over OTLP/HTTP in the background, or to `exporter`."""
+    """Exports spans in the background, over OTLP/HTTP or to `exporter`."""
 
     def __init__(self, service: str, endpoint: str | None, exporter: SpanExporter | None) -> None:
         if exporter is None:
             assert endpoint is not None
-            # The standard's: the general address is that of every signal, and each adds its path.
+            # By the OTLP specification, the base endpoint is shared, and each signal adds its path.
             exporter = OTLPSpanExporter(endpoint=f"{endpoint.rstrip('/')}/v1/traces")
-        # The SDK adds OTEL_RESOURCE_ATTRIBUTES, and reads OTEL_EXPORTER_OTLP_HEADERS and its kind.
+        # The SDK adds OTEL_RESOURCE_ATTRIBUTES and reads OTEL_EXPORTER_OTLP_HEADERS and the like.
         resource = Resource.create({"service.name": f"placewise-{service}"})
         self._provider = TracerProvider(resource=resource)
         self._provider.add_span_processor(BatchSpanProcessor(exporter))
@@ -37,21 +37,21 @@ class OpenTelemetryTracer:
     def span(
         self, name: str, parents: Sequence[str], attributes: dict[str, Attribute]
     ) -> Iterator[SpanUpdate]:
-        around = context.get_current()
+        parent_context = context.get_current()
         links: list[Link] = []
         if len(parents) == 1:
-            around = self._propagator.extract({"traceparent": parents[0]}, around)
+            parent_context = self._propagator.extract({"traceparent": parents[0]}, parent_context)
         elif parents:
-            links = [Link(self._context(one)) for one in dict.fromkeys(parents)][:MAX_SPAN_LINKS]
+            links = [Link(self._span_context(p)) for p in dict.fromkeys(parents)][:MAX_SPAN_LINKS]
         with self._tracer.start_as_current_span(
-            name, context=around, links=links, attributes=attributes
-        ) as made:
+            name, context=parent_context, links=links, attributes=attributes
+        ) as current:
 
-            def describe(name: str, **attributes: Attribute) -> None:
-                made.update_name(name)
-                made.set_attributes(attributes)
+            def update(name: str, **attributes: Attribute) -> None:
+                current.update_name(name)
+                current.set_attributes(attributes)
 
-            yield describe
+            yield update
 
     def traceparent(self) -> str | None:
         carrier: dict[str, str] = {}
@@ -61,6 +61,6 @@ class OpenTelemetryTracer:
     def close(self) -> None:
         self._provider.shutdown()
 
-    def _context(self, traceparent: str) -> SpanContext:
-        read = self._propagator.extract({"traceparent": traceparent}, context.Context())
-        return trace.get_current_span(read).get_span_context()
+    def _span_context(self, traceparent: str) -> SpanContext:
+        extracted = self._propagator.extract({"traceparent": traceparent}, context.Context())
+        return trace.get_current_span(extracted).get_span_context()

@@ -1,13 +1,11 @@
-"""OpenTelemetry traces, where OTEL_EXPORTER_OTLP_ENDPOINT is set; otherwise nothing of it is
-imported and a span costs next to nothing.
+"""Distributed tracing with OpenTelemetry, and the id of the current request.
 
-A trace leads from a request through its job to the transaction that ends it: the job's row carries
-its W3C `traceparent`. https://www.w3.org/TR/trace-context/
+Tracing is on where OTEL_EXPORTER_OTLP_ENDPOINT is set. Otherwise OpenTelemetry is not imported, and
+a span costs next to nothing. A trace leads from a request through its job to the transaction that
+completes it: the job's row carries the W3C `traceparent` (https://www.w3.org/TR/trace-context/).
 
-The id of the request that is being answered, or that the work at hand was asked for by.
-
-The gateway takes it from `X-Request-ID` or makes one. Whoever does a request's job does it under
-the same id: it is kept in the job's row. Log lines, spans and calls to search carry it.
+The gateway takes the request id from `X-Request-ID` or creates one. It is stored in the job's row,
+and the worker runs the job under the same id. Log lines, spans and requests to search carry it.
 """
 
 from __future__ import annotations
@@ -30,13 +28,13 @@ Attribute = str | int | float | bool | Sequence[str]
 
 
 class SpanUpdate(Protocol):
-    """Says of a span under way what it is after all."""
+    """Renames the current span and adds attributes to it."""
 
     def __call__(self, name: str, **attributes: Attribute) -> object: ...
 
 
 class Tracer(Protocol):
-    """What `configure_tracing` puts in the place of doing nothing."""
+    """The tracer that `configure_tracing` installs."""
 
     def span(
         self,
@@ -58,19 +56,28 @@ _trace_id: ContextVar[str | None] = ContextVar("trace_id", default=None)
 def span(
     name: str, parents: Sequence[str | None] = (), **attributes: Attribute | None
 ) -> Iterator[SpanUpdate]:
-    """The block as a span. `parents` are `traceparent`s that it comes from: of one, it is a child;
-    with several (a batch of many requests' jobs) it is linked to all. Without any it is a child of
-    the span around it. What the block raises is noted in the span."""
+    """Trace the block as a span; an exception of the block is recorded in it.
+
+    Args:
+        name: name of the span.
+        parents: `traceparent` values. With one, the span is its child; with several, as for a
+            batch of several requests' jobs, it is linked to all. Without any it is a child of the
+            current span. None values are ignored.
+        attributes: attributes of the span; None values are ignored.
+
+    Yields:
+        A function that renames the span and adds attributes.
+    """
     if _tracer is None:
         yield _ignore_update
         return
-    known = [parent for parent in parents if parent is not None]
-    given = {key: value for key, value in attributes.items() if value is not None}
-    with _tracer.span(name, known, given) as describe:
+    traceparents = [parent for parent in parents if parent is not None]
+    set_attributes = {key: value for key, value in attributes.items() if value is not None}
+    with _tracer.span(name, traceparents, set_attributes) as update:
         parent = _tracer.traceparent()
         token = _trace_id.set(parent.split("-")[1] if parent else None)
         try:
-            yield describe
+            yield update
         finally:
             _trace_id.reset(token)
 
@@ -80,22 +87,27 @@ def _ignore_update(name: str, **attributes: Attribute) -> None:
 
 
 def current_traceparent() -> str | None:
-    """The span at hand as a W3C `traceparent`; None where nothing is traced."""
+    """Return the W3C `traceparent` of the current span; None without tracing."""
     return _tracer.traceparent() if _tracer is not None else None
 
 
 def current_trace_id() -> str | None:
-    """32 hexadecimal digits; None where nothing is traced."""
+    """Return the id of the current trace, 32 hexadecimal digits; None without tracing."""
     return _trace_id.get()
 
 
 def configure_tracing(
     settings: Settings, service: str, exporter: SpanExporter | None = None
 ) -> contextlib.AbstractContextManager[None]:
-    """Trace this process while the block runs, and send what is left at its end.
+    """Trace this process while the block runs, and flush the remaining spans at its end.
 
-    `exporter` takes the place of the one that sends to OTEL_EXPORTER_OTLP_ENDPOINT. Raises
-    Misconfigured (`otel_missing`) where that is set and the extra `otel` is not installed.
+    Args:
+        settings: OTEL_EXPORTER_OTLP_ENDPOINT turns tracing on.
+        service: name of the service in the traces.
+        exporter: replaces the OTLP exporter.
+
+    Raises:
+        Misconfigured: `otel_missing` where tracing is on without the extra `otel`.
     """
     if settings.otel_exporter_otlp_endpoint is None and exporter is None:
         return contextlib.nullcontext()
@@ -104,9 +116,9 @@ def configure_tracing(
     except ModuleNotFoundError as error:
         raise Misconfigured(
             "otel_missing",
-            f"OTEL_EXPORTER_OTLP_ENDPOINT is set, and the package {error.name} is not installed. "
-            "Install the extra `otel` (uv pip install '.[otel]'; in images it is there), or unset "
-            "it.",
+            f"OTEL_EXPORTER_OTLP_ENDPOINT is set, but the package {error.name} is not installed. "
+            "Install the extra `otel` (uv pip install '.[otel]'; the images include it), or unset "
+            "the variable.",
         ) from None
     return _tracing(OpenTelemetryTracer(service, settings.otel_exporter_otlp_endpoint, exporter))
 
@@ -124,25 +136,27 @@ def _tracing(tracer: Tracer) -> Iterator[None]:
 
 REQUEST_ID_HEADER = "X-Request-ID"
 MAX_REQUEST_ID_CHARACTERS = 128
-# What every log, header and column takes as it stands.
+# Safe in every log, header and column without escaping.
 REQUEST_ID_PATTERN = re.compile(rf"[A-Za-z0-9._:/+=@-]{{1,{MAX_REQUEST_ID_CHARACTERS}}}")
 
 _request_id: ContextVar[str | None] = ContextVar("request_id", default=None)
 
 
 def current_request_id() -> str | None:
-    """None outside of a request and its work."""
+    """Return the id of the current request; None outside of a request and its jobs."""
     return _request_id.get()
 
 
-def request_id_or_new(sent: str | None) -> str:
-    """The caller's id where it can be used as it stands, else a fresh one."""
-    return sent if sent is not None and REQUEST_ID_PATTERN.fullmatch(sent) else str(new_id())
+def request_id_or_new(request_id: str | None) -> str:
+    """Return the client's request id if it is valid, else a new one."""
+    if request_id is not None and REQUEST_ID_PATTERN.fullmatch(request_id):
+        return request_id
+    return str(new_id())
 
 
 @contextlib.contextmanager
 def request_id_context(request_id: str | None) -> Iterator[None]:
-    """What the block does, it does for that request; None: for nobody's."""
+    """Set the current request id while the block runs; None for no request."""
     token = _request_id.set(request_id)
     try:
         yield

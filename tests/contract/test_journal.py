@@ -165,7 +165,7 @@ def test_many_segments_become_one_with_the_last_states(
     catalog: Catalog, store: ObjectStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for module in (outbox, segments):
-        monkeypatch.setattr(module, "MERGED_FROM", 4)
+        monkeypatch.setattr(module, "MIN_SEGMENTS_TO_MERGE", 4)
     _, photo_id = filled(catalog)
     for number in range(9):
         with catalog.write() as session:
@@ -240,7 +240,7 @@ def test_a_damaged_segment_says_which_and_stays_when_others_are_merged(
         assert caught.value.code == "journal_damaged"
         assert segment.key in caught.value.detail
     for module in (outbox, segments):
-        monkeypatch.setattr(module, "MERGED_FROM", 3)
+        monkeypatch.setattr(module, "MIN_SEGMENTS_TO_MERGE", 3)
     for _ in range(2):
         with catalog.write() as session:
             add_map(session, str(new_id()))

@@ -80,7 +80,7 @@ def test_flower_shows_what_a_drain_did_and_only_to_who_has_the_password(
     assert flower.get("/api/tasks").json() == {}
 
     home = tmp_path / "home"
-    store = FolderStore(home / "objects", alone=False)
+    store = FolderStore(home / "objects", exclusive=False)
     with catalog_on_postgres.write() as session:
         map_id = add_map(session, "default", "test-tiny-avg").id
     for number in range(PHOTOS):

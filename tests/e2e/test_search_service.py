@@ -118,4 +118,4 @@ def test_an_unfit_shard_is_refused_at_the_start(tmp_path: Path, shard: str) -> N
     ended = run_command("search", env=env, cwd=tmp_path)
     assert ended.returncode != 0
     assert "SEARCH_SHARD" in ended.stderr
-    assert "is no shard" in ended.stderr
+    assert "is not a shard" in ended.stderr

@@ -250,7 +250,7 @@ def test_an_interrupted_restore_goes_on_with_what_it_lacks(
     folder, _ = open_backup(tmp_path / "backup")
     key, hidden = next(iter(folder.index)), tmp_path / "hidden"
     folder.objects.path(key).rename(hidden)
-    with pytest.raises(Misconfigured, match="gone or changed") as caught:
+    with pytest.raises(Misconfigured, match="missing or damaged") as caught:
         restored(tmp_path / "backup", other_catalog, other_store)
     assert caught.value.code == "backup_damaged"
     with other_catalog.read() as session:

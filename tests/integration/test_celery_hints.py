@@ -168,7 +168,7 @@ def test_an_extractor_does_what_is_queued_whatever_happens_to_the_hints(
     own_redis: RedisServer,
     extractor: Extractor,
 ) -> None:
-    store = FolderStore(tmp_path / "home" / "objects", alone=False)
+    store = FolderStore(tmp_path / "home" / "objects", exclusive=False)
     photos = iter(range(1000))
 
     def put(count: int) -> None:

@@ -31,8 +31,8 @@ from shared.integrity.verify import verify_store
 from shared.jobs import InProcessWakeups
 from shared.journal.outbox import catalog_lag, write_journal
 from shared.journal.segments import list_segments
-from shared.rebuild import take_in as take_in_module
-from shared.rebuild.take_in import TakenIn, begin_rebuild, take_in
+from shared.rebuild import recover as recover_module
+from shared.rebuild.recover import RecoveryReport, begin_rebuild, recover_catalog
 from shared.storage import FolderStore
 from shared.storage.chunks import manifest_key
 from shared.storage.keys import JOURNAL, ORIGINALS
@@ -58,10 +58,10 @@ def lose_catalog(catalog: Catalog) -> None:
                 session.execute(delete(table))
 
 
-def rebuilt(service: Service) -> tuple[Service, TakenIn]:
+def rebuilt(service: Service) -> tuple[Service, RecoveryReport]:
     """Services on the rebuilt catalog."""
     begin_rebuild(service.catalog, service.store)
-    taken = take_in(service.catalog, service.store, service.settings, unnamed_age_seconds=0)
+    taken = recover_catalog(service.catalog, service.store, service.settings, unnamed_age_seconds=0)
     return Service(service.catalog, service.store, service.settings, service.make_worker), taken
 
 
@@ -146,9 +146,9 @@ def test_a_rebuild_that_was_killed_goes_on_and_a_full_catalog_is_refused(
     def die(*_: Any, **__: Any) -> Any:
         raise KeyboardInterrupt
 
-    for step in ("take_in_chunks", "take_in_originals", "_queue_photos"):
+    for step in ("recover_chunks", "recover_originals", "_queue_photos"):
         with monkeypatch.context() as patched:
-            patched.setattr(take_in_module, step, die)
+            patched.setattr(recover_module, step, die)
             with pytest.raises(KeyboardInterrupt):
                 rebuilt(service)
         lag = catalog_lag(service.catalog, store)
@@ -307,7 +307,7 @@ def test_an_older_catalog_collects_nothing_and_takes_in_what_came_later(
     assert lag.segments >= 1
     assert write_journal(service.catalog, store).lines == 0
 
-    taken = take_in(service.catalog, store, settings, unnamed_age_seconds=3600)
+    taken = recover_catalog(service.catalog, store, settings, unnamed_age_seconds=3600)
     assert (taken.maps, taken.photos, taken.deleted_photos) == (1, 2, 1)
     assert taken.changed_photos == 1
     assert catalog_lag(service.catalog, store) is None
@@ -317,7 +317,10 @@ def test_an_older_catalog_collects_nothing_and_takes_in_what_came_later(
     assert photo(service, elsewhere, "later")["searchable"]
     assert service("GET", f"/uploads/{second}").status_code == 404
     assert verify_store(service.catalog, store, originals=True).faults == []
-    assert take_in(service.catalog, store, settings, unnamed_age_seconds=3600) == TakenIn()
+    assert (
+        recover_catalog(service.catalog, store, settings, unnamed_age_seconds=3600)
+        == RecoveryReport()
+    )
 
 
 def test_bytes_go_once_the_journal_tells_of_the_deletion(

@@ -43,7 +43,7 @@ class HaltingStore(FolderStore):
     """Keeps whoever reads a chunk waiting until it is let go."""
 
     def __init__(self, folder: FolderStore) -> None:
-        super().__init__(folder.root, alone=False)
+        super().__init__(folder.root, exclusive=False)
         self.go_on = threading.Event()
         self.reached = threading.Event()
 

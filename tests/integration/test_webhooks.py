@@ -227,7 +227,7 @@ def test_a_name_that_has_become_private_since_is_not_called(
     assert told.receiver.messages == []
     (delivery,) = told.log()
     assert delivery["state"] == "failed"
-    assert "no public address" in delivery["last_error"]
+    assert "not a public address" in delivery["last_error"]
 
 
 def _target_of(url: str) -> WebhookTarget:

@@ -125,7 +125,7 @@ def test_what_is_no_address_of_tiles_is_refused(
 ) -> None:
     monkeypatch.setenv("MAP_TILES", tiles)
     monkeypatch.setenv("MAP_ATTRIBUTION", "© somebody")
-    with pytest.raises(ValidationError, match="is no address of tiles"):
+    with pytest.raises(ValidationError, match="is not a URL template"):
         Settings()
 
 

@@ -129,7 +129,7 @@ def test_table_says_what_is_known_of_each_photo(tmp_path: Path) -> None:
 def test_table_with_a_column_that_means_nothing_is_refused(tmp_path: Path) -> None:
     make(tmp_path, "a.jpg")
     table = table_of(tmp_path, "filename,lat,lon\na.jpg,45.1,7.6\n")
-    with pytest.raises(InvalidRequest, match="the columns lat, lon mean nothing here") as caught:
+    with pytest.raises(InvalidRequest, match="the columns lat, lon are unknown") as caught:
         find_photos(tmp_path, table, None)
     assert caught.value.code == "bad_table"
 

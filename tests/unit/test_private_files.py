@@ -67,7 +67,7 @@ def test_backup_is_private(migrated_sqlite: Path, tmp_path: Path) -> None:
     with folder.exclusive_lock(), catalog.read() as session:
         dump_rows(session, folder.path / "catalog-1", lambda *_: None)
         folder.objects.put("originals/a", b"photo")
-        folder.note(BackedUpObject("originals/a", 5, "0" * 64, "2026-11-22T00:00:00+00:00"))
+        folder.add_to_index(BackedUpObject("originals/a", 5, "0" * 64, "2026-11-22T00:00:00+00:00"))
         assert check_private(folder.path) > 10
     catalog.close()
 

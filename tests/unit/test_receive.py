@@ -119,7 +119,7 @@ def test_file_of_any_size_is_stored_and_opened_whole(
     assert received.sha256 == hashlib.sha256(data).hexdigest()
     with received.open(store) as opened:
         assert opened.read() == data
-    assert (received.whole is None) == (beyond >= 0), "no more of it is kept in memory"
+    assert (received.content is None) == (beyond >= 0), "no more of it is kept in memory"
 
 
 @pytest.mark.parametrize("size", [1, 2, 3, 7, 64, 1000, 10**9])
@@ -132,9 +132,9 @@ def test_pieces_of_any_size_give_the_same_file_and_fields(store: FolderStore, si
         filename="street.jpg",
         size_bytes=len(PHOTO),
         sha256=hashlib.sha256(PHOTO).hexdigest(),
-        begin=PHOTO[:16],
+        first_bytes=PHOTO[:16],
         fields={"latitude": "45.07", "place": "Café", "tags": ""},
-        whole=PHOTO,
+        content=PHOTO,
     )
 
 
@@ -155,7 +155,7 @@ def test_photo_shorter_than_its_signature_is_checked_at_its_end(store: FolderSto
     seen: list[bytes] = []
     received = receive(store, file(b"BM12") + END, check_begin=seen.append)
     assert seen == [b"BM12"]
-    assert received.begin == b"BM12"
+    assert received.first_bytes == b"BM12"
 
 
 @pytest.mark.parametrize("size", [1, 10, 10**9])

@@ -115,9 +115,9 @@ def test_s3_speaks_https_with_a_bucket_of_its_own_unless_told_otherwise(
     [
         ({"S3_ACCESS_KEY": ""}, "S3_ENDPOINT needs S3_ACCESS_KEY and S3_SECRET_KEY"),
         ({"S3_SECRET_KEY": ""}, "S3_ENDPOINT needs S3_ACCESS_KEY and S3_SECRET_KEY"),
-        ({"S3_ENDPOINT": "http://s3:8333"}, "S3_SECURE says whether it is HTTPS"),
+        ({"S3_ENDPOINT": "http://s3:8333"}, "S3_SECURE selects HTTPS"),
         ({"S3_ENDPOINT": "s3:8333/placewise"}, "without a scheme"),
-        ({"S3_BUCKET": "Photos"}, "small letters"),
+        ({"S3_BUCKET": "Photos"}, "lower-case letters"),
         ({"S3_PUBLIC_ENDPOINT": "photos.example.com"}, "https://photos.example.com"),
         ({"S3_PUBLIC_ENDPOINT": "https://photos.example.com/bucket"}, "without a path"),
         ({"S3_PUBLIC_ENDPOINT": "https://key@photos.example.com"}, "without a path"),
@@ -256,7 +256,7 @@ def test_what_says_how_dino_is_used_is_refused_without_it(
     monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
     said = refusal(monkeypatch, **{name: PREDECESSORS[name]})
-    assert said.startswith(f"{name}={PREDECESSORS[name]} says how DINO_MODEL is used")
+    assert said.startswith(f"{name}={PREDECESSORS[name]} configures DINO_MODEL")
 
 
 @pytest.mark.usefixtures("production")
@@ -342,7 +342,11 @@ def test_the_extractor_of_new_maps_is_allowed_by_being_chosen(
     [
         ("TORCHHUB_ALLOWED", UNPINNED, "git ls-remote"),
         ("TORCHHUB_ALLOWED", f"{HUB},anyloc-vitb14", "after the repository comes the entry"),
-        ("TORCHHUB_ALLOWED", f"{HUB} anyloc-vitb14", "'anyloc-vitb14' is no torch.hub extractor"),
+        (
+            "TORCHHUB_ALLOWED",
+            f"{HUB} anyloc-vitb14",
+            "'anyloc-vitb14' is not a torch.hub extractor",
+        ),
         ("EXTRACTOR", UNPINNED, "git ls-remote"),
     ],
 )

@@ -1,4 +1,4 @@
-"""Shards: every slot has one, and what is no shard is refused."""
+"""Shards: every slot has one, and what is not a shard is refused."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def test_a_shard_is_written_as_it_is_read() -> None:
 
 @pytest.mark.parametrize("text", ["", "3/3", "-1/3", "1", "1/0", "a/b", "1/2/3", "0.5/2"])
 def test_what_is_no_shard_is_refused(text: str) -> None:
-    with pytest.raises(ValueError, match="is no shard"):
+    with pytest.raises(ValueError, match="is not a shard"):
         Shard.parse(text)
 
 

@@ -44,7 +44,7 @@ from shared.storage.open_store import open_store
 from shared.storage.ownership import read_owner
 
 if TYPE_CHECKING:
-    from shared.rebuild.take_in import TakenIn
+    from shared.rebuild.recover import RecoveryReport
 
 
 @contextlib.contextmanager
@@ -177,7 +177,7 @@ def rebuild_catalog(as_json: JsonOption = False) -> None:
     generations, vocabularies. Stop the services first. Interrupted, it goes on when run again."""
     with report_errors(as_json), progress_reporter() as progress, contextlib.ExitStack() as held:
         # Imported only here: it reads photos, which not every image can.
-        from shared.rebuild.take_in import begin_rebuild, take_in
+        from shared.rebuild.recover import begin_rebuild, recover_catalog
 
         settings = read_settings()
         alone = settings.database_url is None
@@ -188,7 +188,9 @@ def rebuild_catalog(as_json: JsonOption = False) -> None:
         migrate(catalog)
         begin_rebuild(catalog, open_store(settings, exclusive=alone))
         store = open_installation_store(catalog, settings, exclusive=alone)
-        taken = take_in(catalog, store, settings, unnamed_age_seconds=0.0, progress=progress)
+        taken = recover_catalog(
+            catalog, store, settings, unnamed_age_seconds=0.0, progress=progress
+        )
     if as_json:
         print_json(asdict(taken))
         return
@@ -196,7 +198,7 @@ def rebuild_catalog(as_json: JsonOption = False) -> None:
     err_console.print(NEVER_IN_THE_JOURNAL, soft_wrap=True)
 
 
-def print_taken_in(taken: TakenIn) -> None:
+def print_taken_in(taken: RecoveryReport) -> None:
     """What came back, and what did not."""
     console.print(
         f"{taken.photos + taken.unnamed_photos} photos of {taken.maps} new maps came in, with "

@@ -43,7 +43,7 @@ from shared.storage.trash import (
 
 if TYPE_CHECKING:
     from services.steward.tasks.orphans import StoreCount
-    from shared.rebuild.take_in import TakenIn
+    from shared.rebuild.recover import RecoveryReport
 
 
 MAX_FAULTS_SHOWN = 20
@@ -108,14 +108,16 @@ def verify(
 
 def _take_in(
     catalog: Catalog, store: ObjectStore, settings: Settings, lag: Lag, progress: BackupProgress
-) -> TakenIn:
+) -> RecoveryReport:
     if lag.since is None:
         raise Conflict("rebuild_unfinished", lag.detail)
-    from shared.rebuild.take_in import take_in  # it reads photos, which not every image can
+    from shared.rebuild.recover import recover_catalog  # it reads photos, which not every image can
 
     served = settings.database_url is not None or find_running_server(settings.placewise_home)
     age_seconds = UPLOAD_SECONDS if served else 0.0
-    return take_in(catalog, store, settings, unnamed_age_seconds=age_seconds, progress=progress)
+    return recover_catalog(
+        catalog, store, settings, unnamed_age_seconds=age_seconds, progress=progress
+    )
 
 
 def _report_as_json(report: IntegrityReport, queued: int | None) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from shared.config.settings import Settings
 from shared.errors import Misconfigured
 from shared.storage import FolderStore, OwnedStore
 from shared.storage.open_store import open_store
-from shared.storage.ownership import read_owner, taken
+from shared.storage.ownership import read_owner, store_taken_error
 from shared.storage.trash import read_hold
 
 
@@ -27,14 +27,16 @@ def collection_check(settings: Settings) -> str:
     if settings.s3_endpoint is not None:
         store = open_store(settings, exclusive=False)
     elif folder.exists():
-        store = FolderStore(folder, alone=False)  # UPLOAD_DIR, which has no notes, is not marked
+        store = FolderStore(
+            folder, exclusive=False
+        )  # UPLOAD_DIR, which has no notes, is not marked
     else:
         return "nothing is stored yet"
     owner = read_owner(store)
     if owner is None:
         return "the object store has no owner yet; the next start marks it"
     if str(_installation_id(settings)) != owner:
-        raise taken(store, "belongs to another catalog than this one")
+        raise store_taken_error(store, "belongs to another catalog than this one")
     hold = read_hold(store)
     if hold is not None:
         raise Misconfigured("collection_held", hold.describe())

@@ -227,7 +227,7 @@ def _complete_upload(
     try:
         _check_object_size(store.head(key), upload)
         received = _verify_copied_object(store, key, upload)
-        media_type = check_photo_signature(received.begin)
+        media_type = check_photo_signature(received.first_bytes)
         with store.open(key) as file:
             header = read_photo_header(file, gateway.settings.max_image_pixels)
         incoming = ValidatedPhoto(

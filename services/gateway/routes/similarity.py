@@ -221,7 +221,7 @@ def _queue_query(
     idempotent: IdempotentRequest,
 ) -> Job:
     try:
-        check_photo_signature(received.begin)
+        check_photo_signature(received.first_bytes)
         for name in received.fields:
             raise invalid_field_error(name, "is unknown; send filters as query parameters")
         with received.open(gateway.store) as file:

@@ -138,7 +138,7 @@ class BatchItemImporter:
         (`photo_quota_reached`)."""
         if key_id is None or job.params["max_photos"] is None:
             return contextlib.nullcontext()
-        return self._quota.place(key_id, job.params["max_photos"])
+        return self._quota.reserve(key_id, job.params["max_photos"])
 
     def _received_upload(self, item: BatchItem) -> StoredUpload:
         """Return the file that the gateway has stored."""
@@ -148,7 +148,7 @@ class BatchItemImporter:
             filename=base_name(item.name),
             size_bytes=item.source["size_bytes"],
             sha256=item.source["sha256"],
-            begin=self._store.read_range(item.object_key, 0, PHOTO_SIGNATURE_BYTES),
+            first_bytes=self._store.read_range(item.object_key, 0, PHOTO_SIGNATURE_BYTES),
             fields=item.fields,
         )
 
@@ -171,7 +171,7 @@ class BatchItemImporter:
             filename=base_name(item.name),
             size_bytes=validator.size_bytes,
             sha256=validator.sha256,
-            begin=validator.begin,
+            first_bytes=validator.first_bytes,
             fields=item.fields,
         )
 

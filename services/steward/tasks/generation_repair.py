@@ -22,7 +22,7 @@ from shared.catalog.jobs import MODEL_CHANGE_JOBS, UNFINISHED_STATES
 from shared.catalog.processes import unreadable_keys
 from shared.catalog.session import Catalog
 from shared.errors import NotFound, PlacewiseError, Unavailable
-from shared.integrity.verify import give_up_chunk
+from shared.integrity.verify import discard_chunk
 from shared.jobs import Job
 from shared.jobs.model_changes import abandon_generation
 from shared.jobs.transitions import fail_job
@@ -73,7 +73,7 @@ def _read_error(store: ObjectStore, chunk: Chunk) -> PlacewiseError | None:
 
 
 def _repair(session: Session, chunk_id: UUID, error: PlacewiseError) -> None:
-    photos = give_up_chunk(session, chunk_id)
+    photos = discard_chunk(session, chunk_id)
     chunk = session.get_one(Chunk, chunk_id)
     generation = session.get_one(Generation, chunk.generation_id)
     job = session.scalar(

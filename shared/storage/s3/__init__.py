@@ -1,7 +1,7 @@
-"""Objects in a bucket of any S3 server, through the minio client.
+"""Object store in a bucket of any S3 server, through the minio client.
 
-`bucket` connects and turns every failure into one of Placewise's errors; `writer` and `reader`
-stream; `store` is the port; `create` makes the bucket once.
+`client` has the HTTP client, `bucket` connects and translates the client's errors, `streams` reads
+and writes objects as streams, `store` implements the interface of object stores.
 """
 
 from shared.storage.s3.bucket import Bucket, create_bucket

@@ -1,7 +1,4 @@
-"""A bucket, the client that reaches it, and what its failures mean.
-
-Making the bucket, once, by whoever sets a deployment up.
-"""
+"""A bucket and its client, the translation of S3 errors, and the creation of the bucket."""
 
 from __future__ import annotations
 
@@ -35,7 +32,7 @@ from shared.storage.s3.client import Connections, S3Client
 
 log = logging.getLogger(__name__)
 
-MAX_CONNECTIONS = 32  # kept open: the threads that use the store at once in one process
+MAX_CONNECTIONS = 32  # open connections: the concurrent threads of one process
 RETRY_SECONDS = 0.2
 
 NO_SUCH_KEY_CODES = {"NoSuchKey"}
@@ -69,9 +66,9 @@ FULL_RETRY_SECONDS = 60
 
 
 class RetryUnlessTimeout(urllib3.Retry):
-    """Tries again what was cut off or not accepted, but never what was left without an answer.
+    """Retries requests that were rejected or disconnected, but never those that timed out.
 
-    A store that is silent was waited for already: a second wait would double the time limit.
+    Retrying after a timeout would double the time limit.
     """
 
     def increment(
@@ -90,27 +87,27 @@ class RetryUnlessTimeout(urllib3.Retry):
 
 @dataclass(frozen=True, slots=True)
 class Bucket:
-    """One bucket on one server. The client in it may be used by many threads."""
+    """One bucket on one server. Its client is thread-safe."""
 
     client: S3Client
     name: str
     endpoint: str
     region: str
     public: BaseURL
-    """The server as callers reach it."""
+    """The server's URL for clients of Placewise."""
 
     @classmethod
     def from_settings(cls, settings: Settings) -> Bucket:
-        """The bucket that the settings name; nothing is asked of the server yet.
+        """Return the configured bucket, without sending a request to the server.
 
         Raises Misconfigured (`bad_setting`) when S3_ENDPOINT or its keys are not set.
         """
         if not (settings.s3_endpoint and settings.s3_access_key and settings.s3_secret_key):
             raise Misconfigured(
                 "bad_setting",
-                "S3 needs S3_ENDPOINT (host:port), S3_ACCESS_KEY and S3_SECRET_KEY.",
+                "An S3 bucket needs S3_ENDPOINT (host:port), S3_ACCESS_KEY and S3_SECRET_KEY.",
             )
-        # One limit for both: urllib3 sends a request's body under the connection's.
+        # One timeout for both: urllib3 applies the connect timeout to sending the body.
         seconds = settings.s3_timeout_seconds
         connections = Connections(
             num_pools=2,
@@ -121,16 +118,16 @@ class Bucket:
                 backoff_factor=RETRY_SECONDS,
                 status_forcelist=(500, 502, 503, 504),
                 raise_on_status=False,
-                respect_retry_after_header=False,  # it may say minutes
+                respect_retry_after_header=False,  # the server may ask for minutes
             ),
-            cert_reqs="CERT_REQUIRED",  # against the system's authorities, or SSL_CERT_FILE
+            cert_reqs="CERT_REQUIRED",  # by the system's certificate authorities, or SSL_CERT_FILE
         )
         client = S3Client(
             settings.s3_endpoint,
             settings.s3_access_key,
             settings.s3_secret_key.get_secret_value(),
             secure=settings.s3_secure,
-            region=settings.s3_region,  # left out, the client asks the server for it first
+            region=settings.s3_region,  # without it the client would request it first
             http_client=connections,
         )
         public = settings.s3_public_endpoint or (
@@ -145,14 +142,17 @@ class Bucket:
         )
 
     @contextlib.contextmanager
-    def explained(self, key: str | None = None) -> Iterator[None]:
-        """Turns whatever the client raises inside into NotFound (`object_not_found`, only with a
-        `key`) or Unavailable (`object_store_unavailable`, `object_store_busy`,
-        `object_store_refused`, `bucket_not_found`, `object_changed`, and StorageFull:
-        `object_store_full`).
+    def translate_errors(self, key: str | None = None) -> Iterator[None]:
+        """Convert the client's exceptions inside the block into those of Placewise.
 
-        Keys and buckets can be put right while jobs wait, so a wrong one is Unavailable as well:
-        a job that meets it is tried again and not failed for good.
+        Wrong credentials and a missing bucket are Unavailable too: an operator can correct them
+        while jobs wait, so that the jobs are retried instead of failing permanently.
+
+        Raises:
+            NotFound: `object_not_found`, only with a `key`.
+            Unavailable: `object_store_unavailable`, `object_store_busy`, `object_store_refused`,
+                `bucket_not_found`, `object_changed`.
+            StorageFull: `object_store_full`.
         """
         try:
             yield
@@ -162,54 +162,54 @@ class Bucket:
             log.warning("the object store at %s failed: %s", self.endpoint, error)
             raise self._unreachable_error(error) from error
 
-    def missing(self) -> Unavailable:
+    def missing_error(self) -> Unavailable:
         return Unavailable(
             "bucket_not_found",
             f"The object store at {self.endpoint} has no bucket {self.name!r} (S3_BUCKET). "
-            "Make it: placewise storage create-bucket.",
+            "Create it with: placewise storage create-bucket.",
         )
 
     def _translate_s3_error(self, error: S3Error, key: str | None) -> PlacewiseError:
         code = error.code or ""
         if code in NO_SUCH_KEY_CODES and key is not None:
-            return NotFound("object_not_found", f"The object store has no {key!r}.", key=key)
+            return NotFound("object_not_found", f"The object store has no object {key!r}.", key=key)
         if code in NO_SUCH_BUCKET_CODES:
-            return self.missing()
-        log.warning("the object store at %s refused: %s", self.endpoint, error)
+            return self.missing_error()
+        log.warning("the object store at %s rejected a request: %s", self.endpoint, error)
         if code in PRECONDITION_FAILED_CODES:
-            return Unavailable("object_changed", f"{key!r} was written anew while it was read.")
+            return Unavailable("object_changed", f"{key!r} was overwritten while it was read.")
         if code in STORAGE_FULL_CODES or error.response.status == INSUFFICIENT_STORAGE_STATUS:
             return StorageFull(
                 "object_store_full",
-                f"The object store at {self.endpoint} has no room left ({code}). Give it more, or "
-                "delete photos or maps.",
+                f"The object store at {self.endpoint} is full ({code}). Add storage, or delete "
+                "photos or maps.",
                 retry_after_seconds=FULL_RETRY_SECONDS,
             )
         if code in SLOW_DOWN_CODES:
             return Unavailable(
                 "object_store_busy",
-                f"The object store at {self.endpoint} is asked too much ({code}). Try again.",
+                f"The object store at {self.endpoint} is overloaded ({code}). Try again.",
                 retry_after_seconds=BUSY_RETRY_SECONDS,
             )
         advice = _advice(code, self.name)
         if advice is None:
             return Unavailable(
                 "object_store_unavailable",
-                f"The object store at {self.endpoint} can't do this now: {code} {error.message}",
+                f"The object store at {self.endpoint} failed: {code} {error.message}",
             )
         return Unavailable(
             "object_store_refused",
-            f"The object store at {self.endpoint} refuses Placewise ({code}). {advice}",
+            f"The object store at {self.endpoint} rejected the request ({code}). {advice}",
         )
 
     def _unreachable_error(self, error: Exception) -> Unavailable:
         reason: object = error.reason if isinstance(error, MaxRetryError) else error
         if isinstance(reason, SSLError):
-            advice = "Check S3_SECURE: does it speak HTTPS, with a certificate that holds here?"
+            advice = "Check S3_SECURE, and that the server uses HTTPS with a trusted certificate."
         elif isinstance(error, MinioException | ParseError):
-            advice = "It does not answer as S3 does: check S3_ENDPOINT and S3_SECURE."
+            advice = "The response is not from an S3 server: check S3_ENDPOINT and S3_SECURE."
         else:
-            advice = "Check S3_ENDPOINT, and that it runs."
+            advice = "Check S3_ENDPOINT, and that the server is running."
         return Unavailable(
             "object_store_unavailable",
             f"The object store at {self.endpoint} can't be reached ({type(reason).__name__}). "
@@ -218,33 +218,33 @@ class Bucket:
 
 
 def _is_timeout(error: Exception) -> bool:
-    """Was the time limit reached: while connecting, sending or waiting for an answer?"""
+    """Return whether the error is a timeout: of connecting, sending or reading."""
     if isinstance(error, ProtocolError):
         return any(isinstance(cause, TimeoutError) for cause in error.args)
     return isinstance(error, ReadTimeoutError | ConnectTimeoutError)
 
 
 def _advice(code: str, bucket: str) -> str | None:
-    """What to do about a refusal; None for what is no refusal."""
+    """Return what to do about a rejected request; None for any other error."""
     if code in BAD_CREDENTIALS_CODES:
         return "Check S3_ACCESS_KEY and S3_SECRET_KEY."
     if code in ACCESS_DENIED_CODES:
         return (
-            "Check S3_ACCESS_KEY and S3_SECRET_KEY, and that they may read, write, list and delete "
-            f"in the bucket {bucket!r}."
+            "Check S3_ACCESS_KEY and S3_SECRET_KEY, and that they have permission to read, write, "
+            f"list and delete objects in the bucket {bucket!r}."
         )
     if code in WRONG_REGION_CODES:
         return "Set S3_REGION to the region of the bucket."
     if code in CLOCK_SKEW_CODES:
-        return "This machine's clock is wrong, or the store's."
+        return "The clock of this machine or of the object store is wrong: set it."
     return None
 
 
 ALREADY_OWNED_CODE = "BucketAlreadyOwnedByYou"
 LIFECYCLE_UNSUPPORTED_CODES = {"NotImplemented", "MethodNotAllowed"}
-ABORT_UPLOADS_AFTER_DAYS = 1  # S3's least
+ABORT_UPLOADS_AFTER_DAYS = 1  # the minimum of S3
 
-# The parts that killed writers leave can't be seen, and cost room.
+# Parts of the unfinished uploads of killed writers are not listed as objects, but take up space.
 LIFECYCLE_RULES = LifecycleConfig(
     [
         Rule(
@@ -260,20 +260,24 @@ LIFECYCLE_RULES = LifecycleConfig(
 
 
 def create_bucket(bucket: Bucket) -> bool:
-    """Make the bucket, and give it the rule for unfinished uploads unless it has rules already.
+    """Create the bucket, and add a rule for unfinished uploads unless it has lifecycle rules.
 
-    True if it was made, False if it was there. Raises Unavailable as `Bucket.explained` says.
+    Returns:
+        True if the bucket was created, False if it existed.
+
+    Raises:
+        Unavailable: as `Bucket.translate_errors`.
     """
     client = bucket.client
-    with bucket.explained():
-        made = not client.bucket_exists(bucket.name)
-        if made:
+    with bucket.translate_errors():
+        created = not client.bucket_exists(bucket.name)
+        if created:
             try:
                 client.make_bucket(bucket.name)
             except S3Error as error:
                 if error.code != ALREADY_OWNED_CODE:
                     raise
-                made = False  # by another one, since we looked
+                created = False  # by another process, since the check
         try:
             if client.get_bucket_lifecycle(bucket.name) is None:
                 client.set_bucket_lifecycle(bucket.name, LIFECYCLE_RULES)
@@ -281,9 +285,9 @@ def create_bucket(bucket: Bucket) -> bool:
             if error.code not in LIFECYCLE_UNSUPPORTED_CODES:
                 raise
             log.warning(
-                "the object store at %s knows no lifecycle rules: what killed processes have sent "
-                "of an object stays in the bucket %s until someone removes it",
+                "the object store at %s does not support lifecycle rules: unfinished uploads of "
+                "killed processes stay in the bucket %s until an operator removes them",
                 bucket.endpoint,
                 bucket.name,
             )
-    return made
+    return created

@@ -1,12 +1,11 @@
-"""The minio client, signing by the store's clock where this machine's is wrong.
+"""The minio client with two corrections: clock skew, and truncated response heads.
 
-S3 refuses what is signed more than 15 minutes off. A machine whose clock was set wrong would be
-shut out until someone notices; every answer tells the store's time, so that it need not be.
+Clock skew: S3 rejects requests whose signature is more than 15 minutes off. The client takes the
+time from the store's responses, so that a machine whose clock is wrong is not locked out.
 
-Connections that notice when an answer's head was cut off.
-
-http.client takes the end of a connection for the end of the head. What is missing then reads as
-"not said" or, cut within a number, as a smaller one: an object without a size, or a short one.
+Truncated heads: http.client treats the end of a connection as the end of the head. A missing or
+truncated header would then give an object without a size, or a smaller size than it has. The
+connections here raise an error instead.
 """
 
 from __future__ import annotations
@@ -27,94 +26,97 @@ from urllib3.response import BaseHTTPResponse
 log = logging.getLogger(__name__)
 
 FORBIDDEN = 403
-# Less than this is no reason to be refused, and a proxy's Date may be off by a little.
-SKEW = timedelta(minutes=5)
+# A smaller difference is not the reason of a rejection, and a proxy's Date may be slightly off.
+MIN_SKEW = timedelta(minutes=5)
 
 
 class S3Client(Minio):
-    """Overrides two inner calls of the client: hence its narrow range in pyproject.toml."""
+    """The minio client, signing by the store's clock.
+
+    It overrides two private methods: hence the narrow version range in pyproject.toml.
+    """
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
-        self._ahead = timedelta()
+        self._clock_offset = timedelta()
 
     def now(self) -> datetime:
-        """The store's time, UTC, as far as it is known."""
-        return datetime.now(UTC) + self._ahead
+        """Return the current time by the store's clock, UTC."""
+        return datetime.now(UTC) + self._clock_offset
 
     def _build_headers(self, *arguments: Any, **options: Any) -> tuple[dict[str, Any], datetime]:
         headers, date = super()._build_headers(*arguments, **options)
-        date += self._ahead
+        date += self._clock_offset
         headers["x-amz-date"] = to_amz_date(date)
         return headers, date
 
     def _url_open(self, *arguments: Any, **options: Any) -> BaseHTTPResponse:
         try:
-            answer: BaseHTTPResponse = super()._url_open(*arguments, **options)
+            response: BaseHTTPResponse = super()._url_open(*arguments, **options)
         except S3Error as error:
-            # An answer without a body (to HEAD) does not say why it refuses.
-            if error.response.status != FORBIDDEN or not self._follow(error.response):
+            # A response without a body (to HEAD) does not give the reason of the rejection.
+            if error.response.status != FORBIDDEN or not self._adjust_clock(error.response):
                 raise
-            answer = super()._url_open(*arguments, **options)
-        return answer
+            response = super()._url_open(*arguments, **options)
+        return response
 
-    def _follow(self, answer: BaseHTTPResponse) -> bool:
-        """Take over the store's time; whether it differs from what was thought."""
+    def _adjust_clock(self, response: BaseHTTPResponse) -> bool:
+        """Adopt the store's time; return whether it differs from the time assumed so far."""
         try:
-            said = parsedate_to_datetime(answer.headers["date"])
+            server_time = parsedate_to_datetime(response.headers["date"])
         except (KeyError, ValueError):
             return False
-        if said.tzinfo is None or abs(said - self.now()) < SKEW:
+        if server_time.tzinfo is None or abs(server_time - self.now()) < MIN_SKEW:
             return False
-        self._ahead = said - datetime.now(UTC)
+        self._clock_offset = server_time - datetime.now(UTC)
         log.warning(
-            "this machine's clock or the object store's is wrong: they are %.0f s apart; requests "
-            "are signed by the store's",
-            abs(self._ahead.total_seconds()),
+            "the clock of this machine or of the object store is wrong: they differ by %.0f s; "
+            "requests are signed by the store's clock",
+            abs(self._clock_offset.total_seconds()),
         )
         return True
 
 
-BLANK = {b"\r\n", b"\n"}
+BLANK_LINES = {b"\r\n", b"\n"}
 
 
-class _Lines:
-    """A file whose last line is remembered while an answer's head is read from it."""
+class _LastLineReader:
+    """A file that remembers its last line, while the head of a response is read from it."""
 
     def __init__(self, file: Any) -> None:
         self.file = file
         self.last = b""
 
-    def readline(self, most_bytes: int = -1) -> bytes:
-        self.last = self.file.readline(most_bytes)
+    def readline(self, max_bytes: int = -1) -> bytes:
+        self.last = self.file.readline(max_bytes)
         return self.last
 
     def close(self) -> None:
         self.file.close()
 
 
-class _WholeAnswer(http.client.HTTPResponse):
-    fp: Any
+class _CompleteHeadResponse(http.client.HTTPResponse):
+    fp: Any  # replaced while the head is read
 
     def begin(self) -> None:
-        """Raises RemoteDisconnected where the connection ended before the head did."""
-        lines = _Lines(self.fp)
+        """Read the head; RemoteDisconnected when the connection ended before it did."""
+        lines = _LastLineReader(self.fp)
         self.fp = lines
         try:
             super().begin()
         finally:
             if self.fp is lines:
                 self.fp = lines.file
-        if lines.last not in BLANK:
-            raise http.client.RemoteDisconnected("The connection ended within an answer's head")
+        if lines.last not in BLANK_LINES:
+            raise http.client.RemoteDisconnected("The connection ended within a response's head")
 
 
 class _HTTPConnection(HTTPConnection):
-    response_class = _WholeAnswer
+    response_class = _CompleteHeadResponse
 
 
 class _HTTPSConnection(HTTPSConnection):
-    response_class = _WholeAnswer
+    response_class = _CompleteHeadResponse
 
 
 class _HTTPPool(urllib3.HTTPConnectionPool):
@@ -126,7 +128,7 @@ class _HTTPSPool(urllib3.HTTPSConnectionPool):
 
 
 class Connections(urllib3.PoolManager):
-    """As urllib3's own, with these connections."""
+    """urllib3's connection pools with connections that detect a truncated head."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)

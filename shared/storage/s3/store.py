@@ -1,11 +1,9 @@
-"""The object store port on a bucket. Many processes may use one at the same time.
+"""The object store in a bucket, and presigned uploads. Several processes may share a bucket.
 
-Addresses at which whoever has one may put one object into the bucket, for a while.
-
-AWS Signature Version 4 in the query (docs.aws.amazon.com, "Authenticating Requests: Using Query
-Parameters"). The minio client signs the host alone; here the size and the checksum are signed as
-well, so that nothing else can be put there on a server that checks them. Who relies on neither
-looks at what was stored.
+A presigned PUT is a URL that allows uploading one object for a limited time. It uses AWS Signature
+Version 4 in the query (docs.aws.amazon.com, "Authenticating Requests: Using Query Parameters").
+The minio client only signs the host; here size and checksum are signed too, so that a server that
+verifies them accepts no other content. Not every server does: the caller checks what was stored.
 """
 
 from __future__ import annotations
@@ -40,9 +38,9 @@ UNSIGNED_PAYLOAD = "UNSIGNED-PAYLOAD"
 def presign_put(
     bucket: Bucket, key: str, *, size_bytes: int, sha256: str, expires_seconds: int
 ) -> PresignedPut:
-    """Asks the server nothing. `sha256` in hexadecimal."""
+    """Return a presigned PUT without sending a request; `sha256` is hexadecimal."""
     provider, region = bucket.client._provider, bucket.region
-    assert provider is not None, "the settings have both keys"
+    assert provider is not None, "from_settings requires both keys"
     credentials = provider.retrieve()
     url = bucket.public.build(method="PUT", region=region, bucket_name=bucket.name, object_name=key)
     checksum = base64.b64encode(bytes.fromhex(sha256)).decode()
@@ -62,27 +60,29 @@ def presign_put(
         }.items()
     )
     unsigned = SplitResult(url.scheme, url.netloc, url.path, query, "")
-    asked, _ = signer._get_canonical_request_hash("PUT", unsigned, signed, UNSIGNED_PAYLOAD)
+    canonical_request_hash, _ = signer._get_canonical_request_hash(
+        "PUT", unsigned, signed, UNSIGNED_PAYLOAD
+    )
     signature = signer._get_signature(
         signer._get_signing_key(credentials.secret_key, now, region, "s3"),
-        signer._get_string_to_sign(now, scope, asked),
+        signer._get_string_to_sign(now, scope, canonical_request_hash),
     )
     return PresignedPut(f"{unsigned.geturl()}&X-Amz-Signature={signature}", headers)
 
 
 T = TypeVar("T")
 
-PROBE_KEY = ".placewise-check"  # no object: an upload that is begun and given up
+PROBE_KEY = ".placewise-check"  # of a multipart upload that is created and aborted
 
 
 class S3Store:
-    """Objects in a bucket that exists; `create_bucket` makes one."""
+    """The object store in an existing bucket; `create_bucket` creates one."""
 
     def __init__(self, bucket: Bucket) -> None:
         self.bucket = bucket
 
     def writer(self, key: str) -> S3Writer:
-        return S3Writer(self.bucket, check_key(key), self._with_room)
+        return S3Writer(self.bucket, check_key(key), self._free_space_and_retry)
 
     def put(self, key: str, data: bytes) -> None:
         writer = self.writer(key)
@@ -108,39 +108,39 @@ class S3Store:
     def head(self, key: str) -> ObjectInfo | None:
         check_key(key)
         client, bucket = self.bucket.client, self.bucket.name
-        with self.bucket.explained(key):
+        with self.bucket.translate_errors(key):
             try:
-                found = client.stat_object(bucket, key)
+                stat = client.stat_object(bucket, key)
             except S3Error as error:
                 if error.code not in NO_SUCH_KEY_CODES:
                     raise
-                # This answer has no body, which would tell a missing bucket from a missing key.
+                # A HEAD response has no body that would tell a missing bucket from a missing key.
                 if not client.bucket_exists(bucket):
-                    raise self.bucket.missing() from error
+                    raise self.bucket.missing_error() from error
                 return None
-        assert found.last_modified is not None, "S3 always sends it"
-        assert found.size is not None
-        return ObjectInfo(key, found.size, found.last_modified.astimezone(UTC))
+        assert stat.last_modified is not None, "S3 always sends it"
+        assert stat.size is not None
+        return ObjectInfo(key, stat.size, stat.last_modified.astimezone(UTC))
 
     def delete(self, key: str) -> None:
         check_key(key)
         try:
-            with self.bucket.explained(key):
+            with self.bucket.translate_errors(key):
                 self.bucket.client.remove_object(self.bucket.name, key)
         except NotFound:
-            return  # S3 says nothing of it; some servers do
+            return  # S3 does not report a missing key; some servers do
 
     def list(self, prefix: str) -> Iterator[ObjectInfo]:
-        with self.bucket.explained():
-            for found in self.bucket.client.list_objects(
+        with self.bucket.translate_errors():
+            for listed in self.bucket.client.list_objects(
                 self.bucket.name, prefix=prefix, recursive=True
             ):
-                key = found.object_name
-                if key is None or found.last_modified is None or key.endswith("/"):
-                    continue  # the "folder" of some console: no key of ours ends like that
-                # A HEAD tells whole seconds, and the two have to agree.
-                at = found.last_modified.astimezone(UTC).replace(microsecond=0)
-                yield ObjectInfo(key, found.size or 0, at)
+                key = listed.object_name
+                if key is None or listed.last_modified is None or key.endswith("/"):
+                    continue  # a "folder" created by a web console
+                # HEAD responses have whole seconds, and `head` and `list` must agree.
+                modified_at = listed.last_modified.astimezone(UTC).replace(microsecond=0)
+                yield ObjectInfo(key, listed.size or 0, modified_at)
 
     def presign_put(
         self, key: str, *, size_bytes: int, sha256: str, expires_seconds: int
@@ -158,20 +158,20 @@ class S3Store:
         check_key(source), check_key(target)
 
         def send() -> None:
-            with self.bucket.explained(source):
-                # What the sender said of the bytes (a type, an encoding) is not taken over.
+            with self.bucket.translate_errors(source):
+                # The uploader's metadata (content type, encoding) is not copied.
                 client.copy_object(
                     bucket, target, CopySource(bucket, source), metadata_directive=REPLACE
                 )
 
-        self._with_room(send)
+        self._free_space_and_retry(send)
 
     def move(self, source: str, target: str) -> None:
         self.copy(source, target)
         self.delete(source)
 
     def free_trash(self, least_free_bytes: int) -> int:
-        return 0  # the server's disk is its own; `_with_room` is for when it says that it is full
+        return 0  # the server's disk is not local; `_free_space_and_retry` handles a full one
 
     def read_note(self, name: str) -> bytes | None:
         try:
@@ -180,15 +180,15 @@ class S3Store:
             return None
 
     def write_note(self, name: str, data: bytes, *, replace: bool = True) -> None:
-        # Not every server knows conditional writes: who must be the first reads it again.
+        # Not every server supports conditional writes: the caller reads the note again.
         if replace or self.read_note(name) is None:
             self.put(_note(name), data)
 
     def delete_note(self, name: str) -> None:
         self.delete(_note(name))
 
-    def _with_room(self, send: Callable[[], T]) -> T:
-        """What `send` returns. Where the store has no room, the trash is emptied first."""
+    def _free_space_and_retry(self, send: Callable[[], T]) -> T:
+        """Call `send`; when the store is full, empty the trash and retry once."""
         try:
             return send()
         except StorageFull:
@@ -197,25 +197,27 @@ class S3Store:
         return send()
 
     def _empty_trash(self) -> bool:
-        """Delete what lies in the trash; whether there was something."""
+        """Delete all objects in the trash; return whether there were any."""
         deleted = 0
         with contextlib.suppress(Unavailable):
             for info in self.list(TRASH):
                 self.delete(info.key)
                 deleted += 1
         if deleted:
-            log.warning("the object store is full: %d objects of the trash were deleted", deleted)
+            log.warning("the object store is full: %d objects in the trash were deleted", deleted)
         return deleted > 0
 
     def check(self) -> None:
-        """Asks whether the bucket is there and may be written to. A full disk shows only when
-        something is written: a probe that is an object would leave a version at each check in a
-        bucket that keeps them."""
+        """Check that the bucket exists and is writable.
+
+        A full disk is not detected, because no object is written: in a bucket with versioning,
+        each check would leave a version.
+        """
         client, bucket = self.bucket.client, self.bucket.name
-        with self.bucket.explained():
-            # First of all, because some servers make a missing bucket when it is written to.
+        with self.bucket.translate_errors():
+            # Checked first, because some servers create a missing bucket on a write.
             if not client.bucket_exists(bucket):
-                raise self.bucket.missing()
+                raise self.bucket.missing_error()
             upload_id = client._create_multipart_upload(bucket, PROBE_KEY, {})
             client._abort_multipart_upload(bucket, PROBE_KEY, upload_id)
 

@@ -1,6 +1,7 @@
-"""An object read as a file: one request streams it, and a seek begins another one there.
+"""Streaming reads and writes of objects in a bucket.
 
-An object sent in parts while it is written, so that its size need not be known or held.
+`S3Reader` streams an object with one request; a seek starts another one. `S3Writer` sends an object
+in parts while it is written, so that its size need not be known and it need not fit into memory.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ RANGE_NOT_SATISFIABLE_CODE = "InvalidRange"
 
 
 class S3Reader(io.RawIOBase):
-    """Unbuffered; `open_object` gives it a buffer. Every part is of the version first opened."""
+    """An unbuffered reader (see `open_object`); every request reads the version first opened."""
 
     def __init__(self, bucket: Bucket, key: str) -> None:
         super().__init__()
@@ -37,9 +38,9 @@ class S3Reader(io.RawIOBase):
         self._key = key
         self._position = 0
         self._etag: str | None = None
-        self._answer: BaseHTTPResponse | None = self._request(0)
-        self._etag = self._answer.headers.get("etag")
-        self._size = int(self._answer.headers["content-length"])
+        self._response: BaseHTTPResponse | None = self._request(0)
+        self._etag = self._response.headers.get("etag")
+        self._size = int(self._response.headers["content-length"])
 
     def readable(self) -> bool:
         return True
@@ -52,19 +53,19 @@ class S3Reader(io.RawIOBase):
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
         begin = {os.SEEK_SET: 0, os.SEEK_CUR: self._position, os.SEEK_END: self._size}[whence]
-        wanted = begin + offset
-        if wanted < 0:
-            raise ValueError(f"position {wanted} lies before the object")
-        if wanted != self._position:
+        position = begin + offset
+        if position < 0:
+            raise ValueError(f"position {position} is before the beginning of the object")
+        if position != self._position:
             self._release_connection()
-        self._position = wanted
-        return wanted
+        self._position = position
+        return position
 
     def readinto(self, buffer: WriteableBuffer) -> int:
         view = memoryview(buffer).cast("B")
-        piece = self._read(len(view))
-        view[: len(piece)] = piece
-        return len(piece)
+        data = self._read(len(view))
+        view[: len(data)] = data
+        return len(data)
 
     def readall(self) -> bytes:
         return self._read(None)
@@ -74,85 +75,85 @@ class S3Reader(io.RawIOBase):
             self._release_connection()
         super().close()
 
-    def _read(self, most_bytes: int | None) -> bytes:
-        """At most so many bytes from here, all that are left for None; b"" only at the end."""
-        left = self._size - self._position
-        wanted = left if most_bytes is None else min(left, most_bytes)
-        if wanted <= 0:
+    def _read(self, max_bytes: int | None) -> bytes:
+        """Read up to `max_bytes` from the position, or the rest for None; b"" only at the end."""
+        remaining = self._size - self._position
+        requested = remaining if max_bytes is None else min(remaining, max_bytes)
+        if requested <= 0:
             return b""
-        if self._answer is None:
-            self._answer = self._request(self._position)
-        with self._bucket.explained(self._key):
-            piece = self._answer.read(wanted)
-        if len(piece) < (wanted if most_bytes is None else 1):
+        if self._response is None:
+            self._response = self._request(self._position)
+        with self._bucket.translate_errors(self._key):
+            data = self._response.read(requested)
+        if len(data) < (requested if max_bytes is None else 1):
             raise Unavailable(
                 "object_store_unavailable",
-                f"The object store at {self._bucket.endpoint} sent {self._key!r} only in part.",
+                f"The object store at {self._bucket.endpoint} sent only a part of {self._key!r}.",
             )
-        self._position += len(piece)
-        return piece
+        self._position += len(data)
+        return data
 
     def _request(self, begin: int) -> BaseHTTPResponse:
         headers: dict[str, str | list[str] | tuple[str]] = {}
         if self._etag is not None:
             headers["If-Match"] = self._etag
-        with self._bucket.explained(self._key):
+        with self._bucket.translate_errors(self._key):
             return self._bucket.client.get_object(
                 self._bucket.name, self._key, offset=begin, request_headers=headers
             )
 
     def _release_connection(self) -> None:
-        """Give the connection back, or close it when more would come over it."""
-        answer, self._answer = getattr(self, "_answer", None), None
-        if answer is None:
+        """Return the connection to the pool; close it when unread data would follow."""
+        response, self._response = getattr(self, "_response", None), None
+        if response is None:
             return
         if self._position < self._size:
-            answer.close()
-        answer.release_conn()
+            response.close()
+        response.release_conn()
 
 
 def open_object(bucket: Bucket, key: str) -> io.BufferedReader:
-    """The object as a file; NotFound where there is none. Fetches what is read, and what the
-    network has on its way by then."""
+    """Open the object as a buffered, seekable file; NotFound when it is missing."""
     return io.BufferedReader(S3Reader(bucket, key), BUFFER_BYTES)
 
 
 def read_range(bucket: Bucket, key: str, begin: int, size_bytes: int) -> bytes:
-    """Up to so many bytes from `begin`, in one request; b"" behind the object's end."""
+    """Read up to `size_bytes` from `begin` with one request; b"" after the object's end."""
     if size_bytes <= 0:
-        return b""  # to the client 0 means everything
-    with bucket.explained(key):
+        return b""  # the client would read everything for 0
+    with bucket.translate_errors(key):
         try:
-            answer = bucket.client.get_object(bucket.name, key, offset=begin, length=size_bytes)
+            response = bucket.client.get_object(bucket.name, key, offset=begin, length=size_bytes)
         except S3Error as error:
             if error.code != RANGE_NOT_SATISFIABLE_CODE:
                 raise
             return b""
         try:
-            return answer.read()  # raises when less comes than was promised
+            return response.read()  # raises when the response is shorter than its Content-Length
         finally:
-            answer.release_conn()
+            response.release_conn()
 
 
-# S3's least size of a part that is not the last one. Small parts keep a writer's memory and the
-# time of one request small; S3's 10,000 parts of them are 52 GB.
+# S3's minimum size of a part that is not the last one. Small parts keep the memory of a writer and
+# the time of one request small; S3's maximum of 10,000 such parts is 52 GB.
 PART_BYTES = 5 * 1024 * 1024
 
 
 class S3Writer:
-    """Holds one part at most; what fits into one is sent in one request by `commit`.
+    """Sends an object as a multipart upload; one that fits into a single part, in one request.
 
-    The parts of a killed process are removed by the bucket's rule (`create_bucket`). The client's
-    own way to send parts pulls from a stream, and here they are pushed: hence its inner calls,
-    and the narrow range of its version in pyproject.toml.
+    At most one part is in memory. The bucket's lifecycle rule removes the parts of a killed process
+    (`create_bucket`). The client's public multipart upload reads from a stream, but a writer
+    receives its data block by block: hence the use of private methods, and the narrow version
+    range in pyproject.toml.
     """
 
     def __init__(
-        self, bucket: Bucket, key: str, with_room: Callable[[Callable[[], Any]], Any]
+        self, bucket: Bucket, key: str, retry_when_full: Callable[[Callable[[], Any]], Any]
     ) -> None:
-        """`with_room` calls what it is given, and once more where room could be made for it."""
+        """`retry_when_full` calls its argument, and once more where it could free space."""
         self._bucket = bucket
-        self._with_room = with_room
+        self._retry_when_full = retry_when_full
         self._key = key
         self._buffer = bytearray()
         self._upload_id: str | None = None
@@ -160,36 +161,36 @@ class S3Writer:
         self._committed = False
 
     def write(self, data: bytes) -> None:
-        left = memoryview(data)
-        while left:
+        remaining = memoryview(data)
+        while remaining:
             if len(self._buffer) == PART_BYTES:
                 self._send_part()
-            room = PART_BYTES - len(self._buffer)
-            self._buffer += left[:room]
-            left = left[room:]
+            free_bytes = PART_BYTES - len(self._buffer)
+            self._buffer += remaining[:free_bytes]
+            remaining = remaining[free_bytes:]
 
     def commit(self) -> None:
         client, bucket = self._bucket.client, self._bucket.name
         if self._upload_id is None:
 
             def send() -> None:
-                with self._bucket.explained():
+                with self._bucket.translate_errors():
                     data = io.BytesIO(self._buffer)
                     client.put_object(bucket, self._key, data, len(self._buffer))
 
-            self._with_room(send)
+            self._retry_when_full(send)
         else:
             self._send_part()
-            with self._bucket.explained():
-                done = client._complete_multipart_upload(
+            with self._bucket.translate_errors():
+                result = client._complete_multipart_upload(
                     bucket, self._key, self._upload_id, self._parts
                 )
-            if done.etag is None:
-                # S3 begins to answer 200 before it knows: the body then says what went wrong.
+            if result.etag is None:
+                # S3 sends the status 200 before it is done; the body then reports an error.
                 raise Unavailable(
                     "object_store_unavailable",
-                    f"The object store at {self._bucket.endpoint} could not join the parts of an "
-                    "object. Try again.",
+                    f"The object store at {self._bucket.endpoint} could not complete a "
+                    "multipart upload. Try again.",
                 )
         self._committed = True
 
@@ -199,23 +200,23 @@ class S3Writer:
             return
         upload_id, self._upload_id = self._upload_id, None
         try:
-            with self._bucket.explained():
+            with self._bucket.translate_errors():
                 self._bucket.client._abort_multipart_upload(self._bucket.name, self._key, upload_id)
         except Unavailable as error:
-            # Nothing can be seen of them, and the bucket's rule removes them.
-            log.warning("the parts of %s were left in the store: %s", self._key, error.detail)
+            # They are not visible as an object, and the lifecycle rule removes them.
+            log.warning("could not abort the multipart upload of %s: %s", self._key, error.detail)
 
     def _send_part(self) -> None:
         client, bucket = self._bucket.client, self._bucket.name
         number = len(self._parts) + 1
 
         def send() -> str:
-            with self._bucket.explained():
+            with self._bucket.translate_errors():
                 if self._upload_id is None:
                     self._upload_id = client._create_multipart_upload(bucket, self._key, {})
                 return client._upload_part(
                     bucket, self._key, bytes(self._buffer), None, self._upload_id, number
                 )
 
-        self._parts.append(Part(number, self._with_room(send)))
+        self._parts.append(Part(number, self._retry_when_full(send)))
         self._buffer.clear()

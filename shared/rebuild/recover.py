@@ -1,9 +1,8 @@
-"""Making an empty catalog the owner of a store that another catalog has filled.
+"""Recovers the catalog from its object store; see `shared.rebuild`.
 
-Everything that the store holds and the catalog does not know, into the catalog.
-
-Each step looks at what the catalog has already, and commits a little at a time: a run that was
-killed is repeated. Of two states of one row the higher revision counts, and a deletion always.
+Each step checks what the catalog already has and commits in small batches, so that an interrupted
+run can be repeated. Among several states of a row the highest revision counts, and a deletion
+always does.
 """
 
 from __future__ import annotations
@@ -37,25 +36,31 @@ from shared.config.settings import Settings
 from shared.errors import Conflict, Unavailable
 from shared.ids import new_id
 from shared.journal.segments import list_segments, read_segment
-from shared.rebuild.objects import take_in_chunks, take_in_originals
-from shared.rebuild.rows import AT_ONCE, LastStates, Progress, RowsTakenIn, take_in_rows
+from shared.rebuild.objects import recover_chunks, recover_originals
+from shared.rebuild.rows import (
+    ROWS_PER_STATEMENT,
+    LatestStates,
+    Progress,
+    RecoveredRows,
+    recover_rows,
+)
 from shared.storage import ObjectStore, OwnedStore
 from shared.storage.ownership import read_owner
 
-# What a first start, or an interrupted rebuild, may have left.
-MAY_HAVE_ROWS = {
+# Tables that may have rows after a first start or an interrupted rebuild.
+TABLES_WITH_INITIAL_ROWS = {
     table.__tablename__ for table in (ApiKey, Installation, Map, CachedMapStatistics, Model)
 }
 
 
 def begin_rebuild(catalog: Catalog, store: OwnedStore) -> None:
-    """Note that a rebuild is under way, and take over the id that the store is marked with.
+    """Record that a rebuild is running, and adopt the installation id of the store's mark.
 
-    Raises Conflict (`catalog_not_empty`) unless the catalog is empty, or a rebuild of it was
-    interrupted.
+    Raises:
+        Conflict: `catalog_not_empty` unless the catalog is empty or its rebuild was interrupted.
     """
     mark = read_owner(store)
-    owner = UUID(mark) if mark else _writer_of_journal(store)
+    owner = UUID(mark) if mark else _journal_installation_id(store)
     with catalog.write() as session:
         installation = get_or_create_installation(session)
         if installation.journal_sequence != REBUILDING:
@@ -72,19 +77,19 @@ def _check_empty(session: Session) -> None:
     filled = [
         table.name
         for table in backup_tables()
-        if table.name not in MAY_HAVE_ROWS
+        if table.name not in TABLES_WITH_INITIAL_ROWS
         and session.execute(select(table).limit(1)).first() is not None
     ]
     if filled or any(name != DEFAULT_MAP for name in session.scalars(select(Map.name))):
         raise Conflict(
             "catalog_not_empty",
-            "Only an empty catalog is rebuilt, and this one holds "
-            f"{', '.join(filled) or 'maps'}. `placewise verify --repair` brings what is missing "
-            "into it; or give a new database (DATABASE_URL), or move catalog.sqlite away.",
+            "Only an empty catalog can be rebuilt, and this one has "
+            f"{', '.join(filled) or 'maps'}. To recover missing rows, run `placewise verify "
+            "--repair`; to rebuild, set a new database (DATABASE_URL) or move catalog.sqlite away.",
         )
 
 
-def _writer_of_journal(store: ObjectStore) -> UUID | None:
+def _journal_installation_id(store: ObjectStore) -> UUID | None:
     for segment in reversed(list_segments(store)):
         try:
             return read_segment(store, segment.key).installation_id
@@ -95,59 +100,68 @@ def _writer_of_journal(store: ObjectStore) -> UUID | None:
 
 
 @dataclass(slots=True)
-class TakenIn(RowsTakenIn):
-    """What came into the catalog, and what could not."""
+class RecoveryReport(RecoveredRows):
+    """What was recovered, and what could not be."""
 
     chunks: int = 0
     descriptors: int = 0
     damaged_chunks: list[str] = field(default_factory=list)
     unnamed_photos: int = 0
-    """Photos that no journal names: the default map has them, with what EXIF says."""
+    """Photos that are not in the journal: added to the default map with their EXIF data."""
     unreadable_originals: list[str] = field(default_factory=list)
     unnamed_descriptors: int = 0
-    """Rows of chunks of generations that the journal does not know."""
+    """Rows of chunks whose generations are not in the journal."""
     queued_photos: int = 0
-    """Photos without a descriptor: they are described again."""
+    """Photos without a descriptor, which were queued."""
     damaged_segments: list[str] = field(default_factory=list)
 
 
-def take_in(
+def recover_catalog(
     catalog: Catalog,
     store: ObjectStore,
     settings: Settings,
     *,
     unnamed_age_seconds: float,
     progress: Progress = lambda what, done, total: None,
-) -> TakenIn:
-    """Bring maps, photos, generations with their descriptors, and vocabularies into the catalog.
+) -> RecoveryReport:
+    """Recover maps, photos, generations with their descriptors, and vocabularies.
 
-    Originals that the journal does not name are taken in when they are older than
-    `unnamed_age_seconds`: others may belong to uploads that are under way. Raises Unavailable as
-    the store does.
+    Args:
+        catalog: the catalog.
+        store: the object store.
+        settings: extractor of the default map, limits and slot size.
+        unnamed_age_seconds: minimum age of originals that are not in the journal; newer ones may
+            belong to uploads in progress.
+        progress: called after each item.
+
+    Raises:
+        Unavailable: as the store.
     """
-    taken = TakenIn()
-    with LastStates() as states:
+    report = RecoveryReport()
+    with LatestStates() as states:
         states.read(store, progress)
-        taken.damaged_segments = states.damaged
-        take_in_rows(catalog, store, states, taken, progress)
-        found = take_in_chunks(catalog, store, settings.slot_rows, progress)
-        taken.chunks, taken.descriptors = found.chunks, found.descriptors
-        taken.damaged_chunks, taken.unnamed_descriptors = found.damaged, found.unnamed_rows
+        report.damaged_segments = states.damaged
+        recover_rows(catalog, store, states, report, progress)
+        chunks = recover_chunks(catalog, store, settings.slot_rows, progress)
+        report.chunks, report.descriptors = chunks.chunks, chunks.descriptors
+        report.damaged_chunks, report.unnamed_descriptors = chunks.damaged, chunks.unnamed_rows
         unnamed = states.unnamed_originals(time.time() - unnamed_age_seconds)
-        originals = take_in_originals(
-            catalog, store, settings, unnamed, found.newest_extractor, progress
+        originals = recover_originals(
+            catalog, store, settings, unnamed, chunks.newest_extractor, progress
         )
-        taken.unnamed_photos, taken.unreadable_originals = originals.photos, originals.unreadable
-        taken.queued_photos = originals.photos + _queue_photos(catalog, progress)
+        report.unnamed_photos, report.unreadable_originals = originals.photos, originals.unreadable
+        report.queued_photos = originals.photos + _queue_photos(catalog, progress)
         with catalog.write() as session:
             installation = get_or_create_installation(session)
             installation.journal_sequence = max(installation.journal_sequence, states.sequence)
-    return taken
+    return report
 
 
 def _queue_photos(catalog: Catalog, progress: Progress) -> int:
-    """An index job for each live photo that has neither a job nor a descriptor in the generation
-    that answers; how many."""
+    """Queue each live photo without a job and without a descriptor in the active generation.
+
+    Returns the number of queued photos.
+    """
     described = exists().where(
         Descriptor.photo_id == Photo.id,
         Descriptor.generation_id == Generation.id,
@@ -164,17 +178,17 @@ def _queue_photos(catalog: Catalog, progress: Progress) -> int:
         total = session.scalar(select(func.count()).select_from(Photo).where(*missing)) or 0
     done, last = 0, UUID(int=0)
     while True:
-        queued = catalog.run(partial(_queue_some, missing=(*missing, Photo.id > last)))
+        queued = catalog.run(partial(_queue_batch, missing=(*missing, Photo.id > last)))
         if not queued:
             return done
         done, last = done + len(queued), queued[-1]
         progress("photos to describe", done, total)
 
 
-def _queue_some(session: Session, missing: Sequence[Condition]) -> list[UUID]:
-    """Queue the first of these photos by id; their ids."""
+def _queue_batch(session: Session, missing: Sequence[Condition]) -> list[UUID]:
+    """Queue a batch of these photos, ordered by id; return their ids."""
     photos = session.execute(
-        select(Photo.id, Photo.map_id).where(*missing).order_by(Photo.id).limit(AT_ONCE)
+        select(Photo.id, Photo.map_id).where(*missing).order_by(Photo.id).limit(ROWS_PER_STATEMENT)
     ).all()
     if not photos:
         return []

@@ -1,0 +1,199 @@
+"""Settings of descriptor extraction: the extractor of new maps, device, precision, decoding."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal, Self
+
+from pydantic import Field, field_validator, model_validator
+from pydantic_settings import BaseSettings
+
+from shared.errors import Misconfigured
+from shared.extractor_config.anyloc_compat import extractor_from_dino_settings
+from shared.extractor_config.configs import ExtractorConfig, get_extractor_config
+from shared.extractor_config.names import TORCHHUB_PREFIX, parse_torchhub_name
+
+
+class ExtractorSettings(BaseSettings):
+    """Which extractors maps may use, and how an extractor worker runs them."""
+
+    extractor: str = Field(
+        "efficientnet-lite0-vlad",
+        description="extractor of new maps, with options: "
+        "anyloc-vitb14:layer=9,preprocessing=demo1024",
+    )
+    dino_model: str | None = Field(
+        None,
+        description="extractor of new maps by its DINOv2 backbone, instead of EXTRACTOR: "
+        "dinov2_vits14|vitb14|vitl14|vitg14",
+    )
+    desc_layer: int | None = Field(
+        None,
+        description="transformer block of DINO_MODEL, from 0; unset: 10, 10, 20 or 31 by its size",
+    )
+    desc_facet: str | None = Field(
+        None, description="facet of that block: query, key, value or token; unset: value"
+    )
+    vlad_clusters: int | None = Field(
+        None, description="VLAD centres of a vocabulary fitted with DINO_MODEL; unset: 64"
+    )
+    vlad_desc_dim: int | None = Field(
+        None, description="width of DINO_MODEL's features, checked against the model"
+    )
+    allow_test_extractors: bool = Field(
+        False, description="let maps use the tiny extractors that exist for tests"
+    )
+    torchhub_allowed: str | None = Field(
+        None,
+        description="torch.hub extractors that maps may use, whose code is executed: exact names, "
+        "separated by blanks: torchhub:OWNER/NAME@COMMIT:ENTRY; unset: none but EXTRACTOR",
+    )
+    device: Literal["auto", "cpu", "cuda"] = Field(
+        "auto", description="device of the extractor; auto: CUDA where it is available"
+    )
+    precision: Literal["auto", "float32", "bfloat16"] = Field(
+        "auto",
+        description="precision of new generations; auto: bfloat16 for DINOv2 on CUDA, float32 "
+        "otherwise",
+    )
+    dino_weights: Path | None = Field(
+        None,
+        description="DINOv2's weights: a .pth, .pt or .safetensors file; unset: timm's, downloaded "
+        "from the Hugging Face hub",
+    )
+    model_cache_bytes: int = Field(
+        10_000_000_000,
+        ge=0,
+        description="size of an extractor's cache of models fetched from a bucket, under "
+        "PLACEWISE_HOME; the least recently used model is evicted first",
+    )
+    batch_photos: int = Field(16, ge=1, le=1024, description="maximum photos of an inference batch")
+    decode_processes: int = Field(2, ge=1, le=64, description="number of decoding processes")
+    decode_memory_bytes: int = Field(
+        2_000_000_000, ge=500_000_000, description="memory limit of one decoding process, bytes"
+    )
+    decode_timeout_seconds: float = Field(
+        30.0, gt=0, description="timeout for decoding one photo, seconds"
+    )
+    batch_ahead_photos: int = Field(
+        500, ge=1, description="queued photos at which batch uploads wait for the extractors"
+    )
+    descriptor_cache_bytes: int = Field(
+        20_000_000_000,
+        ge=0,
+        description="size of the descriptor cache of `evaluate` and `compare`, in "
+        "PLACEWISE_HOME/descriptors",
+    )
+    auto_fit_photos: int = Field(
+        200,
+        ge=1,
+        description="photos at which a vocabulary is fitted automatically for a map without one",
+    )
+    local_features: Literal["recompute", "keep"] = Field(
+        "recompute",
+        description="local features of compared photos: recompute them each time, or keep them as "
+        "float16 in the object store (44 kB per photo with the default extractor)",
+    )
+
+    @field_validator("torchhub_allowed")
+    @classmethod
+    def _check_torchhub_entries(cls, value: str | None) -> str | None:
+        for name in (value or "").split():
+            if not name.startswith(TORCHHUB_PREFIX):
+                raise ValueError(
+                    f"{name!r} is not a torch.hub extractor: its name begins with {TORCHHUB_PREFIX}"
+                )
+            try:
+                parse_torchhub_name(name)
+            except Misconfigured as error:
+                raise ValueError(error.detail) from error
+        return value
+
+    @field_validator("dino_weights")
+    @classmethod
+    def _resolve_weights_path(cls, value: Path | None) -> Path | None:
+        # Not resolved: a link in a Hugging Face cache has a better name than its target.
+        return None if value is None else value.expanduser().absolute()
+
+    @model_validator(mode="after")
+    def _check_dino_model(self) -> Self:
+        for name in ("desc_layer", "desc_facet", "vlad_clusters", "vlad_desc_dim"):
+            value = getattr(self, name)
+            if value is not None and self.dino_model is None:
+                raise ValueError(
+                    f"{name.upper()}={value} configures DINO_MODEL, which is not set. "
+                    "Set DINO_MODEL, or use the options of EXTRACTOR instead: "
+                    "anyloc-vitb14:layer=9,facet=key,clusters=32"
+                )
+        return self
+
+    @model_validator(mode="after")
+    def _check_one_extractor(self) -> Self:
+        try:
+            config = get_extractor_config(
+                self.extractor, allow_test_extractors=self.allow_test_extractors
+            )
+            check_extractor_is_shared(config)
+        except Misconfigured as error:
+            raise ValueError(f"EXTRACTOR={self.extractor}: {error.detail}") from error
+        selected = self.new_map_extractor
+        if "extractor" in self.model_fields_set and config.name != selected:
+            raise ValueError(
+                f"EXTRACTOR={self.extractor} contradicts DINO_MODEL={self.dino_model}, which "
+                f"means {selected}. Unset one of them"
+            )
+        return self
+
+    @property
+    def new_map_extractor(self) -> str:
+        """The canonical name of the extractor that EXTRACTOR or DINO_MODEL selects."""
+        if self.dino_model is None:
+            return get_extractor_config(
+                self.extractor, allow_test_extractors=self.allow_test_extractors
+            ).name
+        return extractor_from_dino_settings(
+            self.dino_model,
+            desc_layer=self.desc_layer,
+            desc_facet=self.desc_facet,
+            vlad_clusters=self.vlad_clusters,
+            vlad_desc_dim=self.vlad_desc_dim,
+        )
+
+    def recipe(self, name: str) -> ExtractorConfig:
+        """Return the configuration of an extractor that this installation may load.
+
+        Raises:
+            Misconfigured: as `get_extractor_config`; `torchhub_not_allowed` for torch.hub code
+                that TORCHHUB_ALLOWED does not list; `model_not_added` for a checkpoint file of
+                one machine.
+        """
+        config = get_extractor_config(name, allow_test_extractors=self.allow_test_extractors)
+        check_extractor_is_shared(config)
+        if config.hub is not None and config.name not in self.allowed_hub_extractors:
+            raise Misconfigured(
+                "torchhub_not_allowed",
+                f"The extractor {config.name} executes code of {config.hub.source}, which is not "
+                "allowed here. To allow it, the operator adds that exact name to TORCHHUB_ALLOWED "
+                "of the gateway and the extractors, and restarts them.",
+            )
+        return config
+
+    @property
+    def allowed_hub_extractors(self) -> tuple[str, ...]:
+        """Canonical names of the torch.hub extractors that may be loaded."""
+        allowed = [parse_torchhub_name(name).name for name in (self.torchhub_allowed or "").split()]
+        configured = self.new_map_extractor
+        if configured.startswith(TORCHHUB_PREFIX):
+            allowed.append(configured)
+        return tuple(dict.fromkeys(allowed))
+
+
+def check_extractor_is_shared(config: ExtractorConfig) -> None:
+    """Raise Misconfigured (`model_not_added`) for a checkpoint that is a file of one machine."""
+    if config.trained is not None and config.trained.file is not None:
+        raise Misconfigured(
+            "model_not_added",
+            f"{config.trained.file} is a file of one machine, but any extractor worker may "
+            "describe a map's photos. Add it with `placewise models add "
+            f"{config.trained.file} --name NAME`, and use gsv:NAME.",
+        )

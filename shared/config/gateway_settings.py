@@ -1,0 +1,240 @@
+"""Settings of the HTTP API: authentication, connection limits, upload limits, backpressure."""
+
+from __future__ import annotations
+
+import re
+from ipaddress import ip_network
+from typing import Self
+
+from pydantic import Field, SecretStr, field_validator, model_validator
+from pydantic_settings import BaseSettings
+
+from shared.config.lists import split_list
+
+MIN_ADMIN_KEY_CHARACTERS = 16
+
+
+class GatewaySettings(BaseSettings):
+    """Authentication, rate limits, quotas, request limits and the map of the web page."""
+
+    admin_key: SecretStr | None = Field(
+        None,
+        description="API key with every permission, in addition to those of `placewise keys`; "
+        "unset: the embedded Placewise needs no key on loopback, and creates one at its first "
+        "start on any other address",
+    )
+    cors_origins: str | None = Field(
+        None,
+        description="origins whose pages may call the API (CORS), separated by commas: "
+        "https://maps.example.com; unset: none",
+    )
+    hsts_seconds: int = Field(
+        0,
+        ge=0,
+        description="max-age of Strict-Transport-Security; 0: the header is not sent. Set it only "
+        "for servers that are reached over HTTPS",
+    )
+
+    # Limits against slow and against many clients, for every HTTP server of Placewise.
+    max_connections: int = Field(
+        2000,
+        ge=1,
+        description="open connections of one server; fewer where the limit of open files is lower",
+    )
+    max_connections_per_address: int = Field(
+        200,
+        ge=0,
+        description="open connections from one address (IPv6: from one /64); 0: no limit",
+    )
+    trusted_proxies: str | None = Field(
+        None,
+        description="addresses or networks of trusted reverse proxies, separated by commas: "
+        "10.0.0.5, 192.168.0.0/16. Their `X-Forwarded-For` is trusted, and their connections are "
+        "not limited per address; unset: none",
+    )
+    request_head_seconds: float = Field(
+        20.0, gt=0, description="timeout for receiving the head of a request"
+    )
+    min_body_bytes_per_second: int = Field(
+        1000,
+        ge=0,
+        description="minimum rate at which a request body must arrive, measured over 10 seconds; "
+        "0: no limit",
+    )
+    max_event_streams: int = Field(
+        500, ge=0, description="open event streams (GET /jobs/ID/events) of one gateway"
+    )
+    max_event_streams_per_caller: int = Field(
+        100, ge=0, description="open event streams of one key, and of one address"
+    )
+
+    # Rate limit and quotas of keys that have none of their own. ADMIN_KEY is not limited.
+    key_requests_per_minute: int | None = Field(
+        None, ge=1, description="rate limit of one key, requests per minute; unset: no limit"
+    )
+    key_upload_bytes_per_day: int | None = Field(
+        None,
+        ge=1,
+        description="bytes of request bodies that one key may send in 24 hours, whether or not "
+        "they are stored; unset: no limit",
+    )
+    key_max_photos: int | None = Field(
+        None, ge=1, description="photos that one key may store; unset: no limit"
+    )
+
+    webhook_private_addresses: bool = Field(
+        False,
+        description="allow webhooks to private addresses and over plain HTTP: anyone who may "
+        "create a webhook can then reach what the steward can reach",
+    )
+
+    map_tiles: str | None = Field(
+        None,
+        description="URL template of the web page's map tiles: "
+        "https://tile.openstreetmap.org/{z}/{x}/{y}.png; unset: a plain coordinate grid, and the "
+        "page loads nothing from other servers",
+    )
+    map_attribution: str | None = Field(
+        None, description="attribution of MAP_TILES, as their licence requires"
+    )
+
+    # Upload limits.
+    max_file_size: int = Field(10_485_760, gt=0, description="maximum bytes of one photo")
+    max_image_pixels: int = Field(
+        50_000_000, gt=0, description="maximum width x height of one photo"
+    )
+    max_archive_size: int = Field(
+        10_737_418_240,
+        gt=0,
+        description="maximum bytes of one batch: of its archive, packed and unpacked, or of all "
+        "its files",
+    )
+    max_batch_photos: int = Field(
+        100_000,
+        gt=0,
+        description="maximum photos in one batch; every member of an archive counts",
+    )
+    import_prefix: str = Field(
+        "imports/",
+        description="key prefix of the objects that a batch may import from the object store",
+    )
+    max_vocabulary_bytes: int = Field(
+        64_000_000, gt=0, description="maximum bytes of an imported vocabulary"
+    )
+    max_model_bytes: int = Field(
+        2_000_000_000, gt=0, description="maximum bytes of a checkpoint that is added as a model"
+    )
+    presign_seconds: int = Field(
+        900, ge=1, le=604_800, description="time to send and complete a presigned upload, seconds"
+    )
+    max_wait_seconds: int = Field(
+        60, ge=0, description="maximum of `Prefer: wait` and `?wait=`, seconds"
+    )
+
+    # Backpressure: requests are rejected before a queue or a disk fills up.
+    max_queued_jobs: int = Field(
+        200_000,
+        ge=1,
+        description="queued jobs at which requests that create further jobs are rejected",
+    )
+    max_queued_jobs_per_map: int = Field(
+        100_000, ge=1, description="queued jobs of one map at which such requests are rejected"
+    )
+    max_queued_queries: int = Field(
+        1000, ge=1, description="maximum queued query photos; uploads do not count"
+    )
+    max_concurrent_uploads: int = Field(
+        32,
+        ge=1,
+        description="files that one gateway receives at the same time; the same number of query "
+        "photos is allowed in addition",
+    )
+    max_concurrent_uploads_per_caller: int = Field(
+        16, ge=1, description="concurrent uploads of one key, and of one address"
+    )
+    min_free_bytes: int = Field(
+        500_000_000,
+        ge=0,
+        description="free disk space of PLACEWISE_HOME and UPLOAD_DIR below which uploads are "
+        "rejected and batches wait; query photos are rejected below a tenth of it",
+    )
+    idempotency_key_seconds: float = Field(
+        86_400.0, gt=0, description="time for which an Idempotency-Key is remembered, seconds"
+    )
+
+    # Comparison of query and results (`rerank`, `explain`).
+    compare_wait_seconds: float = Field(
+        10.0,
+        ge=0,
+        description="maximum wait for a comparison inside a request, seconds; after that the "
+        "response is 202 with a job to poll",
+    )
+
+    @field_validator("admin_key")
+    @classmethod
+    def _check_admin_key(cls, value: SecretStr | None) -> SecretStr | None:
+        if value is None:
+            return None
+        key = value.get_secret_value()
+        if len(key) < MIN_ADMIN_KEY_CHARACTERS or not re.fullmatch(r"[!-~]+", key):
+            raise ValueError(
+                f"a key has at least {MIN_ADMIN_KEY_CHARACTERS} printable ASCII characters and no "
+                "blanks; generate one with: openssl rand -hex 24"
+            )
+        return value
+
+    @field_validator("cors_origins")
+    @classmethod
+    def _check_origins(cls, value: str | None) -> str | None:
+        for origin in split_list(value):
+            if not re.fullmatch(r"https?://([a-z0-9.-]+|\[[0-9a-f:]+\])(:\d+)?", origin):
+                raise ValueError(
+                    f"{origin!r} is not an origin. An origin is a scheme, a host and a port in "
+                    "lower case, without a path: https://maps.example.com"
+                )
+        return value
+
+    @field_validator("trusted_proxies")
+    @classmethod
+    def _check_networks(cls, value: str | None) -> str | None:
+        for address in split_list(value):
+            try:
+                ip_network(address)
+            except ValueError as error:
+                raise ValueError(
+                    f"{error}; expected an address or network such as 10.0.0.5 or 10.0.0.0/8"
+                ) from None
+        return value
+
+    @field_validator("map_tiles")
+    @classmethod
+    def _check_tile_url(cls, value: str | None) -> str | None:
+        # The host becomes part of the page's Content-Security-Policy: nothing else may follow it.
+        if value is not None and not (
+            re.fullmatch(r"https?://[A-Za-z0-9.-]+(:\d+)?/[^\s]+", value)
+            and all(part in value for part in ("{z}", "{x}", "{y}"))
+        ):
+            raise ValueError(
+                f"{value!r} is not a URL template with {{z}}, {{x}} and {{y}}, such as "
+                "https://tile.openstreetmap.org/{z}/{x}/{y}.png"
+            )
+        return value
+
+    @model_validator(mode="after")
+    def _check_map_attribution(self) -> Self:
+        if self.map_tiles is not None and self.map_attribution is None:
+            raise ValueError(
+                "MAP_TILES needs MAP_ATTRIBUTION, which is shown in the corner of the map: "
+                "© OpenStreetMap contributors"
+            )
+        return self
+
+    @property
+    def allowed_origins(self) -> tuple[str, ...]:
+        """Origins other than the server's own whose pages may call the API."""
+        return tuple(dict.fromkeys(split_list(self.cors_origins)))
+
+    @property
+    def proxy_addresses(self) -> list[str]:
+        """Addresses and networks of trusted reverse proxies."""
+        return split_list(self.trusted_proxies)

@@ -1,0 +1,85 @@
+"""Settings of search: catalog sync, memory budget, shards, ranking, location estimates."""
+
+from __future__ import annotations
+
+import re
+from typing import Literal
+
+from pydantic import Field, field_validator
+from pydantic_settings import BaseSettings
+
+from shared.config.lists import split_list
+from shared.config.shards import Shard
+
+
+class SearchSettings(BaseSettings):
+    """How search workers follow the catalog, share the rows among them and rank results."""
+
+    estimate_radius_m: float = Field(
+        25.0,
+        gt=0,
+        description="distance to the true position within which an estimate counts as correct, "
+        "metres",
+    )
+    word_weights: bool = Field(
+        True,
+        description="rank by visual word weights where a map has them, and learn them for maps "
+        "with a vocabulary of their own",
+    )
+    search_follow_seconds: float = Field(
+        1.0, gt=0, description="interval at which search polls the catalog for changes, seconds"
+    )
+    search_wait_seconds: float = Field(
+        5.0, gt=0, description="maximum wait for `min_version`, seconds"
+    )
+    search_memory_budget: int | None = Field(
+        None,
+        ge=0,
+        description="bytes of codes and rows that search keeps in memory; unset: half of the "
+        "machine's memory, or of the container's memory limit",
+    )
+    search_device: Literal["auto", "cpu", "cuda"] = Field(
+        "auto", description="device that compares rows; auto: a CUDA GPU where there is one"
+    )
+
+    # Search workers on several machines (`placewise search`, which listens on HOST and PORT).
+    search_shard: str = Field(
+        "0/1", description="shard of this search worker: 1/3 is the second of three shards"
+    )
+    search_urls: str | None = Field(
+        None,
+        description="URLs of all search workers, separated by commas; unset: search runs in this "
+        "process",
+    )
+    search_timeout_seconds: float = Field(
+        10.0,
+        gt=0,
+        description="timeout for the shards' responses, seconds; a shard that exceeds it is "
+        "omitted from the result",
+    )
+
+    @field_validator("search_shard")
+    @classmethod
+    def _check_shard(cls, value: str) -> str:
+        return str(Shard.parse(value))
+
+    @field_validator("search_urls")
+    @classmethod
+    def _check_urls(cls, value: str | None) -> str | None:
+        for url in split_list(value):
+            if not re.fullmatch(r"https?://[^\s/?#]+/?", url):
+                raise ValueError(
+                    f"{url!r} is not a URL such as http://search-0:8000; separate several URLs by "
+                    "commas"
+                )
+        return value
+
+    @property
+    def shard(self) -> Shard:
+        """The shard that this process's search worker holds."""
+        return Shard.parse(self.search_shard)
+
+    @property
+    def search_worker_urls(self) -> tuple[str, ...]:
+        """The search workers' URLs without duplicates; () when search runs in this process."""
+        return tuple(dict.fromkeys(url.rstrip("/") for url in split_list(self.search_urls)))
