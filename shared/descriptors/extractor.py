@@ -223,7 +223,7 @@ class Extractor:
             ) from error
 
     def features(self, pixels: Pixels) -> torch.Tensor:
-        """Compute the (B, patches, width) float32 features of (B, H, W, 3) pixels, on the device."""
+        """Compute (B, patches, width) float32 features of (B, H, W, 3) pixels, on the device."""
         with autocast(self.precision, self.backbone.device):
             return self.backbone.features(torch.from_numpy(np.ascontiguousarray(pixels)))
 

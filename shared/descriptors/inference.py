@@ -73,7 +73,7 @@ class BatchSizeLimit:
         """Halve the limit after a pass of `photos` photos ran out of memory."""
         self._max_pixels = min(self._max_pixels, photos * photo_pixels // 2)
         log.warning(
-            "%d photos of %d pixels at once are too much for the GPU: using half of that from now on",
+            "%d photos of %d pixels at once are too much for the GPU; halving the batch size limit",
             photos,
             photo_pixels,
         )
