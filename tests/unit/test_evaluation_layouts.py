@@ -37,7 +37,7 @@ def test_splits_of_a_data_set_are_sets_and_so_are_several_data_sets(tmp_path: Pa
     with pytest.raises(InvalidRequest, match="sfxs_test, sfxs_val, tokyoxs_test") as caught:
         open_evaluation_set(tmp_path)
     assert code_of(caught) == "which_set"
-    with pytest.raises(NotFound, match="There are: sfxs_test, sfxs_val") as missing:
+    with pytest.raises(NotFound, match="Available: sfxs_test, sfxs_val") as missing:
         open_evaluation_set(tmp_path / "SF_XS", "sfxs_tset")
     assert code_of(missing) == "set_missing"
 
