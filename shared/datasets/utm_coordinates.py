@@ -18,9 +18,9 @@ UtmGrid = tuple[int, bool]
 Positions = NDArray[np.float64]
 
 MAX_ZONE_SPAN_DEGREES = 9.0
-"""Maximum distance in longitude from a zone's meridian for projecting into the zone. No zone extends
-more than 6 degrees to one side; beyond 9 degrees the projection is off by millimetres, and no photo
-there is within the radius of any rule."""
+"""Maximum distance in longitude from a zone's meridian for projecting into the zone. No zone
+extends more than 6 degrees to one side; beyond 9 degrees the projection is off by millimetres, and
+no photo there is within the radius of any rule."""
 
 
 def utm_positions(photos: Sequence[DatasetPhoto]) -> tuple[Positions, list[UtmGrid | None]]:

@@ -182,7 +182,7 @@ def test_csv_tables_place_photos_by_degrees_or_metres_over_zones(tmp_path: Path)
     first = opened.database[0]
     assert (first.heading, first.place, first.frame, first.sequence) == (10, "x", 3, "s")
     assert first.zone == "32U"
-    with pytest.raises(InvalidRequest, match="1 photos say no frame"):
+    with pytest.raises(InvalidRequest, match="1 photos have no frame"):
         open_evaluation_set(tmp_path, rule="frames 2")
 
 
