@@ -126,7 +126,7 @@ def test_kept_features_are_what_was_compared() -> None:
     ids=["empty", "a header's begin", "cut off", "an archive"],
 )
 def test_damaged_features_are_noticed(data: bytes) -> None:
-    with pytest.raises(ValueError, match="no array"):
+    with pytest.raises(ValueError, match="not a NumPy array"):
         LocalFeatures.decode(data, WIDTH)
 
 
